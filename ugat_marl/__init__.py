@@ -1,0 +1,1 @@
+"""Multi-agent traffic-signal environments across the gap between simulation and street."""

@@ -1,0 +1,82 @@
+"""Every exception that crosses a module boundary.
+
+Messages name the thing, the value, what is allowed and the way out; the command line prints them
+as one line and leaves with exit code 2.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class UgatMarlError(Exception):
+    """Base of all errors a user of `ugat_marl` can provoke."""
+
+
+class ScenarioError(UgatMarlError):
+    """A scenario directory, or one of its files, is missing, unreadable or contradicts itself."""
+
+
+class UnknownNameError(UgatMarlError, ValueError):
+    """A name (scenario, domain, observation, option ...) that does not exist.
+
+    Args:
+        kind: What was asked for, e.g. ``"domain"``.
+        name: The name as given.
+        allowed: All names that exist.
+        hint: A sentence on the way out, appended to the message.
+    """
+
+    def __init__(self, kind: str, name: str, allowed: Iterable[str], hint: str = "") -> None:
+        self.kind = kind
+        self.name = name
+        self.allowed = sorted(set(allowed))
+        near = nearest(name, self.allowed)
+        guess = f" Did you mean {near!r}?" if near else ""
+        listed = ", ".join(self.allowed)
+        super().__init__(
+            f"unknown {kind} {name!r}.{guess} Known: {listed}.{' ' + hint if hint else ''}"
+        )
+
+    def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str]]]:
+        return (type(self), (self.kind, self.name, self.allowed))
+
+
+class OptionError(UgatMarlError, ValueError):
+    """An option has an impossible value."""
+
+
+class ActionError(UgatMarlError, ValueError):
+    """An action is missing, of the wrong type, or outside the action space of its agent."""
+
+
+class SimulatorError(UgatMarlError, RuntimeError):
+    """SUMO refused to start, or failed while running; the message holds SUMO's own words."""
+
+
+class SimulatorBusy(SimulatorError):
+    """A second simulation was asked for in a process that already runs one."""
+
+
+class SimulatorCrashed(SimulatorError):
+    """The process that ran the simulation died; other simulations are not affected."""
+
+
+class EpisodeError(UgatMarlError, RuntimeError):
+    """`step`, `state` or `scores` was called at a moment of the episode when it has no meaning."""
+
+
+class LogError(UgatMarlError):
+    """A transition log cannot be read or does not fit the scenario."""
+
+
+class CheckpointError(UgatMarlError):
+    """A checkpoint cannot be read, holds impossible numbers, or belongs to something else."""
+
+
+def nearest(name: str, allowed: Iterable[str]) -> str | None:
+    """The spelling in `allowed` closest to `name`, or None if nothing is close."""
+    by_lower = {candidate.lower(): candidate for candidate in allowed}
+    found = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
+    return by_lower[found[0]] if found else None

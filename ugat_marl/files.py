@@ -1,0 +1,102 @@
+"""Files that are whole or absent, and XML that cannot do anything but be read.
+
+Everything the suite writes goes through `write_whole`: a killed run leaves the old file or the new
+one, never half of either. Everything it reads as XML goes through `parse_xml`, which refuses
+entities and document types.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import os
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from xml.parsers import expat
+
+from ugat_marl.errors import ScenarioError
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a temporary path beside `path`; it replaces `path` if the block ends normally."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: bytes | str) -> None:
+    """Writes `content` to `path` so that a reader sees the old file or the new one."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of `path`, unpacked if its name ends in ``.gz``.
+
+    Raises:
+        ScenarioError: The file is missing, unreadable or a broken archive.
+    """
+    try:
+        data = path.read_bytes()
+        return gzip.decompress(data) if path.suffix == ".gz" else data
+    except FileNotFoundError:
+        raise ScenarioError(f"{path}: no such file") from None
+    except (OSError, EOFError) as error:
+        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+
+
+def parse_xml(content: bytes, name: str) -> ET.Element:
+    """Parses XML without document types or entities.
+
+    Args:
+        content: The document.
+        name: What to call it in errors, usually its path.
+
+    Raises:
+        ScenarioError: Not well-formed (a truncated file, say), or declares a document type.
+    """
+    builder = ET.TreeBuilder()
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+
+    def refuse(*_: object) -> None:
+        raise ScenarioError(f"{name}: XML document types and entities are not accepted; remove them")
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        builder.start(tag, attributes)
+
+    def end(tag: str) -> None:
+        builder.end(tag)
+
+    parser.StartDoctypeDeclHandler = refuse
+    parser.EntityDeclHandler = refuse
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.CharacterDataHandler = builder.data
+    try:
+        parser.Parse(content, True)
+        return builder.close()
+    except expat.ExpatError as error:
+        raise ScenarioError(
+            f"{name}: not well-formed XML ({error}); the file may have been cut short"
+        ) from None
+    except (ValueError, LookupError) as error:
+        raise ScenarioError(f"{name}: cannot be decoded: {error}") from None
+
+
+def xml_bytes(root: ET.Element) -> bytes:
+    """Serialises an element tree as an indented UTF-8 document."""
+    ET.indent(root, "    ")
+    return ET.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"

@@ -1,0 +1,29 @@
+"""Seeds derived from seeds: the same path of numbers always gives the same stream.
+
+A run that is resumed asks for the stream of "iteration 3, episode 2" and gets it, without any
+generator state having been saved.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+
+def derive_seed(seed: int, *path: int | str) -> int:
+    """A 31-bit seed, independent for every `path` below the same root `seed`."""
+    words = [seed & 0xFFFFFFFF, (seed >> 32) & 0xFFFFFFFF]
+    for part in path:
+        words.extend(part.encode() if isinstance(part, str) else [part & 0xFFFFFFFF])
+        words.append(0xFFFFFFFF)  # ends a part, so that ("ab", "c") and ("a", "bc") differ
+    return int(np.random.SeedSequence(words).generate_state(1, np.uint32)[0] >> 1)
+
+
+def numpy_generator(seed: int, *path: int | str) -> np.random.Generator:
+    """A numpy generator for the stream `path` below `seed`."""
+    return np.random.default_rng(derive_seed(seed, *path))
+
+
+def torch_generator(seed: int, *path: int | str) -> torch.Generator:
+    """A torch CPU generator for the stream `path` below `seed`."""
+    return torch.Generator().manual_seed(derive_seed(seed, *path))
