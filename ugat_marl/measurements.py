@@ -1,0 +1,74 @@
+"""What is measured: every lane at one instant, and every vehicle at the end of an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+HALTING_MPS = 0.1
+"""A vehicle slower than this stands in a queue (SUMO's definition of halting, m/s)."""
+
+
+@dataclass(frozen=True)
+class LaneTable:
+    """Which lanes are measured, in the order of every array of a `Snapshot`.
+
+    Attributes:
+        ids: Lane ids of SUMO, ``(lanes,)``.
+        capacity: Vehicles that fit on the lane, ``(lanes,)``, float64.
+        speed_mps: Speed limit, ``(lanes,)``, float64.
+    """
+
+    ids: tuple[str, ...]
+    capacity: NDArray[np.float64]
+    speed_mps: NDArray[np.float64]
+
+    def indices(self, lanes: Sequence[str]) -> NDArray[np.int64]:
+        """Positions of `lanes` in the arrays, int64."""
+        position = {lane: index for index, lane in enumerate(self.ids)}
+        return np.array([position[lane] for lane in lanes], dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All measured lanes at one instant.
+
+    Attributes:
+        time_s: Time on the scenario's clock.
+        vehicles: Number of vehicles per lane, ``(lanes,)``.
+        halting: Of these, slower than `HALTING_MPS`, ``(lanes,)``.
+        mean_speed_mps: Mean speed per lane; the speed limit where the lane is empty, ``(lanes,)``.
+        waiting_s: Sum over the lane's vehicles of the seconds since each last moved, ``(lanes,)``;
+            empty unless the simulator was started with `waiting`.
+        departed: Vehicles that entered the network since the start of the episode.
+        backlog: Vehicles due but not yet in the network, for want of space.
+    """
+
+    time_s: float
+    vehicles: NDArray[np.float64]
+    halting: NDArray[np.float64]
+    mean_speed_mps: NDArray[np.float64]
+    waiting_s: NDArray[np.float64]
+    departed: int
+    backlog: int
+
+
+@dataclass(frozen=True)
+class Trips:
+    """All vehicles due in an episode, finished or not, as SUMO reports them.
+
+    Attributes:
+        travel_time_s: From the scheduled departure to the arrival, or to the end of the episode,
+            ``(vehicles,)``; waiting outside the network counts.
+        delay_s: Time loss inside the network plus departure delay, ``(vehicles,)``.
+        finished: Whether the vehicle arrived, bool ``(vehicles,)``.
+        entered: Whether the vehicle got into the network, bool ``(vehicles,)``.
+    """
+
+    travel_time_s: NDArray[np.float64]
+    delay_s: NDArray[np.float64]
+    finished: NDArray[np.bool_]
+    entered: NDArray[np.bool_]

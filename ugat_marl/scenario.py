@@ -1,0 +1,411 @@
+"""A scenario: road network, demand, timing and signal rules, as one immutable value.
+
+On disk it is a directory with a ``scenario.toml`` and SUMO files, or a plain ``.sumocfg``. Effects
+(see `ugat_marl.effects`) map scenarios to scenarios; a derived one keeps its edited files in memory
+until it is written or simulated.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import tomllib
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import Field
+
+from ugat_marl.errors import ScenarioError, UnknownNameError, nearest
+from ugat_marl.files import parse_xml, read_bytes, replacing, write_whole
+
+PhaseSource = Literal["programme", "conflict-free"] | tuple[str, ...]
+"""Where an intersection's green phases come from: the network's own signal programme, all maximal
+conflict-free sets of movements, or an explicit list of SUMO states."""
+
+_FORBIDDEN_SUMO_OPTIONS = (
+    "output", "file", "files", "seed", "port", "begin", "end", "step-length", "script", "log",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Document:
+    """One SUMO input file: on disk as it was found, or edited in memory.
+
+    Attributes:
+        name: File name, without directories.
+        path: Where it lies, or None if it exists only in memory.
+        content: The edited bytes, or None if the file on disk is meant.
+    """
+
+    name: str
+    path: Path | None = None
+    content: bytes | None = None
+
+    @property
+    def source(self) -> str:
+        """What to call the document in errors."""
+        return str(self.path or self.name)
+
+    def read(self) -> bytes:
+        """The (unpacked) bytes."""
+        if self.content is not None:
+            return self.content
+        assert self.path is not None
+        return read_bytes(self.path)
+
+    def parse(self) -> ET.Element:
+        """The document as an element tree, a fresh one at each call."""
+        return parse_xml(self.read(), self.source)
+
+    def edited(self, content: bytes) -> Document:
+        """The same document with other content."""
+        return Document(self.name.removesuffix(".gz"), None, content)
+
+
+class ControlSettings(pydantic.BaseModel):
+    """Signal timing. Greens, yellows and all-reds are in seconds."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+    decision_interval_s: Annotated[float, Field(gt=0, le=600)] = 10.0
+    yellow_s: Annotated[float, Field(ge=0, le=60)] = 3.0
+    all_red_s: Annotated[float, Field(ge=0, le=60)] = 2.0
+    min_green_s: Annotated[float, Field(ge=0, le=600)] = 5.0
+    phases: PhaseSource = "programme"
+
+
+class IntersectionSettings(pydantic.BaseModel):
+    """What one traffic light does differently from `ControlSettings`."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+    phases: PhaseSource
+
+
+class ScenarioFile(pydantic.BaseModel):
+    """The content of a ``scenario.toml``."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+    description: str = ""
+    network: str
+    routes: Annotated[tuple[str, ...], Field(min_length=1)]
+    additional: tuple[str, ...] = ()
+    begin_s: float = 0.0
+    duration_s: Annotated[float, Field(gt=0)] = 3600.0
+    step_length_s: Annotated[float, Field(gt=0, le=10)] = 1.0
+    control: ControlSettings = ControlSettings()
+    intersections: dict[str, IntersectionSettings] = {}
+    effects: tuple[dict[str, Any], ...] = ()
+    sumo: dict[str, str] = {}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A road network with demand and rules, ready to be simulated.
+
+    Attributes:
+        id: Name, ending in ``-vN`` for shipped scenarios.
+        network: The ``.net.xml``.
+        routes: Route files (vehicles, trips, flows).
+        additional: Additional files.
+        settings: Everything else, as in ``scenario.toml``.
+        applied: Descriptions of the effects that made this scenario out of another one.
+    """
+
+    id: str
+    network: Document
+    routes: tuple[Document, ...]
+    additional: tuple[Document, ...]
+    settings: ScenarioFile
+    applied: tuple[str, ...] = field(default=())
+
+    @property
+    def control(self) -> ControlSettings:
+        """Signal timing."""
+        return self.settings.control
+
+    @property
+    def decisions(self) -> int:
+        """Number of decisions in an episode of the scenario's full duration."""
+        return int(self.settings.duration_s // self.control.decision_interval_s)
+
+    @property
+    def documents(self) -> tuple[Document, ...]:
+        """All files: network, routes, additional."""
+        return (self.network, *self.routes, *self.additional)
+
+    @functools.cached_property
+    def hash(self) -> str:
+        """SHA-256 over the content of all files and all settings, as 64 hex digits."""
+        digest = hashlib.sha256()
+        settings = self.settings.model_dump(mode="json")
+        for cosmetic in ("description", "network", "routes", "additional"):
+            settings.pop(cosmetic)
+        digest.update(json.dumps(settings, sort_keys=True).encode())
+        for document in self.documents:
+            content = document.read()
+            digest.update(f"\0{len(content)}\0".encode())
+            digest.update(content)
+        return digest.hexdigest()
+
+    def with_control(self, **changes: Any) -> Scenario:
+        """The same scenario with other signal timing (keywords of `ControlSettings`)."""
+        control = {**self.control.model_dump(), **changes}
+        settings = {**self.settings.model_dump(), "control": control}
+        return replace(self, settings=_validated(settings, f"scenario {self.id!r}"))
+
+    def with_duration(self, duration_s: float) -> Scenario:
+        """The same scenario, ending earlier or later."""
+        settings = {**self.settings.model_dump(), "duration_s": duration_s}
+        return replace(self, settings=_validated(settings, f"scenario {self.id!r}"))
+
+    def write(self, directory: Path) -> Path:
+        """Writes a scenario directory that any SUMO and `load_scenario` can use.
+
+        Returns:
+            `directory`.
+        """
+        names = {document.name for document in self.documents}
+        if len(names) != len(self.documents):
+            raise ScenarioError(f"scenario {self.id!r}: two of its files have the same name")
+        for document in self.documents:
+            write_whole(directory / document.name, _as_found(document))
+        settings = self.settings.model_dump(mode="json", exclude_defaults=True)
+        settings |= {
+            "network": self.network.name,
+            "routes": [document.name for document in self.routes],
+            "additional": [document.name for document in self.additional],
+        }
+        with replacing(directory / "scenario.toml") as temporary:
+            temporary.write_text(_toml(settings, self.applied))
+        return directory
+
+
+def load_scenario(name: str | Path) -> Scenario:
+    """Loads a scenario; effects listed in its ``scenario.toml`` are kept in its settings.
+
+    Args:
+        name: Id of a shipped scenario (``"grid4x4-v1"``), a directory with a ``scenario.toml``, a
+            ``.sumocfg``, or ``"resco:<map>"`` for a network of an installed `sumo-rl` wheel.
+
+    Raises:
+        UnknownNameError: No such scenario.
+        ScenarioError: A file is missing, or the description is not valid.
+    """
+    text = str(name)
+    if text.startswith("resco:"):
+        return _load_sumocfg(_resco_configuration(text.removeprefix("resco:")), text)
+    path = Path(text).expanduser()
+    if path.suffix == ".sumocfg" or path.name.endswith(".sumocfg.xml"):
+        return _load_sumocfg(path, path.name.split(".")[0])
+    if (path / "scenario.toml").is_file():
+        return _load_directory(path)
+    if path.name == "scenario.toml" and path.is_file():
+        return _load_directory(path.parent)
+    shipped = dict(shipped_scenarios())
+    if text in shipped:
+        return _load_directory(shipped[text])
+    if path.is_dir():
+        raise ScenarioError(f"{path}: a directory without scenario.toml is not a scenario")
+    raise UnknownNameError(
+        "scenario", text, shipped, "A directory, a .sumocfg file and resco:<map> work as well."
+    )
+
+
+def shipped_scenarios() -> Iterator[tuple[str, Path]]:
+    """Ids and directories of the scenarios that come with the package."""
+    package = Path(__file__).resolve().parent
+    for root in (package / "_scenarios", package.parent / "scenarios"):
+        if root.is_dir():
+            for file in sorted(root.glob("*/scenario.toml")):
+                yield file.parent.name, file.parent
+            return
+
+
+def _load_directory(directory: Path) -> Scenario:
+    file = directory / "scenario.toml"
+    try:
+        raw = tomllib.loads(file.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{file}: not valid TOML: {error}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{file}: cannot be read: {error}") from None
+    settings = _validated(raw, str(file))
+
+    def document(name: str, key: str) -> Document:
+        path = directory / name
+        if not path.is_file():
+            raise ScenarioError(f"{file}: {key} names {name!r}, but {path} does not exist")
+        return Document(path.name, path)
+
+    return Scenario(
+        id=directory.resolve().name,
+        network=document(settings.network, "network"),
+        routes=tuple(document(name, "routes") for name in settings.routes),
+        additional=tuple(_quiet(document(name, "additional")) for name in settings.additional),
+        settings=settings,
+    )
+
+
+def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
+    root = parse_xml(read_bytes(path), str(path))
+    values = {element.tag: element.get("value", "") for element in root.iter() if "value" in element.attrib}
+    values = {tag.removesuffix("s") if tag == "net-files" else tag: v for tag, v in values.items()}
+    if "net-file" not in values:
+        raise ScenarioError(f"{path}: no <net-file>; a scenario needs a network")
+    if not values.get("route-files"):
+        raise ScenarioError(f"{path}: no <route-files>; a scenario needs vehicles")
+
+    def documents(key: str) -> tuple[Document, ...]:
+        found: list[Document] = []
+        for name in values.get(key, "").replace(",", " ").split():
+            file = path.parent / name
+            if not file.is_file():
+                raise ScenarioError(f"{path}: <{key}> names {name!r}, but {file} does not exist")
+            found.append(Document(file.name, file))
+        return tuple(found)
+
+    begin = _seconds(values.get("begin", "0"), path, "begin")
+    end = _seconds(values.get("end", "-1"), path, "end")
+    if end >= 0 and end <= begin:
+        raise ScenarioError(f"{path}: end ({end:g} s) is not after begin ({begin:g} s)")
+    processing = root.find("processing")
+    routing = root.find("routing")
+    sumo = {
+        child.tag: child.get("value", "")
+        for section in (processing, routing)
+        for child in (section if section is not None else ())
+        if _harmless(child.tag) and child.tag != "time-to-teleport"
+    }
+    network = documents("net-file")[0]
+    routes, additional = documents("route-files"), documents("additional-files")
+    settings = _validated(
+        {
+            "description": f"SUMO configuration {path.name}",
+            "network": network.name,
+            "routes": [document.name for document in routes],
+            "additional": [document.name for document in additional],
+            "begin_s": begin,
+            "duration_s": end - begin if end >= 0 else 3600.0,
+            "step_length_s": _seconds(values.get("step-length", "1"), path, "step-length"),
+            "sumo": sumo,
+        },
+        str(path),
+    )
+    return Scenario(scenario_id, network, routes, tuple(map(_quiet, additional)), settings)
+
+
+def _resco_configuration(name: str) -> Path:
+    """The ``.sumocfg`` of a RESCO map inside an installed sumo-rl, which is never imported."""
+    from importlib.util import find_spec
+
+    spec = find_spec("sumo_rl")
+    roots = list(spec.submodule_search_locations or []) if spec else []
+    if not roots:
+        raise ScenarioError(
+            f"resco:{name} needs the RESCO networks of the sumo-rl wheel; "
+            "install them with: pip install 'ugat-marl[resco]'"
+        )
+    maps = {file.parent.name: file for file in Path(roots[0]).glob("nets/RESCO/*/*.sumocfg")}
+    if name not in maps:
+        raise UnknownNameError("RESCO map", name, maps)
+    return maps[name]
+
+
+def _validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
+    try:
+        settings = ScenarioFile.model_validate(raw)
+    except pydantic.ValidationError as error:
+        raise ScenarioError("; ".join(_explain(source, item) for item in error.errors())) from None
+    for option in settings.sumo:
+        if not _harmless(option):
+            raise ScenarioError(f"{source}: sumo.{option} is set by the suite and cannot be given")
+    control = settings.control
+    step = settings.step_length_s
+    for key in ("decision_interval_s", "yellow_s", "all_red_s", "min_green_s"):
+        value = getattr(control, key)
+        if abs(value / step - round(value / step)) > 1e-6:
+            raise ScenarioError(
+                f"{source}: control.{key} = {value:g} is not a multiple of step_length_s = {step:g}; "
+                "SUMO would cut the phase"
+            )
+    if settings.duration_s < control.decision_interval_s:
+        raise ScenarioError(
+            f"{source}: duration_s = {settings.duration_s:g} is shorter than one decision interval "
+            f"({control.decision_interval_s:g} s)"
+        )
+    return settings
+
+
+def _explain(source: str, item: Any) -> str:
+    key = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        known = {
+            *ScenarioFile.model_fields, *ControlSettings.model_fields,
+        }  # fmt: skip
+        guess = nearest(str(item["loc"][-1]), known)
+        return f"{source}: unknown key {key!r}" + (f"; did you mean {guess!r}?" if guess else "")
+    if item["type"] == "missing":
+        return f"{source}: key {key!r} is missing"
+    return f"{source}: {key} = {item['input']!r}: {item['msg'].lower()}"
+
+
+def _harmless(option: str) -> bool:
+    return not set(option.split("-")) & set(_FORBIDDEN_SUMO_OPTIONS) and option not in (
+        "step-length",
+    )
+
+
+def _seconds(text: str, path: Path, key: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ScenarioError(f"{path}: {key} = {text!r} is not a number of seconds") from None
+
+
+def _as_found(document: Document) -> bytes:
+    if document.content is None and document.path is not None:
+        return document.path.read_bytes()
+    return document.read()
+
+
+def _quiet(document: Document) -> Document:
+    """The document without outputs: detectors and edge data would write beside the user's files."""
+    root = document.parse()
+    writers = [element for element in root.iter() if "file" in element.attrib]
+    if not writers:
+        return document
+    from ugat_marl.files import xml_bytes
+
+    for element in writers:
+        element.set("file", "NUL")
+    return document.edited(xml_bytes(root))
+
+
+def _toml(settings: Mapping[str, Any], applied: tuple[str, ...]) -> str:
+    lines = [f"# made by applying {text}" for text in applied]
+    tables: list[str] = []
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            tables += _toml_table(key, value)
+        elif key == "effects":
+            for effect in value:
+                tables += ["", "[[effects]]", *(f"{k} = {json.dumps(v)}" for k, v in effect.items())]
+        else:
+            lines.append(f"{key} = {json.dumps(value)}")
+    return "\n".join(lines + tables) + "\n"
+
+
+def _toml_table(name: str, table: Mapping[str, Any]) -> list[str]:
+    plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
+    lines = ["", f"[{name}]", *(f"{json.dumps(k)} = {json.dumps(v)}" for k, v in plain.items())]
+    for key, value in table.items():
+        if isinstance(value, dict):
+            lines += _toml_table(f"{name}.{json.dumps(key)}", value)
+    return lines
