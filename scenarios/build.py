@@ -1,0 +1,59 @@
+"""Builds network and demand of the shipped scenarios from their `source.toml`: `make scenarios`.
+
+    python scenarios/build.py [name ...] [--into FOLDER]
+
+The same sources give the same bytes, whatever the day and the machine; a test rebuilds them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from demand import draw_demand
+from roads import convert, plain_xml, read_plan
+
+from ugat_marl.files import write_whole
+
+HERE = Path(__file__).resolve().parent
+
+
+def build(name: str, into: Path) -> list[Path]:
+    """Writes network.net.xml and demand.rou.xml of scenario `name` below `into`."""
+    source = _read(HERE / name / "source.toml")
+    settings = _read(HERE / name / "scenario.toml")
+    vehicles = _read(HERE / "vehicles.toml")
+    plan = read_plan(source)
+    files = {
+        settings["network"]: convert(plain_xml(plan, source["speed_mps"]), source["netconvert"]),
+        settings["routes"][0]: draw_demand(
+            plan, source["demand"], vehicles, settings["duration_s"]
+        ),
+    }
+    for file, content in files.items():
+        write_whole(into / name / file, content)
+    return [into / name / file for file in files]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+def main() -> None:
+    """Command line."""
+    known = sorted(folder.parent.name for folder in HERE.glob("*/source.toml"))
+    parser = argparse.ArgumentParser(description="Build the shipped scenarios.")
+    parser.add_argument("names", nargs="*", metavar="name", help=f"of {', '.join(known)}; all")
+    parser.add_argument("--into", type=Path, default=HERE, help="folder to write to")
+    options = parser.parse_args()
+    for name in options.names or known:
+        if name not in known:
+            parser.error(f"no scenario {name!r} with a source.toml; there are {', '.join(known)}")
+        for path in build(name, options.into):
+            print(path)
+
+
+if __name__ == "__main__":
+    main()
