@@ -79,8 +79,9 @@ class Plan:
     def connections(self, approach: Road) -> list[tuple[int, Road, int]]:
         """(lane, road entered, lane entered) for every lane and turn of `approach`.
 
-        Right turns enter the lane at the kerb, left turns the one in the middle, through lanes
-        keep their order: so streams that are served together never merge where there is room.
+        Right turns enter the lane at the kerb and through lanes keep their order. Left turns may
+        enter every lane: they need the whole road, so that they conflict with the through traffic
+        that enters it from another side, and a four-arm junction has eight conflict-free phases.
         """
         exits = self.exits(approach)
         through = [lane for lane, turns in enumerate(approach.lanes) if "s" in turns]
@@ -89,11 +90,12 @@ class Plan:
             for turn in turns:
                 if turn not in exits:
                     raise ScenarioError(f"{approach.id} lane {lane}: no road to the {TURNS[turn]}")
-                last = len(exits[turn].lanes) - 1
-                entered = {"r": 0, "l": last, "s": through.index(lane) if turn == "s" else 0}[turn]
-                if entered > last:
+                count = len(exits[turn].lanes)
+                if turn == "s" and through.index(lane) >= count:
                     raise ScenarioError(f"{approach.id}: more lanes straight on than the road has")
-                found.append((lane, exits[turn], entered))
+                first = through.index(lane) if turn == "s" else 0
+                entered = range(count) if turn == "l" else (first,)
+                found.extend((lane, exits[turn], target) for target in entered)
         return found
 
 
