@@ -73,5 +73,5 @@ def mask_of(sizes: Sequence[int]) -> Tensor:
 
 
 def pad(rows: Sequence[Tensor], width: int) -> Tensor:
-    """Stacks ``(batch, size_i)`` tensors into ``(agents, batch, width)``, zero-padded on the right."""
+    """Stacks ``(batch, size_i)`` tensors into ``(agents, batch, width)``, zeros on the right."""
     return torch.stack([nn.functional.pad(row, (0, width - row.shape[-1])) for row in rows])

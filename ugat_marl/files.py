@@ -72,7 +72,7 @@ def parse_xml(content: bytes, name: str) -> ET.Element:
     parser.buffer_text = True
 
     def refuse(*_: object) -> None:
-        raise ScenarioError(f"{name}: XML document types and entities are not accepted; remove them")
+        raise ScenarioError(f"{name}: document types and entities are not accepted; remove them")
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         builder.start(tag, attributes)

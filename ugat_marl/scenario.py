@@ -255,7 +255,11 @@ def _load_directory(directory: Path) -> Scenario:
 
 def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
     root = parse_xml(read_bytes(path), str(path))
-    values = {element.tag: element.get("value", "") for element in root.iter() if "value" in element.attrib}
+    values = {
+        element.tag: element.get("value", "")
+        for element in root.iter()
+        if "value" in element.attrib
+    }
     values = {tag.removesuffix("s") if tag == "net-files" else tag: v for tag, v in values.items()}
     if "net-file" not in values:
         raise ScenarioError(f"{path}: no <net-file>; a scenario needs a network")
@@ -332,8 +336,8 @@ def _validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
         value = getattr(control, key)
         if abs(value / step - round(value / step)) > 1e-6:
             raise ScenarioError(
-                f"{source}: control.{key} = {value:g} is not a multiple of step_length_s = {step:g}; "
-                "SUMO would cut the phase"
+                f"{source}: control.{key} = {value:g} is not a multiple of step_length_s = "
+                f"{step:g}; SUMO would cut the phase"
             )
     if settings.duration_s < control.decision_interval_s:
         raise ScenarioError(
@@ -396,7 +400,11 @@ def _toml(settings: Mapping[str, Any], applied: tuple[str, ...]) -> str:
             tables += _toml_table(key, value)
         elif key == "effects":
             for effect in value:
-                tables += ["", "[[effects]]", *(f"{k} = {json.dumps(v)}" for k, v in effect.items())]
+                tables += [
+                    "",
+                    "[[effects]]",
+                    *(f"{k} = {json.dumps(v)}" for k, v in effect.items()),
+                ]
         else:
             lines.append(f"{key} = {json.dumps(value)}")
     return "\n".join(lines + tables) + "\n"

@@ -1,0 +1,313 @@
+"""Static facts read from a ``.net.xml``: intersections, lanes, links, conflicts, neighbours."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import parse_xml
+from ugat_marl.measurements import LaneTable
+from ugat_marl.phases import Link, conflict_free_phases, conflicting_greens, programme_phases
+from ugat_marl.scenario import Scenario
+from ugat_marl.signals import check_phases
+
+VEHICLE_SPACE_M = 7.5
+"""Room of a queued default vehicle: 5 m length plus 2.5 m gap."""
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A lane outside of junctions.
+
+    Attributes:
+        id: SUMO id.
+        edge: Its edge.
+        length_m: Length.
+        speed_mps: Speed limit.
+        shape: Centre line, ``((x, y), ...)`` in m.
+    """
+
+    id: str
+    edge: str
+    length_m: float
+    speed_mps: float
+    shape: tuple[tuple[float, float], ...]
+
+    @property
+    def capacity(self) -> float:
+        """Default vehicles that fit on the lane, at least one."""
+        return max(1.0, self.length_m / VEHICLE_SPACE_M)
+
+
+@dataclass(frozen=True)
+class Intersection:
+    """One traffic light: an agent.
+
+    Attributes:
+        id: SUMO id of the traffic light.
+        incoming_lanes: Lanes that lead to a link, in order of link index.
+        outgoing_lanes: Lanes that links lead to, in order of link index.
+        links: All links by index.
+        phases: Green states the agent chooses from.
+        programme: The network's own programme, ``(duration_s, state)``.
+        neighbours: Traffic lights one road away, in either direction.
+        position: Mean of the junctions' coordinates, m.
+    """
+
+    id: str
+    incoming_lanes: tuple[str, ...]
+    outgoing_lanes: tuple[str, ...]
+    links: tuple[Link, ...]
+    phases: tuple[str, ...]
+    programme: tuple[tuple[float, str], ...]
+    neighbours: tuple[str, ...]
+    position: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Network:
+    """All lanes and all intersections of a scenario.
+
+    Attributes:
+        lanes: Lanes outside of junctions by id.
+        intersections: Traffic lights with at least two green phases, in the order of their ids.
+        uncontrolled: Traffic lights with fewer green phases; they run their own programme.
+    """
+
+    lanes: Mapping[str, Lane]
+    intersections: tuple[Intersection, ...]
+    uncontrolled: tuple[str, ...]
+
+    @classmethod
+    def read(cls, scenario: Scenario) -> Network:
+        """Reads and checks the network of a scenario.
+
+        Raises:
+            ScenarioError: Not a network, no traffic light to control, phases that cannot be shown
+                or whose greens conflict, or settings for a traffic light that does not exist.
+        """
+        document = scenario.network
+        root = parse_xml(document.read(), document.source)
+        if root.tag != "net":
+            raise ScenarioError(f"{document.source}: the root is <{root.tag}>, not <net>")
+        lanes = _lanes(root)
+        links = _links(root)
+        programmes = _programmes(root, scenario)
+        if unknown := sorted(set(scenario.settings.intersections) - set(links)):
+            raise ScenarioError(
+                f"scenario {scenario.id!r}: intersections.{unknown[0]} is not a traffic light of "
+                f"{document.source}; it has: {', '.join(sorted(links)) or 'none'}"
+            )
+        foes = _foes(root)
+        reachable = _neighbours(links, root)
+        positions = _positions(root)
+        found: list[Intersection] = []
+        uncontrolled: list[str] = []
+        for tls in sorted(links):
+            own = tuple(sorted(links[tls], key=lambda link: (link.index, link.to_lane)))
+            programme = programmes.get(tls, ())
+            phases = _phases_of(scenario, tls, own, programme, foes)
+            if len(phases) < 2:
+                uncontrolled.append(tls)
+                continue
+            found.append(
+                Intersection(
+                    id=tls,
+                    incoming_lanes=_unique(link.from_lane for link in own),
+                    outgoing_lanes=_unique(link.to_lane for link in own),
+                    links=own,
+                    phases=phases,
+                    programme=programme,
+                    neighbours=reachable[tls],
+                    position=_centre([positions[link.junction] for link in own]),
+                )
+            )
+        if not found:
+            what = (
+                "only traffic lights with fewer than two green phases"
+                if links
+                else "no traffic light"
+            )
+            raise ScenarioError(
+                f"{document.source}: {what}; an environment needs at least one intersection with "
+                "two green phases (netconvert --tls.guess adds traffic lights)"
+            )
+        agents = {intersection.id for intersection in found}
+        pruned = tuple(_with_neighbours(item, agents) for item in found)
+        return cls(lanes, pruned, tuple(uncontrolled))
+
+    def intersection(self, tls: str) -> Intersection:
+        """The intersection with this SUMO id."""
+        return next(item for item in self.intersections if item.id == tls)
+
+    def lane_table(self) -> LaneTable:
+        """All incoming and outgoing lanes of intersections, each once, in a fixed order."""
+        names = _unique(
+            lane
+            for item in self.intersections
+            for lane in (*item.incoming_lanes, *item.outgoing_lanes)
+        )
+        return LaneTable(
+            names,
+            np.array([self.lanes[name].capacity for name in names]),
+            np.array([self.lanes[name].speed_mps for name in names]),
+        )
+
+
+def _phases_of(
+    scenario: Scenario,
+    tls: str,
+    links: tuple[Link, ...],
+    programme: tuple[tuple[float, str], ...],
+    foes: Mapping[str, Sequence[int]],
+) -> tuple[str, ...]:
+    own = scenario.settings.intersections.get(tls)
+    source = own.phases if own else scenario.control.phases
+    width = max(link.index for link in links) + 1
+    where = f"scenario {scenario.id!r}, traffic light {tls!r}"
+    for _, state in programme:
+        if len(state) < width:
+            raise ScenarioError(
+                f"{where}: a state of its programme has {len(state)} letters ({state!r}), but it "
+                f"controls {width} links; write one letter per link into the <tlLogic>"
+            )
+    if programme:
+        width = len(programme[0][1])
+    if source == "conflict-free":
+        phases = conflict_free_phases(links, foes, width, where)
+    elif source == "programme":
+        phases = programme_phases(programme)
+    else:
+        phases = source
+    check_phases(phases, width, where)
+    for phase in phases:
+        if pair := conflicting_greens(phase, links, foes):
+            raise ScenarioError(
+                f"{where}: phase {phase!r} gives protected green (G) to the conflicting links "
+                f"{pair[0]} and {pair[1]}; write g for the one that must yield"
+            )
+    return phases
+
+
+def _lanes(root: ET.Element) -> dict[str, Lane]:
+    lanes: dict[str, Lane] = {}
+    for edge in root.iter("edge"):
+        if edge.get("function") in ("internal", "crossing", "walkingarea"):
+            continue
+        for lane in edge.iter("lane"):
+            name = lane.get("id", "")
+            lanes[name] = Lane(
+                name,
+                edge.get("id", ""),
+                float(lane.get("length", "0")),
+                float(lane.get("speed", "0")),
+                _shape(lane.get("shape", "")),
+            )
+    return lanes
+
+
+def _shape(text: str) -> tuple[tuple[float, float], ...]:
+    points = (point.split(",") for point in text.split())
+    return tuple((float(xyz[0]), float(xyz[1])) for xyz in points)
+
+
+def _links(root: ET.Element) -> dict[str, list[Link]]:
+    links: dict[str, list[Link]] = defaultdict(list)
+    for item in root.iter("connection"):
+        tls = item.get("tl")
+        if tls is None or item.get("from", ":").startswith(":"):
+            continue
+        junction, request = _request_of(item.get("via", ""))
+        links[tls].append(
+            Link(
+                index=int(item.get("linkIndex", "0")),
+                from_lane=f"{item.get('from')}_{item.get('fromLane')}",
+                to_lane=f"{item.get('to')}_{item.get('toLane')}",
+                direction=item.get("dir", "s"),
+                junction=junction,
+                request=request,
+            )
+        )
+    return links
+
+
+def _request_of(via: str) -> tuple[str, int]:
+    """Junction and matrix row of an internal lane ``:<junction>_<first row>_<lane>``."""
+    if not via:
+        return "", -1
+    junction, first, lane = via[1:].rsplit("_", 2)
+    return junction, int(first) + int(lane)
+
+
+def _foes(root: ET.Element) -> dict[str, list[int]]:
+    """Per junction, a bit mask of conflicting rows for each row of the right-of-way matrix."""
+    foes: dict[str, list[int]] = {}
+    for junction in root.iter("junction"):
+        rows = {
+            int(r.get("index", "0")): int(r.get("foes", "0"), 2) for r in junction.iter("request")
+        }
+        foes[junction.get("id", "")] = [rows.get(i, 0) for i in range(max(rows, default=-1) + 1)]
+    return foes
+
+
+def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[float, str], ...]]:
+    """The programme SUMO runs: the last one defined, additional files after the network."""
+    programmes: dict[str, tuple[tuple[float, str], ...]] = {}
+    for tree in (root, *(document.parse() for document in scenario.additional)):
+        for logic in tree.iter("tlLogic"):
+            phases = tuple(
+                (float(phase.get("duration", "0")), phase.get("state", ""))
+                for phase in logic.iter("phase")
+            )
+            if phases:
+                programmes[logic.get("id", "")] = phases
+    return programmes
+
+
+def _neighbours(links: Mapping[str, list[Link]], root: ET.Element) -> dict[str, tuple[str, ...]]:
+    """Traffic lights reached along roads without another traffic light in between."""
+    enters = {link.from_edge: tls for tls, own in links.items() for link in own}
+    following: dict[str, set[str]] = defaultdict(set)
+    for item in root.iter("connection"):
+        if not item.get("from", ":").startswith(":") and item.get("tl") is None:
+            following[item.get("from", "")].add(item.get("to", ""))
+    adjacent: dict[str, set[str]] = {tls: set() for tls in links}
+    for tls, own in links.items():
+        edges = {link.to_lane.rsplit("_", 1)[0] for link in own}
+        seen: set[str] = set()
+        while edges:
+            edge = edges.pop()
+            seen.add(edge)
+            other = enters.get(edge)
+            if other is None:
+                edges |= following[edge] - seen
+            elif other != tls:
+                adjacent[tls].add(other)
+                adjacent[other].add(tls)
+    return {tls: tuple(sorted(found)) for tls, found in adjacent.items()}
+
+
+def _positions(root: ET.Element) -> dict[str, tuple[float, float]]:
+    positions = {
+        item.get("id", ""): (float(item.get("x", "0")), float(item.get("y", "0")))
+        for item in root.iter("junction")
+    }
+    return {"": (0.0, 0.0), **positions}
+
+
+def _centre(points: list[tuple[float, float]]) -> tuple[float, float]:
+    x, y = np.mean(points, axis=0)
+    return float(x), float(y)
+
+
+def _unique(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names))
+
+
+def _with_neighbours(item: Intersection, agents: set[str]) -> Intersection:
+    return replace(item, neighbours=tuple(n for n in item.neighbours if n in agents))
