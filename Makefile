@@ -1,0 +1,64 @@
+# Everything needs only Python 3.11 or newer (and make): the first call sets up .venv by itself.
+#
+#   make demo       trains a policy across the gap on a shipped network and prints the table
+#   make test       builds the wheel, installs it into .venv and tests it
+#   make check      format, lint, types, architecture, tests
+#   make bench      the figures of docs/, measured on this machine
+#   make scenarios  builds the shipped scenarios again from their sources
+#
+# PYTHON=... picks the interpreter, TESTS=... the tests, ARGS=... adds options to the command run.
+
+SHELL := /bin/bash
+VENV := .venv
+BIN := $(VENV)/bin
+TESTS ?= tests
+JOBS ?= auto
+
+# The first interpreter that is new enough; `make PYTHON=/path/to/python` overrules.
+CANDIDATES := python3 python3.13 python3.12 python3.11 python3.14 python
+PYTHON ?= $(shell for p in $(CANDIDATES); do \
+	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$p" && break; done)
+ENVIRONMENT = "$(PYTHON)" tools/environment.py
+
+# Nothing outside .venv is imported: not the source tree, not the user's own packages.
+unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV
+export PYTHONSAFEPATH := 1
+export PYTHONNOUSERSITE := 1
+
+.PHONY: help demo test check static bench scenarios python environment environment-dev
+.DEFAULT_GOAL := help
+
+help:
+	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
+
+demo: environment
+	$(BIN)/ugat-marl train grid2x2-v1 --real V4 --preset demo --out runs/demo $(ARGS)
+
+test: environment-dev
+	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
+
+check: static
+	@$(MAKE) --no-print-directory test
+
+static: environment-dev
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m ruff check .
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
+	$(BIN)/python -m pytest -q tests/architecture_test.py
+
+bench: environment-dev
+	$(BIN)/ugat-marl bench all $(ARGS)
+
+scenarios: environment
+	$(BIN)/python scenarios/build.py $(ARGS)
+
+environment: python
+	@$(ENVIRONMENT)
+
+environment-dev: python
+	@$(ENVIRONMENT) dev resco
+
+python:
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	echo "ugat_marl needs Python 3.11 or newer and found none in PATH (PYTHON='$(PYTHON)')." >&2; \
+	echo "Install one, or name it: make PYTHON=/path/to/python3.12 $(or $(MAKECMDGOALS),test)" >&2; exit 1; }
