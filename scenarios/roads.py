@@ -79,9 +79,10 @@ class Plan:
     def connections(self, approach: Road) -> list[tuple[int, Road, int]]:
         """(lane, road entered, lane entered) for every lane and turn of `approach`.
 
-        Right turns enter the lane at the kerb and through lanes keep their order. Left turns may
-        enter every lane: they need the whole road, so that they conflict with the through traffic
-        that enters it from another side, and a four-arm junction has eight conflict-free phases.
+        Right turns enter the lane at the kerb, left turns the one in the middle. Through lanes
+        keep their order and the innermost may enter all lanes that are left: so through traffic
+        needs the whole road, a left turn from another side conflicts with it, and a junction of
+        four arms has the usual eight conflict-free phases.
         """
         exits = self.exits(approach)
         through = [lane for lane, turns in enumerate(approach.lanes) if "s" in turns]
@@ -91,10 +92,12 @@ class Plan:
                 if turn not in exits:
                     raise ScenarioError(f"{approach.id} lane {lane}: no road to the {TURNS[turn]}")
                 count = len(exits[turn].lanes)
-                if turn == "s" and through.index(lane) >= count:
+                entered = {"r": range(1), "l": range(count - 1, count)}.get(turn)
+                if entered is None:
+                    order = through.index(lane)
+                    entered = range(order, count if lane == through[-1] else order + 1)
+                if not entered:
                     raise ScenarioError(f"{approach.id}: more lanes straight on than the road has")
-                first = through.index(lane) if turn == "s" else 0
-                entered = range(count) if turn == "l" else (first,)
                 found.extend((lane, exits[turn], target) for target in entered)
         return found
 
