@@ -1,0 +1,152 @@
+"""Domains: lists of effects by name, V1-V4 of the UGAT paper among them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.effects.base import Effect
+from ugat_marl.effects.vehicles import (
+    Acceleration,
+    Deceleration,
+    EmergencyDeceleration,
+    StartupDelay,
+)
+from ugat_marl.errors import OptionError, UnknownNameError, nearest
+from ugat_marl.scenario import Scenario, load_scenario
+
+Domain = str | Sequence[Effect]
+"""``"sim"``, a setting or its alias, ``"effect=value+effect=value"``, a scenario directory or
+``.sumocfg`` on the same road network, or effects."""
+
+
+def _setting(accel: float, decel: float, emergency: float, startup: float) -> tuple[Effect, ...]:
+    return (
+        Acceleration(accel),
+        Deceleration(decel),
+        EmergencyDeceleration(emergency),
+        StartupDelay(startup),
+    )
+
+
+SETTINGS: dict[str, tuple[Effect, ...]] = {
+    "V1": _setting(1.00, 2.50, 6.00, 0.50),
+    "V2": _setting(1.00, 2.50, 6.00, 0.75),
+    "V3": _setting(0.75, 3.50, 6.00, 0.25),
+    "V4": _setting(0.50, 1.50, 2.00, 0.50),
+}
+"""Da et al. (2023), table "Real-world Configurations": accel, decel, emergencyDecel (m/s^2) and
+startupDelay (s). The default, our ``sim``, is 2.60 / 4.50 / 9.00 / 0.00."""
+
+ALIASES: dict[str, str] = {
+    "light-loads": "V1",
+    "heavy-loads": "V2",
+    "rain": "V3",
+    "snow": "V4",
+}
+
+_EFFECTS: dict[str, type[Effect]] = {
+    kind.name: kind for kind in (Acceleration, Deceleration, EmergencyDeceleration, StartupDelay)
+}
+
+
+def known_effects() -> Mapping[str, type[Effect]]:
+    """All effects by name."""
+    return dict(_EFFECTS)
+
+
+def effect_from(record: Mapping[str, Any]) -> Effect:
+    """An effect from its name and parameters, as in ``[[effects]]`` of a scenario file.
+
+    Raises:
+        UnknownNameError: No effect of this name, or no parameter of this name.
+        OptionError: A parameter is missing or outside its range.
+    """
+    values = dict(record)
+    name = str(values.pop("name", ""))
+    if name not in _EFFECTS:
+        raise UnknownNameError("effect", name, _EFFECTS)
+    kind = _EFFECTS[name]
+    parameters = [item.name for item in fields(kind)]
+    for key in values:
+        if key not in parameters:
+            raise UnknownNameError(f"parameter of effect {name!r}", key, parameters)
+    if missing := [key for key in parameters if key not in values]:
+        raise OptionError(f"effect {name!r}: parameter {missing[0]!r} is missing")
+    return kind(**values)
+
+
+def parse_domain(domain: Domain) -> tuple[Effect, ...]:
+    """The effects that make `domain` out of a scenario; none for ``"sim"``.
+
+    Raises:
+        UnknownNameError: No such setting or effect.
+        OptionError: An effect has an impossible value.
+    """
+    if not isinstance(domain, str):
+        return tuple(domain)
+    if domain.lower() == "sim":
+        return ()
+    settings = {name.lower(): name for name in SETTINGS} | ALIASES
+    if domain.lower() in settings:
+        return SETTINGS[settings[domain.lower()]]
+    if "=" not in domain:
+        known = ("sim", *SETTINGS, *ALIASES)
+        guess = nearest(domain, known)
+        example = "Effects work as well: startup_delay=0.5+acceleration=1.0"
+        raise UnknownNameError("domain", domain, known, "" if guess else example)
+    return tuple(_effect_from_text(text) for text in domain.split("+"))
+
+
+def _effect_from_text(text: str) -> Effect:
+    name, _, values = text.partition("=")
+    if name not in _EFFECTS:
+        raise UnknownNameError("effect", name, _EFFECTS)
+    parameters = [item.name for item in fields(_EFFECTS[name])]
+    parts = values.split(",")
+    if len(parts) != len(parameters):
+        raise OptionError(f"effect {name!r} takes {len(parameters)} value(s): {parameters}")
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        raise OptionError(f"effect {name!r}: {values!r} is not a number") from None
+    return _EFFECTS[name](*numbers)
+
+
+def describe(domain: Domain) -> str:
+    """A short name for a domain, as tables show it."""
+    if isinstance(domain, str):
+        lower = domain.lower()
+        return ALIASES.get(lower, domain.upper() if lower.upper() in SETTINGS else domain)
+    return "+".join(map(str, domain)) or "sim"
+
+
+def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
+    """Applies effects one after the other."""
+    for effect in effects:
+        scenario = effect.apply(scenario)
+    return scenario
+
+
+def load(name: str | Path | Scenario) -> Scenario:
+    """Loads a scenario and applies the effects its own file lists (see `load_scenario`)."""
+    scenario = name if isinstance(name, Scenario) else load_scenario(name)
+    effects = [effect_from(record) for record in scenario.settings.effects]
+    plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
+    return apply_effects(plain, effects)
+
+
+def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
+    """The scenario as it is in `domain`.
+
+    Args:
+        scenario: What `load` returned.
+        domain: Effects, or the name of some, or the path of another scenario on the same network.
+    """
+    if isinstance(domain, str) and "=" not in domain:
+        path = Path(domain).expanduser()
+        if path.suffix == ".sumocfg" or (path / "scenario.toml").is_file():
+            return load(path)
+    return apply_effects(scenario, parse_domain(domain))
