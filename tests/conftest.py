@@ -1,4 +1,4 @@
-"""What all tests share: a deterministic Hypothesis, one torch thread, and which package is tested."""
+"""What all tests share: a deterministic Hypothesis, and a word on which package is tested."""
 
 from __future__ import annotations
 

@@ -79,14 +79,18 @@ def found() -> Record | None:
         return None
 
 
+def environment() -> dict[str, str]:
+    """The variables subprocesses run with: nothing that lets another installation shine through."""
+    return {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+
+
 def run(*command: str | Path, quiet: bool = False) -> bool:
     """Runs a command without stdin and says whether it succeeded; `quiet` hides its words."""
     silence = subprocess.DEVNULL if quiet else None
-    environ = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     finished = subprocess.run(
         [str(part) for part in command],
         cwd=ROOT,
-        env=environ,
+        env=environment(),
         stdin=subprocess.DEVNULL,
         stdout=silence,
         stderr=silence,
@@ -105,11 +109,31 @@ def stage(text: str) -> Iterator[None]:
 
 
 def pip(*arguments: str | Path, failure: str) -> None:
-    """Installs into `.venv`; the tested versions are always in force."""
+    """Installs into `.venv`; the tested versions are always in force.
+
+    On a terminal one line shows what pip is at; everything it said is shown only if it fails.
+    """
     constraints = ROOT / "constraints.txt"
-    options = ("install", "-qq", "--disable-pip-version-check", "--no-input", "-c", constraints)
-    if not run(PYTHON, "-m", "pip", *options, *arguments):
-        sys.exit(f"environment: {failure}")
+    options = ("install", "--disable-pip-version-check", "--no-input", "-c", constraints)
+    said: list[str] = []
+    with subprocess.Popen(
+        [str(part) for part in (PYTHON, "-m", "pip", *options, *arguments)],
+        cwd=ROOT,
+        env=environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            said.append(line)
+            if sys.stdout.isatty() and line.startswith(("Collecting", "Downloading", "Installing")):
+                print(f"\r\033[K  {line.strip()[:76]}", end="", flush=True)
+    if sys.stdout.isatty():
+        print("\r\033[K", end="", flush=True)
+    if process.returncode != 0:
+        sys.exit("".join([*said[-30:], f"environment: {failure}"]))
 
 
 def create() -> None:
