@@ -25,7 +25,7 @@ unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV
 export PYTHONSAFEPATH := 1
 export PYTHONNOUSERSITE := 1
 
-.PHONY: help demo test check static bench scenarios python environment environment-dev
+.PHONY: help demo test check static format lint types architecture bench scenarios python environment environment-dev
 .DEFAULT_GOAL := help
 
 help:
@@ -40,17 +40,25 @@ test: environment-dev
 check: static
 	@$(MAKE) --no-print-directory test
 
-static: environment-dev
+static: format lint types architecture
+
+format: environment-dev
 	$(BIN)/python -m ruff format --check .
+
+lint: environment-dev
 	$(BIN)/python -m ruff check .
+
+types: environment-dev
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
+
+architecture: environment-dev
 	$(BIN)/python -m pytest -q tests/architecture_test.py
 
 bench: environment-dev
 	$(BIN)/ugat-marl bench all $(ARGS)
 
 scenarios: environment
-	$(BIN)/python scenarios/build.py $(ARGS)
+	PYTHONSAFEPATH= $(BIN)/python scenarios/build.py $(ARGS)
 
 environment: python
 	@$(ENVIRONMENT)

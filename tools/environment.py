@@ -19,7 +19,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import TypedDict
 
@@ -100,7 +100,7 @@ def run(*command: str | Path, quiet: bool = False) -> bool:
 
 
 @contextlib.contextmanager
-def stage(text: str) -> Iterator[None]:
+def stage(text: str) -> Generator[None]:
     """Prints what is being done and how long it took."""
     print(f"environment: {text} ...", flush=True)
     began = time.monotonic()
