@@ -1,0 +1,70 @@
+"""Checkpoints: dictionaries of tensors and plain values, whole and finite or refused."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ugat_marl.errors import CheckpointError
+from ugat_marl.files import replacing
+
+_UNREADABLE = (OSError, EOFError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError)
+
+
+def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
+    """Writes `content` so that `path` holds the old checkpoint or the new one, never half.
+
+    Raises:
+        CheckpointError: A number in `content` is not finite; the file at `path` is left as it was.
+    """
+    require_finite(content, str(path), "was not written over")
+    with replacing(path) as temporary:
+        torch.save({"kind": kind, **content}, temporary)
+
+
+def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
+    """Reads what `write_checkpoint` wrote, without executing anything from the file.
+
+    Raises:
+        CheckpointError: Missing, cut short, of another kind, or with a number that is not finite.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such checkpoint file")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except _UNREADABLE as error:
+        first_line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise CheckpointError(
+            f"{path}: not a readable checkpoint ({first_line[:200]}); it may have been cut short: "
+            "use an earlier one or train again"
+        ) from None
+    found = content.get("kind") if isinstance(content, dict) else None
+    if found != kind:
+        raise CheckpointError(f"{path}: holds {found!r}, expected {kind!r}; give the right file")
+    require_finite(content, str(path), "cannot be used: take an earlier checkpoint or train again")
+    return content
+
+
+def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> None:
+    """Refuses NaN and infinity anywhere below `content`.
+
+    Raises:
+        CheckpointError: Names the entry that is not finite.
+    """
+    for key, tensor in _tensors("", content):
+        if not bool(torch.isfinite(tensor).all()):
+            raise CheckpointError(f"{name}: {key} holds NaN or infinity; the file {consequence}")
+
+
+def _tensors(prefix: str, content: Mapping[str, Any]) -> Iterator[tuple[str, torch.Tensor]]:
+    for key, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _tensors(f"{prefix}{key}.", value)
+        elif isinstance(value, torch.Tensor):
+            yield f"{prefix}{key}", value
+        elif isinstance(value, float):
+            yield f"{prefix}{key}", torch.tensor(value)

@@ -1,0 +1,346 @@
+"""Independent deep Q-learning, one network per intersection, all of them computed together.
+
+Mnih et al. 2015 with double Q-learning (van Hasselt et al. 2016), a softly updated target network
+and exploration that persists. It is the learner of the UGAT paper, made stronger: FACTS of the
+project showed that the gap between domains is judged wrongly with a weak one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
+from ugat_marl.learners.agents import AgentSet
+from ugat_marl.learners.checkpoint import read_checkpoint, write_checkpoint
+from ugat_marl.learners.dqn_config import DQNConfig
+from ugat_marl.learners.dqn_policy import (
+    DQNPolicy,
+    greedy_actions,
+    header,
+    parse_header,
+    q_network,
+)
+from ugat_marl.learners.exploration import StickyExploration
+from ugat_marl.learners.replay import Replay
+from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
+from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
+
+_KIND = "ugat_marl.dqn"
+_COUNTERS = ("episodes", "decisions", "updates")
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+
+
+@dataclass
+class _Tally:
+    """Sums over one episode."""
+
+    reward: float = 0.0
+    loss: float = 0.0
+    q: float = 0.0
+    decisions: int = 0
+    updates: int = 0
+
+
+class DQN:
+    """Learns one Q-network per agent of a parallel environment.
+
+    Works for any `ParallelEnv` with Box vectors and Discrete actions in which all agents stay to
+    the end; spaces may differ between agents. Episodes that end by truncation are bootstrapped
+    through; a terminated agent's future counts as zero reward.
+
+    Args:
+        agents: Names and sizes of the agents; `DQN.of(env)` reads them from an environment.
+        config: Settings.
+        seed: Seed of the initial weights.
+        env_options: Options of the environment the learned policy relies on.
+    """
+
+    def __init__(
+        self,
+        agents: AgentSet,
+        config: DQNConfig | None = None,
+        seed: int = 0,
+        env_options: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.agents = agents
+        self.config = config if config is not None else DQNConfig()
+        self.env_options: Mapping[str, Any] = dict(env_options or {})
+        self.episodes = 0
+        self.decisions = 0
+        self.updates = 0
+        hidden = self.config.hidden
+        self._online = q_network(agents, hidden, torch_generator(seed, "dqn", "weights"))
+        self._target = q_network(agents, hidden, torch.Generator())
+        self._weights = flatten_parameters(self._online)
+        self._target_weights = flatten_parameters(self._target)
+        self._target_weights.data.copy_(self._weights.data)
+        self._target.requires_grad_(False)
+        self._adam = torch.optim.Adam([self._weights], lr=self.config.learning_rate, fused=True)
+        self._replay = Replay(agents, self.config.replay_capacity)
+        self._centre = torch.zeros(len(agents), 1)
+        self._scale = torch.full((len(agents), 1), self.config.reward_scale or 1.0)
+
+    @classmethod
+    def of(
+        cls,
+        env: AnyParallelEnv,
+        config: DQNConfig | None = None,
+        seed: int = 0,
+        env_options: Mapping[str, Any] | None = None,
+    ) -> DQN:
+        """A learner for the agents of `env`; its options come along if it declares them.
+
+        Raises:
+            OptionError: `env` has a space this learner cannot use.
+        """
+        if env_options is None:
+            env_options = getattr(env.unwrapped, "env_options", {})
+        return cls(AgentSet.of(env), config, seed, env_options)
+
+    def learn(
+        self,
+        env: AnyParallelEnv,
+        episodes: int,
+        seed: int,
+        on_episode: EpisodeCallback | None = None,
+    ) -> DQNPolicy:
+        """Trains for `episodes` more episodes; goes on from where it was.
+
+        Every random choice depends on `seed` and the number of episodes so far only, so that one
+        call for four episodes equals two calls for two.
+
+        Args:
+            env: An environment with the agents of this learner; its state is reset.
+            episodes: Episodes to train.
+            seed: Root of the seeds of environment, exploration and replay.
+            on_episode: Called after each episode with its number (from 0, over the learner's life)
+                and ``return`` (sum of the reward, mean over agents), ``loss``, ``q``, ``epsilon``.
+
+        Returns:
+            The greedy policy at the end.
+
+        Raises:
+            OptionError: `env` has other agents or spaces than this learner.
+            EpisodeError: An agent left before the others, or a reward is not finite.
+        """
+        if AgentSet.of(env) != self.agents:
+            raise OptionError(
+                f"the environment's agents are {AgentSet.of(env)}, this learner's {self.agents}; "
+                "make a new learner with DQN.of(env)"
+            )
+        with _one_thread():
+            for _ in range(episodes):
+                numbers = self._episode(env, seed)
+                if on_episode is not None:
+                    on_episode(self.episodes - 1, numbers)
+        return self.policy()
+
+    def policy(self) -> DQNPolicy:
+        """The current greedy policy; later learning does not change it."""
+        return DQNPolicy(self.agents, self.config.hidden, self._weights, self.env_options)
+
+    def _episode(self, env: AnyParallelEnv, seed: int) -> dict[str, float]:
+        number = self.episodes
+        explore = StickyExploration(
+            len(self.agents),
+            self.config.sticky_decisions,
+            numpy_generator(seed, "dqn", "explore", number),
+        )
+        sampling = torch_generator(seed, "dqn", "replay", number)
+        tally = _Tally()
+        observations, infos = env.reset(seed=derive_seed(seed, "dqn", "episode", number))
+        now, allowed = self.agents.stack(observations), self.agents.masks(infos)
+        while env.agents:
+            epsilon = self.config.epsilon(self.decisions)
+            greedy = greedy_actions(self._online, torch.from_numpy(now), torch.from_numpy(allowed))
+            actions = explore.choose(greedy, allowed, epsilon)
+            observations, rewards, terminated, _, infos = env.step(self.agents.actions(actions))
+            self._require_all_or_none(env)
+            then, allowed = self.agents.stack(observations), self.agents.masks(infos)
+            reward = self._finite(self.agents.values(rewards))
+            terminal = self.agents.values(terminated).astype(np.bool_)
+            self._replay.add(now, actions, reward, terminal, then, allowed)
+            now = then
+            self.decisions += 1
+            tally.decisions += 1
+            tally.reward += float(reward.mean())
+            if self._is_time_to_update():
+                loss, q = self._update(sampling)
+                tally.loss, tally.q, tally.updates = (
+                    tally.loss + loss,
+                    tally.q + q,
+                    tally.updates + 1,
+                )
+        self.episodes += 1
+        updates = max(1, tally.updates)
+        return {
+            "return": tally.reward,
+            "loss": tally.loss / updates,
+            "q": tally.q / updates,
+            "epsilon": self.config.epsilon(self.decisions),
+        }
+
+    def _is_time_to_update(self) -> bool:
+        if self.decisions == self.config.warmup_decisions and self.config.reward_scale is None:
+            self._measure_rewards()
+        return (
+            self.decisions >= self.config.warmup_decisions
+            and self.decisions % self.config.update_every == 0
+        )
+
+    def _measure_rewards(self) -> None:
+        deviation, mean = torch.std_mean(self._replay.rewards(), dim=1, keepdim=True, correction=0)
+        self._centre = mean
+        self._scale = torch.where(deviation > 1e-6, 1.0 / deviation.clamp_min(1e-6), 1.0)
+
+    def _update(self, generator: torch.Generator) -> tuple[float, float]:
+        """One gradient step of all agents; returns mean loss and mean Q before it."""
+        batch = self._replay.sample(self.config.batch_size, generator)
+        with torch.no_grad():
+            best = self._online(batch.next_observation)
+            best = best.masked_fill_(~batch.next_allowed, -torch.inf).argmax(-1, keepdim=True)
+            future = self._target(batch.next_observation).gather(-1, best).squeeze(-1)
+            # no reward for ever, in the centred and scaled unit
+            nothing = -self._centre * self._scale / (1 - self.config.discount)
+            future = torch.where(batch.terminal, nothing, future)
+            reward = (batch.reward - self._centre) * self._scale
+            wanted = reward + self.config.discount * future
+        chosen = self._online(batch.observation).gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
+        losses = nn.functional.huber_loss(
+            chosen, wanted, reduction="none", delta=self.config.huber_delta
+        )
+        # the sum over agents keeps their networks independent of how many there are
+        losses.mean(dim=1).sum().backward()
+        self._adam.step()
+        assert self._weights.grad is not None
+        self._weights.grad.zero_()
+        self._target_weights.data.lerp_(self._weights.data, self.config.target_rate)
+        self.updates += 1
+        return float(losses.detach().mean()), float(chosen.detach().mean())
+
+    def _require_all_or_none(self, env: AnyParallelEnv) -> None:
+        if env.agents and len(env.agents) != len(self.agents):
+            gone = sorted(set(self.agents.names) - set(env.agents))
+            raise EpisodeError(
+                f"agents {', '.join(gone)} left before the others; this learner needs all agents "
+                "to stay to the end of the episode"
+            )
+
+    def _finite(self, reward: NDArray[np.float32]) -> NDArray[np.float32]:
+        if not np.isfinite(reward).all():
+            name = self.agents.names[int(np.isfinite(reward).argmin())]
+            raise EpisodeError(
+                f"the reward of agent {name!r} is not finite at decision {self.decisions}; "
+                "correct the reward function"
+            )
+        return reward
+
+    def save(self, path: Path) -> None:
+        """Writes the whole state, from which `load` goes on to the same numbers.
+
+        Raises:
+            CheckpointError: The networks have diverged (NaN); a file at `path` stays as it was.
+        """
+        content = {
+            **header(self.agents, self.config.hidden, self.env_options),
+            "counters": {name: getattr(self, name) for name in _COUNTERS}
+            | {"added": self._replay.added},
+            "tensors": {name: tensor.clone() for name, tensor in self._tensors().items()},
+            "adam": dict(self._adam.state.get(self._weights, {})),
+            "replay": self._replay.state(),
+        }
+        write_checkpoint(path, _KIND, content)
+
+    def load(self, path: Path) -> None:
+        """Restores what `save` wrote; settings other than `hidden` remain this learner's own.
+
+        Raises:
+            CheckpointError: Missing, cut short, not finite, or of other agents or sizes. The
+                learner is left as it was.
+        """
+        content = read_checkpoint(path, _KIND)
+        try:
+            agents, hidden, env_options = parse_header(content)
+            _require_same(path, "agents", agents, self.agents)
+            _require_same(path, "hidden sizes", hidden, self.config.hidden)
+            counters = {name: int(content["counters"][name]) for name in (*_COUNTERS, "added")}
+            tensors = _like(path, content["tensors"], self._tensors())
+            stored = _like(path, content["replay"], self._replay.rows(counters["added"]))
+            moments = {name: content["adam"][name] for name in _MOMENTS if content["adam"]}
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"{path}: not a whole checkpoint ({error!r})") from None
+        self.env_options = env_options
+        for name in _COUNTERS:
+            setattr(self, name, counters[name])
+        for name, tensor in self._tensors().items():
+            tensor.copy_(tensors[name])
+        self._replay.restore(stored, counters["added"])
+        self._adam.state.clear()
+        if moments:
+            self._adam.state[self._weights] = moments
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {
+            "weights": self._weights.data,
+            "target_weights": self._target_weights.data,
+            "centre": self._centre,
+            "scale": self._scale,
+        }
+
+
+def flatten_parameters(module: nn.Module) -> nn.Parameter:
+    """Moves all parameters of `module`, and their gradients, into one vector each.
+
+    The module computes on views of the vector, so that the optimiser and the target network's
+    update are single operations over all agents and layers.
+    """
+    parameters = list(module.parameters())
+    flat = nn.Parameter(nn.utils.parameters_to_vector(parameters).detach().clone())
+    flat.grad = torch.zeros_like(flat)
+    start = 0
+    for parameter in parameters:
+        end = start + parameter.numel()
+        parameter.data = flat.data[start:end].view_as(parameter)
+        parameter.grad = flat.grad[start:end].view_as(parameter)
+        start = end
+    return flat
+
+
+def _require_same(path: Path, what: str, found: object, own: object) -> None:
+    if found != own:
+        raise CheckpointError(
+            f"{path}: its {what} are {found}, this learner's {own}; give the checkpoint of this "
+            "scenario and these settings, or train a new one"
+        )
+
+
+def _like(path: Path, found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of `found`, checked against names, shapes and types of `own`."""
+    for name, tensor in own.items():
+        given = found[name]
+        if given.shape != tensor.shape or given.dtype != tensor.dtype:
+            raise CheckpointError(
+                f"{path}: {name} has shape {tuple(given.shape)}, this learner needs "
+                f"{tuple(tensor.shape)}; use the settings it was saved with"
+            )
+    return dict(found)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Products this small lose by being split; and on one thread sums keep their order."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

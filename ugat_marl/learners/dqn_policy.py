@@ -1,0 +1,141 @@
+"""The greedy policy a DQN learner hands out: networks frozen at one moment."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ugat_marl.batched import BatchedMLP
+from ugat_marl.errors import CheckpointError
+from ugat_marl.learners.agents import AgentSet
+from ugat_marl.learners.checkpoint import read_checkpoint, write_checkpoint
+from ugat_marl.policy import Actions, Infos, Observations
+
+_KIND = "ugat_marl.dqn_policy"
+
+
+class DQNPolicy:
+    """Takes the allowed action of highest Q in every agent's own network.
+
+    Args:
+        agents: The agents it acts for.
+        hidden: Sizes of the hidden layers of each network.
+        parameters: All parameters as one vector, as `flatten_parameters` orders them; copied.
+        env_options: Options of the environment the policy relies on.
+    """
+
+    def __init__(
+        self,
+        agents: AgentSet,
+        hidden: tuple[int, ...],
+        parameters: Tensor | NDArray[np.float32],
+        env_options: Mapping[str, Any],
+    ) -> None:
+        self.agents = agents
+        self.hidden = hidden
+        self.env_options: Mapping[str, Any] = dict(env_options)
+        self._network = q_network(agents, hidden, torch.Generator())
+        vector = torch.as_tensor(parameters).detach().clone()
+        nn.utils.vector_to_parameters(vector, self._network.parameters())
+        self._network.requires_grad_(False)
+
+    @property
+    def parameters(self) -> NDArray[np.float32]:
+        """All parameters as one vector (a copy)."""
+        return nn.utils.parameters_to_vector(self._network.parameters()).numpy().copy()
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget: the policy is deterministic and has no memory."""
+
+    def q_values(self, observations: Observations) -> dict[str, NDArray[np.float32]]:
+        """Every agent's Q of every one of its actions, ``(actions,)`` (in scaled reward)."""
+        values = self._network(torch.from_numpy(self.agents.stack(observations)).unsqueeze(1))
+        rows = zip(self.agents.names, self.agents.action_counts, values.squeeze(1), strict=True)
+        return {name: row[:count].numpy() for name, count, row in rows}
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """The greedy action of every agent.
+
+        Raises:
+            OptionError: The observations are not of the agents this policy was trained for.
+        """
+        stacked = torch.from_numpy(self.agents.stack(observations))
+        allowed = torch.from_numpy(self.agents.masks(infos))
+        return self.agents.actions(greedy_actions(self._network, stacked, allowed))
+
+    def save(self, path: Path) -> None:
+        """Writes the policy to one file; `load` reads it."""
+        content = {**header(self.agents, self.hidden, self.env_options)}
+        parameters = torch.from_numpy(self.parameters)
+        write_checkpoint(path, _KIND, {**content, "parameters": parameters})
+
+    @classmethod
+    def load(cls, path: Path) -> DQNPolicy:
+        """Reads a saved policy.
+
+        Raises:
+            CheckpointError: Missing, cut short, not finite, or not a policy.
+        """
+        content = read_checkpoint(path, _KIND)
+        try:
+            agents, hidden, env_options = parse_header(content)
+            return cls(agents, hidden, content["parameters"], env_options)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise CheckpointError(f"{path}: not a whole policy ({error}); save it again") from None
+
+    def __reduce__(self) -> tuple[type[DQNPolicy], tuple[Any, ...]]:
+        # numpy, since torch would send tensors between processes through shared memory
+        return DQNPolicy, (self.agents, self.hidden, self.parameters, self.env_options)
+
+
+def q_network(agents: AgentSet, hidden: tuple[int, ...], generator: torch.Generator) -> BatchedMLP:
+    """One Q-network per agent: observation to the value of each action, padded."""
+    return BatchedMLP(agents.observation_sizes, hidden, agents.most_actions, generator)
+
+
+def greedy_actions(network: nn.Module, stacked: Tensor, allowed: Tensor) -> NDArray[np.int64]:
+    """Allowed action of highest value for one observation of every agent, ``(agents,)``."""
+    with torch.no_grad():
+        values = network(stacked.unsqueeze(1)).squeeze(1)
+        return values.masked_fill(~allowed, -torch.inf).argmax(dim=1).numpy()
+
+
+def header(
+    agents: AgentSet, hidden: tuple[int, ...], env_options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What a checkpoint says about itself.
+
+    Raises:
+        CheckpointError: An option of the environment is not plain data (a callable, say).
+    """
+    try:
+        options = json.dumps(dict(env_options), sort_keys=True)
+    except TypeError as error:
+        raise CheckpointError(
+            f"env_options {dict(env_options)!r} cannot be saved ({error}); keep to plain data"
+        ) from None
+    return {
+        "agents": list(agents.names),
+        "observation_sizes": list(agents.observation_sizes),
+        "action_counts": list(agents.action_counts),
+        "hidden": list(hidden),
+        "env_options": options,
+    }
+
+
+def parse_header(content: Mapping[str, Any]) -> tuple[AgentSet, tuple[int, ...], dict[str, Any]]:
+    """Agents, hidden sizes and environment options out of what `header` made."""
+    agents = AgentSet(
+        tuple(content["agents"]),
+        tuple(content["observation_sizes"]),
+        tuple(content["action_counts"]),
+    )
+    options = cast(dict[str, Any], json.loads(content["env_options"]))
+    return agents, tuple(content["hidden"]), options
