@@ -8,6 +8,7 @@ from ugat_marl.effects.base import Effect, Parameter
 from ugat_marl.effects.settings import (
     ALIASES,
     SETTINGS,
+    Domain,
     apply_effects,
     describe,
     effect_from,
@@ -29,6 +30,7 @@ __all__ = [
     "SETTINGS",
     "Acceleration",
     "Deceleration",
+    "Domain",
     "Effect",
     "EmergencyDeceleration",
     "Parameter",

@@ -1,0 +1,114 @@
+"""Messages between a simulation and its user: JSON with float64 arrays behind it.
+
+No pickle: what arrives is data, whoever sent it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+_LENGTHS = struct.Struct("<II")
+
+
+class ChannelClosed(Exception):
+    """The other end is gone."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A JSON object and arrays.
+
+    Attributes:
+        header: The object; its key ``"shapes"`` is the channel's own.
+        arrays: float64 arrays of any shape.
+    """
+
+    header: dict[str, Any]
+    arrays: list[NDArray[np.float64]]
+
+
+class Channel:
+    """One end of a two-way byte stream.
+
+    Args:
+        reader: Where the other end's bytes arrive.
+        writer: Where bytes for the other end go.
+        close_writer: Tells the other end that nothing more will come.
+    """
+
+    def __init__(
+        self, reader: BinaryIO | Any, writer: BinaryIO | Any, close_writer: Callable[[], None]
+    ) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._close_writer = close_writer
+
+    def send(self, message: Message) -> None:
+        """Writes one message."""
+        shapes = [array.shape for array in message.arrays]
+        header = json.dumps({**message.header, "shapes": shapes}).encode()
+        bodies = [np.ascontiguousarray(array, dtype="<f8").tobytes() for array in message.arrays]
+        body = b"".join(bodies)
+        self._writer.write(_LENGTHS.pack(len(header), len(body)) + header + body)
+        self._writer.flush()
+
+    def receive(self) -> Message:
+        """Waits for one message.
+
+        Raises:
+            ChannelClosed: The other end is gone.
+        """
+        n_header, n_body = _LENGTHS.unpack(self._exactly(_LENGTHS.size))
+        header: dict[str, Any] = json.loads(self._exactly(n_header))
+        body = self._exactly(n_body)
+        arrays: list[NDArray[np.float64]] = []
+        offset = 0
+        for shape in header.pop("shapes"):
+            size = int(np.prod(shape))
+            array = np.frombuffer(body, dtype="<f8", count=size, offset=offset).reshape(shape)
+            arrays.append(array)
+            offset += 8 * size
+        return Message(header, arrays)
+
+    def ask(self, header: dict[str, Any]) -> Message:
+        """Sends a question without arrays and waits for the answer."""
+        self.send(Message(header, []))
+        return self.receive()
+
+    def hang_up(self, patience_s: float) -> bool:
+        """Closes this end; returns whether the other end closed within `patience_s` seconds."""
+        gone = threading.Event()
+
+        def wait_for_end() -> None:
+            with contextlib.suppress(OSError, ValueError):
+                while self._reader.read(65536):
+                    pass
+            gone.set()
+
+        with contextlib.suppress(OSError, ValueError):
+            self._writer.flush()
+        with contextlib.suppress(OSError, ValueError):
+            self._close_writer()
+        thread = threading.Thread(target=wait_for_end, daemon=True)
+        thread.start()
+        thread.join(patience_s)
+        if gone.is_set():
+            self._reader.close()
+            with contextlib.suppress(OSError, ValueError):
+                self._writer.close()
+        return gone.is_set()
+
+    def _exactly(self, count: int) -> bytes:
+        data = self._reader.read(count)
+        if data is None or len(data) < count:
+            raise ChannelClosed
+        return data

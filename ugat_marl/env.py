@@ -1,0 +1,439 @@
+"""The PettingZoo environment: one agent per signalised intersection."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from ugat_marl import signals
+from ugat_marl.demand import check_demand
+from ugat_marl.effects import Domain, describe, in_domain, load
+from ugat_marl.errors import ActionError, EpisodeError, OptionError, UnknownNameError
+from ugat_marl.measurements import Snapshot
+from ugat_marl.metrics import EpisodeRecorder, Scores
+from ugat_marl.network import Network
+from ugat_marl.observations import Observer
+from ugat_marl.rendering import Picture
+from ugat_marl.rewards import RewardFunction, Rewarder
+from ugat_marl.scenario import Scenario
+from ugat_marl.simulator import LibsumoSimulator, Simulator, launch_of
+from ugat_marl.simulator_process import ProcessSimulator
+from ugat_marl.transitions import AgentLayout
+
+RenderMode = Literal["human", "rgb_array"]
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """Options of an environment.
+
+    Attributes:
+        observation: What an agent sees; see `ugat_marl.observations.UNITS`.
+        reward: ``"queue"``, ``"pressure"``, ``"waiting"`` or a function of two `IntersectionView`.
+        neighbours: How many roads away intersections are whose features and phase are seen too.
+        signals: ``"actions"``, or ``"programme"``: SUMO runs the network's own signal programme
+            and actions are ignored.
+        duration_s: Length of an episode in s; None for the scenario's own.
+        simulator: ``"process"`` (any number at once, reproducible to the bit), ``"spawn"`` (the
+            same without forking), or ``"inprocess"`` (one per process, a little faster).
+        render_mode: None, ``"rgb_array"`` (a picture from `render`) or ``"human"`` (sumo-gui).
+    """
+
+    observation: str = "count"
+    reward: str | RewardFunction = "queue"
+    neighbours: int = 0
+    signals: str = "actions"
+    duration_s: float | None = None
+    simulator: str = "process"
+    render_mode: str | None = None
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("signals", ("actions", "programme")),
+            ("simulator", ("process", "spawn", "inprocess")),
+            ("render_mode", (None, *get_args(RenderMode))),
+        ):
+            value = getattr(self, name)
+            if value not in allowed:
+                names = [item for item in allowed if item]
+                raise UnknownNameError(f"value of option {name!r}:", str(value), names)
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> EnvOptions:
+        """Options from keywords.
+
+        Raises:
+            UnknownNameError: No option of this name, or no such value.
+        """
+        known = [item.name for item in fields(cls)]
+        for name in options:
+            if name not in known:
+                raise UnknownNameError("option", name, known)
+        return cls(**options)
+
+
+class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
+    """Traffic signals of a road network, one agent per intersection.
+
+    An action is the green phase of the next decision interval; yellow, all-red and minimum green
+    are kept whatever is asked for. Episodes end by truncation, for all agents at once. SUMO is not
+    started before `reset`.
+
+    Args:
+        scenario: The simulation.
+        domain: The world the environment is in: ``"sim"``, ``"V1"``..``"V4"``, effects, ....
+        options: See `EnvOptions`.
+
+    Attributes:
+        scenario: The scenario in its domain.
+        domain: Name of the domain.
+        network: Static facts.
+        layouts: Agent to the parts of its observation.
+        intersection_of: Agent to SUMO's id of its traffic light.
+        agent_groups: Group to its agents; agents of one group have the same spaces.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own convention
+        "name": "ugat_marl_v1",
+        "render_modes": ["human", "rgb_array"],
+        "is_parallelizable": True,
+        "render_fps": 1,
+    }
+
+    def __init__(self, scenario: Scenario, domain: Domain, options: EnvOptions) -> None:
+        self.scenario = in_domain(scenario, domain)
+        if options.duration_s is not None:
+            self.scenario = self.scenario.with_duration(options.duration_s)
+        self.domain = describe(domain)
+        self.options = options
+        self.render_mode = options.render_mode
+        self.network = Network.read(self.scenario)
+        self.demand = check_demand(self.scenario, self.network)
+        control = self.scenario.control
+        self.decision_interval_s = control.decision_interval_s
+        self._timing = signals.SignalTiming(
+            control.yellow_s, control.all_red_s, control.min_green_s
+        )
+        self._lanes = self.network.lane_table()
+        self._observer = Observer(self.network, options.observation, options.neighbours)
+        self._rewarder = Rewarder(self.network, options.reward)
+        self._name_agents()
+        self._state_space = self._joint_space()
+        self._simulator: Simulator | None = None
+        self._directory: Path | None = None
+        self._generator = np.random.default_rng()
+        self.agents: list[str] = []
+        self._scores: Scores | None = None
+        self._picture: Picture | None = None
+
+    # --- spaces -------------------------------------------------------------------------------
+
+    def observation_space(self, agent: str) -> Box:
+        """The space of an agent's observations, the same object at each call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Discrete:
+        """The space of an agent's actions, the same object at each call."""
+        return self.action_spaces[agent]
+
+    @property
+    def state_space(self) -> Box:
+        """The space of `state`: all observations, one after the other."""
+        return self._state_space
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """What a policy must know to be given the same observations elsewhere."""
+        return {"observation": self.options.observation, "neighbours": self.options.neighbours}
+
+    # --- episode ------------------------------------------------------------------------------
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
+        """Starts an episode in a fresh simulation.
+
+        Args:
+            seed: Fixes the simulation to the bit; without it the seed is drawn from the one before.
+            options: Not used.
+        """
+        if seed is not None:
+            self._generator = np.random.default_rng(seed)
+        self._start(int(self._generator.integers(2**31)))
+        self.agents = self.possible_agents[:]
+        self._scores = None
+        self._decision = 0
+        self._states = [signals.initial_state(self._timing) for _ in self.agents]
+        self._recorder = EpisodeRecorder(
+            self._lanes,
+            [self._lanes.indices(item.incoming_lanes) for item in self.network.intersections],
+        )
+        return self._observe(), self._infos()
+
+    def step(
+        self, actions: Mapping[str, int]
+    ) -> tuple[
+        dict[str, NDArray[np.float32]],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Shows the chosen phases for one decision interval.
+
+        Args:
+            actions: A green phase for every agent.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos of all agents.
+
+        Raises:
+            ActionError: An action is missing, unknown or out of range; nothing has happened.
+            EpisodeError: The episode has not begun or is over.
+            SimulatorError: SUMO failed.
+        """
+        requested = self._checked(actions)
+        before = self._snapshot
+        self._advance(requested)
+        rewards = self._rewarder.rewards(before, self._snapshot)
+        self._recorder.add(self._snapshot, sum(rewards) / len(rewards))
+        self._decision += 1
+        self._warn_if_empty()
+        over = self._decision == self.scenario.decisions
+        agents = self.agents
+        result = (
+            self._observe(),
+            dict(zip(agents, rewards, strict=True)),
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, over),
+            self._infos(),
+        )
+        if over:
+            self._finish()
+        return result
+
+    def state(self) -> NDArray[np.float32]:
+        """All observations, one after the other; also after the last step."""
+        if not hasattr(self, "_vectors"):
+            raise EpisodeError("state() has no meaning before the first reset()")
+        return np.concatenate(self._vectors)
+
+    def scores(self) -> Scores:
+        """The measures of the episode that has ended.
+
+        Raises:
+            EpisodeError: No episode has ended since the last reset.
+        """
+        if self._scores is None:
+            raise EpisodeError(
+                f"scores() needs a whole episode of {self.scenario.decisions} steps; "
+                "set duration_s for shorter ones"
+            )
+        return self._scores
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The network with its vehicles and signals, uint8 ``(height, width, 3)``.
+
+        None with render mode "human": there SUMO draws its own window.
+        """
+        if self.render_mode != "rgb_array":
+            return None
+        if self._picture is None:
+            self._picture = Picture(self.network)
+        if self._simulator is not None and self.agents:
+            self._picture.draw(self._simulator.vehicles(), self._simulator.signals())
+        return self._picture.pixels()
+
+    def close(self) -> None:
+        """Ends the simulation and its process and removes its files; may be called again."""
+        simulator, self._simulator = self._simulator, None
+        self.agents = []
+        if simulator is not None:
+            simulator.close()
+        self._remove_directory()
+
+    def __del__(self) -> None:
+        if getattr(self, "_simulator", None) is not None:
+            self.close()
+
+    # --- parts --------------------------------------------------------------------------------
+
+    def _name_agents(self) -> None:
+        """Agents are named ``<group>_<n>``; the same group means the same spaces."""
+        items = self.network.intersections
+        kinds = [
+            (space.shape, len(item.phases), tuple(space.low))
+            for space, item in zip(self._observer.spaces, items, strict=True)
+        ]
+        distinct = list(dict.fromkeys(kinds))
+        self.agent_groups: dict[str, list[str]] = {}
+        self.possible_agents: list[str] = []
+        for kind in kinds:
+            number = distinct.index(kind)
+            group = "signal" if len(distinct) == 1 else f"signal{_letters(number)}"
+            members = self.agent_groups.setdefault(group, [])
+            members.append(f"{group}_{len(members)}")
+            self.possible_agents.append(members[-1])
+        agents = self.possible_agents
+        self.intersection_of = {a: item.id for a, item in zip(agents, items, strict=True)}
+        self.layouts: dict[str, AgentLayout] = dict(
+            zip(agents, self._observer.layouts, strict=True)
+        )
+        spaces = {kind: space for kind, space in zip(kinds, self._observer.spaces, strict=True)}
+        self.observation_spaces = {a: spaces[k] for a, k in zip(agents, kinds, strict=True)}
+        self.action_spaces = {a: Discrete(k[1]) for a, k in zip(agents, kinds, strict=True)}
+
+    def _joint_space(self) -> Box:
+        spaces = list(self.observation_spaces.values())
+        return Box(
+            np.concatenate([space.low for space in spaces]),
+            np.concatenate([space.high for space in spaces]),
+            dtype=np.float32,
+        )
+
+    def _start(self, seed: int) -> None:
+        self._remove_directory()
+        if self._simulator is None:
+            self._simulator = _simulator(self.options.simulator)
+        self._directory = Path(tempfile.mkdtemp(prefix="ugat_marl-"))
+        launch = launch_of(
+            self.scenario,
+            seed,
+            self._directory,
+            self._lanes.ids,
+            waiting=self._observer.needs_waiting or self._rewarder.needs_waiting,
+            gui=self.render_mode == "human",
+        )
+        self.agents = []
+        self._snapshot = self._simulator.start(launch)
+
+    def _checked(self, actions: Mapping[str, int]) -> list[int]:
+        if not self.agents:
+            raise EpisodeError("step() needs a running episode; call reset() first")
+        if unknown := sorted(set(actions) - set(self.agents)):
+            raise ActionError(f"actions for unknown agents {unknown}; agents: {self.agents}")
+        requested: list[int] = []
+        for agent in self.agents:
+            if agent not in actions:
+                raise ActionError(f"no action for agent {agent!r}; every agent needs one")
+            action, space = actions[agent], self.action_spaces[agent]
+            if not isinstance(action, (int, np.integer)) and not (
+                isinstance(action, np.ndarray) and action.shape == () and action.dtype.kind in "iu"
+            ):
+                raise ActionError(
+                    f"action of agent {agent!r} is {action!r}; allowed: integers 0 to {space.n - 1}"
+                )
+            if not 0 <= int(action) < space.n:
+                raise ActionError(
+                    f"action of agent {agent!r} is {int(action)}; "
+                    f"allowed: 0 to {space.n - 1}, its green phases"
+                )
+            requested.append(int(action))
+        return requested
+
+    def _advance(self, requested: list[int]) -> None:
+        assert self._simulator is not None
+        plans: dict[str, list[signals.Segment]] = {}
+        states: list[signals.SignalState] = []
+        for item, state, phase in zip(
+            self.network.intersections, self._states, requested, strict=True
+        ):
+            after, plans[item.id] = signals.advance(
+                item.phases, state, phase, self.decision_interval_s, self._timing
+            )
+            states.append(after)
+        if self.options.signals == "programme":
+            plans, states = {}, self._states
+        self._snapshot: Snapshot = self._simulator.advance(self.decision_interval_s, plans)
+        self._states = states
+
+    def _observe(self) -> dict[str, NDArray[np.float32]]:
+        self._vectors = self._observer.observe(
+            self._snapshot, [state.phase for state in self._states]
+        )
+        return dict(zip(self.agents, self._vectors, strict=True))
+
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        infos: dict[str, dict[str, Any]] = {}
+        for agent, state in zip(self.agents, self._states, strict=True):
+            phases = int(self.action_spaces[agent].n)
+            if signals.free_to_change(state, self._timing, self.decision_interval_s):
+                mask = np.ones(phases, dtype=np.int8)
+            else:
+                mask = np.zeros(phases, dtype=np.int8)
+                mask[state.phase] = 1
+            infos[agent] = {"action_mask": mask, "executed_action": state.phase}
+        return infos
+
+    def _warn_if_empty(self) -> None:
+        if self._decision == max(1, self.scenario.decisions // 10) and not self._snapshot.departed:
+            warnings.warn(
+                f"scenario {self.scenario.id!r}: no vehicle has entered the network in the first "
+                f"{self._decision * self.decision_interval_s:g} s "
+                f"({self._snapshot.backlog} are waiting to); check departures and routes",
+                stacklevel=3,
+            )
+
+    def _finish(self) -> None:
+        assert self._simulator is not None
+        if self.render_mode == "rgb_array":
+            self.render()
+        self._scores = self._recorder.scores(self._simulator.finish())
+        self.agents = []
+
+    def _remove_directory(self) -> None:
+        directory, self._directory = self._directory, None
+        if directory is not None:
+            shutil.rmtree(directory, ignore_errors=True)
+
+
+def parallel_env(
+    scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any
+) -> TrafficEnv:
+    """The environment as a PettingZoo `ParallelEnv`.
+
+    Args:
+        scenario: Id of a shipped scenario, a scenario directory, a ``.sumocfg``, ``resco:<map>``,
+            or a loaded scenario.
+        domain: ``"sim"``, ``"V1"``..``"V4"`` or an alias, ``"effect=value+..."``, the path of
+            another scenario on the same network, or a list of effects.
+        **options: See `EnvOptions`.
+
+    Raises:
+        UnknownNameError: No such scenario, domain or option.
+        ScenarioError: The scenario's files are missing or contradict each other.
+    """
+    return TrafficEnv(load(scenario), domain, EnvOptions.of(options))
+
+
+def env(scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any) -> Any:
+    """The environment as a PettingZoo `AECEnv`; arguments as for `parallel_env`."""
+    from pettingzoo.utils import parallel_to_aec
+
+    return parallel_to_aec(parallel_env(scenario, domain, **options))
+
+
+def _simulator(name: str) -> Simulator:
+    if name == "inprocess":
+        return LibsumoSimulator()
+    return ProcessSimulator("spawn" if name == "spawn" else None)
+
+
+def _letters(number: int) -> str:
+    """a, b, ..., z, aa, ab, ..."""
+    text = ""
+    number += 1
+    while number:
+        number, digit = divmod(number - 1, 26)
+        text = chr(ord("a") + digit) + text
+    return text

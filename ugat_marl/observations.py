@@ -1,0 +1,189 @@
+"""Snapshot -> one vector per intersection, with its space.
+
+Every vector is ``features | own phase one-hot | context``: what the intersection measures, what it
+shows, and, if asked for, the same of its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.measurements import Snapshot
+from ugat_marl.network import Network
+from ugat_marl.transitions import AgentLayout
+
+ObservationName = Literal["count", "queue", "pressure", "waiting", "density", "movements"]
+
+COUNT_SCALE = 40.0
+"""Vehicles that make a count 1: what fits on a lane of 300 m."""
+
+WAITING_SCALE_S = 100.0
+"""Mean waiting time per storage place that makes `waiting` 1."""
+
+UNITS: dict[str, str] = {
+    "count": "vehicles per incoming lane / 40",
+    "queue": "halting vehicles per incoming lane / 40",
+    "pressure": "vehicles / lane capacity, incoming lane minus mean of the lanes its links lead to",
+    "waiting": "waiting time summed over the lane's vehicles / (lane capacity * 100 s)",
+    "density": "vehicles per incoming lane / lane capacity (lane length / 7.5 m)",
+    "movements": "halting per incoming, vehicles per incoming, vehicles per outgoing lane; each / lane capacity",
+}  # fmt: skip
+"""What one feature of each observation is. All are clipped to [0, 1] (pressure: [-1, 1])."""
+
+
+class Observer:
+    """Computes the observations of all intersections at once.
+
+    Args:
+        network: The network.
+        name: One of `ObservationName`; ``"count"`` is the observation of the UGAT paper.
+        neighbours: How many roads away intersections are whose features and phase are included.
+
+    Attributes:
+        layouts: Sizes of the parts of each intersection's vector, in the network's order.
+        spaces: A float32 `Box` for each intersection.
+    """
+
+    def __init__(self, network: Network, name: str = "count", neighbours: int = 0) -> None:
+        if name not in get_args(ObservationName):
+            raise UnknownNameError("observation", name, get_args(ObservationName))
+        if neighbours < 0:
+            raise OptionError(f"neighbours = {neighbours}: must be 0 or a number of roads")
+        self.name = name
+        self._lanes = network.lane_table()
+        items = network.intersections
+        self._incoming = np.concatenate(
+            [self._lanes.indices(item.incoming_lanes) for item in items]
+        )
+        self._downstream = _downstream_matrix(network) if name == "pressure" else None
+        self._gather, sizes = _gather(network, name)
+        self._features = _slices(sizes)
+        self._phases = [len(item.phases) for item in items]
+        self._near = _within(network, neighbours)
+        self.layouts = [
+            AgentLayout(
+                features=size,
+                phases=phases,
+                context=sum(sizes[j] + self._phases[j] for j in near),
+            )
+            for size, phases, near in zip(sizes, self._phases, self._near, strict=True)
+        ]
+        low = -1.0 if name == "pressure" else 0.0
+        self.spaces = [self._space(index, low) for index in range(len(items))]
+        self._eyes = [np.eye(phases, dtype=np.float32) for phases in self._phases]
+
+    @property
+    def needs_waiting(self) -> bool:
+        """Whether snapshots must hold waiting times."""
+        return self.name == "waiting"
+
+    def observe(self, snapshot: Snapshot, phases: Sequence[int]) -> list[NDArray[np.float32]]:
+        """The vectors of all intersections.
+
+        Args:
+            snapshot: What was measured.
+            phases: Green phase each intersection shows or clears towards.
+
+        Returns:
+            For each intersection float32 ``(layout.size,)``, fresh arrays.
+        """
+        flat = self._flat(snapshot).astype(np.float32)
+        own = [
+            np.concatenate((flat[part], eye[phase]))
+            for part, eye, phase in zip(self._features, self._eyes, phases, strict=True)
+        ]
+        if not any(self._near):
+            return own
+        return [
+            np.concatenate((vector, *(own[j] for j in near)))
+            for vector, near in zip(own, self._near, strict=True)
+        ]
+
+    def _flat(self, snapshot: Snapshot) -> NDArray[np.float64]:
+        capacity = self._lanes.capacity
+        if self.name == "count":
+            values = snapshot.vehicles[self._incoming] / COUNT_SCALE
+        elif self.name == "queue":
+            values = snapshot.halting[self._incoming] / COUNT_SCALE
+        elif self.name == "density":
+            values = (snapshot.vehicles / capacity)[self._incoming]
+        elif self.name == "waiting":
+            values = (snapshot.waiting_s / capacity)[self._incoming] / WAITING_SCALE_S
+        elif self.name == "pressure":
+            assert self._downstream is not None
+            filled = snapshot.vehicles / capacity
+            return np.clip(filled[self._incoming] - self._downstream @ filled, -1.0, 1.0)
+        else:
+            both = np.concatenate((snapshot.halting / capacity, snapshot.vehicles / capacity))
+            values = both[self._gather]
+        return np.minimum(values, 1.0)
+
+    def _space(self, index: int, low: float) -> Box:
+        parts: list[NDArray[np.float32]] = []
+        for j in (index, *self._near[index]):
+            features = self._features[j].stop - self._features[j].start
+            parts.append(np.full(features, low, dtype=np.float32))
+            parts.append(np.zeros(self._phases[j], dtype=np.float32))
+        lows = np.concatenate(parts)
+        return Box(lows, np.ones_like(lows), dtype=np.float32)
+
+
+def _gather(network: Network, name: str) -> tuple[NDArray[np.int64], list[int]]:
+    """Positions in (halting | vehicles) for `movements`, and the number of features of each."""
+    lanes = network.lane_table()
+    count = len(lanes.ids)
+    parts: list[NDArray[np.int64]] = []
+    sizes: list[int] = []
+    for item in network.intersections:
+        incoming, outgoing = lanes.indices(item.incoming_lanes), lanes.indices(item.outgoing_lanes)
+        if name == "movements":
+            own = np.concatenate((incoming, incoming + count, outgoing + count))
+        else:
+            own = incoming
+        parts.append(own)
+        sizes.append(len(own))
+    return np.concatenate(parts), sizes
+
+
+def _downstream_matrix(network: Network) -> NDArray[np.float64]:
+    """Rows average, for each incoming lane, the lanes its links lead to."""
+    lanes = network.lane_table()
+    rows: list[NDArray[np.float64]] = []
+    for item in network.intersections:
+        for lane in item.incoming_lanes:
+            row = np.zeros(len(lanes.ids))
+            for to_lane in {link.to_lane for link in item.links if link.from_lane == lane}:
+                row[lanes.indices([to_lane])] = 1.0
+            rows.append(row / row.sum())
+    return np.stack(rows)
+
+
+def _within(network: Network, hops: int) -> list[list[int]]:
+    """For each intersection the others at most `hops` roads away, nearest first."""
+    position = {item.id: index for index, item in enumerate(network.intersections)}
+    found: list[list[int]] = []
+    for item in network.intersections:
+        reached = [item.id]
+        frontier = [item.id]
+        for _ in range(hops):
+            frontier = [
+                other
+                for name in frontier
+                for other in network.intersections[position[name]].neighbours
+                if other not in reached
+            ]
+            frontier = list(dict.fromkeys(frontier))
+            reached += frontier
+        found.append([position[name] for name in reached[1:]])
+    return found
+
+
+def _slices(sizes: Sequence[int]) -> list[slice]:
+    ends = np.cumsum(sizes)
+    return [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]

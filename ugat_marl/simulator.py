@@ -1,0 +1,302 @@
+"""The only file that talks to SUMO.
+
+libsumo holds one simulation per process, and a second start replaces the first without a word; here
+it is refused. `ugat_marl.simulator_process` gives the same interface in a process of its own.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import libsumo
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.errors import SimulatorBusy, SimulatorError
+from ugat_marl.files import write_whole
+from ugat_marl.measurements import Snapshot, Trips
+from ugat_marl.scenario import Document, Scenario
+from ugat_marl.signals import Segment
+
+Plans = Mapping[str, Sequence[Segment]]
+"""Traffic light to what it shows in the coming seconds; lights that are left out go on as before."""
+
+_TRIPS, _ERRORS = "trips.xml", "errors.log"
+
+
+@dataclass(frozen=True)
+class Launch:
+    """All that is needed to start a simulation, in plain values that can be sent to a process.
+
+    Attributes:
+        arguments: Options of SUMO, without the name of the program.
+        directory: A folder for this simulation's own files; whoever runs it may remove it.
+        begin_s: Start of the simulation on the scenario's clock.
+        lanes: Lanes to measure.
+        waiting: Whether to measure waiting times as well.
+        gui: Whether to open a window.
+    """
+
+    arguments: tuple[str, ...]
+    directory: str
+    begin_s: float
+    lanes: tuple[str, ...]
+    waiting: bool = False
+    gui: bool = False
+
+    def as_dict(self) -> dict[str, Any]:
+        """The fields, for JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class VehiclePicture:
+    """Where the vehicles are, for drawing.
+
+    Attributes:
+        position: Front bumpers, m, ``(vehicles, 2)``.
+        angle_deg: Heading, 0 is north, clockwise, ``(vehicles,)``.
+        length_m: Lengths, ``(vehicles,)``.
+        speed_mps: Speeds, ``(vehicles,)``.
+    """
+
+    position: NDArray[np.float64]
+    angle_deg: NDArray[np.float64]
+    length_m: NDArray[np.float64]
+    speed_mps: NDArray[np.float64]
+
+
+class Simulator(Protocol):
+    """One simulation at a time; start, advance repeatedly, finish."""
+
+    def start(self, launch: Launch) -> Snapshot:
+        """Starts a simulation; one that is under way is ended first."""
+        ...
+
+    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+        """Simulates `seconds` under the given signals."""
+        ...
+
+    def vehicles(self) -> VehiclePicture:
+        """Positions of all vehicles now."""
+        ...
+
+    def signals(self) -> dict[str, str]:
+        """State of every traffic light now, including those that run their own programme."""
+        ...
+
+    def finish(self) -> Trips:
+        """Ends the simulation and returns what became of every vehicle due."""
+        ...
+
+    def close(self) -> None:
+        """Ends the simulation, if there is one; may be called again."""
+        ...
+
+
+def launch_of(
+    scenario: Scenario,
+    seed: int,
+    directory: Path,
+    lanes: Sequence[str],
+    *,
+    waiting: bool = False,
+    gui: bool = False,
+) -> Launch:
+    """Writes a scenario's edited files to `directory` and lists SUMO's options.
+
+    Args:
+        scenario: What to simulate.
+        seed: SUMO's seed; any 31-bit integer.
+        directory: An existing folder that belongs to the simulation.
+        lanes: Lanes to measure.
+        waiting: Whether to measure waiting times.
+        gui: Whether to open a window.
+    """
+    settings = scenario.settings
+    files = {
+        "--net-file": [scenario.network],
+        "--route-files": list(scenario.routes),
+        "--additional-files": list(scenario.additional),
+    }
+    arguments: list[str] = []
+    for option, documents in files.items():
+        if documents:
+            arguments += [option, ",".join(_on_disk(item, directory) for item in documents)]
+    for option, value in settings.sumo.items():
+        arguments += [f"--{option}", value]
+    arguments += [
+        "--begin", f"{settings.begin_s:g}",
+        "--step-length", f"{settings.step_length_s:g}",
+        "--seed", str(seed & 0x7FFFFFFF),
+        "--time-to-teleport", "-1",
+        "--tripinfo-output", str(directory / _TRIPS),
+        "--tripinfo-output.write-unfinished", "true",
+        "--tripinfo-output.write-undeparted", "true",
+        "--error-log", str(directory / _ERRORS),
+        "--no-step-log", "true",
+        "--duration-log.disable", "true",
+        "--no-warnings", "true",
+    ]  # fmt: skip
+    if gui:
+        arguments += ["--start", "true", "--quit-on-end", "true"]
+    return Launch(tuple(arguments), str(directory), settings.begin_s, tuple(lanes), waiting, gui)
+
+
+def _on_disk(document: Document, directory: Path) -> str:
+    if document.path is not None:
+        return str(document.path.resolve())
+    path = directory / document.name
+    write_whole(path, document.read())
+    return str(path)
+
+
+class LibsumoSimulator:
+    """SUMO inside this process.
+
+    Restarting in one process is not always reproducible to the bit (seen on RESCO cologne1); use
+    `ugat_marl.simulator_process.ProcessSimulator` where that matters.
+    """
+
+    def __init__(self) -> None:
+        self._launch: Launch | None = None
+        self._shown: dict[str, str] = {}
+        self._time_s = 0.0
+
+    def start(self, launch: Launch) -> Snapshot:
+        """Starts a simulation.
+
+        Raises:
+            SimulatorBusy: This process already runs a simulation of somebody else.
+            SimulatorError: SUMO refuses; its own words are in the message.
+        """
+        self.close()
+        if libsumo.simulation.isLoaded():
+            raise SimulatorBusy(
+                "this process already runs a SUMO simulation, and libsumo holds only one: close "
+                'the other one, or use simulator="process", which runs any number'
+            )
+        program = "sumo-gui" if launch.gui else "sumo"
+        self._launch = launch
+        try:
+            libsumo.start([program, *launch.arguments])
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            self._fail("SUMO did not start", error)
+        self._shown = {}
+        self._time_s = launch.begin_s
+        return self._snapshot()
+
+    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+        """Simulates `seconds`, showing the planned signal states.
+
+        Raises:
+            SimulatorError: SUMO failed; its own words are in the message.
+        """
+        assert self._launch is not None, "advance before start"
+        changes: dict[float, list[tuple[str, str]]] = defaultdict(list)
+        for tls, segments in plans.items():
+            offset = 0.0
+            for duration, state in segments:
+                changes[offset].append((tls, state))
+                offset += duration
+        begin = self._time_s
+        try:
+            for offset in sorted(changes):
+                if offset > 0:
+                    libsumo.simulation.step(begin + offset)
+                for tls, state in changes[offset]:
+                    if self._shown.get(tls) != state:
+                        libsumo.trafficlight.setRedYellowGreenState(tls, state)
+                        self._shown[tls] = state
+            libsumo.simulation.step(begin + seconds)
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            self._fail(f"SUMO failed after {begin:g} s", error)
+        self._time_s = begin + seconds
+        return self._snapshot()
+
+    def vehicles(self) -> VehiclePicture:
+        """Positions of all vehicles now."""
+        api = libsumo.vehicle
+        names = api.getIDList()
+        return VehiclePicture(
+            np.array([api.getPosition(name) for name in names], dtype=np.float64).reshape(-1, 2),
+            np.array([api.getAngle(name) for name in names], dtype=np.float64),
+            np.array([api.getLength(name) for name in names], dtype=np.float64),
+            np.array([api.getSpeed(name) for name in names], dtype=np.float64),
+        )
+
+    def signals(self) -> dict[str, str]:
+        """State of every traffic light now."""
+        api = libsumo.trafficlight
+        return {name: api.getRedYellowGreenState(name) for name in api.getIDList()}
+
+    def finish(self) -> Trips:
+        """Ends the simulation; SUMO then writes what became of every vehicle due."""
+        assert self._launch is not None, "finish before start"
+        directory = Path(self._launch.directory)
+        self.close()
+        return read_trips(directory / _TRIPS)
+
+    def close(self) -> None:
+        """Ends the simulation of this object, if there is one."""
+        if self._launch is not None:
+            self._launch = None
+            if libsumo.simulation.isLoaded():
+                libsumo.simulation.close()
+
+    def _snapshot(self) -> Snapshot:
+        assert self._launch is not None
+        lanes, api = self._launch.lanes, libsumo.lane
+        count, halting, speed = (
+            api.getLastStepVehicleNumber,
+            api.getLastStepHaltingNumber,
+            api.getLastStepMeanSpeed,
+        )
+        statistic = libsumo.simulation.getParameter
+        return Snapshot(
+            time_s=self._time_s,
+            vehicles=np.array([count(lane) for lane in lanes], dtype=np.float64),
+            halting=np.array([halting(lane) for lane in lanes], dtype=np.float64),
+            mean_speed_mps=np.array([speed(lane) for lane in lanes], dtype=np.float64),
+            waiting_s=np.array(
+                [api.getWaitingTime(lane) for lane in lanes] if self._launch.waiting else [],
+                dtype=np.float64,
+            ),
+            departed=int(statistic("", "stats.vehicles.inserted")),
+            backlog=int(statistic("", "stats.vehicles.waiting")),
+        )
+
+    def _fail(self, what: str, error: Exception) -> None:
+        assert self._launch is not None
+        said = _errors_of(Path(self._launch.directory)) or str(error)
+        self.close()
+        raise SimulatorError(f"{what}: {said}") from None
+
+
+def _errors_of(directory: Path) -> str:
+    """SUMO's error log in one line."""
+    path = directory / _ERRORS
+    text = path.read_text(errors="replace") if path.exists() else ""
+    lines = [line.strip().removeprefix("Error: ") for line in text.splitlines()]
+    return " ".join(line for line in lines if line and line != "Quitting (on error).")
+
+
+def read_trips(path: Path) -> Trips:
+    """Reads SUMO's tripinfo file, unfinished and undeparted vehicles included."""
+    rows: list[tuple[float, float, bool, bool]] = []
+    for _, item in ET.iterparse(path):
+        if item.tag == "tripinfo":
+            entered = float(item.get("depart", "-1")) >= 0
+            finished = float(item.get("arrival", "-1")) >= 0
+            waited = float(item.get("departDelay", "0"))
+            inside = float(item.get("duration", "0"))
+            lost = float(item.get("timeLoss", "0"))
+            rows.append((waited + inside, waited + lost, finished, entered))
+        item.clear()
+    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    return Trips(table[:, 0], table[:, 1], table[:, 2] > 0, table[:, 3] > 0)
