@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -12,7 +12,7 @@ import torch
 from ugat_marl.errors import CheckpointError
 from ugat_marl.files import replacing
 
-_UNREADABLE = (OSError, EOFError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError)
+_UNREADABLE = (OSError, EOFError, RuntimeError, ValueError, KeyError, UnpicklingError)
 
 
 def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
