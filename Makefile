@@ -49,7 +49,7 @@ lint: environment-dev
 	$(BIN)/python -m ruff check .
 
 types: environment-dev
-	$(BIN)/basedpyright --pythonpath $(BIN)/python
+	$(BIN)/python -m basedpyright --pythonpath $(BIN)/python
 
 architecture: environment-dev
 	$(BIN)/python -m pytest -q tests/architecture_test.py

@@ -227,7 +227,10 @@ def main() -> None:
     LOCK.parent.mkdir(exist_ok=True)
     with LOCK.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        prepare(extras)
+        try:
+            prepare(extras)
+        except KeyboardInterrupt:
+            sys.exit("\nenvironment: interrupted; the same command starts it afresh")
 
 
 if __name__ == "__main__":
