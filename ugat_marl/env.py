@@ -292,6 +292,7 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         spaces = {kind: space for kind, space in zip(kinds, self._observer.spaces, strict=True)}
         self.observation_spaces = {a: spaces[k] for a, k in zip(agents, kinds, strict=True)}
         self.action_spaces = {a: Discrete(k[1]) for a, k in zip(agents, kinds, strict=True)}
+        self._all_free = [np.ones(kind[1], dtype=np.int8) for kind in kinds]
 
     def _joint_space(self) -> Box:
         spaces = list(self.observation_spaces.values())
@@ -326,17 +327,12 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         for agent in self.agents:
             if agent not in actions:
                 raise ActionError(f"no action for agent {agent!r}; every agent needs one")
-            action, space = actions[agent], self.action_spaces[agent]
-            if not isinstance(action, (int, np.integer)) and not (
-                isinstance(action, np.ndarray) and action.shape == () and action.dtype.kind in "iu"
-            ):
+            action = actions[agent]
+            if not self.action_spaces[agent].contains(action):
+                last = self.action_spaces[agent].n - 1
                 raise ActionError(
-                    f"action of agent {agent!r} is {action!r}; allowed: integers 0 to {space.n - 1}"
-                )
-            if not 0 <= int(action) < space.n:
-                raise ActionError(
-                    f"action of agent {agent!r} is {int(action)}; "
-                    f"allowed: 0 to {space.n - 1}, its green phases"
+                    f"action of agent {agent!r} is {action!r}; "
+                    f"allowed: the integers 0 to {last}, its green phases"
                 )
             requested.append(int(action))
         return requested
@@ -365,12 +361,10 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
 
     def _infos(self) -> dict[str, dict[str, Any]]:
         infos: dict[str, dict[str, Any]] = {}
-        for agent, state in zip(self.agents, self._states, strict=True):
-            phases = int(self.action_spaces[agent].n)
-            if signals.free_to_change(state, self._timing, self.decision_interval_s):
-                mask = np.ones(phases, dtype=np.int8)
-            else:
-                mask = np.zeros(phases, dtype=np.int8)
+        for agent, state, free in zip(self.agents, self._states, self._all_free, strict=True):
+            mask = free.copy()
+            if not signals.free_to_change(state, self._timing, self.decision_interval_s):
+                mask[:] = 0
                 mask[state.phase] = 1
             infos[agent] = {"action_mask": mask, "executed_action": state.phase}
         return infos

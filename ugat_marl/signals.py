@@ -6,8 +6,9 @@ does not change its mind while clearing. It knows nothing of SUMO.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from ugat_marl.errors import OptionError, ScenarioError
 
@@ -57,6 +58,10 @@ class SignalState:
         """Whether yellow or all-red is shown."""
         return self.phase != self.origin
 
+    def later(self, seconds: float) -> SignalState:
+        """The same light, `seconds` later."""
+        return SignalState(self.phase, self.origin, self.elapsed_s + seconds)
+
 
 def initial_state(timing: SignalTiming) -> SignalState:
     """Phase 0, green for long enough that any phase may follow."""
@@ -94,6 +99,8 @@ def advance(
         The state afterwards, and what is shown: segments whose durations add up to `seconds`.
     """
     assert 0 <= requested < len(phases)
+    if requested == state.phase and not state.clearing:
+        return state.later(seconds), [(seconds, phases[requested])]
     shown: list[Segment] = []
     left = seconds
     while left > 1e-9:
@@ -111,20 +118,20 @@ def _next_segment(
     green = phases[state.phase]
     if state.clearing:
         origin = phases[state.origin]
-        for until, shown in (
-            (timing.yellow_s, yellow_between(origin, green)),
-            (timing.clearance_s, red_between(origin, green)),
-        ):
-            if state.elapsed_s < until:
-                duration = min(until - state.elapsed_s, left)
-                return replace(state, elapsed_s=state.elapsed_s + duration), (duration, shown)
-        return SignalState(state.phase, state.phase, 0.0), (0.0, green)
+        if state.elapsed_s < timing.yellow_s:
+            until, shown = timing.yellow_s, yellow_between(origin, green)
+        elif state.elapsed_s < timing.clearance_s:
+            until, shown = timing.clearance_s, red_between(origin, green)
+        else:
+            return SignalState(state.phase, state.phase, 0.0), (0.0, green)
+        duration = min(until - state.elapsed_s, left)
+        return state.later(duration), (duration, shown)
     if requested == state.phase:
-        return replace(state, elapsed_s=state.elapsed_s + left), (left, green)
+        return state.later(left), (left, green)
     held = timing.min_green_s - state.elapsed_s
     if held > 0:
         duration = min(held, left)
-        return replace(state, elapsed_s=state.elapsed_s + duration), (duration, green)
+        return state.later(duration), (duration, green)
     return SignalState(requested, state.phase, 0.0), (0.0, green)
 
 
@@ -135,11 +142,13 @@ def _append(shown: list[Segment], segment: Segment) -> None:
         shown.append(segment)
 
 
+@functools.cache
 def yellow_between(origin: str, target: str) -> str:
     """Yellow where a green ends; green where it goes on, with the weaker of the two rights."""
     return "".join(_ending(a, b, "y") for a, b in zip(origin, target, strict=True))
 
 
+@functools.cache
 def red_between(origin: str, target: str) -> str:
     """Red where a green ended or is about to begin; green where it goes on."""
     return "".join(_ending(a, b, "r") for a, b in zip(origin, target, strict=True))

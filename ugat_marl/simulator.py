@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -252,21 +252,17 @@ class LibsumoSimulator:
     def _snapshot(self) -> Snapshot:
         assert self._launch is not None
         lanes, api = self._launch.lanes, libsumo.lane
-        count, halting, speed = (
-            api.getLastStepVehicleNumber,
-            api.getLastStepHaltingNumber,
-            api.getLastStepMeanSpeed,
-        )
+
+        def measure(what: Callable[[str], float]) -> NDArray[np.float64]:
+            return np.fromiter(map(what, lanes), np.float64, len(lanes))
+
         statistic = libsumo.simulation.getParameter
         return Snapshot(
             time_s=self._time_s,
-            vehicles=np.array([count(lane) for lane in lanes], dtype=np.float64),
-            halting=np.array([halting(lane) for lane in lanes], dtype=np.float64),
-            mean_speed_mps=np.array([speed(lane) for lane in lanes], dtype=np.float64),
-            waiting_s=np.array(
-                [api.getWaitingTime(lane) for lane in lanes] if self._launch.waiting else [],
-                dtype=np.float64,
-            ),
+            vehicles=measure(api.getLastStepVehicleNumber),
+            halting=measure(api.getLastStepHaltingNumber),
+            mean_speed_mps=measure(api.getLastStepMeanSpeed),
+            waiting_s=measure(api.getWaitingTime) if self._launch.waiting else np.empty(0),
             departed=int(statistic("", "stats.vehicles.inserted")),
             backlog=int(statistic("", "stats.vehicles.waiting")),
         )
