@@ -1,0 +1,1 @@
+"""Grounding: actions of the simulation that do what the policy's action would do in reality."""

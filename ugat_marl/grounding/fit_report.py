@@ -1,0 +1,260 @@
+"""What a fit of f and h was worth, measured on episodes that it did not see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ugat_marl.grounding.calibration import auroc, rate_by_quantile, spearman
+from ugat_marl.grounding.evidential import uncertainty
+from ugat_marl.grounding.forward import ForwardModel
+from ugat_marl.grounding.inverse import InverseModel
+from ugat_marl.grounding.off_data import OffData
+from ugat_marl.grounding.stacked import StackedTransitions
+
+QUANTILES = 5
+DISCRIMINATES = 0.55
+"""AUROC below which u is called uninformative in the warnings."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """How a training went.
+
+    Attributes:
+        epochs: Epochs run before held-out loss stopped falling.
+        train_loss: Mean loss of the last epoch, over agents.
+        held_out_loss: Mean held-out loss of the weights that were kept.
+        split: "episodes", or "steps" where the log has only one episode.
+        train_rows: Rows trained on, over all agents.
+        held_out_rows: Rows held out, over all agents.
+    """
+
+    epochs: int
+    train_loss: float
+    held_out_loss: float
+    split: str
+    train_rows: int
+    held_out_rows: int
+
+
+@dataclass(frozen=True)
+class ForwardReport:
+    """Held-out error of f, per agent: root mean squares in the unit of the features.
+
+    Attributes:
+        training: How the training went.
+        error: Of f.
+        no_change: Of predicting that nothing changes.
+    """
+
+    training: TrainingRecord
+    error: Floats
+    no_change: Floats
+
+    @property
+    def ratio(self) -> Floats:
+        """Error over the error of no change, per agent: below 1, f has learnt something."""
+        return self.error / np.maximum(self.no_change, 1e-12)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Whether u tells right from wrong, and known from unknown, over all agents together.
+
+    Attributes:
+        spearman: Rank correlation of u with being wrong.
+        auroc: Probability that u is higher for a wrong answer than for a right one.
+        error_by_quantile: Error rate in fifths of rising u.
+        mean_u: Mean u on held-out data.
+        mean_u_off_data: Mean u on states and changes drawn around, not from, the data.
+        auroc_off_data: Probability that u is higher off the data than on it.
+    """
+
+    spearman: float
+    auroc: float
+    error_by_quantile: tuple[float, ...]
+    mean_u: float
+    mean_u_off_data: float
+    auroc_off_data: float
+
+
+@dataclass(frozen=True)
+class InverseReport:
+    """Held-out quality of h, per agent where an array.
+
+    Attributes:
+        training: How the training went.
+        accuracy: Share of right answers.
+        chance: 1 / number of phases.
+        majority: Accuracy of always answering the phase most frequent in training.
+        mean_u: Mean uncertainty.
+        auroc: u against being wrong, agent by agent.
+        calibration: The same and more, pooled.
+    """
+
+    training: TrainingRecord
+    accuracy: Floats
+    chance: Floats
+    majority: Floats
+    mean_u: Floats
+    auroc: Floats
+    calibration: Calibration
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What f and h are worth, alone and together.
+
+    Attributes:
+        agents: Names, the order of all arrays.
+        forward: f, on held-out real transitions.
+        inverse: h, on held-out simulated transitions.
+        agreement: Per agent, share of held-out simulated states in which h, fed by f, answers the
+            action that f was given. Without a gap and with a perfect f this is h's accuracy; what
+            is missing is the gap and the errors of both models. It says how much grounding would
+            change if every grounded action were taken.
+        mean_u_on_predictions: Per agent, mean u of these answers: what the gate will see.
+    """
+
+    agents: tuple[str, ...]
+    forward: ForwardReport
+    inverse: InverseReport
+    agreement: Floats
+    mean_u_on_predictions: Floats
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons not to obey the grounded actions yet; empty if there are none."""
+        h, calibration = self.inverse, self.inverse.calibration
+        found = [
+            self._weak("f is no better than predicting no change", self.forward.ratio >= 1.0),
+            self._weak("h is no better than the most frequent phase", h.accuracy <= h.majority),
+        ]
+        if calibration.auroc < DISCRIMINATES:
+            found.append(f"u does not tell wrong answers (AUROC {calibration.auroc:.2f})")
+        if calibration.mean_u_off_data <= calibration.mean_u:
+            found.append(
+                f"u does not rise off the data ({calibration.mean_u_off_data:.2f} against "
+                f"{calibration.mean_u:.2f} on it)"
+            )
+        return tuple(sentence for sentence in found if sentence)
+
+    def _weak(self, complaint: str, where: NDArray[np.bool_]) -> str:
+        names = [agent for agent, hit in zip(self.agents, where, strict=True) if hit]
+        shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+        return f"{complaint} at {len(names)} of {len(self.agents)} ({shown})" if names else ""
+
+    def as_dict(self) -> dict[str, float]:
+        """Flat numbers; arrays as their mean over agents and as one entry per agent."""
+        numbers: dict[str, float] = {}
+        for prefix, part in (("forward", self.forward), ("inverse", self.inverse)):
+            training = part.training
+            numbers[f"{prefix}/epochs"] = float(training.epochs)
+            numbers[f"{prefix}/train_loss"] = training.train_loss
+            numbers[f"{prefix}/held_out_loss"] = training.held_out_loss
+            for entry in fields(part):
+                value = getattr(part, entry.name)
+                if isinstance(value, np.ndarray):
+                    numbers |= self._entries(f"{prefix}/{entry.name}", value)
+        numbers |= self._entries("forward/ratio", self.forward.ratio)
+        numbers |= self._entries("agreement", self.agreement)
+        numbers |= self._entries("mean_u_on_predictions", self.mean_u_on_predictions)
+        calibration = self.inverse.calibration
+        for entry in fields(calibration):
+            value = getattr(calibration, entry.name)
+            if isinstance(value, tuple):
+                for i, rate in enumerate(value):
+                    numbers[f"calibration/{entry.name}/{i}"] = rate
+            else:
+                numbers[f"calibration/{entry.name}"] = value
+        return numbers
+
+    def _entries(self, name: str, values: Floats) -> dict[str, float]:
+        known = values[~np.isnan(values)]
+        numbers = {name: float(known.mean()) if len(known) else float("nan")}
+        return numbers | {
+            f"{name}/{agent}": float(value)
+            for agent, value in zip(self.agents, values, strict=True)
+        }
+
+
+@torch.no_grad()
+def forward_report(
+    model: ForwardModel, data: StackedTransitions, held_out: Tensor, training: TrainingRecord
+) -> ForwardReport:
+    """Errors of f on the held-out rows; `held_out` is ``(agents, n)`` weights."""
+    happened = model.change(data.observation, data.next_observation)
+    predicted = model(data.observation, data.asked) * model.scale
+    outputs = model.valid_outputs.sum(-1)[:, 0].double()
+    share = (held_out / held_out.sum(1, keepdim=True)).double()
+
+    def root_mean_square(error: Tensor) -> Floats:
+        return ((error.double() ** 2).sum(-1) * share).sum(1).div(outputs).sqrt().numpy()
+
+    return ForwardReport(
+        training, root_mean_square(predicted - happened), root_mean_square(happened)
+    )
+
+
+@torch.no_grad()
+def inverse_report(
+    model: InverseModel,
+    data: StackedTransitions,
+    train: Tensor,
+    held_out: Tensor,
+    training: TrainingRecord,
+    generator: torch.Generator,
+) -> InverseReport:
+    """Accuracy of h and calibration of its u on the held-out rows."""
+    answer = model.predict(data.observation, data.next_observation)
+    kept = held_out.bool().numpy()
+    wrong = (answer.action != data.executed).numpy()
+    u = answer.u.numpy()
+    inputs = model.inputs(data.observation, data.next_observation)
+    drawn = OffData.around(inputs, train, model.stack).draw(
+        int(held_out.sum(1).max()), generator, state_share=1.0
+    )
+    off = uncertainty(model(drawn), model.valid_actions).flatten().numpy()
+    counts = torch.zeros(train.shape[0], model.stack.actions)
+    counts.scatter_add_(1, data.executed, train)
+    usual = counts.argmax(1)[:, None]
+    majority = ((data.executed == usual) * held_out).sum(1) / held_out.sum(1)
+    rows = range(len(kept))
+    on_u, on_wrong = u[kept], wrong[kept]
+    both = np.concatenate([on_u, off])
+    calibration = Calibration(
+        spearman=spearman(on_u, on_wrong),
+        auroc=auroc(on_u, on_wrong),
+        error_by_quantile=rate_by_quantile(on_u, on_wrong, QUANTILES),
+        mean_u=float(on_u.mean()),
+        mean_u_off_data=float(off.mean()),
+        auroc_off_data=auroc(both, np.arange(len(both)) >= len(on_u)),
+    )
+    return InverseReport(
+        training=training,
+        accuracy=np.array([1.0 - wrong[i][kept[i]].mean() for i in rows]),
+        chance=1.0 / np.array(model.stack.phases, float),
+        majority=majority.double().numpy(),
+        mean_u=np.array([u[i][kept[i]].mean() for i in rows], float),
+        auroc=np.array([auroc(u[i][kept[i]], wrong[i][kept[i]]) for i in rows]),
+        calibration=calibration,
+    )
+
+
+@torch.no_grad()
+def on_predictions(
+    forward: ForwardModel, inverse: InverseModel, data: StackedTransitions, held_out: Tensor
+) -> tuple[Floats, Floats]:
+    """Per agent, agreement and mean u of h fed by f in held-out simulated states."""
+    predicted = forward.predict(data.observation, data.executed)
+    answer = inverse.predict(data.observation, predicted)
+    share = held_out.double() / held_out.double().sum(1, keepdim=True)
+    agreement = ((answer.action == data.executed) * share).sum(1)
+    return agreement.numpy(), (answer.u * share).sum(1).numpy()

@@ -1,0 +1,96 @@
+"""Forward models f_i: what the real world makes of a state and an action.
+
+One multi-layer perceptron per intersection, all of them computed as one batch. A model predicts
+the *change* of the features over one decision interval: knowing nothing is predicting no change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ugat_marl.batched import BatchedMLP, mask_of
+from ugat_marl.errors import OptionError
+from ugat_marl.grounding.scaling import SMALLEST_SPREAD, Standardiser
+from ugat_marl.grounding.stacked import Stack
+
+
+@dataclass(frozen=True)
+class ForwardConfig:
+    """Shape of the forward models.
+
+    Attributes:
+        hidden: Sizes of the hidden layers.
+        include_phase: Whether the phase of s' is predicted, too. Off: it is known from the action,
+            and with it an inverse model could only answer the action that made it.
+    """
+
+    hidden: tuple[int, ...] = (128, 128)
+    include_phase: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.hidden or min(self.hidden) < 1:
+            raise OptionError(f"forward hidden is {self.hidden}; allowed: one or more sizes >= 1")
+
+
+class ForwardModel(nn.Module):
+    """f of every intersection: (s, a) -> features of s'.
+
+    Args:
+        stack: The agents.
+        config: Shape of the models.
+        generator: Source of the initial weights.
+    """
+
+    fitted: Tensor
+    scale: Tensor
+    offsets: Tensor
+    valid_outputs: Tensor
+
+    def __init__(self, stack: Stack, config: ForwardConfig, generator: torch.Generator) -> None:
+        super().__init__()
+        self.stack = stack
+        self.config = config
+        heads = stack.heads(config.include_phase)
+        fan_in = [size + k for size, k in zip(stack.sizes, stack.phases, strict=True)]
+        self.standardise = Standardiser(len(heads), stack.width)
+        self.network = BatchedMLP(fan_in, config.hidden, max(heads), generator)
+        self.width = max(fan_in)
+        self.register_buffer("scale", torch.ones(len(heads), 1, 1))
+        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("offsets", torch.tensor(stack.sizes)[:, None, None], persistent=False)
+        self.register_buffer("valid_outputs", mask_of(heads)[:, None, :], persistent=False)
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Predicted change in units of ``scale``: ``(agents, batch, outputs)``, 0 in padding.
+
+        Args:
+            observation: ``(agents, batch, width)``.
+            action: ``(agents, batch)`` int64.
+        """
+        inputs = nn.functional.pad(
+            self.standardise(observation), (0, self.width - observation.shape[-1])
+        )
+        # The one-hot action stands directly behind the agent's own numbers, not behind the padding.
+        inputs = inputs.scatter(2, self.offsets + action[..., None], 1.0)
+        return self.network(inputs) * self.valid_outputs
+
+    def predict(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Predicted features (and phase, if included) of s', ``(agents, batch, outputs)``."""
+        change = self(observation, action) * self.scale
+        return observation[..., : change.shape[-1]] * self.valid_outputs + change
+
+    def change(self, observation: Tensor, next_observation: Tensor) -> Tensor:
+        """The change that happened, ``(agents, batch, outputs)`` in the features' own unit."""
+        size = self.valid_outputs.shape[-1]
+        return (next_observation - observation)[..., :size] * self.valid_outputs
+
+    def fit_scale(self, observation: Tensor, change: Tensor, weight: Tensor) -> None:
+        """Takes the statistics of inputs and of changes from the training rows."""
+        self.standardise.fit(observation, weight)
+        share = (weight / weight.sum(1, keepdim=True))[..., None]
+        outputs = self.valid_outputs.sum(-1, keepdim=True)
+        spread = ((share * change**2).sum((1, 2), keepdim=True) / outputs).sqrt()
+        self.scale.copy_(spread.clamp(min=SMALLEST_SPREAD))

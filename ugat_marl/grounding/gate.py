@@ -1,0 +1,232 @@
+"""The gate: per intersection and step, the policy's action or the grounded one.
+
+A grounded action is taken where the inverse model's uncertainty u is below the threshold alpha. In
+UGAT alpha starts at infinity (everything is taken) and is then the mean of the u that were logged;
+a fixed alpha and an infinite one (GAT, no gate) are the paper's ablations.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ugat_marl.errors import CheckpointError, OptionError
+
+MODES = ("infinite", "static", "dynamic")
+SCOPES = ("intersection", "pooled")
+
+
+@dataclass(frozen=True)
+class GateConfig:
+    """How alpha is found.
+
+    Attributes:
+        mode: "infinite" takes every grounded action, "static" compares with `static_alpha`,
+            "dynamic" with the mean of the u logged before the last update.
+        static_alpha: Threshold in (0, 1], for mode "static".
+        scope: One alpha per intersection, or one pooled over all.
+        window_epochs: E, the number of epochs whose u enter the mean.
+    """
+
+    mode: Literal["infinite", "static", "dynamic"] = "dynamic"
+    static_alpha: float = 0.5
+    scope: Literal["intersection", "pooled"] = "intersection"
+    window_epochs: int = 20
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise OptionError(f"gate mode is {self.mode!r}; allowed: {', '.join(MODES)}")
+        if self.scope not in SCOPES:
+            raise OptionError(f"gate scope is {self.scope!r}; allowed: {', '.join(SCOPES)}")
+        if not 0.0 < self.static_alpha <= 1.0:
+            raise OptionError(f"gate static_alpha is {self.static_alpha}; allowed: in (0, 1]")
+        if self.window_epochs < 1:
+            raise OptionError(f"gate window_epochs is {self.window_epochs}; allowed: >= 1")
+
+
+@dataclass(frozen=True)
+class GateReport:
+    """What the gate did since the last update; arrays over the agents.
+
+    Attributes:
+        agents: Names.
+        iteration: Number of updates before these decisions.
+        decisions: Decisions per agent.
+        alpha: Threshold these decisions were compared with.
+        acceptance: Share of decisions in which the grounded action was taken.
+        mean_u: Mean uncertainty.
+        change_rate: Share of decisions in which another action than the policy's was executed.
+        warning: A sentence if the gate let everything or nothing through, else "".
+    """
+
+    agents: tuple[str, ...]
+    iteration: int
+    decisions: NDArray[np.int64]
+    alpha: NDArray[np.float64]
+    acceptance: NDArray[np.float64]
+    mean_u: NDArray[np.float64]
+    change_rate: NDArray[np.float64]
+    warning: str
+
+    def as_dict(self) -> dict[str, float]:
+        """Flat numbers: means over agents, and alpha, acceptance, u and changes per agent."""
+        numbers: dict[str, float] = {"decisions": float(self.decisions.sum())}
+        for name in ("alpha", "acceptance", "mean_u", "change_rate"):
+            values: NDArray[np.float64] = getattr(self, name)
+            numbers[name] = float(values.mean())
+            numbers |= {f"{name}/{a}": float(v) for a, v in zip(self.agents, values, strict=True)}
+        return numbers
+
+
+class Gate:
+    """Accepts or refuses grounded actions and counts what it did.
+
+    Args:
+        agents: Names, in the order of all arrays.
+        config: How alpha is found.
+    """
+
+    def __init__(self, agents: Sequence[str], config: GateConfig) -> None:
+        self.agents = tuple(agents)
+        self.config = config
+        start = config.static_alpha if config.mode == "static" else np.inf
+        self.alpha: NDArray[np.float64] = np.full(len(self.agents), start)
+        self.iteration = 0
+        self._epochs: deque[NDArray[np.float64]] = deque(maxlen=config.window_epochs)
+        self._running = np.zeros((2, len(self.agents)))  # sum and number of u in this epoch
+        self._counts = np.zeros((4, len(self.agents)))  # decisions, accepted, changed, sum of u
+
+    def decide(
+        self,
+        u: NDArray[np.floating[Any]],
+        action: NDArray[np.int64],
+        grounded: NDArray[np.int64],
+        permitted: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.bool_]:
+        """Which grounded actions are taken; logs u and counts.
+
+        Args:
+            u: ``(agents,)`` uncertainties.
+            action: ``(agents,)`` the policy's actions.
+            grounded: ``(agents,)`` the grounded actions.
+            permitted: ``(agents,)`` false where the grounded action is masked out.
+
+        Returns:
+            ``(agents,)`` bool: u < alpha and permitted.
+        """
+        accepted = u < self.alpha
+        if permitted is not None:
+            accepted = accepted & permitted
+        self._running += (u, np.ones_like(u))
+        self._counts += (np.ones_like(u), accepted, accepted & (action != grounded), u)
+        return accepted
+
+    def end_epoch(self) -> None:
+        """Closes an epoch: its u count as one of the window's E epochs. Empty ones do not."""
+        if self._running[1].any():
+            self._epochs.append(self._running)
+            self._running = np.zeros_like(self._running)
+
+    def update(self) -> GateReport:
+        """Ends an iteration: reports, moves a dynamic alpha, and starts counting anew.
+
+        Warns (UserWarning) if, after the first iteration, some intersections took everything or
+        nothing, unless that is the mode's purpose.
+        """
+        self.end_epoch()
+        report = self.report()
+        if report.warning:
+            warnings.warn(report.warning, stacklevel=2)
+        if self.config.mode == "dynamic" and self._epochs:
+            total = np.sum(self._epochs, axis=0)
+            if self.config.scope == "pooled":
+                total = np.broadcast_to(total.sum(1, keepdims=True), total.shape)
+            self.alpha = np.divide(total[0], total[1], out=self.alpha.copy(), where=total[1] > 0)
+        self._counts = np.zeros_like(self._counts)
+        self.iteration += 1
+        return report
+
+    def report(self) -> GateReport:
+        """What the gate did since the last update."""
+        decisions, accepted, changed, total = self._counts
+        count = np.maximum(decisions, 1.0)
+        return GateReport(
+            agents=self.agents,
+            iteration=self.iteration,
+            decisions=decisions.astype(np.int64),
+            alpha=self.alpha.copy(),
+            acceptance=accepted / count,
+            mean_u=total / count,
+            change_rate=changed / count,
+            warning=self._warning(accepted, decisions),
+        )
+
+    def _warning(self, accepted: NDArray[np.float64], decisions: NDArray[np.float64]) -> str:
+        if self.iteration == 0 or self.config.mode == "infinite":
+            return ""
+        parts: list[str] = []
+        for share, found in (
+            ("no grounded action was taken", (accepted == 0) & (decisions > 0)),
+            ("every grounded action was taken", (accepted == decisions) & (decisions > 0)),
+        ):
+            if found.any():
+                names = [a for a, hit in zip(self.agents, found, strict=True) if hit]
+                shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+                parts.append(f"{share} at {len(names)} of {len(self.agents)} ({shown})")
+        if not parts:
+            return ""
+        return (
+            f"iteration {self.iteration}: {'; '.join(parts)}: the gate does not discriminate "
+            "there; look at alpha and the calibration of u in the report"
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on as if never interrupted."""
+        epochs = np.array(self._epochs).reshape(-1, 2, len(self.agents))
+        return {
+            "agents": list(self.agents),
+            "iteration": self.iteration,
+            # Checkpoints hold finite numbers only; where the gate is open, alpha is infinite.
+            "alpha": torch.from_numpy(np.where(np.isinf(self.alpha), 0.0, self.alpha)),
+            "open": torch.from_numpy(np.isinf(self.alpha)),
+            "epochs": torch.from_numpy(epochs),
+            "running": torch.from_numpy(self._running.copy()),
+            "counts": torch.from_numpy(self._counts.copy()),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores `state_dict`.
+
+        Raises:
+            CheckpointError: Of other agents, incomplete, or with impossible numbers.
+        """
+        if state.get("agents") != list(self.agents):
+            raise CheckpointError(
+                "the gate in the checkpoint belongs to other agents; start a new run"
+            )
+        count = len(self.agents)
+        shapes = {"alpha": (count,), "open": (count,), "running": (2, count), "counts": (4, count)}
+        epochs = state.get("epochs")
+        shapes["epochs"] = (len(epochs) if isinstance(epochs, torch.Tensor) else 0, 2, count)
+        arrays: dict[str, NDArray[np.float64]] = {}
+        for name, shape in shapes.items():
+            value = state.get(name)
+            if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
+                raise CheckpointError(f"the gate in the checkpoint has no {name} of shape {shape}")
+            if not torch.isfinite(value).all() or bool((value < 0).any()):
+                raise CheckpointError(f"the gate in the checkpoint has an impossible {name}")
+            arrays[name] = value.numpy().astype(np.float64)
+        iteration = state.get("iteration")
+        if not isinstance(iteration, int) or iteration < 0:
+            raise CheckpointError(f"the gate in the checkpoint has iteration {iteration!r}")
+        self.alpha = np.where(arrays["open"] > 0, np.inf, arrays["alpha"])
+        self._running, self._counts = arrays["running"], arrays["counts"]
+        self._epochs = deque(arrays["epochs"], maxlen=self.config.window_epochs)
+        self.iteration = iteration

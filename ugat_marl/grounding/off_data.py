@@ -1,0 +1,72 @@
+"""Inputs of h that the simulation never produces, to teach and to test that u rises there.
+
+The evidential loss alone says nothing about inputs far from the data, where a network of ReLUs
+grows ever more confident: on planted dynamics u was 0.26 on the data and 0.10 off it. So a state is
+drawn from a box around the observed ones, and so is the change of its features; the current phase
+stays a valid one, or it alone would give the invented rows away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ugat_marl.grounding.stacked import Stack
+
+REACH = 1.5
+"""Half-width of the box in units of the observed range: three times as wide as the data."""
+
+
+@dataclass(frozen=True)
+class OffData:
+    """The box around the training inputs of every agent.
+
+    Attributes:
+        inputs: ``(agents, n, width)`` unscaled inputs of h.
+        candidates: Columns of `inputs` to start from, ``(m,)``.
+        low: ``(agents, 1, width)`` lower end of the box; ``high`` the upper.
+        kept: ``(agents, 1, width)`` bool, the phase and padding: never redrawn.
+        change: ``(agents, 1, width)`` bool, the change of the features.
+    """
+
+    inputs: Tensor
+    candidates: Tensor
+    low: Tensor
+    high: Tensor
+    kept: Tensor
+    change: Tensor
+
+    @classmethod
+    def around(cls, inputs: Tensor, weight: Tensor, stack: Stack) -> OffData:
+        """The box around the rows of `inputs` with weight, ``(agents, n)``."""
+        own = weight.bool()[..., None]
+        low = torch.where(own, inputs, torch.inf).amin(1, keepdim=True)
+        high = torch.where(own, inputs, -torch.inf).amax(1, keepdim=True)
+        centre, reach = (high + low) / 2, (high - low) * REACH
+        kept = torch.zeros(low.shape, dtype=torch.bool)
+        change = torch.zeros(low.shape, dtype=torch.bool)
+        for i, layout in enumerate(stack.layouts.values()):
+            kept[i, 0, layout.features : layout.features + layout.phases] = True
+            change[i, 0, layout.size :] = True
+        candidates = weight.bool().all(0).nonzero()[:, 0]
+        if not len(candidates):  # agents measured at different times share no column
+            candidates = weight.bool().any(0).nonzero()[:, 0]
+        return cls(inputs, candidates, centre - reach, centre + reach, kept, change)
+
+    def draw(self, count: int, generator: torch.Generator, state_share: float) -> Tensor:
+        """Invented inputs ``(agents, count, width)``.
+
+        Args:
+            count: Rows per agent.
+            generator: Source of the draws.
+            state_share: Share of rows in which the state is drawn, too; in the others it is an
+                observed one with a change that it never had.
+        """
+        rows = torch.randint(len(self.candidates), (count,), generator=generator)
+        observed = self.inputs[:, self.candidates[rows]]
+        noise = torch.rand(observed.shape, generator=generator)
+        drawn = self.low + (self.high - self.low) * noise
+        whole = torch.rand(1, count, 1, generator=generator) < state_share
+        return torch.where((self.change | whole) & ~self.kept, drawn, observed)

@@ -1,0 +1,125 @@
+"""Observations and transitions of unequal intersections as padded tensors, one row each.
+
+An observation is ``features | phase one-hot | context``; the part that f predicts and h compares is
+its head: the features, with the phase behind them where a model asks for it. So every quantity is
+padded on the right only, and an intersection's own numbers always start at 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ugat_marl.batched import mask_of
+from ugat_marl.errors import LogError
+from ugat_marl.transitions import AgentLayout, TransitionLog
+
+
+class Stack:
+    """The agents of a network in their order, and the sizes of their padded tensors.
+
+    Attributes:
+        layouts: Agent to the division of its observation.
+        agents: Agent names; index i of every tensor's first axis is ``agents[i]``.
+        sizes: Observation length of each agent; ``width`` is the largest.
+        phases: Number of phases of each agent; ``actions`` is the largest.
+        valid_actions: ``(agents, actions)`` bool, the phases each agent has.
+    """
+
+    def __init__(self, layouts: Mapping[str, AgentLayout]) -> None:
+        self.layouts = dict(layouts)
+        self.agents = tuple(layouts)
+        self.sizes = [layout.size for layout in layouts.values()]
+        self.phases = [layout.phases for layout in layouts.values()]
+        self.width = max(self.sizes)
+        self.actions = max(self.phases)
+        self.valid_actions = mask_of(self.phases)
+
+    def heads(self, include_phase: bool) -> list[int]:
+        """Length of each agent's predicted part: its features, with its phase if asked for."""
+        return [layout.features + layout.phases * include_phase for layout in self.layouts.values()]
+
+    def observations(self, observations: Mapping[str, NDArray[np.float32]]) -> Tensor:
+        """One observation per agent as ``(agents, 1, width)`` float32."""
+        rows = np.zeros((len(self.agents), 1, self.width), np.float32)
+        for row, agent, size in zip(rows, self.agents, self.sizes, strict=True):
+            row[0, :size] = observations[agent]
+        return torch.from_numpy(rows)
+
+    def masks(self, masks: Mapping[str, NDArray[np.int8] | None]) -> NDArray[np.bool_]:
+        """Action masks as ``(agents, actions)`` bool; an agent without a mask may do all it has."""
+        rows = self.valid_actions.numpy().copy()
+        for row, agent, phases in zip(rows, self.agents, self.phases, strict=True):
+            mask = masks.get(agent)
+            if mask is not None:
+                row[:phases] = np.asarray(mask, bool)
+        return rows
+
+
+@dataclass(frozen=True)
+class StackedTransitions:
+    """Transitions of all agents, padded; n is the longest agent's number of rows.
+
+    Attributes:
+        observation: ``(agents, n, width)`` float32.
+        next_observation: ``(agents, n, width)`` float32.
+        asked: ``(agents, n)`` int64, the action the policy chose.
+        executed: ``(agents, n)`` int64, the phase that was served.
+        episode: ``(agents, n)`` int64, counted from 0 without gaps; -1 in padding.
+        step: ``(agents, n)`` int64.
+        weight: ``(agents, n)`` float32, 1 for a row, 0 for padding.
+    """
+
+    observation: Tensor
+    next_observation: Tensor
+    asked: Tensor
+    executed: Tensor
+    episode: Tensor
+    step: Tensor
+    weight: Tensor
+
+
+def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
+    """All transitions of a log as padded tensors.
+
+    Raises:
+        LogError: The log is of other agents, or an agent has no rows.
+    """
+    if dict(log.provenance.layouts) != stack.layouts:
+        raise LogError(
+            f"the transition log of {log.provenance.scenario} "
+            f"({log.provenance.observation} observation, agents {_names(log.agents)}) does not fit "
+            f"the models, made for agents {_names(stack.agents)}; use the same scenario and "
+            "the same observation options"
+        )
+    rows = [log.transitions(agent) for agent in stack.agents]
+    for agent, own in zip(stack.agents, rows, strict=True):
+        if not len(own):
+            raise LogError(f"the transition log has no row of {agent}; record whole episodes")
+    number = np.unique(log.frame["episode"].to_numpy())
+    count, n = len(rows), max(len(own) for own in rows)
+    observation = torch.zeros(count, n, stack.width)
+    following = torch.zeros(count, n, stack.width)
+    asked, executed, step = (torch.zeros(count, n, dtype=torch.long) for _ in range(3))
+    episode = torch.full((count, n), -1)
+    weight = torch.zeros(count, n)
+    for i, own in enumerate(rows):
+        k, size = len(own), stack.sizes[i]
+        observation[i, :k, :size] = torch.from_numpy(own.observation)
+        following[i, :k, :size] = torch.from_numpy(own.next_observation)
+        asked[i, :k] = torch.from_numpy(own.action)
+        executed[i, :k] = torch.from_numpy(own.executed)
+        episode[i, :k] = torch.from_numpy(np.searchsorted(number, own.episode))
+        step[i, :k] = torch.from_numpy(own.step)
+        weight[i, :k] = 1.0
+    return StackedTransitions(observation, following, asked, executed, episode, step, weight)
+
+
+def _names(agents: tuple[str, ...]) -> str:
+    shown = ", ".join(agents[:4])
+    return f"{shown}, ... ({len(agents)})" if len(agents) > 4 else shown

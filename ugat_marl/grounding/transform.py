@@ -1,0 +1,184 @@
+"""The grounded action transformation: forward, inverse and gate composed.
+
+For the policy's action a in state s: s' = f(s, a) is what the real world would do; a' = h(s, s') is
+the action with which the simulation does the same; the gate takes a' where h is sure enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
+from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
+from ugat_marl.grounding.gate import Gate, GateConfig
+from ugat_marl.grounding.inverse import InverseConfig, InverseModel
+from ugat_marl.grounding.stacked import Stack
+from ugat_marl.learners.checkpoint import read_checkpoint, write_checkpoint
+from ugat_marl.seeding import torch_generator
+from ugat_marl.transitions import AgentLayout
+
+KIND = "grounding"
+"""What a checkpoint file of this module says it is."""
+
+
+@dataclass(frozen=True)
+class Grounding:
+    """The outcome for all agents at one step; arrays ``(agents,)``.
+
+    Attributes:
+        executed: int64, what the simulation is told to do.
+        grounded: int64, what the inverse model answered.
+        u: float32, its uncertainty.
+        accepted: bool, whether the grounded action was taken.
+    """
+
+    executed: NDArray[np.int64]
+    grounded: NDArray[np.int64]
+    u: NDArray[np.float32]
+    accepted: NDArray[np.bool_]
+
+
+class GroundedActionTransform:
+    """f, h and gate of a network.
+
+    Args:
+        layouts: Agent to the division of its observation, in the environment's order.
+        seed: Decides the initial weights.
+        forward: Shape of the forward models.
+        inverse: Shape of the inverse models.
+        gate: How alpha is found.
+    """
+
+    def __init__(
+        self,
+        layouts: Mapping[str, AgentLayout],
+        seed: int,
+        forward: ForwardConfig | None = None,
+        inverse: InverseConfig | None = None,
+        gate: GateConfig | None = None,
+    ) -> None:
+        forward, inverse = forward or ForwardConfig(), inverse or InverseConfig()
+        if forward.include_phase != inverse.include_phase:
+            raise OptionError(
+                f"include_phase is {forward.include_phase} in the forward and "
+                f"{inverse.include_phase} in the inverse model; h must be given what f predicts"
+            )
+        self.stack = Stack(layouts)
+        self.forward = ForwardModel(self.stack, forward, torch_generator(seed, "forward"))
+        self.inverse = InverseModel(self.stack, inverse, torch_generator(seed, "inverse"))
+        self.gate = Gate(self.stack.agents, gate or GateConfig())
+
+    @property
+    def fitted(self) -> bool:
+        """Whether both models have been fitted; before that there is nothing to ground with."""
+        return bool(self.forward.fitted) and bool(self.inverse.fitted)
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        observations: Tensor,
+        actions: NDArray[np.int64],
+        permitted: NDArray[np.bool_] | None = None,
+    ) -> Grounding:
+        """Grounds one action per agent, all of them in one pass.
+
+        Args:
+            observations: ``(agents, 1, width)`` float32, padded (`Stack.observations`).
+            actions: ``(agents,)`` the policy's actions.
+            permitted: ``(agents, phases)`` action masks; a masked grounded action is not taken.
+
+        Raises:
+            EpisodeError: The models have not been fitted.
+        """
+        if not self.fitted:
+            raise EpisodeError(
+                "actions cannot be grounded before the models are fitted; "
+                "call grounding.fitting.fit first or load a checkpoint"
+            )
+        asked = torch.from_numpy(actions)[:, None]
+        predicted = self.forward.predict(observations, asked)
+        answer = self.inverse.predict(observations, predicted)
+        grounded, u = answer.action[:, 0].numpy(), answer.u[:, 0].numpy()
+        allowed = None if permitted is None else permitted[np.arange(len(grounded)), grounded]
+        accepted = self.gate.decide(u, actions, grounded, allowed)
+        return Grounding(np.where(accepted, grounded, actions), grounded, u, accepted)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights, statistics and gate, as tensors and plain values."""
+        return {
+            "layouts": {a: list(_sizes(v)) for a, v in self.stack.layouts.items()},
+            "forward": self.forward.state_dict(),
+            "inverse": self.inverse.state_dict(),
+            "gate": self.gate.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores `state_dict`; on an error nothing is changed.
+
+        Raises:
+            CheckpointError: Of other agents or shapes, incomplete, or not finite.
+        """
+        layouts = state.get("layouts")
+        own = [(agent, list(_sizes(layout))) for agent, layout in self.stack.layouts.items()]
+        if not isinstance(layouts, Mapping) or list(layouts.items()) != own:
+            raise CheckpointError(
+                "the grounding in the checkpoint belongs to other agents or another observation; "
+                f"this one has {len(own)} agents ({', '.join(self.stack.agents[:4])} ...)"
+            )
+        models: dict[str, nn.Module] = {"forward": self.forward, "inverse": self.inverse}
+        for name, model in models.items():
+            _refuse_foreign(name, state.get(name), model.state_dict())
+        if not isinstance(state.get("gate"), Mapping):
+            raise CheckpointError("the grounding in the checkpoint has no gate")
+        self.gate.load_state_dict(state["gate"])
+        for name, model in models.items():
+            model.load_state_dict(state[name])
+
+    def save(self, path: Path) -> None:
+        """Writes `state_dict` to a file, whole or not at all.
+
+        Raises:
+            CheckpointError: A weight is not finite; a file at `path` is left as it was.
+        """
+        write_checkpoint(path, KIND, self.state_dict())
+
+    def load(self, path: Path) -> None:
+        """Restores what `save` wrote.
+
+        Raises:
+            CheckpointError: Unreadable, of other agents or shapes, or not finite.
+        """
+        state = read_checkpoint(path, KIND)
+        try:
+            self.load_state_dict(state)
+        except CheckpointError as error:
+            raise CheckpointError(f"{path}: {error}") from None
+
+
+def _sizes(layout: AgentLayout) -> tuple[int, int, int]:
+    return layout.features, layout.phases, layout.context
+
+
+def _refuse_foreign(name: str, found: Any, own: Mapping[str, Tensor]) -> None:
+    if not isinstance(found, Mapping) or set(found) != set(own):
+        raise CheckpointError(f"the {name} model in the checkpoint has other parts than this one")
+    for part, value in own.items():
+        tensor = found[part]
+        if not isinstance(tensor, Tensor) or tensor.shape != value.shape:
+            shape = tuple(tensor.shape) if isinstance(tensor, Tensor) else type(tensor).__name__
+            raise CheckpointError(
+                f"{name}.{part} in the checkpoint is {shape}; expected {tuple(value.shape)}; "
+                "it was made with other options"
+            )
+        if not torch.isfinite(tensor).all():
+            raise CheckpointError(
+                f"{name}.{part} in the checkpoint is not finite; use an earlier checkpoint"
+            )

@@ -1,0 +1,132 @@
+"""The grounded simulation as an environment: the learner acts, the grounded action is executed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pettingzoo.utils import BaseParallelWrapper
+
+from ugat_marl.errors import ActionError, OptionError
+from ugat_marl.grounding.transform import GroundedActionTransform
+from ugat_marl.policy import AnyParallelEnv
+
+Infos = dict[str, dict[str, Any]]
+
+
+class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
+    """Executes grounded actions in the wrapped simulation; the learner never notices.
+
+    A learner sees the observations and rewards that its action had in the grounded world and stores
+    its own action beside them. What was done instead is in the infos of `reset` and `step`:
+
+    - ``grounded_action``: int, the inverse model's answer; -1 at reset.
+    - ``uncertainty``: float, its u in (0, 1]; 1.0 at reset.
+    - ``accepted``: int, 1 if the grounded action was executed.
+
+    A grounded action that the agent's action mask forbids is never executed. An epoch of the gate
+    is an episode of this environment.
+
+    Args:
+        env: The simulation.
+        transform: Fitted models and gate, made for the same agents.
+
+    Raises:
+        OptionError: The transform was made for other agents or observations.
+    """
+
+    def __init__(self, env: AnyParallelEnv, transform: GroundedActionTransform) -> None:
+        super().__init__(env)
+        _refuse_misfit(env, transform)
+        self.transform = transform
+        self._observations: dict[str, Any] = {}
+        self._infos: Infos = {}
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], Infos]:
+        """Starts an episode of the wrapped environment."""
+        self.transform.gate.end_epoch()
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._observations = observations
+        self._infos = infos
+        return observations, _extended(infos, self.env.agents)
+
+    def step(
+        self, actions: dict[str, Any]
+    ) -> tuple[
+        dict[str, Any],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Grounds the actions and executes the outcome.
+
+        Raises:
+            ActionError: An agent's action is missing or outside its action space.
+        """
+        acting = list(self.env.agents)
+        if not acting:  # after the last step; the environment itself says so
+            return self.env.step(actions)
+        stack = self.transform.stack
+        own = np.array([self._action(agent, actions) for agent in stack.agents])
+        masks = {a: self._infos.get(a, {}).get("action_mask") for a in stack.agents}
+        outcome = self.transform(stack.observations(self._observations), own, stack.masks(masks))
+        executed = dict(zip(stack.agents, outcome.executed.tolist(), strict=True))
+        observations, rewards, terminations, truncations, infos = self.env.step(executed)
+        self._observations = observations
+        self._infos = infos
+        if not self.env.agents:
+            self.transform.gate.end_epoch()
+        columns = (outcome.grounded.tolist(), outcome.u.tolist(), outcome.accepted.tolist())
+        taken = dict(zip(stack.agents, zip(*columns, strict=True), strict=True))
+        return observations, rewards, terminations, truncations, _extended(infos, acting, taken)
+
+    def _action(self, agent: str, actions: dict[str, Any]) -> int:
+        phases = self.transform.stack.layouts[agent].phases
+        if agent not in actions:
+            raise ActionError(f"no action for {agent}; every agent acts at every step")
+        action = np.asarray(actions[agent])
+        if action.size != 1 or not np.issubdtype(action.dtype, np.integer):
+            raise ActionError(
+                f"action of {agent} is {actions[agent]!r}; allowed: whole numbers 0 to {phases - 1}"
+            )
+        if not 0 <= action.item() < phases:
+            raise ActionError(f"action of {agent} is {action}; allowed: 0 to {phases - 1}")
+        return int(action.item())
+
+
+def _extended(
+    infos: Infos, agents: list[str], taken: dict[str, tuple[int, float, bool]] | None = None
+) -> Infos:
+    """Copies of the infos with the three keys of the grounding; other entries are kept."""
+    extended = dict(infos)
+    for agent in agents:
+        grounded, u, accepted = taken[agent] if taken else (-1, 1.0, False)
+        extended[agent] = {
+            **infos.get(agent, {}),
+            "grounded_action": grounded,
+            "uncertainty": u,
+            "accepted": int(accepted),
+        }
+    return extended
+
+
+def _refuse_misfit(env: AnyParallelEnv, transform: GroundedActionTransform) -> None:
+    layouts = transform.stack.layouts
+    if tuple(env.possible_agents) != transform.stack.agents:
+        raise OptionError(
+            f"the grounding was made for {len(layouts)} agents {tuple(layouts)[:4]}, the "
+            f"environment has {len(env.possible_agents)} {tuple(env.possible_agents)[:4]}; "
+            "use the same scenario"
+        )
+    for agent, layout in layouts.items():
+        shape = env.observation_space(agent).shape
+        phases = int(getattr(env.action_space(agent), "n", 0))
+        if shape != (layout.size,) or phases != layout.phases:
+            raise OptionError(
+                f"the grounding expects observations of ({layout.size},) and {layout.phases} "
+                f"phases from {agent}; the environment has {shape} and {phases}; use the "
+                "observation options the models were fitted with"
+            )
