@@ -25,7 +25,7 @@ unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV
 export PYTHONSAFEPATH := 1
 export PYTHONNOUSERSITE := 1
 
-.PHONY: help demo test check static format lint types architecture bench scenarios python environment environment-dev
+.PHONY: help demo test check static format lint types architecture bench scenarios oldest python environment environment-dev
 .DEFAULT_GOAL := help
 
 help:
@@ -59,6 +59,13 @@ bench: environment-dev
 
 scenarios: environment
 	PYTHONSAFEPATH= $(BIN)/python scenarios/build.py $(ARGS)
+
+# The lower ends of the version ranges, in an environment of their own.
+oldest: environment-dev
+	"$(PYTHON)" -m venv $(VENV)-oldest
+	$(VENV)-oldest/bin/python -m pip install -q -c constraints-oldest.txt --force-reinstall --no-deps $(VENV)/wheel/*.whl
+	$(VENV)-oldest/bin/python -m pip install -q -c constraints-oldest.txt ugat-marl hypothesis pytest pytest-timeout pytest-xdist sumo-rl==1.4.5
+	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(VENV)-oldest/bin/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
 
 environment: python
 	@$(ENVIRONMENT)
