@@ -150,6 +150,8 @@ def test_report_is_flat_numbers(fitted) -> None:
         "calibration/error_by_quantile/4",
         "agreement",
         "mean_u_on_predictions",
+        "accuracy_on_real/a_0",
+        "mean_u_on_real",
     ):
         assert math.isfinite(numbers[name]), name
 
@@ -267,6 +269,40 @@ def test_too_little_data_and_foreign_data_are_refused() -> None:
     with pytest.raises(LogError, match="does not fit the models"):
         fit_inverse(foreign, planted(0.3, episodes=2, steps=5), QUICK, seed=0)
     assert not h.fitted
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"scenario": "elsewhere"}, {"observation": "queue"}, {"decision_interval_s": 5.0}],
+)
+def test_logs_that_cannot_be_composed_are_refused(change: dict) -> None:
+    f, h = models()
+    log = planted(0.3, episodes=2, steps=5)
+    other = TransitionLog(dataclasses.replace(log.provenance, **change), log.frame)
+    with pytest.raises(LogError, match=f"real log has {next(iter(change))}"):
+        fit(f, h, other, log, QUICK, seed=0)
+
+
+def test_the_gap_is_visible_in_actions(fitted) -> None:
+    """Served at half the rate, h still names the lane, and is less sure than at home."""
+    _, h, report = fitted
+    assert (report.accuracy_on_real > 0.8).all()
+    assert (report.mean_u_on_real > report.inverse.mean_u).all()
+    same = fit_inverse(h, planted(0.3, seed=2), dataclasses.replace(QUICK, warm_start=True), 0)
+    assert (report.accuracy_on_real <= same.accuracy + 1e-9).all()
+
+
+def test_only_models_that_learnt_something_are_trusted(fitted) -> None:
+    report = fitted[2]
+    assert report.trusted().tolist() == [True, True]
+    assert report.trusted(least_accuracy=1.1).tolist() == [False, False]
+    poor = dataclasses.replace(
+        report, forward=dataclasses.replace(report.forward, error=np.array([1.0, 0.01]))
+    )
+    assert poor.trusted().tolist() == [False, True]
+    assert any(
+        "f is no better than predicting no change at 1 of 2 (a_0)" in w for w in poor.warnings
+    )
 
 
 def test_epochs_are_reported_as_they_end() -> None:

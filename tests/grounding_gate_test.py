@@ -120,6 +120,21 @@ def test_taking_everything_is_what_infinite_is_for() -> None:
         gate.update()
 
 
+def test_an_agent_that_is_not_trusted_keeps_its_policy_and_is_not_warned_of() -> None:
+    gate = Gate(AGENTS, GateConfig())
+    gate.trust(np.array([True, False]))
+    assert run(gate, (0.25, 0.5), (0.75, 0.5)) == [[True, False], [True, False]]
+    gate.update()
+    assert gate.alpha.tolist() == [0.5, 0.5]  # its u is logged all the same
+    run(gate, (0.25, 0.1), (0.75, 0.1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert gate.update().as_dict()["trusted/signal_1"] == 0.0
+    restored = Gate(AGENTS, GateConfig())
+    restored.load_state_dict(gate.state_dict())
+    assert restored.trusted.tolist() == [True, False]
+
+
 def test_a_restored_gate_goes_on_to_the_same_numbers() -> None:
     one = Gate(AGENTS, GateConfig(window_epochs=3))
     run(one, (0.2, 0.4))

@@ -161,6 +161,7 @@ def test_an_episode_is_an_epoch_of_the_gate() -> None:
     assert len(seen) == 6
 
 
+@pytest.mark.filterwarnings("ignore:Agent was given info but was dead")  # it means __common__
 def test_it_is_a_parallel_environment() -> None:
     parallel_api_test(GroundedEnv(Crossing(), transform()), num_cycles=20)
 

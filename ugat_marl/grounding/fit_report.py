@@ -121,6 +121,9 @@ class FitReport:
             is missing is the gap and the errors of both models. It says how much grounding would
             change if every grounded action were taken.
         mean_u_on_predictions: Per agent, mean u of these answers: what the gate will see.
+        accuracy_on_real: Per agent, share of held-out real transitions whose action h names. What
+            it lacks of h's own accuracy is the gap itself, in actions, without f's part in it.
+        mean_u_on_real: Per agent, mean u of these answers: how foreign the real world is to h.
     """
 
     agents: tuple[str, ...]
@@ -128,6 +131,8 @@ class FitReport:
     inverse: InverseReport
     agreement: Floats
     mean_u_on_predictions: Floats
+    accuracy_on_real: Floats
+    mean_u_on_real: Floats
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -145,6 +150,15 @@ class FitReport:
                 f"{calibration.mean_u:.2f} on it)"
             )
         return tuple(sentence for sentence in found if sentence)
+
+    def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
+        """Agents whose models may be obeyed, for `Gate.trust`; ``(agents,)``.
+
+        f beats "no change", and h both the most frequent phase and `least_accuracy`.
+        """
+        h = self.inverse
+        better = (self.forward.ratio < 1.0) & (h.accuracy > h.majority)
+        return better & (h.accuracy >= least_accuracy)
 
     def _weak(self, complaint: str, where: NDArray[np.bool_]) -> str:
         names = [agent for agent, hit in zip(self.agents, where, strict=True) if hit]
@@ -164,8 +178,8 @@ class FitReport:
                 if isinstance(value, np.ndarray):
                     numbers |= self._entries(f"{prefix}/{entry.name}", value)
         numbers |= self._entries("forward/ratio", self.forward.ratio)
-        numbers |= self._entries("agreement", self.agreement)
-        numbers |= self._entries("mean_u_on_predictions", self.mean_u_on_predictions)
+        for name in ("agreement", "mean_u_on_predictions", "accuracy_on_real", "mean_u_on_real"):
+            numbers |= self._entries(name, getattr(self, name))
         calibration = self.inverse.calibration
         for entry in fields(calibration):
             value = getattr(calibration, entry.name)
@@ -254,7 +268,21 @@ def on_predictions(
 ) -> tuple[Floats, Floats]:
     """Per agent, agreement and mean u of h fed by f in held-out simulated states."""
     predicted = forward.predict(data.observation, data.executed)
-    answer = inverse.predict(data.observation, predicted)
+    return _answers(inverse, data, predicted, held_out)
+
+
+@torch.no_grad()
+def on_transitions(
+    inverse: InverseModel, data: StackedTransitions, held_out: Tensor
+) -> tuple[Floats, Floats]:
+    """Per agent, accuracy and mean u of h on transitions as they happened, real ones say."""
+    return _answers(inverse, data, data.next_observation, held_out)
+
+
+def _answers(
+    inverse: InverseModel, data: StackedTransitions, next_features: Tensor, held_out: Tensor
+) -> tuple[Floats, Floats]:
+    answer = inverse.predict(data.observation, next_features)
     share = held_out.double() / held_out.double().sum(1, keepdim=True)
     agreement = ((answer.action == data.executed) * share).sum(1)
     return agreement.numpy(), (answer.u * share).sum(1).numpy()

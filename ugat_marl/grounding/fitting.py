@@ -24,6 +24,7 @@ from ugat_marl.grounding.fit_report import (
     forward_report,
     inverse_report,
     on_predictions,
+    on_transitions,
 )
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.inverse import InverseModel
@@ -130,14 +131,31 @@ def fit(
         on_epoch: Called after every epoch.
 
     Raises:
-        LogError: A log is of other agents, or too short to be split.
+        LogError: A log is of other agents, or too short to be split, or the logs differ in
+            scenario, observation or decision interval.
     """
+    _refuse_mismatch(real, simulated)
     f = fit_forward(forward, real, config, seed, on_epoch)
     h = fit_inverse(inverse, simulated, config, seed, on_epoch)
-    data = stack_log(simulated, inverse.stack)
-    held_out = split(data, config.held_out_every, inverse.stack).held_out
-    agreement, mean_u = on_predictions(forward, inverse, data, held_out)
-    return FitReport(forward.stack.agents, f, h, agreement, mean_u)
+    ours, theirs = stack_log(simulated, inverse.stack), stack_log(real, inverse.stack)
+    held_out = split(ours, config.held_out_every, inverse.stack).held_out
+    held_out_real = split(theirs, config.held_out_every, inverse.stack).held_out
+    agreement, u_on_predictions = on_predictions(forward, inverse, ours, held_out)
+    accuracy_on_real, u_on_real = on_transitions(inverse, theirs, held_out_real)
+    return FitReport(
+        forward.stack.agents, f, h, agreement, u_on_predictions, accuracy_on_real, u_on_real
+    )
+
+
+def _refuse_mismatch(real: TransitionLog, simulated: TransitionLog) -> None:
+    """Models of different networks, state spaces or intervals cannot be composed."""
+    for name in ("scenario", "observation", "decision_interval_s"):
+        one, two = getattr(real.provenance, name), getattr(simulated.provenance, name)
+        if one != two:
+            raise LogError(
+                f"the real log has {name} {one!r}, the simulated log {two!r}; record both with the "
+                f"same {name}"
+            )
 
 
 def fit_forward(

@@ -63,6 +63,7 @@ class GateReport:
         acceptance: Share of decisions in which the grounded action was taken.
         mean_u: Mean uncertainty.
         change_rate: Share of decisions in which another action than the policy's was executed.
+        trusted: Whether the agent's models may be obeyed at all (`Gate.trust`).
         warning: A sentence if the gate let everything or nothing through, else "".
     """
 
@@ -73,13 +74,14 @@ class GateReport:
     acceptance: NDArray[np.float64]
     mean_u: NDArray[np.float64]
     change_rate: NDArray[np.float64]
+    trusted: NDArray[np.bool_]
     warning: str
 
     def as_dict(self) -> dict[str, float]:
-        """Flat numbers: means over agents, and alpha, acceptance, u and changes per agent."""
+        """Flat numbers: means over agents, and the same per agent."""
         numbers: dict[str, float] = {"decisions": float(self.decisions.sum())}
-        for name in ("alpha", "acceptance", "mean_u", "change_rate"):
-            values: NDArray[np.float64] = getattr(self, name)
+        for name in ("alpha", "acceptance", "mean_u", "change_rate", "trusted"):
+            values: NDArray[Any] = getattr(self, name)
             numbers[name] = float(values.mean())
             numbers |= {f"{name}/{a}": float(v) for a, v in zip(self.agents, values, strict=True)}
         return numbers
@@ -98,10 +100,19 @@ class Gate:
         self.config = config
         start = config.static_alpha if config.mode == "static" else np.inf
         self.alpha: NDArray[np.float64] = np.full(len(self.agents), start)
+        self.trusted: NDArray[np.bool_] = np.ones(len(self.agents), bool)
         self.iteration = 0
         self._epochs: deque[NDArray[np.float64]] = deque(maxlen=config.window_epochs)
         self._running = np.zeros((2, len(self.agents)))  # sum and number of u in this epoch
         self._counts = np.zeros((4, len(self.agents)))  # decisions, accepted, changed, sum of u
+
+    def trust(self, agents: NDArray[np.bool_]) -> None:
+        """Says at which agents, ``(agents,)`` bool, the models may be obeyed at all.
+
+        Alpha is infinite at first, so a poor h would be obeyed everywhere; it makes a policy worse.
+        All agents are trusted until this is called; `FitReport.trusted` knows whom to trust.
+        """
+        self.trusted = np.asarray(agents, bool).copy()
 
     def decide(
         self,
@@ -119,9 +130,9 @@ class Gate:
             permitted: ``(agents,)`` false where the grounded action is masked out.
 
         Returns:
-            ``(agents,)`` bool: u < alpha and permitted.
+            ``(agents,)`` bool: u < alpha, permitted, and the agent's models trusted.
         """
-        accepted = u < self.alpha
+        accepted = (u < self.alpha) & self.trusted
         if permitted is not None:
             accepted = accepted & permitted
         self._running += (u, np.ones_like(u))
@@ -165,6 +176,7 @@ class Gate:
             acceptance=accepted / count,
             mean_u=total / count,
             change_rate=changed / count,
+            trusted=self.trusted.copy(),
             warning=self._warning(accepted, decisions),
         )
 
@@ -172,10 +184,11 @@ class Gate:
         if self.iteration == 0 or self.config.mode == "infinite":
             return ""
         parts: list[str] = []
-        for share, found in (
-            ("no grounded action was taken", (accepted == 0) & (decisions > 0)),
-            ("every grounded action was taken", (accepted == decisions) & (decisions > 0)),
+        for share, everywhere in (
+            ("no grounded action was taken", accepted == 0),
+            ("every grounded action was taken", accepted == decisions),
         ):
+            found = everywhere & (decisions > 0) & self.trusted
             if found.any():
                 names = [a for a, hit in zip(self.agents, found, strict=True) if hit]
                 shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
@@ -196,6 +209,7 @@ class Gate:
             # Checkpoints hold finite numbers only; where the gate is open, alpha is infinite.
             "alpha": torch.from_numpy(np.where(np.isinf(self.alpha), 0.0, self.alpha)),
             "open": torch.from_numpy(np.isinf(self.alpha)),
+            "trusted": torch.from_numpy(self.trusted.copy()),
             "epochs": torch.from_numpy(epochs),
             "running": torch.from_numpy(self._running.copy()),
             "counts": torch.from_numpy(self._counts.copy()),
@@ -212,7 +226,8 @@ class Gate:
                 "the gate in the checkpoint belongs to other agents; start a new run"
             )
         count = len(self.agents)
-        shapes = {"alpha": (count,), "open": (count,), "running": (2, count), "counts": (4, count)}
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("alpha", "open", "trusted"), (count,))
+        shapes |= {"running": (2, count), "counts": (4, count)}
         epochs = state.get("epochs")
         shapes["epochs"] = (len(epochs) if isinstance(epochs, torch.Tensor) else 0, 2, count)
         arrays: dict[str, NDArray[np.float64]] = {}
@@ -227,6 +242,7 @@ class Gate:
         if not isinstance(iteration, int) or iteration < 0:
             raise CheckpointError(f"the gate in the checkpoint has iteration {iteration!r}")
         self.alpha = np.where(arrays["open"] > 0, np.inf, arrays["alpha"])
+        self.trusted = arrays["trusted"] > 0
         self._running, self._counts = arrays["running"], arrays["counts"]
         self._epochs = deque(arrays["epochs"], maxlen=self.config.window_epochs)
         self.iteration = iteration
