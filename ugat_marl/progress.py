@@ -1,0 +1,80 @@
+"""What long work says while it runs: progress bars in a terminal, nothing elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+Advance = Callable[..., None]
+"""Called as ``advance()`` or ``advance(note="...")`` when a unit of work is done."""
+
+
+class Reporter(Protocol):
+    """Shows tasks of known length."""
+
+    def task(self, name: str, total: int) -> contextlib.AbstractContextManager[Advance]:
+        """A task; the value of the context advances it by one."""
+        ...
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        ...
+
+
+class Silent:
+    """Shows nothing."""
+
+    @contextlib.contextmanager
+    def task(self, name: str, total: int) -> Iterator[Advance]:
+        """Does nothing."""
+        del name, total
+        yield lambda note="": None
+
+    def say(self, text: str) -> None:
+        """Does nothing."""
+
+
+class Bars:
+    """Progress bars with the time left; where there is no terminal, one line per task at its end.
+
+    Args:
+        console: Where to write.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+
+    @contextlib.contextmanager
+    def task(self, name: str, total: int) -> Iterator[Advance]:
+        """A bar that leaves one line behind when the task is done."""
+        columns = (
+            TextColumn("{task.description:<26.26}"),
+            BarColumn(bar_width=18),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(compact=True),
+            TextColumn("[dim]{task.fields[note]}"),
+        )
+        with Progress(*columns, console=self._console) as progress:
+            bar = progress.add_task(name, total=total, note="")
+
+            def advance(note: str = "") -> None:
+                progress.update(bar, advance=1, **({"note": note} if note else {}))
+
+            yield advance
+
+    def say(self, text: str) -> None:
+        """Writes a line."""
+        self._console.print(text, highlight=False)

@@ -1,0 +1,129 @@
+"""The one act-step-observe loop, and what is recorded along the way."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ugat_marl.policy import Actions, AnyParallelEnv, Infos, Observations, Policy
+from ugat_marl.seeding import numpy_generator
+from ugat_marl.transitions import Provenance, TransitionLog, TransitionRecorder
+
+SIMULATING = ("libsumo", "numpy", "ugat-marl")
+"""Packages whose version can change a trajectory; written into every log."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What came of one roll-out.
+
+    Attributes:
+        steps: Decisions made.
+        mean_reward: Mean over decisions and agents.
+        log: All transitions, if asked for.
+    """
+
+    steps: int
+    mean_reward: float
+    log: TransitionLog | None
+
+
+StepCallback = Callable[[int], None]
+"""Called with the number of decisions made so far."""
+
+
+def roll_out(
+    env: AnyParallelEnv,
+    policy: Policy,
+    seed: int,
+    *,
+    record: bool = False,
+    on_step: StepCallback | None = None,
+) -> Episode:
+    """Plays one whole episode.
+
+    Args:
+        env: An environment made with the policy's `env_options`.
+        policy: Who acts.
+        seed: Fixes the simulation and the policy's own choices.
+        record: Whether to keep the transitions; needs an environment of the suite.
+        on_step: Called after every decision.
+    """
+    observations, infos = env.reset(seed=seed)
+    policy.reset(seed)
+    recorder = TransitionRecorder(provenance_of(env, seed)) if record else None
+    steps, total = 0, 0.0
+    while env.agents:
+        agents = list(env.agents)
+        actions = policy.act(observations, infos)
+        then, rewards, _, _, infos = env.step(actions)
+        if recorder is not None:
+            executed = {agent: int(infos[agent]["executed_action"]) for agent in agents}
+            recorder.record(0, steps, observations, actions, executed, rewards, then)
+        observations = then
+        total += sum(rewards.values()) / len(agents)
+        steps += 1
+        if on_step is not None:
+            on_step(steps)
+    return Episode(steps, total / max(steps, 1), recorder.log() if recorder else None)
+
+
+def provenance_of(env: AnyParallelEnv, *seeds: int) -> Provenance:
+    """Where a log recorded in `env` (wrapped or not) comes from."""
+    base: Any = env.unwrapped
+    observation = base.options.observation
+    return Provenance(
+        scenario=base.scenario.id,
+        scenario_hash=base.scenario.hash,
+        domain=base.domain,
+        seeds=seeds,
+        decision_interval_s=base.decision_interval_s,
+        observation=observation,
+        layouts=base.layouts,
+        versions={name: _version(name) for name in SIMULATING},
+        units={"observation": observation, "reward": str(base.options.reward)},
+    )
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+class Exploring:
+    """A policy that at each decision, agent by agent, takes a random permitted phase with chance ε.
+
+    Roll-outs for D_sim and D_real need actions the policy would not take: without them h never sees
+    what they do.
+
+    Args:
+        policy: The policy to follow otherwise.
+        epsilon: Chance of a random phase, in [0, 1].
+    """
+
+    def __init__(self, policy: Policy, epsilon: float) -> None:
+        self._policy = policy
+        self._epsilon = epsilon
+        self.env_options: Mapping[str, Any] = policy.env_options
+        self._generator = numpy_generator(0)
+
+    def reset(self, seed: int) -> None:
+        """Begins an episode; `seed` decides where exploration happens."""
+        self._policy.reset(seed)
+        self._generator = numpy_generator(seed, "exploring")
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """The policy's actions, some of them replaced."""
+        actions = dict(self._policy.act(observations, infos))
+        draws = self._generator.random(len(actions))
+        for agent, draw in zip(sorted(actions), draws, strict=True):
+            if draw < self._epsilon:
+                permitted = np.flatnonzero(infos[agent]["action_mask"])
+                actions[agent] = int(self._generator.choice(permitted))
+        return actions
