@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.signals import GREEN
+from ugat_marl.signals import GREEN, YELLOW
 
 MOST_PHASES = 64
 """More maximal conflict-free sets than this mean a junction that needs an explicit list."""
@@ -49,9 +49,7 @@ def programme_phases(programme: Sequence[tuple[float, str]]) -> tuple[str, ...]:
     """The green phases of a signal programme: states with green and without yellow, each once."""
     return tuple(
         dict.fromkeys(
-            state
-            for _, state in programme
-            if set(state) & GREEN and not set(state) & frozenset("yYu")
+            state for _, state in programme if set(state) & GREEN and not set(state) & YELLOW
         )
     )
 

@@ -13,11 +13,15 @@ from dataclasses import dataclass
 from ugat_marl.errors import OptionError, ScenarioError
 
 GREEN = frozenset("Gg")
+YELLOW = frozenset("yYu")
 STATES = frozenset("rugGyYoOs")
 """Letters SUMO knows: red, red-yellow, green (minor, major), yellow, off, right-on-red."""
 
 Segment = tuple[float, str]
 """A duration in seconds and the state shown for it."""
+
+_INSTANT_S = 1e-6
+"""Sums of tenths are not exact in binary; SUMO counts in milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) ->
     wait = timing.min_green_s - state.elapsed_s
     if state.clearing:
         wait = timing.clearance_s - state.elapsed_s + timing.min_green_s
-    return wait < within_s
+    return wait < within_s - _INSTANT_S
 
 
 def advance(
@@ -103,7 +107,7 @@ def advance(
         return state.later(seconds), [(seconds, phases[requested])]
     shown: list[Segment] = []
     left = seconds
-    while left > 1e-9:
+    while left > _INSTANT_S:
         state, segment = _next_segment(phases, state, requested, left, timing)
         if segment[0] > 0:
             _append(shown, segment)
@@ -118,9 +122,9 @@ def _next_segment(
     green = phases[state.phase]
     if state.clearing:
         origin = phases[state.origin]
-        if state.elapsed_s < timing.yellow_s:
+        if state.elapsed_s < timing.yellow_s - _INSTANT_S:
             until, shown = timing.yellow_s, yellow_between(origin, green)
-        elif state.elapsed_s < timing.clearance_s:
+        elif state.elapsed_s < timing.clearance_s - _INSTANT_S:
             until, shown = timing.clearance_s, red_between(origin, green)
         else:
             return SignalState(state.phase, state.phase, 0.0), (0.0, green)
@@ -129,7 +133,7 @@ def _next_segment(
     if requested == state.phase:
         return state.later(left), (left, green)
     held = timing.min_green_s - state.elapsed_s
-    if held > 0:
+    if held > _INSTANT_S:
         duration = min(held, left)
         return state.later(duration), (duration, green)
     return SignalState(requested, state.phase, 0.0), (0.0, green)
@@ -171,9 +175,9 @@ def check_phases(phases: Sequence[str], links: int, source: str) -> None:
         source: What to call the list in errors.
 
     Raises:
-        ScenarioError: A wrong length, an unknown letter, no green, or a phase given twice.
+        ScenarioError: A wrong length, an unknown letter, yellow, no green, or a phase given twice.
     """
-    seen: set[str] = set()
+    seen: dict[str, int] = {}
     for index, phase in enumerate(phases):
         where = f"{source}: phase {index} ({phase!r})"
         if len(phase) != links:
@@ -183,8 +187,12 @@ def check_phases(phases: Sequence[str], links: int, source: str) -> None:
             )
         if unknown := sorted(set(phase) - STATES):
             raise ScenarioError(f"{where} has unknown letters {unknown}; allowed: {sorted(STATES)}")
+        if set(phase) & YELLOW:
+            raise ScenarioError(
+                f"{where} has yellow; list green phases only, yellow is put in between them"
+            )
         if not set(phase) & GREEN:
-            raise ScenarioError(f"{where} has no green")
+            raise ScenarioError(f"{where} has no green (G or g); leave it out or give it one")
         if phase in seen:
-            raise ScenarioError(f"{where} is listed twice")
-        seen.add(phase)
+            raise ScenarioError(f"{where} is listed twice, as phase {seen[phase]} before")
+        seen[phase] = index
