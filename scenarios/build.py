@@ -1,6 +1,7 @@
 """Builds network and demand of the shipped scenarios from their `source.toml`: `make scenarios`.
 
-    python scenarios/build.py [name ...] [--into FOLDER]
+    python scenarios/build.py [name ...] [--into FOLDER]     networks and demand
+    python scenarios/build.py [name ...] --headroom          the tables in the READMEs
 
 The same sources give the same bytes, whatever the day and the machine; a test rebuilds them.
 """
@@ -15,9 +16,11 @@ from typing import Any
 from demand import draw_demand
 from roads import convert, plain_xml, read_plan
 
+from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
 
 HERE = Path(__file__).resolve().parent
+BEGIN, END = "<!-- headroom: begin -->\n", "<!-- headroom: end -->\n"
 
 
 def build(name: str, into: Path) -> list[Path]:
@@ -37,6 +40,22 @@ def build(name: str, into: Path) -> list[Path]:
     return [into / name / file for file in files]
 
 
+def measure(name: str, workers: int | None) -> Path:
+    """Writes the headroom of scenario `name` between the markers of its README."""
+    # Building needs no simulation; only this does.
+    from ugat_marl.headroom import headroom, markdown
+    from ugat_marl.scenario import load_scenario
+
+    readme = HERE / name / "README.md"
+    text = readme.read_text(encoding="utf-8")
+    if BEGIN not in text or END not in text:
+        raise ScenarioError(f"{readme}: has no lines {BEGIN.strip()!r} and {END.strip()!r}")
+    before, _, rest = text.partition(BEGIN)
+    table = markdown(headroom(load_scenario(HERE / name), workers=workers))
+    write_whole(readme, f"{before}{BEGIN}{table}{END}{rest.partition(END)[2]}")
+    return readme
+
+
 def _read(path: Path) -> dict[str, Any]:
     return tomllib.loads(path.read_text(encoding="utf-8"))
 
@@ -47,10 +66,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Build the shipped scenarios.")
     parser.add_argument("names", nargs="*", metavar="name", help=f"of {', '.join(known)}; all")
     parser.add_argument("--into", type=Path, default=HERE, help="folder to write to")
+    parser.add_argument("--headroom", action="store_true", help="measure headroom instead")
+    parser.add_argument("--workers", type=int, help="simulations at a time (number of cores)")
     options = parser.parse_args()
     for name in options.names or known:
         if name not in known:
             parser.error(f"no scenario {name!r} with a source.toml; there are {', '.join(known)}")
+        if options.headroom:
+            print(measure(name, options.workers))
+            continue
         for path in build(name, options.into):
             print(path)
 
