@@ -51,7 +51,9 @@ class FitConfig:
         patience: Epochs without a lower held-out loss after which training ends.
         held_out_every: Every n-th episode is held out; of a single episode, the last n-th part.
         kl_epochs: Epochs over which the divergence term of the evidential loss is annealed in.
-        kl_weight: Its final weight.
+        kl_weight: Its final weight; 1 is Sensoy et al. With eight phases that often look alike, 1
+            keeps h from learning: on grid2x2-v1 its held-out accuracy is 0.60 (u 0.90, AUROC of u
+            0.72) against 0.70 (0.48, 0.73) at 0.1.
         off_data_weight: Weight of the certainty h shows on invented inputs (`off_data`); 0 is the
             evidential loss alone, under which u need not rise off the data.
         warm_start: Go on from the current weights instead of drawing new ones.
@@ -63,7 +65,7 @@ class FitConfig:
     patience: int = 10
     held_out_every: int = 4
     kl_epochs: int = 10
-    kl_weight: float = 1.0
+    kl_weight: float = 0.1
     off_data_weight: float = 0.1
     warm_start: bool = False
 
