@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sysconfig
+from collections.abc import Callable
 from pathlib import Path
 
 import hypothesis
@@ -37,3 +39,73 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_report_header() -> str:
     """Says in the first lines which package is tested."""
     return f"ugat_marl {ugat_marl.__version__} from {Path(ugat_marl.__file__).parent}"
+
+
+DATA = Path(__file__).parent / "data"
+
+ROUTES = """<routes>
+    <vType id="car" vClass="passenger" length="5" minGap="2.5" accel="2.5" decel="4.5" sigma="0"
+           speedFactor="1" speedDev="0"/>
+    {types}
+    <route id="north" edges="S_C C_N"/>
+    <route id="east" edges="W_C C_E"/>
+    {vehicles}
+</routes>
+"""
+
+
+def make_crossing(
+    directory: Path,
+    vehicles: str | None = None,
+    types: str = "",
+    edit: Callable[[str], str] | None = None,
+    toml: Callable[[str], str] | None = None,
+) -> Path:
+    """Copies the hand-made crossing of tests/data and changes it.
+
+    Args:
+        directory: Where the scenario goes.
+        vehicles: XML of the vehicles; the routes "north" and "east" and the type "car" exist. None
+            keeps a car every 20 s on each road.
+        types: XML of further vehicle types.
+        edit: Changes the text of the network.
+        toml: Changes the text of scenario.toml.
+    """
+    shutil.copytree(DATA / "crossing", directory)
+    if vehicles is not None:
+        (directory / "demand.rou.xml").write_text(ROUTES.format(types=types, vehicles=vehicles))
+    for name, change in (("network.net.xml", edit), ("scenario.toml", toml)):
+        if change is not None:
+            file = directory / name
+            before = file.read_text()
+            after = change(before)
+            assert after != before, f"the edit of {name} changed nothing"
+            file.write_text(after)
+    return directory
+
+
+@pytest.fixture
+def crossing(tmp_path: Path) -> Callable[..., Path]:
+    """`make_crossing` in a new directory at each call."""
+    made: list[Path] = []
+
+    def make(**changes: object) -> Path:
+        made.append(tmp_path / f"crossing{len(made)}-v1")
+        return make_crossing(made[-1], **changes)  # pyright: ignore[reportArgumentType]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Files made for the tests."""
+    return DATA
+
+
+@pytest.fixture(scope="session")
+def hangzhou() -> Path:
+    """The Hangzhou networks, which have no licence and so are never part of the project."""
+    directory = Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not directory.is_dir():
+        pytest.skip(f"no Hangzhou networks in {directory}")
+    return directory

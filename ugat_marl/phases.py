@@ -5,7 +5,7 @@ The conflicts are those of the junction's own right-of-way matrix (``<request fo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 from ugat_marl.errors import ScenarioError
@@ -91,8 +91,9 @@ def conflict_free_phases(
 ) -> tuple[str, ...]:
     """All maximal sets of compatible movements, as SUMO states.
 
-    A movement is a group of links with one approach and one direction. Right turns follow: they are
-    green with every phase that gives green to a lane they share or that they do not conflict with.
+    A movement is a group of links with one approach and one direction; movements that share a
+    letter of the state count as one. Right turns follow: they are green with every phase that gives
+    green to a lane they share or that they do not conflict with.
     On a 4-arm junction with left lanes this gives the eight phases of the UGAT paper.
 
     Args:
@@ -112,9 +113,7 @@ def conflict_free_phases(
             f"{source}: the network has no internal lanes, so conflicts are unknown; "
             'use phases = "programme" or list the phases'
         )
-    groups: dict[Movement, list[Link]] = {}
-    for link in links:
-        groups.setdefault((link.from_edge, _turn(link.direction)), []).append(link)
+    groups = _movements(links)
     following = {name for name in groups if name[1] == "r"}
     while True:
         phases = _maximal_phases(groups, following, foes, source)
@@ -148,10 +147,33 @@ def _maximal_phases(
     def through_first(chosen: frozenset[Movement]) -> tuple[int, list[int]]:
         return sum(name[1] == "l" for name in chosen), sorted(map(main.index, chosen))
 
-    return [
-        {*chosen, *(name for name in following if _right_may_go(name, chosen, groups, foes))}
-        for chosen in sorted(_maximal_cliques(compatible, source), key=through_first)
-    ]
+    phases: list[set[Movement]] = []
+    for leading in sorted(_maximal_cliques(compatible, source), key=through_first):
+        chosen = set(leading)
+        for name in groups:
+            if name in following and _right_may_go(name, chosen, groups, foes):
+                chosen.add(name)
+        phases.append(chosen)
+    return phases
+
+
+def _movements(links: Sequence[Link]) -> dict[Movement, list[Link]]:
+    """Links by approach and turn; those that share a letter can only be green together."""
+    groups: dict[Movement, list[Link]] = {}
+    for link in links:
+        groups.setdefault((link.from_edge, _turn(link.direction)), []).append(link)
+    # A right turn joins the movement it shares a letter with, not the other way round.
+    for name in sorted(groups, key=lambda name: name[1] == "r"):
+        letters = {link.index for link in groups.get(name, ())}
+        while joined := [
+            other
+            for other, own in groups.items()
+            if other != name and letters & {link.index for link in own}
+        ]:
+            for other in joined:
+                groups[name] += groups.pop(other)
+            letters = {link.index for link in groups[name]}
+    return groups
 
 
 def _turn(direction: str) -> str:
@@ -162,14 +184,12 @@ def _turn(direction: str) -> str:
 def _groups_conflict(
     a: Sequence[Link], b: Sequence[Link], foes: Mapping[str, Sequence[int]]
 ) -> bool:
-    if a[0].from_edge == b[0].from_edge:
-        return False
-    return any(are_foes(x, y, foes) for x in a for y in b)
+    return any(x.from_edge != y.from_edge and are_foes(x, y, foes) for x in a for y in b)
 
 
 def _right_may_go(
     name: Movement,
-    chosen: frozenset[Movement],
+    chosen: Set[Movement],
     groups: Mapping[Movement, Sequence[Link]],
     foes: Mapping[str, Sequence[int]],
 ) -> bool:
