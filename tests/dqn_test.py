@@ -380,6 +380,7 @@ def test_numbers_that_are_not_finite_are_refused_both_ways(tmp_path: Path, bad: 
     learner._weights.data[0] = bad
     with pytest.raises(CheckpointError, match="NaN or infinity"):
         learner.save(path)
+    learner._target_weights.data[0] = bad
     with pytest.raises(CheckpointError, match="NaN or infinity"):
         learner.policy().save(path)
     assert path.read_bytes() == good
