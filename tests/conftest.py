@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 import sysconfig
 from collections.abc import Callable
 from pathlib import Path
@@ -109,3 +110,12 @@ def hangzhou() -> Path:
     if not directory.is_dir():
         pytest.skip(f"no Hangzhou networks in {directory}")
     return directory
+
+
+@pytest.fixture
+def python(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The command of an interpreter that imports the package under test, from any directory."""
+    package = str(Path(ugat_marl.__file__).parents[1])
+    others = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(dict.fromkeys([package, *others])))
+    return [sys.executable]

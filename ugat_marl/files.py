@@ -12,6 +12,7 @@ import gzip
 import os
 import tempfile
 import xml.etree.ElementTree as ET
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from xml.parsers import expat
@@ -50,11 +51,20 @@ def read_bytes(path: Path) -> bytes:
     """
     try:
         data = path.read_bytes()
-        return gzip.decompress(data) if path.suffix == ".gz" else data
     except FileNotFoundError:
         raise ScenarioError(f"{path}: no such file") from None
-    except (OSError, EOFError) as error:
-        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+    if path.suffix != ".gz":
+        return data
+    try:
+        if not data:
+            raise EOFError("it is empty")
+        return gzip.decompress(data)
+    except (OSError, EOFError, zlib.error) as error:
+        raise ScenarioError(
+            f"{path}: not a whole gzip archive ({error}); it may have been cut short"
+        ) from None
 
 
 def parse_xml(content: bytes, name: str) -> ET.Element:

@@ -1,0 +1,217 @@
+"""Files are whole or absent, and XML can do nothing but be read."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import os
+import signal
+import stat
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import parse_xml, read_bytes, replacing, write_whole, xml_bytes
+
+
+def test_write_whole_writes_and_leaves_nothing_else(tmp_path: Path) -> None:
+    file = tmp_path / "deep" / "er" / "file.txt"
+    write_whole(file, "grün")
+    assert file.read_bytes() == "grün".encode()
+    write_whole(file, b"\x00\x01")
+    assert file.read_bytes() == b"\x00\x01"
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_failed_block_leaves_the_old_file(tmp_path: Path) -> None:
+    file = tmp_path / "file.txt"
+    file.write_text("old")
+
+    def fail() -> None:
+        with replacing(file) as temporary:
+            temporary.write_text("half of the n")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert file.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_the_file_gets_the_rights_any_new_file_gets(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_whole(tmp_path / "file", b"")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
+
+
+KILLED = """
+import os, sys, time
+from pathlib import Path
+from ugat_marl.files import replacing
+with replacing(Path(sys.argv[1])) as temporary:
+    with temporary.open("wb") as file:
+        file.write(b"new" * 1000)
+        file.flush()
+        print("half", flush=True)
+        time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_process_killed_while_writing_leaves_the_old_file(
+    how: signal.Signals, tmp_path: Path, python: list[str]
+) -> None:
+    file = tmp_path / "table.parquet"
+    file.write_bytes(b"old")
+    with subprocess.Popen(
+        [*python, "-c", KILLED, str(file)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"half\n"
+        process.send_signal(how)
+        process.wait(20)
+    assert file.read_bytes() == b"old"
+    # A name that no pattern of ours picks up; and nothing at all where Python could clean up.
+    left = [path.name for path in tmp_path.iterdir() if path != file]
+    assert all(name.startswith(".") and name.endswith(".tmp") for name in left)
+    if how == signal.SIGINT:
+        assert not left
+
+
+def test_a_writer_killed_at_any_moment_leaves_a_whole_file(
+    tmp_path: Path, python: list[str]
+) -> None:
+    """A process rewrites a file as fast as it can and is killed: never half of anything."""
+    script = (
+        "import sys, itertools\nfrom pathlib import Path\nfrom ugat_marl.files import write_whole\n"
+        "print('go', flush=True)\n"
+        "for n in itertools.count():\n    write_whole(Path(sys.argv[1]), str(n % 10) * 300_000)\n"
+    )
+    file = tmp_path / "file"
+    for pause in (0.03, 0.05, 0.09):
+        with subprocess.Popen(
+            [*python, "-c", script, str(file)], stdout=subprocess.PIPE
+        ) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            deadline = time.monotonic() + 10
+            while not file.exists() and time.monotonic() < deadline:
+                time.sleep(0.01)
+            time.sleep(pause)
+            process.kill()
+            process.wait(20)
+        content = file.read_text()
+        assert len(content) == 300_000
+        assert set(content) == {content[0]}
+
+
+def test_read_bytes_unpacks(tmp_path: Path) -> None:
+    (tmp_path / "a.xml").write_bytes(b"<a/>")
+    (tmp_path / "a.xml.gz").write_bytes(gzip.compress(b"<a/>"))
+    assert read_bytes(tmp_path / "a.xml") == read_bytes(tmp_path / "a.xml.gz") == b"<a/>"
+
+
+PACKED = gzip.compress(bytes(range(256)) * 200)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        PACKED[:-20],
+        PACKED[:5],
+        b"<net/>",
+        PACKED[:30] + b"\xff\xff\xff" + PACKED[33:],
+        b"",
+    ],
+    ids=["cut", "header only", "not packed", "damaged inside", "empty"],
+)
+def test_a_broken_archive_is_named(content: bytes, tmp_path: Path) -> None:
+    file = tmp_path / "net.xml.gz"
+    file.write_bytes(content)
+    with pytest.raises(ScenarioError, match=r"net\.xml\.gz: not a whole gzip archive"):
+        read_bytes(file)
+
+
+def test_a_missing_file_and_a_directory_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"gone\.xml: no such file"):
+        read_bytes(tmp_path / "gone.xml")
+    with pytest.raises(ScenarioError, match="cannot be read: .*directory"):
+        read_bytes(tmp_path)
+
+
+DOCUMENT = b"""<?xml version="1.0" encoding="UTF-8"?>
+<!-- who made it -->
+<net version="1.20" xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"
+     xsi:noNamespaceSchemaLocation="http://sumo.dlr.de/xsd/net_file.xsd">
+    <edge id="a&amp;b"/> text &lt; <edge id="\xc3\xbc"/> tail
+</net>
+"""
+
+
+def test_xml_survives_reading_and_writing() -> None:
+    root = parse_xml(DOCUMENT, "net")
+    again = parse_xml(xml_bytes(root), "net")
+    for tree in (root, again):
+        assert tree.tag == "net"
+        assert tree.get("xsi:noNamespaceSchemaLocation", "").endswith("net_file.xsd")
+        assert [edge.get("id") for edge in tree.iter("edge")] == ["a&b", "ü"]
+
+
+@given(st.dictionaries(st.sampled_from("abc"), st.text(max_size=20).filter(str.isprintable)))
+def test_any_attribute_survives(attributes: dict[str, str]) -> None:
+    root = parse_xml(b"<r/>", "r")
+    for key, value in attributes.items():
+        root.set(key, value)
+    assert dict(parse_xml(xml_bytes(root), "r").items()) == attributes
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_are_a_traceback(content: bytes) -> None:
+    with contextlib.suppress(ScenarioError):
+        parse_xml(content, "here")
+
+
+@given(st.integers(0, len(DOCUMENT) - 9))
+def test_a_document_cut_anywhere_is_refused(length: int) -> None:
+    with pytest.raises(ScenarioError, match="net: not well-formed XML .*cut short"):
+        parse_xml(DOCUMENT[:length], "net")
+
+
+def laughs() -> str:
+    """The billion laughs: ten entities, each ten times the one before."""
+    entities = '<!ENTITY lol0 "lol">' + "".join(
+        f'<!ENTITY lol{n} "{f"&lol{n - 1};" * 10}">' for n in range(1, 10)
+    )
+    return f'<?xml version="1.0"?><!DOCTYPE lolz [{entities}]><lolz>&lol9;</lolz>'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        laughs(),
+        '<!DOCTYPE r SYSTEM "file:///etc/passwd"><r/>',
+        '<!DOCTYPE r [<!ENTITY e SYSTEM "file:///etc/passwd">]><r>&e;</r>',
+        '<!DOCTYPE r [<!ENTITY % p SYSTEM "http://localhost/x"> %p;]><r/>',
+        "<!DOCTYPE r><r/>",
+    ],
+)
+def test_document_types_and_entities_are_refused(content: str) -> None:
+    start = time.perf_counter()
+    with pytest.raises(ScenarioError, match="here: document types and entities are not accepted"):
+        parse_xml(content.encode(), "here")
+    assert time.perf_counter() - start < 1
+
+
+def test_an_unknown_encoding_is_named() -> None:
+    with pytest.raises(ScenarioError, match="here: "):
+        parse_xml(b'<?xml version="1.0" encoding="klingon"?><r/>', "here")
+    with pytest.raises(ScenarioError, match="here: "):
+        parse_xml("<r>ü</r>".encode("latin-1"), "here")
