@@ -7,8 +7,9 @@ whoever reads it, so no intersection sees another one's numbers.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -75,3 +76,14 @@ def mask_of(sizes: Sequence[int]) -> Tensor:
 def pad(rows: Sequence[Tensor], width: int) -> Tensor:
     """Stacks ``(batch, size_i)`` tensors into ``(agents, batch, width)``, zeros on the right."""
     return torch.stack([nn.functional.pad(row, (0, width - row.shape[-1])) for row in rows])
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Runs torch on one thread: products this small lose by being split, sums keep their order."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

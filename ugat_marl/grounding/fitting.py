@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ugat_marl.batched import one_thread
 from ugat_marl.errors import LogError, OptionError
 from ugat_marl.grounding.evidential import annealing, divergence_from_uniform, evidential_loss
 from ugat_marl.grounding.fit_report import (
@@ -137,8 +138,9 @@ def fit(
             scenario, observation or decision interval.
     """
     _refuse_mismatch(real, simulated)
-    f = fit_forward(forward, real, config, seed, on_epoch)
-    h = fit_inverse(inverse, simulated, config, seed, on_epoch)
+    with one_thread():
+        f = fit_forward(forward, real, config, seed, on_epoch)
+        h = fit_inverse(inverse, simulated, config, seed, on_epoch)
     ours, theirs = stack_log(simulated, inverse.stack), stack_log(real, inverse.stack)
     held_out = split(ours, config.held_out_every, inverse.stack).held_out
     held_out_real = split(theirs, config.held_out_every, inverse.stack).held_out

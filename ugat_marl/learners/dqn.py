@@ -1,14 +1,13 @@
 """Independent deep Q-learning, one network per intersection, all of them computed together.
 
 Mnih et al. 2015 with double Q-learning (van Hasselt et al. 2016), a softly updated target network
-and exploration that persists. It is the learner of the UGAT paper, made stronger: FACTS of the
-project showed that the gap between domains is judged wrongly with a weak one.
+and exploration that persists. It is the learner of the UGAT paper, made stronger: with a weak one,
+under-training passes for a gap between domains.
 """
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ugat_marl.batched import one_thread
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.checkpoint import read_checkpoint, write_checkpoint
@@ -137,7 +137,7 @@ class DQN:
                 f"the environment's agents are {AgentSet.of(env)}, this learner's {self.agents}; "
                 "make a new learner with DQN.of(env)"
             )
-        with _one_thread():
+        with one_thread():
             for _ in range(episodes):
                 numbers = self._episode(env, seed)
                 if on_episode is not None:
@@ -338,14 +338,3 @@ def _like(path: Path, found: Mapping[str, Tensor], own: Mapping[str, Tensor]) ->
                 f"{tuple(tensor.shape)}; use the settings it was saved with"
             )
     return dict(found)
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Products this small lose by being split; and on one thread sums keep their order."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -1,0 +1,1 @@
+"""Reads records and draws pictures and tables; computes nothing."""

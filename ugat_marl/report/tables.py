@@ -1,0 +1,117 @@
+"""Evaluations as tables that fit a terminal of 80 columns."""
+
+from __future__ import annotations
+
+import math
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from ugat_marl.evaluation import Estimate, Evaluation
+from ugat_marl.metrics import MEASURES
+
+
+def transfer_table(found: Evaluation) -> RenderableType:
+    """ATT of every policy in the simulation and the real domains, with gap and regret."""
+    first, *others = found.domains
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        title=f"{found.scenario}: average travel time in s (95 % interval)",
+        title_justify="left",
+        caption=_caption(found),
+        caption_justify="left",
+        pad_edge=False,
+    )
+    table.add_column("policy", max_width=22)
+    table.add_column(first, justify="right")
+    for domain in others:
+        for heading in (domain, "gap", "regret"):
+            table.add_column(heading, justify="right")
+    for policy in found.policies:
+        cells = [_with_interval(found.estimate(policy, first, "att_s"))]
+        for domain in others:
+            cells += [
+                _with_interval(found.estimate(policy, domain, "att_s")),
+                _signed(found.gap(policy, domain, "att_s")),
+                _number(found.regret(policy, domain).mean),
+            ]
+        table.add_row(policy, *cells)
+    return table
+
+
+def measures_table(found: Evaluation) -> RenderableType:
+    """One block per domain: all measures, their intervals, and gaps against the first domain."""
+    blocks: list[RenderableType] = []
+    for domain in found.domains:
+        table = Table(
+            box=box.SIMPLE_HEAD,
+            title=f"{found.scenario} in {domain}",
+            title_justify="left",
+            pad_edge=False,
+            padding=(0, 1, 0, 0),
+        )
+        table.add_column("policy", max_width=18, overflow="fold")
+        headings = ("ATT s", "through.", "reward", "queue", "delay", "delay s", "regret s")
+        for heading in headings:
+            table.add_column(heading, justify="right", no_wrap=True)
+        for policy in found.policies:
+            estimates = [found.estimate(policy, domain, measure) for measure in MEASURES]
+            estimates.append(found.regret(policy, domain))
+            table.add_row(policy, *(_number(e.mean) for e in estimates))
+            if not math.isnan(estimates[0].low):
+                halves = (f"±{_number((e.high - e.low) / 2)}" for e in estimates)
+                table.add_row(*_dim("  95 % interval", *halves))
+            if domain != found.domains[0]:
+                gaps = [found.gap(policy, domain, measure) for measure in MEASURES]
+                table.add_row(*_dim(f"  gap to {found.domains[0]}", *map(_signed, gaps)))
+        blocks.append(table)
+    blocks.append(Text(_legend(found), style="dim"))
+    return Group(*blocks)
+
+
+def _caption(found: Evaluation) -> str:
+    keys = [f"best rule in {domain}" for domain in found.domains]
+    lines = [f"{key}: {found.notes[key]}" for key in keys if key in found.notes]
+    lines.append(
+        f"{_seeds(found)} seeds. gap: minus {found.domains[0]}. regret: ATT above the best of "
+        "these policies in that domain."
+    )
+    return "\n".join(lines)
+
+
+def _legend(found: Evaluation) -> str:
+    return (
+        f"{_seeds(found)} seeds. ATT: all vehicles due, scheduled departure to arrival or end. "
+        "queue: halting vehicles per intersection. delay: 1 - v/vmax of incoming lanes. "
+        "delay s: time loss plus departure delay. regret: ATT above the best of these policies."
+    )
+
+
+def _seeds(found: Evaluation) -> int:
+    return len({result.seed for result in found.results})
+
+
+def _dim(*cells: str) -> list[Text]:
+    return [Text(cell, style="dim") for cell in cells]
+
+
+def _with_interval(estimate: Estimate) -> str:
+    if math.isnan(estimate.low):
+        return _number(estimate.mean)
+    return f"{_number(estimate.mean)} ({_number(estimate.low)}-{_number(estimate.high)})"
+
+
+def _signed(estimate: Estimate) -> str:
+    text = _number(estimate.mean)
+    return text if text.startswith("-") else f"+{text}"
+
+
+def _number(value: float) -> str:
+    """Three significant digits, or whole numbers above a hundred."""
+    if math.isnan(value):
+        return "-"
+    if abs(value) >= 99.95:
+        return f"{value:.0f}"
+    return f"{value:.1f}" if abs(value) >= 0.9995 else f"{value:.2f}"

@@ -1,0 +1,245 @@
+"""One experiment: train across the gap, judge in both worlds, say what was won."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.controllers import STANDARD_RULES
+from ugat_marl.effects import describe, in_domain, load
+from ugat_marl.env import TrafficEnv, parallel_env
+from ugat_marl.errors import OptionError
+from ugat_marl.evaluation import (
+    TUNING_SEED,
+    Evaluation,
+    PolicyFactory,
+    best_rules,
+    evaluate,
+    fixed_policy,
+    rule_factory,
+)
+from ugat_marl.grounding.transform import GroundedActionTransform
+from ugat_marl.learners.dqn import DQN
+from ugat_marl.learners.dqn_config import DQNConfig
+from ugat_marl.learners.dqn_policy import DQNPolicy
+from ugat_marl.policy import Policy
+from ugat_marl.progress import Reporter, Silent
+from ugat_marl.scenario import Scenario
+from ugat_marl.training import Run
+from ugat_marl.transitions import TransitionLog
+from ugat_marl.ugat import (
+    DIRECT_LEARNER,
+    RecordedWorld,
+    State,
+    UgatConfig,
+    World,
+    make_world,
+    restore,
+    train_ugat,
+)
+
+EVALUATION_SEED = 1000
+"""First seed of the reported episodes; apart from those of training and of the search for rules."""
+
+DIRECT, UGAT, CONTROL = "direct transfer", "UGAT", "more plain sim"
+
+
+@dataclass(frozen=True)
+class TransferConfig:
+    """What to train, where, and how to judge it.
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        real: The real domain: V1..V4 or an alias, effect=value+..., or a scenario directory. "none"
+            with `real_log`: nothing but the log is known of the real world.
+        sim: The simulation to train in; "sim", or a domain like `real`.
+        real_log: Recorded transitions that take the place of roll-outs in the real domain.
+        seed: Root of every random choice in training.
+        observation: What agents see: count, queue, pressure, waiting, density.
+        reward: What agents want: queue, pressure, waiting.
+        neighbours: How many roads away intersections are seen too.
+        duration_s: Length of an episode in s; default: the scenario's own.
+        evaluation_seeds: Episodes behind every number of the table.
+        tuning_seeds: Episodes behind the choice of the best rule.
+        control: Also train as many further episodes in plain sim, for comparison.
+        ugat: Settings of the algorithm.
+        dqn: Settings of the learner.
+    """
+
+    scenario: str
+    real: str = "V4"
+    sim: str = "sim"
+    real_log: Path | None = None
+    seed: int = 0
+    observation: str = "count"
+    reward: str = "queue"
+    neighbours: int = 0
+    duration_s: float | None = None
+    evaluation_seeds: int = 5
+    tuning_seeds: int = 2
+    control: bool = True
+    ugat: UgatConfig = field(default_factory=UgatConfig)
+    dqn: DQNConfig = field(default_factory=DQNConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("evaluation_seeds", "tuning_seeds"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if self.real == "none" and self.real_log is None:
+            raise OptionError('real = "none" needs a real_log: something must be known of the real')
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Options of every environment of the experiment."""
+        return {
+            "observation": self.observation,
+            "reward": self.reward,
+            "neighbours": self.neighbours,
+            "duration_s": self.duration_s,
+        }
+
+    @property
+    def domains(self) -> list[str]:
+        """The domains the policies are judged in."""
+        return [self.sim] if self.real == "none" else [self.sim, self.real]
+
+
+def transfer(
+    config: TransferConfig,
+    directory: Path,
+    *,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> Evaluation:
+    """Trains by UGAT, evaluates, and leaves everything in `directory`.
+
+    Args:
+        config: What to do.
+        directory: Folder of the run; ``table.json``, ``metrics.parquet``, ``policy.pt``,
+            TensorBoard files and checkpoints go there.
+        resume: Go on with the run in the folder.
+        reporter: Shows progress.
+    """
+    reporter = reporter or Silent()
+    scenario = load(config.scenario)
+    env = parallel_env(scenario, config.sim, **config.env_options)
+    real_log = TransitionLog.read(config.real_log) if config.real_log else None
+    identity = _identity(config, scenario, env)
+    try:
+        run = Run(directory, identity, resume, reporter)
+        learner = DQN.of(env, config.dqn, config.seed)
+        transform = GroundedActionTransform(
+            env.layouts, config.seed, config.ugat.forward, config.ugat.inverse, config.ugat.gate
+        )
+        state = State(learner, transform)
+        restore(state, run, DQNPolicy.load)
+        policy = _train(config, scenario, env, real_log, state, run)
+        policies: dict[str, Policy] = {}
+        if state.direct is not None:
+            policies[DIRECT] = state.direct
+        policies[UGAT] = policy
+        if config.control:
+            policies[CONTROL] = _control(config, env, run)
+    finally:
+        env.close()
+    for name, trained in policies.items():
+        if isinstance(trained, DQNPolicy):
+            trained.save(directory / "policies" / f"{name.replace(' ', '-').lower()}.pt")
+    run.close()
+    table = judge(config, scenario, policies, reporter)
+    table.write(directory / "table.json")
+    return table
+
+
+def judge(
+    config: TransferConfig,
+    scenario: Scenario,
+    policies: Mapping[str, Policy],
+    reporter: Reporter,
+) -> Evaluation:
+    """Evaluates policies beside the rules that are best in each domain."""
+    reporter.say("searching the best rule of each domain")
+    rules = best_rules(
+        scenario,
+        config.domains,
+        seeds=[TUNING_SEED + k for k in range(config.tuning_seeds)],
+        duration_s=config.duration_s,
+        reporter=reporter,
+    )
+    factories: dict[str, PolicyFactory] = {
+        name: fixed_policy(policy) for name, policy in policies.items()
+    }
+    for rule in rules.values():
+        factories.setdefault(f"rule {rule}", rule_factory(rule))
+    return evaluate(
+        scenario,
+        factories,
+        config.domains,
+        [EVALUATION_SEED + k for k in range(config.evaluation_seeds)],
+        duration_s=config.duration_s,
+        reporter=reporter,
+        notes={
+            **{f"best rule in {domain}": rule for domain, rule in rules.items()},
+            "rules searched": ", ".join(STANDARD_RULES),
+            "training seed": str(config.seed),
+        },
+    )
+
+
+def _train(
+    config: TransferConfig,
+    scenario: Scenario,
+    env: TrafficEnv,
+    real_log: TransitionLog | None,
+    state: State,
+    run: Run,
+) -> Policy:
+    def probe(policy: Policy) -> dict[str, float]:
+        """ATT after each iteration, on a seed that is not reported."""
+        found = evaluate(
+            scenario,
+            {"policy": fixed_policy(policy)},
+            config.domains,
+            [TUNING_SEED],
+            duration_s=config.duration_s,
+        )
+        return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
+
+    sim: World = make_world(scenario, config.sim, config.ugat, config.env_options, "sim")
+    if real_log is not None:
+        real: World = RecordedWorld(real_log, env)
+    else:
+        real = make_world(scenario, config.real, config.ugat, config.env_options, "real")
+    try:
+        return train_ugat(state, env, sim, real, config.ugat, config.seed, run, probe)
+    finally:
+        sim.close()
+        real.close()
+
+
+def _control(config: TransferConfig, env: TrafficEnv, run: Run) -> Policy:
+    """Direct transfer trained on, in plain sim, for as many episodes as the iterations had."""
+    path = run.directory / "control.pt"
+    if path.exists():
+        return DQNPolicy.load(path)
+    learner = DQN.of(env, config.dqn, config.seed)
+    learner.load(run.directory / DIRECT_LEARNER)
+    episodes = config.ugat.iterations * config.ugat.grounded_episodes
+    with run.reporter.task("control: more plain sim", episodes) as advance:
+        learner.learn(env, episodes, config.seed, lambda _number, _numbers: advance())
+    policy = learner.policy()
+    policy.save(path)
+    return policy
+
+
+def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> dict[str, Any]:
+    settings = asdict(config)
+    for judging in ("evaluation_seeds", "tuning_seeds", "control"):
+        settings.pop(judging)
+    settings["real_log"] = str(config.real_log) if config.real_log else None
+    hashes = {"sim": env.scenario.hash}
+    if config.real != "none":
+        hashes["real"] = in_domain(scenario, config.real).hash
+    return {**settings, "scenario_hash": hashes, "domains": [describe(d) for d in config.domains]}

@@ -1,0 +1,375 @@
+"""Uncertainty-aware Grounded Action Transformation, network-wide: Algorithm 1 of the paper.
+
+Da, Mei, Sharma, Wei: Uncertainty-aware Grounded Action Transformation towards Sim-to-Real Transfer
+for Traffic Signal Control, CDC 2023.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from ugat_marl.effects import Domain
+from ugat_marl.env import TrafficEnv, parallel_env
+from ugat_marl.errors import LogError, OptionError
+from ugat_marl.grounding.fitting import FitConfig, FitReport, fit
+from ugat_marl.grounding.forward import ForwardConfig
+from ugat_marl.grounding.gate import GateConfig, GateReport
+from ugat_marl.grounding.inverse import InverseConfig
+from ugat_marl.grounding.transform import GroundedActionTransform
+from ugat_marl.grounding.wrapper import GroundedEnv
+from ugat_marl.policy import AnyParallelEnv, Learner, Policy
+from ugat_marl.rollout import Exploring, roll_out
+from ugat_marl.scenario import Scenario
+from ugat_marl.seeding import derive_seed
+from ugat_marl.training import Run
+from ugat_marl.transitions import TransitionLog
+
+CHUNK = 10
+"""Episodes of plain training between two checkpoints."""
+
+DIRECT_LEARNER = "direct-learner.pt"
+"""The learner as it was after plain training, in the run's folder: where controls start from."""
+
+
+@dataclass(frozen=True)
+class UgatConfig:
+    """Settings of the algorithm.
+
+    Attributes:
+        pretrain_episodes: M, episodes in plain sim before the first iteration.
+        iterations: I, rounds of rolling out, fitting and grounded training.
+        grounded_episodes: E, episodes of training in the grounded sim per iteration.
+        sim_rollouts: Episodes added to D_sim per iteration.
+        real_rollouts: Episodes added to D_real per iteration.
+        rollout_epsilon: Chance of a random phase in these roll-outs.
+        forward: Shape of f.
+        inverse: Shape of h.
+        fit: How f and h are fitted.
+        gate: How alpha is found.
+    """
+
+    pretrain_episodes: int = 60
+    iterations: int = 4
+    grounded_episodes: int = 10
+    sim_rollouts: int = 3
+    real_rollouts: int = 3
+    rollout_epsilon: float = 0.3
+    forward: ForwardConfig = field(default_factory=ForwardConfig)
+    inverse: InverseConfig = field(default_factory=InverseConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    gate: GateConfig = field(default_factory=GateConfig)
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("pretrain_episodes", 0),
+            ("iterations", 0),
+            ("grounded_episodes", 1),
+            ("sim_rollouts", 1),
+            ("real_rollouts", 1),
+        ):
+            if getattr(self, name) < least:
+                raise OptionError(f"{name} = {getattr(self, name)}: must be at least {least}")
+        if not 0 <= self.rollout_epsilon <= 1:
+            raise OptionError(f"rollout_epsilon = {self.rollout_epsilon}: must be from 0 to 1")
+
+
+class World(Protocol):
+    """Where transitions come from."""
+
+    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
+        """The transitions this iteration adds; None if there are no more."""
+        ...
+
+    def close(self) -> None:
+        """Gives up what the world holds."""
+        ...
+
+
+class SimulatedWorld:
+    """Roll-outs in a domain.
+
+    Args:
+        make_env: Makes an environment of the domain.
+        name: Distinguishes the seeds of two worlds.
+        episodes: Roll-outs per iteration.
+        epsilon: Chance of a random phase.
+    """
+
+    def __init__(
+        self, make_env: Callable[[], TrafficEnv], name: str, episodes: int, epsilon: float
+    ) -> None:
+        self._make_env = make_env
+        self._name = name
+        self._episodes = episodes
+        self._epsilon = epsilon
+        self._env: TrafficEnv | None = None
+
+    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
+        """Plays the iteration's episodes and returns their transitions."""
+        if self._env is None:
+            self._env = self._make_env()
+        exploring = Exploring(policy, self._epsilon)
+        logs: list[TransitionLog] = []
+        for episode in range(self._episodes):
+            episode_seed = derive_seed(seed, "roll-out", self._name, iteration, episode)
+            log = roll_out(self._env, exploring, episode_seed, record=True).log
+            assert log is not None
+            logs.append(log)
+        return TransitionLog.concatenate(logs)
+
+    def close(self) -> None:
+        """Ends the simulation."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+
+class RecordedWorld:
+    """A log that was measured or recorded before; no simulator stands in for the street.
+
+    Args:
+        log: The transitions.
+        env: The simulation they are to be compared with.
+
+    Raises:
+        LogError: The log's agents, observation or decision interval are not those of `env`.
+    """
+
+    def __init__(self, log: TransitionLog, env: TrafficEnv) -> None:
+        own = log.provenance
+        for what, found, wanted in (
+            ("agents and observation sizes", dict(own.layouts), dict(env.layouts)),
+            ("observation", own.observation, env.options.observation),
+            ("decision interval", own.decision_interval_s, env.decision_interval_s),
+        ):
+            if found != wanted:
+                raise LogError(
+                    f"the real log's {what} are {found}, the simulation's {wanted}; record it on "
+                    f"{env.scenario.id!r} with the same options"
+                )
+        self._log = log
+
+    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
+        """The whole log at the first iteration, nothing afterwards."""
+        del policy, seed
+        return self._log if iteration == 0 else None
+
+    def close(self) -> None:
+        """Nothing to give up."""
+
+
+@dataclass
+class State:
+    """Where a run stands; everything that a checkpoint holds.
+
+    Attributes:
+        learner: The policy in training.
+        transform: f, h and gate.
+        direct: The policy after plain training: direct transfer.
+        simulated: D_sim.
+        real: D_real.
+        pretrained: Episodes of plain training so far.
+        iteration: Iterations completed.
+    """
+
+    learner: Learner
+    transform: GroundedActionTransform
+    direct: Policy | None = None
+    simulated: list[TransitionLog] = field(default_factory=list)
+    real: list[TransitionLog] = field(default_factory=list)
+    pretrained: int = 0
+    iteration: int = 0
+
+
+Probe = Callable[[Policy], Mapping[str, float]]
+"""Measures a policy between iterations; the numbers are logged and never decide anything."""
+
+
+def train_ugat(
+    state: State,
+    env: AnyParallelEnv,
+    sim: World,
+    real: World,
+    config: UgatConfig,
+    seed: int,
+    run: Run,
+    probe: Probe | None = None,
+) -> Policy:
+    """Algorithm 1: pre-train in sim, then iterate roll-outs, fitting and grounded training.
+
+    Args:
+        state: A fresh state, or one restored from a checkpoint.
+        env: The simulation to train in.
+        sim: Fills D_sim.
+        real: Fills D_real.
+        config: Settings.
+        seed: Root of every random choice.
+        run: Where metrics and checkpoints go.
+        probe: Measures the policy after every iteration.
+
+    Returns:
+        The policy after the last iteration.
+    """
+    _pretrain(state, env, config, seed, run, probe)
+    grounded = GroundedEnv(env, state.transform)
+    while state.iteration < config.iterations:
+        i = state.iteration
+        policy = state.learner.policy()
+        _collect(state, sim, real, policy, i, seed, run)
+        report = _fit(state, config, derive_seed(seed, "fit", i), run, i)
+        _learn(state, grounded, config.grounded_episodes, seed, run, f"grounded, round {i + 1}")
+        gate = state.transform.gate.update()  # alpha of the next iteration
+        run.log("iteration", i + 1, _numbers(report, gate, state, probe))
+        state.iteration += 1
+        save(state, run)
+    return state.learner.policy()
+
+
+def _pretrain(
+    state: State,
+    env: AnyParallelEnv,
+    config: UgatConfig,
+    seed: int,
+    run: Run,
+    probe: Probe | None,
+) -> None:
+    while state.pretrained < config.pretrain_episodes:
+        episodes = min(CHUNK, config.pretrain_episodes - state.pretrained)
+        done = f"{state.pretrained + 1}-{state.pretrained + episodes}"
+        _learn(state, env, episodes, seed, run, f"plain sim, episode {done}")
+        state.pretrained += episodes
+        if state.pretrained < config.pretrain_episodes:
+            save(state, run)
+    if state.direct is None:
+        state.direct = state.learner.policy()
+        state.learner.save(run.directory / DIRECT_LEARNER)
+        if probe is not None:
+            run.log("iteration", 0, probe(state.direct))
+        save(state, run)
+
+
+def _learn(
+    state: State, env: AnyParallelEnv, episodes: int, seed: int, run: Run, title: str
+) -> None:
+    with run.reporter.task(title, episodes) as advance:
+
+        def on_episode(number: int, numbers: Mapping[str, float]) -> None:
+            run.log("episode", number, numbers)
+            advance(note=f"return {numbers['return']:.0f}" if "return" in numbers else "")
+
+        state.learner.learn(env, episodes, seed, on_episode)
+
+
+def _collect(
+    state: State, sim: World, real: World, policy: Policy, iteration: int, seed: int, run: Run
+) -> None:
+    """Rolls the policy out in both worlds at the same time."""
+    with (
+        run.reporter.task(f"roll-outs, round {iteration + 1}", 2) as advance,
+        concurrent.futures.ThreadPoolExecutor(2) as pool,
+    ):
+        running = [pool.submit(world.collect, policy, iteration, seed) for world in (sim, real)]
+        for future, data in zip(running, (state.simulated, state.real), strict=True):
+            log = future.result()
+            if log is not None:
+                data.append(log)
+            advance()
+
+
+def _fit(state: State, config: UgatConfig, seed: int, run: Run, iteration: int) -> FitReport:
+    transform = state.transform
+    with run.reporter.task(f"fitting f and h, round {iteration + 1}", 2 * config.fit.epochs) as go:
+        report = fit(
+            transform.forward,
+            transform.inverse,
+            TransitionLog.concatenate(state.real),
+            TransitionLog.concatenate(state.simulated),
+            config.fit,
+            seed,
+            on_epoch=lambda _model, _epoch, _loss: go(),
+        )
+    for warning in report.warnings:
+        run.reporter.say(f"[yellow]round {iteration + 1}:[/yellow] {warning}")
+    return report
+
+
+def _numbers(
+    report: FitReport, gate: GateReport, state: State, probe: Probe | None
+) -> dict[str, float]:
+    numbers = {**report.as_dict(), **{f"gate/{k}": v for k, v in gate.as_dict().items()}}
+    if probe is not None:
+        numbers |= probe(state.learner.policy())
+    return numbers
+
+
+def save(state: State, run: Run) -> None:
+    """Makes a checkpoint of `state`."""
+
+    def write(folder: Path) -> None:
+        state.learner.save(folder / "learner.pt")
+        state.transform.save(folder / "grounding.pt")
+        if state.direct is not None:
+            save_policy(state.direct, folder / "direct.pt")
+        save_policy(state.learner.policy(), folder / "policy.pt")
+        for name, logs in (("sim", state.simulated), ("real", state.real)):
+            for number, log in enumerate(logs):
+                log.write(folder / f"{name}-{number:03}.parquet")
+
+    run.save({"pretrained": state.pretrained, "iteration": state.iteration}, write)
+
+
+def restore(state: State, run: Run, load_policy: Callable[[Path], Policy]) -> None:
+    """Brings a fresh `state` to where the run's checkpoint stands, if there is one.
+
+    Raises:
+        CheckpointError: The checkpoint cannot be used.
+        LogError: One of its logs cannot.
+    """
+    if not run.resumable:
+        return
+
+    def read(folder: Path) -> None:
+        state.learner.load(folder / "learner.pt")
+        state.transform.load(folder / "grounding.pt")
+        if (folder / "direct.pt").exists():
+            state.direct = load_policy(folder / "direct.pt")
+        state.simulated = _logs(folder, "sim")
+        state.real = _logs(folder, "real")
+
+    found = run.restore(read)
+    state.pretrained = int(found["pretrained"])
+    state.iteration = int(found["iteration"])
+
+
+def _logs(folder: Path, name: str) -> list[TransitionLog]:
+    return [TransitionLog.read(path) for path in sorted(folder.glob(f"{name}-*.parquet"))]
+
+
+def save_policy(policy: Any, path: Path) -> None:
+    """Writes a policy that knows how to save itself; others are rebuilt from their learner."""
+    if hasattr(policy, "save"):
+        policy.save(path)
+
+
+def make_world(
+    scenario: Scenario, domain: Domain, config: UgatConfig, options: Mapping[str, Any], name: str
+) -> SimulatedWorld:
+    """Roll-outs in a domain of a scenario.
+
+    Args:
+        scenario: The scenario.
+        domain: The domain.
+        config: How many roll-outs, and how exploratory.
+        options: Options of the environment.
+        name: ``"sim"`` for what fills D_sim, ``"real"`` for D_real.
+    """
+    return SimulatedWorld(
+        lambda: parallel_env(scenario, domain, **options),
+        name,
+        config.sim_rollouts if name == "sim" else config.real_rollouts,
+        config.rollout_epsilon,
+    )
