@@ -71,6 +71,10 @@ class LogError(UgatMarlError):
     """A transition log cannot be read or does not fit the scenario."""
 
 
+class MeasurementError(UgatMarlError):
+    """A measured process of a bench failed, or did other work than what it is compared with."""
+
+
 class CheckpointError(UgatMarlError):
     """A checkpoint cannot be read, holds impossible numbers, or belongs to something else."""
 

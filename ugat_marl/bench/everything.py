@@ -1,0 +1,42 @@
+"""``bench all``: every figure in one report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ugat_marl.bench.learning import LearningBench
+from ugat_marl.bench.memory import MemoryBench
+from ugat_marl.bench.report import Report
+from ugat_marl.bench.speed import EnvBench
+
+
+@dataclass(frozen=True)
+class AllBench:
+    """All benches, one after the other.
+
+    Attributes:
+        env: Options of ``bench env``.
+        learning: Options of ``bench learning``.
+        memory: Options of ``bench memory``.
+        out: Folder for one JSON file per bench.
+    """
+
+    env: EnvBench = field(default_factory=EnvBench)
+    learning: LearningBench = field(default_factory=LearningBench)
+    memory: MemoryBench = field(default_factory=MemoryBench)
+    out: Path | None = None
+
+    def run(self) -> list[Report]:
+        """Measures all of them; each report is written as soon as it is there.
+
+        Raises:
+            MeasurementError: A measured process failed.
+        """
+        reports: list[Report] = []
+        for name in ("env", "learning", "memory"):
+            bench: EnvBench | LearningBench | MemoryBench = getattr(self, name)
+            if self.out is not None and bench.out is None:
+                bench = replace(bench, out=self.out / f"{name}.json")
+            reports.append(bench.run())
+        return reports

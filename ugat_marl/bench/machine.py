@@ -1,0 +1,64 @@
+"""The machine and the versions a figure was taken with."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import os
+import platform
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+_LIBRARIES = (
+    "ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch", "gymnasium", "pettingzoo",
+)  # fmt: skip
+
+
+def machine_facts() -> dict[str, Any]:
+    """CPU, cores, load, memory, system, Python, library versions, date and command line."""
+    return {
+        "cpu": cpu_model(),
+        "cores": usable_cores(),
+        "load_1min": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "memory_gib": memory_gib(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "versions": {name: version_of(name) for name in _LIBRARIES},
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    }
+
+
+def cpu_model() -> str:
+    """The processor's name, as the system calls it."""
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text(errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def usable_cores() -> int:
+    """Cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def memory_gib() -> float | None:
+    """Physical memory, or None where the system does not say."""
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def version_of(distribution: str) -> str | None:
+    """Installed version of a package, or None."""
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
