@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from ugat_marl.errors import ScenarioError
 from ugat_marl.network import Network
 from ugat_marl.scenario import Document, Scenario
+from ugat_marl.scenario_settings import seconds_of
 
 _ROUTED = ("from", "to", "via", "edges")
+_NO_TIME = frozenset({"triggered", "containerTriggered", "split", "now", "begin"})
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ def check_demand(scenario: Scenario, network: Network) -> Demand:
             if item.tag == "flow":
                 flows += 1
             elif item.tag in ("vehicle", "trip"):
-                vehicles += begin <= _depart_s(item.get("depart", ""), document) < end
+                vehicles += begin <= _depart_s(item.get("depart", ""), document, begin) < end
     if not vehicles and not flows:
         files = ", ".join(document.source for document in scenario.routes)
         raise ScenarioError(
@@ -65,15 +67,13 @@ def _unknown_edge(
     )
 
 
-def _depart_s(text: str, document: Document) -> float:
-    """Seconds; SUMO also knows triggered departures and ``h:m:s``."""
-    if text in ("triggered", "containerTriggered", "now", "begin"):
-        return 0.0
+def _depart_s(text: str, document: Document, begin_s: float) -> float:
+    """Seconds; a triggered departure counts as one at the beginning."""
+    if text in _NO_TIME:
+        return begin_s
     try:
-        parts = [float(part) for part in text.split(":")]
+        return seconds_of(text)
     except ValueError:
-        raise ScenarioError(f"{document.source}: depart={text!r} is not a time") from None
-    seconds = 0.0
-    for part in parts:
-        seconds = seconds * 60 + part
-    return seconds
+        raise ScenarioError(
+            f"{document.source}: depart={text!r} is not a time; give seconds or h:m:s"
+        ) from None

@@ -15,21 +15,17 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import pydantic
-from pydantic import Field
-
-from ugat_marl.errors import ScenarioError, UnknownNameError, nearest
-from ugat_marl.files import parse_xml, read_bytes, replacing, write_whole
-
-PhaseSource = Literal["programme", "conflict-free"] | tuple[str, ...]
-"""Where an intersection's green phases come from: the network's own signal programme, all maximal
-conflict-free sets of movements, or an explicit list of SUMO states."""
-
-_FORBIDDEN_SUMO_OPTIONS = (
-    "output", "file", "files", "seed", "port", "begin", "end", "step-length", "script", "log",
-)  # fmt: skip
+from ugat_marl.errors import ScenarioError, UnknownNameError
+from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
+from ugat_marl.scenario_settings import (
+    ControlSettings,
+    ScenarioFile,
+    may_be_given,
+    seconds_of,
+    validated,
+)
 
 
 @dataclass(frozen=True)
@@ -67,44 +63,6 @@ class Document:
         return Document(self.name.removesuffix(".gz"), None, content)
 
 
-class ControlSettings(pydantic.BaseModel):
-    """Signal timing. Greens, yellows and all-reds are in seconds."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
-
-    decision_interval_s: Annotated[float, Field(gt=0, le=600)] = 10.0
-    yellow_s: Annotated[float, Field(ge=0, le=60)] = 3.0
-    all_red_s: Annotated[float, Field(ge=0, le=60)] = 2.0
-    min_green_s: Annotated[float, Field(ge=0, le=600)] = 5.0
-    phases: PhaseSource = "programme"
-
-
-class IntersectionSettings(pydantic.BaseModel):
-    """What one traffic light does differently from `ControlSettings`."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
-
-    phases: PhaseSource
-
-
-class ScenarioFile(pydantic.BaseModel):
-    """The content of a ``scenario.toml``."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
-
-    description: str = ""
-    network: str
-    routes: Annotated[tuple[str, ...], Field(min_length=1)]
-    additional: tuple[str, ...] = ()
-    begin_s: float = 0.0
-    duration_s: Annotated[float, Field(gt=0)] = 3600.0
-    step_length_s: Annotated[float, Field(gt=0, le=10)] = 1.0
-    control: ControlSettings = ControlSettings()
-    intersections: dict[str, IntersectionSettings] = {}
-    effects: tuple[dict[str, Any], ...] = ()
-    sumo: dict[str, str] = {}
-
-
 @dataclass(frozen=True)
 class Scenario:
     """A road network with demand and rules, ready to be simulated.
@@ -133,7 +91,7 @@ class Scenario:
     @property
     def decisions(self) -> int:
         """Number of decisions in an episode of the scenario's full duration."""
-        return int(self.settings.duration_s // self.control.decision_interval_s)
+        return int(self.settings.duration_s / self.control.decision_interval_s + 1e-9)
 
     @property
     def documents(self) -> tuple[Document, ...]:
@@ -158,12 +116,12 @@ class Scenario:
         """The same scenario with other signal timing (keywords of `ControlSettings`)."""
         control = {**self.control.model_dump(), **changes}
         settings = {**self.settings.model_dump(), "control": control}
-        return replace(self, settings=_validated(settings, f"scenario {self.id!r}"))
+        return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
 
     def with_duration(self, duration_s: float) -> Scenario:
         """The same scenario, ending earlier or later."""
         settings = {**self.settings.model_dump(), "duration_s": duration_s}
-        return replace(self, settings=_validated(settings, f"scenario {self.id!r}"))
+        return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
 
     def write(self, directory: Path) -> Path:
         """Writes a scenario directory that any SUMO and `load_scenario` can use.
@@ -171,9 +129,12 @@ class Scenario:
         Returns:
             `directory`.
         """
-        names = {document.name for document in self.documents}
-        if len(names) != len(self.documents):
-            raise ScenarioError(f"scenario {self.id!r}: two of its files have the same name")
+        names = [document.name for document in self.documents]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ScenarioError(
+                f"scenario {self.id!r}: two of its files are called {twice[0]!r}, which one "
+                "directory cannot hold; rename one of them"
+            )
         for document in self.documents:
             write_whole(directory / document.name, _as_found(document))
         settings = self.settings.model_dump(mode="json", exclude_defaults=True)
@@ -182,8 +143,7 @@ class Scenario:
             "routes": [document.name for document in self.routes],
             "additional": [document.name for document in self.additional],
         }
-        with replacing(directory / "scenario.toml") as temporary:
-            temporary.write_text(_toml(settings, self.applied))
+        write_whole(directory / "scenario.toml", _toml(settings, self.applied))
         return directory
 
 
@@ -236,7 +196,7 @@ def _load_directory(directory: Path) -> Scenario:
         raise ScenarioError(f"{file}: not valid TOML: {error}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{file}: cannot be read: {error}") from None
-    settings = _validated(raw, str(file))
+    settings = validated(raw, str(file))
 
     def document(name: str, key: str) -> Document:
         path = directory / name
@@ -253,43 +213,48 @@ def _load_directory(directory: Path) -> Scenario:
     )
 
 
+_SYNONYMS = {
+    "net-file": ("net-file", "net", "n"),
+    "route-files": ("route-files", "routes", "r"),
+    "additional-files": ("additional-files", "additional", "a"),
+    "begin": ("begin", "b"),
+    "end": ("end", "e"),
+    "step-length": ("step-length",),
+}
+"""What SUMO lets the elements of a configuration be called."""
+
+
 def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
     root = parse_xml(read_bytes(path), str(path))
-    values = {
-        element.tag: element.get("value", "")
-        for element in root.iter()
-        if "value" in element.attrib
-    }
-    values = {tag.removesuffix("s") if tag == "net-files" else tag: v for tag, v in values.items()}
-    if "net-file" not in values:
-        raise ScenarioError(f"{path}: no <net-file>; a scenario needs a network")
-    if not values.get("route-files"):
-        raise ScenarioError(f"{path}: no <route-files>; a scenario needs vehicles")
+    given = {item.tag: item.get("value", item.get("v", "")) for item in root.iter()}
 
-    def documents(key: str) -> tuple[Document, ...]:
-        found: list[Document] = []
-        for name in values.get(key, "").replace(",", " ").split():
-            file = path.parent / name
-            if not file.is_file():
-                raise ScenarioError(f"{path}: <{key}> names {name!r}, but {file} does not exist")
-            found.append(Document(file.name, file))
-        return tuple(found)
+    def value(key: str, default: str = "") -> str:
+        return next((given[name] for name in _SYNONYMS[key] if name in given), default)
 
-    begin = _seconds(values.get("begin", "0"), path, "begin")
-    end = _seconds(values.get("end", "-1"), path, "end")
-    if end >= 0 and end <= begin:
+    def documents(key: str, what: str = "") -> tuple[Document, ...]:
+        names = _names(value(key), path.parent)
+        if what and not names:
+            raise ScenarioError(f"{path}: no <{key} value=...>; a scenario needs {what}")
+        for name in names:
+            if not (path.parent / name).is_file():
+                raise ScenarioError(
+                    f"{path}: <{key}> names {name!r}, but {path.parent / name} does not exist"
+                )
+        return tuple(Document(Path(name).name, path.parent / name) for name in names)
+
+    def seconds(key: str, default: str) -> float:
+        text = value(key, default)
+        try:
+            return seconds_of(text)
+        except ValueError:
+            raise ScenarioError(f"{path}: {key} = {text!r} is not a time in seconds") from None
+
+    begin, end = seconds("begin", "0"), seconds("end", "-1")
+    if 0 <= end <= begin:
         raise ScenarioError(f"{path}: end ({end:g} s) is not after begin ({begin:g} s)")
-    processing = root.find("processing")
-    routing = root.find("routing")
-    sumo = {
-        child.tag: child.get("value", "")
-        for section in (processing, routing)
-        for child in (section if section is not None else ())
-        if _harmless(child.tag) and child.tag != "time-to-teleport"
-    }
-    network = documents("net-file")[0]
-    routes, additional = documents("route-files"), documents("additional-files")
-    settings = _validated(
+    network = documents("net-file", "a network")[0]
+    routes, additional = documents("route-files", "vehicles"), documents("additional-files")
+    settings = validated(
         {
             "description": f"SUMO configuration {path.name}",
             "network": network.name,
@@ -297,12 +262,27 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
             "additional": [document.name for document in additional],
             "begin_s": begin,
             "duration_s": end - begin if end >= 0 else 3600.0,
-            "step_length_s": _seconds(values.get("step-length", "1"), path, "step-length"),
-            "sumo": sumo,
+            "step_length_s": seconds("step-length", "1"),
+            "sumo": {
+                item.tag: item.get("value", item.get("v", ""))
+                for section in (*root.iter("processing"), *root.iter("routing"))
+                for item in section
+                if may_be_given(item.tag)
+            },
         },
         str(path),
     )
     return Scenario(scenario_id, network, routes, tuple(map(_quiet, additional)), settings)
+
+
+def _names(text: str, directory: Path) -> list[str]:
+    """File names separated by commas, or as of old by blanks."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    return [
+        part
+        for name in names
+        for part in ([name] if (directory / name).is_file() else name.split())
+    ]
 
 
 def _resco_configuration(name: str) -> Path:
@@ -322,57 +302,6 @@ def _resco_configuration(name: str) -> Path:
     return maps[name]
 
 
-def _validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
-    try:
-        settings = ScenarioFile.model_validate(raw)
-    except pydantic.ValidationError as error:
-        raise ScenarioError("; ".join(_explain(source, item) for item in error.errors())) from None
-    for option in settings.sumo:
-        if not _harmless(option):
-            raise ScenarioError(f"{source}: sumo.{option} is set by the suite and cannot be given")
-    control = settings.control
-    step = settings.step_length_s
-    for key in ("decision_interval_s", "yellow_s", "all_red_s", "min_green_s"):
-        value = getattr(control, key)
-        if abs(value / step - round(value / step)) > 1e-6:
-            raise ScenarioError(
-                f"{source}: control.{key} = {value:g} is not a multiple of step_length_s = "
-                f"{step:g}; SUMO would cut the phase"
-            )
-    if settings.duration_s < control.decision_interval_s:
-        raise ScenarioError(
-            f"{source}: duration_s = {settings.duration_s:g} is shorter than one decision interval "
-            f"({control.decision_interval_s:g} s)"
-        )
-    return settings
-
-
-def _explain(source: str, item: Any) -> str:
-    key = ".".join(str(part) for part in item["loc"])
-    if item["type"] == "extra_forbidden":
-        known = {
-            *ScenarioFile.model_fields, *ControlSettings.model_fields,
-        }  # fmt: skip
-        guess = nearest(str(item["loc"][-1]), known)
-        return f"{source}: unknown key {key!r}" + (f"; did you mean {guess!r}?" if guess else "")
-    if item["type"] == "missing":
-        return f"{source}: key {key!r} is missing"
-    return f"{source}: {key} = {item['input']!r}: {item['msg'].lower()}"
-
-
-def _harmless(option: str) -> bool:
-    return not set(option.split("-")) & set(_FORBIDDEN_SUMO_OPTIONS) and option not in (
-        "step-length",
-    )
-
-
-def _seconds(text: str, path: Path, key: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ScenarioError(f"{path}: {key} = {text!r} is not a number of seconds") from None
-
-
 def _as_found(document: Document) -> bytes:
     if document.content is None and document.path is not None:
         return document.path.read_bytes()
@@ -385,11 +314,14 @@ def _quiet(document: Document) -> Document:
     writers = [element for element in root.iter() if "file" in element.attrib]
     if not writers:
         return document
-    from ugat_marl.files import xml_bytes
-
     for element in writers:
         element.set("file", "NUL")
     return document.edited(xml_bytes(root))
+
+
+def _quoted(value: Any) -> str:
+    """A value as TOML, which agrees with JSON but for surrogates and the character DEL."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _toml(settings: Mapping[str, Any], applied: tuple[str, ...]) -> str:
@@ -403,17 +335,17 @@ def _toml(settings: Mapping[str, Any], applied: tuple[str, ...]) -> str:
                 tables += [
                     "",
                     "[[effects]]",
-                    *(f"{k} = {json.dumps(v)}" for k, v in effect.items()),
+                    *(f"{k} = {_quoted(v)}" for k, v in effect.items()),
                 ]
         else:
-            lines.append(f"{key} = {json.dumps(value)}")
+            lines.append(f"{key} = {_quoted(value)}")
     return "\n".join(lines + tables) + "\n"
 
 
 def _toml_table(name: str, table: Mapping[str, Any]) -> list[str]:
     plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
-    lines = ["", f"[{name}]", *(f"{json.dumps(k)} = {json.dumps(v)}" for k, v in plain.items())]
+    lines = ["", f"[{name}]", *(f"{_quoted(k)} = {_quoted(v)}" for k, v in plain.items())]
     for key, value in table.items():
         if isinstance(value, dict):
-            lines += _toml_table(f"{name}.{json.dumps(key)}", value)
+            lines += _toml_table(f"{name}.{_quoted(key)}", value)
     return lines

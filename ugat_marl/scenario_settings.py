@@ -1,0 +1,156 @@
+"""What stands in a ``scenario.toml``, checked value by value."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import Field
+
+from ugat_marl.errors import ScenarioError, nearest
+
+PhaseSource = Literal["programme", "conflict-free"] | tuple[str, ...]
+"""Where an intersection's green phases come from: the network's own signal programme, all maximal
+conflict-free sets of movements, or an explicit list of SUMO states."""
+
+_SET_BY_THE_SUITE = frozenset(
+    {
+        "begin", "end", "step-length", "seed", "random", "no-warnings", "suppress-warnings",
+        "time-to-teleport",
+    }
+)  # fmt: skip
+_INPUT_AND_OUTPUT = frozenset({"output", "file", "files", "port", "script", "log", "gui"})
+
+_STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ControlSettings(pydantic.BaseModel):
+    """Signal timing. Greens, yellows and all-reds are in seconds."""
+
+    model_config = _STRICT
+
+    decision_interval_s: Annotated[float, Field(gt=0, le=600)] = 10.0
+    yellow_s: Annotated[float, Field(ge=0, le=60)] = 3.0
+    all_red_s: Annotated[float, Field(ge=0, le=60)] = 2.0
+    min_green_s: Annotated[float, Field(ge=0, le=600)] = 5.0
+    phases: PhaseSource = "programme"
+
+
+class IntersectionSettings(pydantic.BaseModel):
+    """What one traffic light does differently from `ControlSettings`."""
+
+    model_config = _STRICT
+
+    phases: PhaseSource
+
+
+class ScenarioFile(pydantic.BaseModel):
+    """The content of a ``scenario.toml``."""
+
+    model_config = _STRICT
+
+    description: str = ""
+    network: str
+    routes: Annotated[tuple[str, ...], Field(min_length=1)]
+    additional: tuple[str, ...] = ()
+    begin_s: Annotated[float, Field(ge=0)] = 0.0
+    duration_s: Annotated[float, Field(gt=0)] = 3600.0
+    step_length_s: Annotated[float, Field(ge=0.001, le=10)] = 1.0
+    control: ControlSettings = ControlSettings()
+    intersections: dict[str, IntersectionSettings] = {}
+    effects: tuple[dict[str, Any], ...] = ()
+    sumo: dict[str, str] = {}
+
+
+def validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
+    """Checks the content of a scenario file.
+
+    Args:
+        raw: Keys and values.
+        source: What to call it in errors.
+
+    Raises:
+        ScenarioError: An unknown or missing key, an impossible value, or values that contradict
+            each other.
+    """
+    try:
+        settings = ScenarioFile.model_validate(raw)
+    except pydantic.ValidationError as error:
+        explained = dict.fromkeys(_explain(item) for item in error.errors())
+        raise ScenarioError(f"{source}: {'; '.join(explained)}") from None
+    for option in settings.sumo:
+        if not may_be_given(option):
+            raise ScenarioError(
+                f"{source}: sumo.{option} is set by the suite and cannot be given; leave it out"
+            )
+    control = settings.control
+    step = settings.step_length_s
+    for key, value in (
+        ("begin_s", settings.begin_s),
+        ("control.decision_interval_s", control.decision_interval_s),
+        ("control.yellow_s", control.yellow_s),
+        ("control.all_red_s", control.all_red_s),
+        ("control.min_green_s", control.min_green_s),
+    ):
+        if abs(value / step - round(value / step)) > 1e-6:
+            raise ScenarioError(
+                f"{source}: {key} = {value:g} is not a multiple of step_length_s = {step:g}; "
+                "SUMO would cut it short"
+            )
+    if settings.duration_s < control.decision_interval_s:
+        raise ScenarioError(
+            f"{source}: duration_s = {settings.duration_s:g} is shorter than one decision interval "
+            f"({control.decision_interval_s:g} s)"
+        )
+    return settings
+
+
+def may_be_given(option: str) -> bool:
+    """Whether a scenario may set this option of SUMO: not what the suite sets, reads or writes."""
+    words = set(re.split("[-.]", option))
+    return option not in _SET_BY_THE_SUITE and not words & _INPUT_AND_OUTPUT
+
+
+def seconds_of(text: str) -> float:
+    """Seconds of a time as SUMO writes it: ``seconds``, ``h:m:s`` or ``days:h:m:s``.
+
+    Raises:
+        ValueError: Not a time.
+    """
+    parts = [float(part) for part in text.split(":")]
+    if len(parts) not in (1, 3, 4):
+        raise ValueError(text)
+    seconds = 0.0
+    for part, unit in zip(reversed(parts), (1, 60, 3600, 86400), strict=False):
+        seconds += part * unit
+    return seconds
+
+
+def _explain(item: Any) -> str:
+    """One complaint of pydantic in words of the file."""
+    names = [str(part) for part in item["loc"]]
+    if "phases" in names:  # the alternatives of a union stand behind the key
+        key = ".".join(names[: names.index("phases") + 1])
+        if item["type"] == "missing":
+            return f"key {key!r} is missing"
+        return f"{key}: give 'programme', 'conflict-free', or a list of SUMO states in quotes"
+    key = ".".join(names)
+    if item["type"] == "extra_forbidden":
+        known = _known_keys(names[:-1])
+        guess = nearest(names[-1], known)
+        hint = f"did you mean {guess!r}?" if guess else f"known: {', '.join(known)}"
+        return f"unknown key {key!r}; {hint}"
+    if item["type"] == "missing":
+        return f"key {key!r} is missing"
+    return f"{key} = {item['input']!r}: {item['msg'][:1].lower()}{item['msg'][1:]}"
+
+
+def _known_keys(table: list[str]) -> list[str]:
+    """The keys of the table an unknown one stands in, and where it might belong instead."""
+    if not table:
+        return [*ScenarioFile.model_fields]
+    if table[0] == "intersections":
+        return [*IntersectionSettings.model_fields]
+    return [*ControlSettings.model_fields]
