@@ -1,7 +1,7 @@
 """Builds network and demand of the shipped scenarios from their `source.toml`: `make scenarios`.
 
     python scenarios/build.py [name ...] [--into FOLDER]     networks and demand
-    python scenarios/build.py [name ...] --headroom          the tables in the READMEs
+    python scenarios/build.py [name ...] --headroom          measures the tables in the READMEs
 
 The same sources give the same bytes, whatever the day and the machine; a test rebuilds them.
 """
@@ -40,7 +40,7 @@ def build(name: str, into: Path) -> list[Path]:
     return [into / name / file for file in files]
 
 
-def measure(name: str, workers: int | None) -> Path:
+def measure(name: str, seeds: list[int], workers: int | None) -> Path:
     """Writes the headroom of scenario `name` between the markers of its README."""
     # Building needs no simulation; only this does.
     from ugat_marl.headroom import headroom, markdown
@@ -51,8 +51,9 @@ def measure(name: str, workers: int | None) -> Path:
     if BEGIN not in text or END not in text:
         raise ScenarioError(f"{readme}: has no lines {BEGIN.strip()!r} and {END.strip()!r}")
     before, _, rest = text.partition(BEGIN)
-    table = markdown(headroom(load_scenario(HERE / name), workers=workers))
-    write_whole(readme, f"{before}{BEGIN}{table}{END}{rest.partition(END)[2]}")
+    table = markdown(headroom(load_scenario(HERE / name), seeds=seeds, workers=workers))
+    caption = f"Means over the seeds {', '.join(map(str, seeds))}:\n\n"
+    write_whole(readme, f"{before}{BEGIN}{caption}{table}{END}{rest.partition(END)[2]}")
     return readme
 
 
@@ -67,13 +68,14 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="name", help=f"of {', '.join(known)}; all")
     parser.add_argument("--into", type=Path, default=HERE, help="folder to write to")
     parser.add_argument("--headroom", action="store_true", help="measure headroom instead")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="of episodes")
     parser.add_argument("--workers", type=int, help="simulations at a time (number of cores)")
     options = parser.parse_args()
     for name in options.names or known:
         if name not in known:
             parser.error(f"no scenario {name!r} with a source.toml; there are {', '.join(known)}")
         if options.headroom:
-            print(measure(name, options.workers))
+            print(measure(name, options.seeds, options.workers))
             continue
         for path in build(name, options.into):
             print(path)

@@ -76,7 +76,8 @@ def headroom_rows(name: str) -> list[list[str]]:
     table = text.partition("<!-- headroom: begin -->\n")[2].partition("<!-- headroom: end -->")[0]
     return [
         [cell.strip(" *") for cell in line.strip("|").split("|")]
-        for line in table.strip().splitlines()
+        for line in table.splitlines()
+        if line.startswith("|")
     ]
 
 
