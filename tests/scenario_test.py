@@ -75,7 +75,7 @@ def test_a_scenario_is_a_value(crossing: Crossing) -> None:
         scenario.settings.begin_s = 1.0  # type: ignore[misc]
 
 
-# --- the hash --------------------------------------------------------------------------------------
+# --- the hash ------------------------------------------------------------------------------------
 
 
 def test_the_hash_knows_every_byte_and_setting(crossing: Crossing) -> None:
@@ -123,7 +123,7 @@ def test_files_do_not_flow_into_each_other(crossing: Crossing) -> None:
     assert load_scenario(first).hash != load_scenario(second).hash
 
 
-# --- derived scenarios -----------------------------------------------------------------------------
+# --- derived scenarios ---------------------------------------------------------------------------
 
 
 def test_with_control_and_duration_leave_the_original(crossing: Crossing) -> None:
@@ -164,7 +164,8 @@ def test_written_and_read_again_it_is_the_same(crossing: Crossing, tmp_path: Pat
             (
                 text.replace('description = "', 'description = "grün \\u0007 \\" \\U0001F6A6 ')
                 + 'min_green_s = 0.5\n[intersections.C]\nphases = ["Gr", "rG"]\n'
-                '[sumo]\n"lateral-resolution" = "0.8"\n[[effects]]\nname = "acceleration"\nmps2 = 1.5\n'
+                '[sumo]\n"lateral-resolution" = "0.8"\n'
+                '[[effects]]\nname = "acceleration"\nmps2 = 1.5\n'
             )
             .replace("min_green_s = 0\n", "", 1)
             .replace("duration_s = 200", "duration_s = 200\nstep_length_s = 0.5")
@@ -224,7 +225,7 @@ def test_two_files_of_one_name_are_not_written_over_each_other(
     assert not (tmp_path / "copy").exists()
 
 
-# --- a .sumocfg ------------------------------------------------------------------------------------
+# --- a .sumocfg ----------------------------------------------------------------------------------
 
 
 def configure(directory: Path, content: str) -> Path:
@@ -305,7 +306,7 @@ def test_detectors_do_not_write_beside_the_user_s_files(crossing: Crossing) -> N
     assert (directory / "d.add.xml").read_text() == content
 
 
-# --- RESCO -----------------------------------------------------------------------------------------
+# --- RESCO ---------------------------------------------------------------------------------------
 
 
 def fake_wheel(directory: Path, crossing: Path) -> Path:
@@ -337,7 +338,7 @@ def test_without_the_wheel_the_error_says_how_to_install(monkeypatch: pytest.Mon
         load_scenario("resco:cologne3")
 
 
-# --- values ----------------------------------------------------------------------------------------
+# --- values --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
