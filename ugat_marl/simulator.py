@@ -296,3 +296,8 @@ def read_trips(path: Path) -> Trips:
         item.clear()
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     return Trips(table[:, 0], table[:, 1], table[:, 2] > 0, table[:, 3] > 0)
+
+
+def simulates_here() -> bool:
+    """Whether this very process runs a simulation."""
+    return bool(libsumo.simulation.isLoaded())

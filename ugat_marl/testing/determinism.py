@@ -1,0 +1,150 @@
+"""Checks that a seed decides an episode to the bit, whatever else runs or ran."""
+
+from __future__ import annotations
+
+from ugat_marl.testing.behaviour import an_episode_runs
+from ugat_marl.testing.episodes import (
+    EnvironmentCase,
+    Episode,
+    MakeEnv,
+    Moment,
+    begin,
+    different,
+    proceed,
+    random_actions,
+    replaying,
+    require_same,
+)
+from ugat_marl.testing.results import ConformanceError, Result, require, run_checks
+
+_SEED_ALL = "draw every random number, SUMO's too, from the seed given to reset()"
+
+
+def a_seed_repeats_its_episode(case: EnvironmentCase) -> None:
+    """The same seed twice in one environment gives the same episode."""
+    case.need_episode()
+    env = case.make()
+    first, second = case.play(env, case.seed), case.play(env, case.seed)
+    require_same(
+        first,
+        second,
+        "the same seed twice in one environment gave different episodes",
+        "clear in reset() what the last episode left, and start SUMO in a fresh process",
+    )
+
+
+def other_episodes_leave_no_trace(case: EnvironmentCase) -> None:
+    """An episode does not depend on which others ran before, to their end or not."""
+    case.need_episode()
+    env = case.make()
+    case.play(env, case.seed + 1)
+    begin(env, case.seed + 2)
+    second = case.play(env, case.seed)
+    require_same(
+        case.episode,
+        second,
+        "an episode differs after others ran in the same environment",
+        "clear in reset() what they left, and start SUMO in a fresh process",
+    )
+
+
+def replayed_actions_repeat_the_episode(case: EnvironmentCase) -> None:
+    """Recorded actions, played back from dicts of another order, give the same again."""
+    env = case.make()
+    again = case.play(env, case.seed, replaying(case.episode, reverse=True))
+    cure = "let nothing depend on the order of the actions, and " + _SEED_ALL
+    require_same(case.episode, again, "replayed actions gave another episode", cure)
+    where = different(case.episode.scores, again.scores)
+    require(not where, f"replayed actions gave other scores: {where}; {cure}")
+
+
+def live_environments_are_independent(case: EnvironmentCase) -> None:
+    """Two environments stepped in turn give what each gives alone."""
+    case.need_episode()
+    solo = case.make()
+    alone = [case.episode, case.play(solo, case.seed + 1)]
+    together = _in_lock_step(case, (case.seed, case.seed + 1))
+    for a, b in zip(alone, together, strict=True):
+        require_same(
+            a,
+            b,
+            "an episode differs when another environment runs in turn with it",
+            "share no state between environments; libsumo holds one simulation per process",
+        )
+
+
+def _in_lock_step(case: EnvironmentCase, seeds: tuple[int, ...]) -> list[Episode]:
+    envs = [case.make() for _ in seeds]
+    chosen = [random_actions(case.seed) for _ in seeds]
+    moments: list[list[Moment]] = [
+        [begin(env, seed)] for env, seed in zip(envs, seeds, strict=True)
+    ]
+    while any(env.agents for env in envs):
+        for env, choose, own in zip(envs, chosen, moments, strict=True):
+            if env.agents:
+                own.append(proceed(env, choose(len(own) - 1, env, own[-1].infos)))
+            if len(own) > case.max_steps:
+                raise ConformanceError(f"no end after {case.max_steps} steps")
+    return [Episode(tuple(own)) for own in moments]
+
+
+def other_seeds_give_other_episodes(case: EnvironmentCase) -> None:
+    """Different seeds give different episodes."""
+    env = case.make()
+    actions = replaying(case.episode)
+    for seed in (case.seed + 1, case.seed + 2):
+        other = case.play(env, seed, actions)
+        if any(
+            different(a.parts, b.parts)
+            for a, b in zip(case.episode.moments, other.moments, strict=False)
+        ):
+            return
+    raise ConformanceError(
+        f"seeds {case.seed} to {case.seed + 2} gave the same episode; pass the seed on to SUMO, "
+        "and make sure vehicles enter within the episode"
+    )
+
+
+def resets_without_seed_follow_from_the_last(case: EnvironmentCase) -> None:
+    """After `reset(seed)`, further episodes without a seed are decided by it too, and differ."""
+    case.need_episode()
+    runs: list[list[Episode]] = []
+    for _ in range(2):
+        env = case.make()
+        begin(env, case.seed)
+        runs.append([case.play(env, None) for _ in range(2)])
+    for a, b in zip(*runs, strict=True):
+        require_same(
+            a,
+            b,
+            "after reset(seed), reset() without one gave different episodes in two runs",
+            "draw the seed of an episode from a generator that reset(seed) sets",
+        )
+
+
+DETERMINISM_CHECKS = (
+    an_episode_runs,
+    a_seed_repeats_its_episode,
+    other_episodes_leave_no_trace,
+    replayed_actions_repeat_the_episode,
+    live_environments_are_independent,
+    other_seeds_give_other_episodes,
+    resets_without_seed_follow_from_the_last,
+)
+"""All checks of determinism; each takes an `EnvironmentCase`."""
+
+
+def check_determinism(make_env: MakeEnv, seed: int = 1) -> list[Result]:
+    """Checks that episodes are reproducible to the bit.
+
+    Plays about a dozen whole episodes; give it short ones.
+
+    Args:
+        make_env: Makes a fresh environment.
+        seed: Seed of the first episode.
+    """
+    case = EnvironmentCase(make_env, seed)
+    try:
+        return run_checks(DETERMINISM_CHECKS, case)
+    finally:
+        case.close()

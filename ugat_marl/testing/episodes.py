@@ -1,0 +1,296 @@
+"""Whole episodes as values, to be looked at and compared to the bit."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, is_dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.policy import Actions, AnyParallelEnv
+from ugat_marl.seeding import numpy_generator
+from ugat_marl.testing.results import ConformanceError, Listening, NotChecked
+
+MakeEnv = Callable[[], AnyParallelEnv]
+"""Makes a fresh environment of the kind to be checked, not reset yet."""
+
+Choose = Callable[[int, AnyParallelEnv, Mapping[str, Any]], Actions]
+"""Maps step, environment and infos to actions."""
+
+PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What `reset` or one `step` gave.
+
+    Attributes:
+        parts: Name of each of `PARTS` that was given, to a copy of it as it was at the time.
+        given: The same objects themselves, which the environment may have changed since.
+        agents: `env.agents` afterwards.
+        actions: The actions that led here; None for `reset`.
+    """
+
+    parts: Mapping[str, Any]
+    given: Mapping[str, Any]
+    agents: tuple[str, ...]
+    actions: Actions | None
+
+    @property
+    def observations(self) -> Mapping[str, Any]:
+        """Agent to observation."""
+        return self.parts["observations"]
+
+    @property
+    def infos(self) -> Mapping[str, Any]:
+        """Agent to info."""
+        return self.parts["infos"]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """All moments of an episode, `reset` first, and the scores the environment gave at its end."""
+
+    moments: tuple[Moment, ...]
+    scores: Any = None
+
+    @property
+    def actions(self) -> list[Actions]:
+        """The actions of all steps."""
+        return [moment.actions for moment in self.moments if moment.actions is not None]
+
+
+class EnvironmentCase:
+    """An environment under examination; what several checks need is done once.
+
+    Args:
+        make_env: Makes the environment.
+        seed: Seed of the episodes.
+        max_steps: An episode longer than this is taken to have no end.
+    """
+
+    def __init__(self, make_env: MakeEnv, seed: int = 1, max_steps: int = 10_000) -> None:
+        self._make_env = make_env
+        self.seed = seed
+        self.max_steps = max_steps
+        self._made: list[AnyParallelEnv] = []
+        self._kept: list[AnyParallelEnv] = []
+        self._fresh: AnyParallelEnv | None = None
+        self._episode: Episode | None = None
+        self._failed = False
+
+    def make(self) -> AnyParallelEnv:
+        """A new environment, which `tidy` closes."""
+        env = self._make_env()
+        self._made.append(env)
+        return env
+
+    @property
+    def fresh(self) -> AnyParallelEnv:
+        """An environment that is never reset."""
+        if self._fresh is None:
+            self._fresh = self._keep()
+        return self._fresh
+
+    @property
+    def episode(self) -> Episode:
+        """A whole episode of `seed` under random actions, in an environment of its own."""
+        if self._failed:
+            raise NotChecked("not checked, because no whole episode could be run")
+        if self._episode is None:
+            self._failed = True
+            # Its episode over, it holds no simulation, but the process that forks new ones.
+            self._episode = self.play(self._keep(), self.seed)
+            self._failed = False
+        return self._episode
+
+    def need_episode(self) -> None:
+        """For checks that make no sense where no episode can be run.
+
+        Raises:
+            NotChecked: It cannot.
+        """
+        _ = self.episode
+
+    def play(
+        self,
+        env: AnyParallelEnv,
+        seed: int | None,
+        choose: Choose | None = None,
+        watch: Callable[[], None] | None = None,
+    ) -> Episode:
+        """Runs an episode to its end; see `play`."""
+        return play(env, seed, choose or random_actions(self.seed), self.max_steps, watch)
+
+    def tidy(self) -> None:
+        """Closes what `make` has made; what is wrong with `close` is for a check to say."""
+        while self._made:
+            with Listening():
+                self._made.pop().close()
+
+    def close(self) -> None:
+        """Closes all environments."""
+        self._made += self._kept
+        self._kept.clear()
+        self.tidy()
+
+    def _keep(self) -> AnyParallelEnv:
+        env = self._make_env()
+        self._kept.append(env)
+        return env
+
+
+def play(
+    env: AnyParallelEnv,
+    seed: int | None,
+    choose: Choose,
+    max_steps: int,
+    watch: Callable[[], None] | None = None,
+) -> Episode:
+    """Runs an episode to its end.
+
+    Args:
+        env: The environment.
+        seed: Given to `reset`, unless it is None.
+        choose: Chooses the actions.
+        max_steps: When to give up.
+        watch: Called after `reset` and after every step.
+
+    Raises:
+        ConformanceError: The episode does not end.
+    """
+    moments = [begin(env, seed)]
+    if not env.agents:
+        raise ConformanceError("env.agents is empty after reset(); set it to possible_agents there")
+    if watch:
+        watch()
+    while env.agents:
+        if len(moments) > max_steps:
+            raise ConformanceError(
+                f"the episode has not ended after {max_steps} steps; truncate all agents and "
+                "empty env.agents at its end"
+            )
+        moments.append(proceed(env, choose(len(moments) - 1, env, moments[-1].infos)))
+        if watch:
+            watch()
+        if _all_over(moments[-1]):
+            break
+    scores = getattr(env.unwrapped, "scores", None)
+    return Episode(tuple(moments), scores() if callable(scores) else None)
+
+
+def begin(env: AnyParallelEnv, seed: int | None) -> Moment:
+    """Resets."""
+    given = env.reset() if seed is None else env.reset(seed=seed)
+    return _moment(env, ("observations", "infos"), given, None)
+
+
+def proceed(env: AnyParallelEnv, actions: Actions) -> Moment:
+    """Steps."""
+    return _moment(env, PARTS, env.step(dict(actions)), dict(actions))
+
+
+def _moment(
+    env: AnyParallelEnv, names: tuple[str, ...], given: Any, actions: Actions | None
+) -> Moment:
+    what = "reset" if actions is None else "step"
+    if not isinstance(given, tuple) or len(given) != len(names):
+        raise ConformanceError(f"{what}() must return the tuple ({', '.join(names)})")
+    for name, part in zip(names, given, strict=True):
+        if not isinstance(part, dict):
+            raise ConformanceError(
+                f"{what}() returned {name} as {type(part).__name__}; return a dict by agent"
+            )
+    parts = dict(zip(names, given, strict=True))
+    return Moment(copy.deepcopy(parts), parts, tuple(env.agents), actions)
+
+
+def _all_over(moment: Moment) -> bool:
+    """Whether everybody is done, even if the environment left them in `agents`."""
+    ended, cut = moment.parts["terminations"], moment.parts["truncations"]
+    return all(ended.get(agent) or cut.get(agent) for agent in moment.agents)
+
+
+def random_actions(seed: int) -> Choose:
+    """Chooses among the actions each agent's mask allows; the stream begins anew at step 0."""
+    generator = numpy_generator(seed, "conformance", "actions")
+
+    def choose(step: int, env: AnyParallelEnv, infos: Mapping[str, Any]) -> Actions:
+        nonlocal generator
+        if step == 0:
+            generator = numpy_generator(seed, "conformance", "actions")
+        return {agent: _random_action(env, agent, infos, generator) for agent in env.agents}
+
+    return choose
+
+
+def _random_action(
+    env: AnyParallelEnv, agent: str, infos: Mapping[str, Any], generator: np.random.Generator
+) -> int:
+    space: Any = env.action_space(agent)
+    if not hasattr(space, "n"):
+        raise ConformanceError(
+            f"the action space of {agent} is {space}; an action is a green phase: "
+            "use gymnasium.spaces.Discrete"
+        )
+    allowed = allowed_actions(infos.get(agent), int(space.n))
+    return int(getattr(space, "start", 0)) + int(generator.choice(allowed))
+
+
+def allowed_actions(info: Any, count: int) -> NDArray[np.int64]:
+    """What an action mask allows; everything where there is none, or none that makes sense."""
+    mask = np.asarray(info.get("action_mask")) if isinstance(info, Mapping) else np.empty(0)
+    if mask.shape == (count,) and mask.dtype.kind in "biu" and mask.any():
+        return np.flatnonzero(mask)
+    return np.arange(count)
+
+
+def replaying(episode: Episode, *, reverse: bool = False) -> Choose:
+    """Chooses what was chosen in `episode`; with `reverse` in dicts of the opposite order."""
+
+    def choose(step: int, env: AnyParallelEnv, infos: Mapping[str, Any]) -> Actions:
+        if step >= len(episode.actions):
+            raise ConformanceError(
+                f"the episode went on after {step} steps, where it had ended when recorded"
+            )
+        items = list(episode.actions[step].items())
+        return dict(items[::-1] if reverse else items)
+
+    return choose
+
+
+def require_same(expected: Episode, found: Episode, what: str, cure: str) -> None:
+    """Raises a `ConformanceError` that names the first difference of two episodes.
+
+    Scores are not compared; see `different`.
+    """
+    for step, (a, b) in enumerate(zip(expected.moments, found.moments, strict=False)):
+        if where := different(a.parts, b.parts):
+            raise ConformanceError(f"{what}: after step {step}, {where}; {cure}")
+    if len(expected.moments) != len(found.moments):
+        lengths = f"{len(expected.moments) - 1} and {len(found.moments) - 1} steps"
+        raise ConformanceError(f"{what}: the episodes have {lengths}; {cure}")
+
+
+def different(a: Any, b: Any, path: str = "") -> str:
+    """Where two nested values first differ, in words; empty if they are equal to the bit."""
+    if is_dataclass(a) and is_dataclass(b):
+        a, b = asdict(a), asdict(b)  # pyright: ignore[reportArgumentType]
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        if set(a) != set(b):
+            return f"{path or 'the keys'} {sorted(map(str, a))} became {sorted(map(str, b))}"
+        found = (different(a[key], b[key], f"{path}[{key!r}]" if path else str(key)) for key in a)
+        return next((where for where in found if where), "")
+    first, second = np.asarray(a), np.asarray(b)
+    if first.shape != second.shape or first.dtype != second.dtype:
+        return f"{path} changed from {first.dtype}{first.shape} to {second.dtype}{second.shape}"
+    numeric = first.dtype.kind in "fc"
+    if np.array_equal(first, second, equal_nan=numeric):
+        return ""
+    if not first.ndim:
+        return f"{path} was {a!r} and became {b!r}"
+    index = tuple(int(i) for i in np.argwhere(first != second)[0])
+    return f"{path}[{', '.join(map(str, index))}] was {first[index]} and became {second[index]}"

@@ -1,0 +1,125 @@
+"""What a check says, and how a list of checks is run and shown."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, TypeVar
+
+from rich.text import Text
+
+from ugat_marl.errors import UgatMarlError
+
+
+class ConformanceError(UgatMarlError, AssertionError):
+    """A subject breaks a rule; the message says which, and how to mend it."""
+
+
+class NotChecked(ConformanceError):
+    """A check could not be made because another one failed."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """The outcome of one check.
+
+    Attributes:
+        name: Name of the check's function.
+        passed: Whether the subject passed; None if the check could not be made.
+        message: What is wrong and how to mend it; empty if passed.
+    """
+
+    name: str
+    passed: bool | None
+    message: str = ""
+
+
+class Closing(Protocol):
+    """A subject under examination that cleans up after each check."""
+
+    def tidy(self) -> None:
+        """Closes what the last check has made."""
+        ...
+
+
+AnyCase = TypeVar("AnyCase", bound=Closing)
+
+
+class Listening:
+    """Keeps what a foreign subject raises in its body, whatever it is; Ctrl-C goes on.
+
+    Attributes:
+        error: The exception, or None.
+    """
+
+    error: BaseException | None = None
+
+    def __enter__(self) -> Listening:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> bool:
+        self.error = error
+        return isinstance(error, Exception)
+
+
+def run_checks(checks: Sequence[Callable[[AnyCase], None]], case: AnyCase) -> list[Result]:
+    """Runs every check on one case, whatever the others said."""
+    results: list[Result] = []
+    for check in checks:
+        with Listening() as heard:
+            check(case)
+        case.tidy()
+        if heard.error is None:
+            results.append(Result(check.__name__, True))
+        elif isinstance(heard.error, NotChecked):
+            results.append(Result(check.__name__, None, str(heard.error)))
+        else:
+            results.append(Result(check.__name__, False, said(heard.error)))
+    return results
+
+
+def said(error: BaseException) -> str:
+    """An exception in one line: our own by their message, others with kind and place."""
+    if isinstance(error, UgatMarlError):
+        return str(error)
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {error}{where}"
+
+
+def require(condition: object, message: str) -> None:
+    """Raises a `ConformanceError` unless `condition` holds."""
+    if not condition:
+        raise ConformanceError(message)
+
+
+def failures(results: Sequence[Result]) -> list[Result]:
+    """The checks that did not pass, those that could not be made included."""
+    return [result for result in results if not result.passed]
+
+
+def report(results: Sequence[Result]) -> Text:
+    """One line per check and a count, for `rich` to print (`.plain` is the bare text)."""
+    words = {
+        True: ("ok     ", "green"),
+        False: ("FAILED ", "bold red"),
+        None: ("skipped", "yellow"),
+    }
+    text = Text()
+    for result in results:
+        word, style = words[result.passed]
+        text.append(word, style)
+        text.append(f" {result.name.replace('_', ' ')}\n")
+        if result.message:
+            text.append(f"          {result.message}\n", "default" if result.passed else style)
+    good = sum(result.passed is True for result in results)
+    text.append(f"{good} of {len(results)} checks passed")
+    return text

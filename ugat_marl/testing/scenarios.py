@@ -1,0 +1,246 @@
+"""Checks of a scenario: network, phases, demand, effects, files."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from ugat_marl.demand import check_demand
+from ugat_marl.effects import SETTINGS, in_domain, load
+from ugat_marl.env import EnvOptions, TrafficEnv
+from ugat_marl.network import Intersection, Network
+from ugat_marl.scenario import Scenario, load_scenario
+from ugat_marl.signals import GREEN
+from ugat_marl.testing.episodes import begin, proceed, random_actions
+from ugat_marl.testing.results import NotChecked, Result, require, run_checks
+
+Change = Callable[[Scenario, str], Scenario]
+"""Puts a scenario into a domain."""
+
+
+class ScenarioCase:
+    """A scenario under examination.
+
+    Args:
+        name: As for `ugat_marl.load_scenario`.
+        seed: Seed of the short simulations.
+        change: How a scenario is put into a domain.
+    """
+
+    def __init__(
+        self, name: str | Path | Scenario, seed: int = 1, change: Change = in_domain
+    ) -> None:
+        self.name = name
+        self.seed = seed
+        self.change = change
+        self._failed: set[str] = set()
+        self._envs: list[TrafficEnv] = []
+
+    @cached_property
+    def _scenario(self) -> Scenario:
+        return load(self.name)
+
+    @cached_property
+    def _network(self) -> Network:
+        return Network.read(self.scenario)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario, with the effects of its own file."""
+        return self._once("_scenario", "it cannot be loaded")
+
+    @property
+    def network(self) -> Network:
+        """Its network."""
+        return self._once("_network", "its network cannot be used")
+
+    def _once(self, attribute: str, why: str) -> Any:
+        if attribute in self._failed:
+            raise NotChecked(f"not checked, because {why}")
+        self._failed.add(attribute)
+        found = getattr(self, attribute)
+        self._failed.discard(attribute)
+        return found
+
+    def environment(self, scenario: Scenario) -> TrafficEnv:
+        """An environment of the scenario as it is."""
+        env = TrafficEnv(scenario, (), EnvOptions())
+        self._envs.append(env)
+        return env
+
+    def tidy(self) -> None:
+        """Closes the environments of the last check."""
+        while self._envs:
+            self._envs.pop().close()
+
+
+def it_loads(case: ScenarioCase) -> None:
+    """Its files are there and its settings valid."""
+    require(case.scenario.decisions > 0, f"scenario {case.scenario.id!r} has no decision in it")
+
+
+def its_network_can_be_controlled(case: ScenarioCase) -> None:
+    """The network has traffic lights, and their phases can be shown and do not conflict."""
+    require(case.network.intersections, "the network has no traffic light")
+
+
+def every_lane_gets_green(case: ScenarioCase) -> None:
+    """Every lane and every link is green in some phase, or vehicles would wait for ever."""
+    for item in case.network.intersections:
+        served = _served(item)
+        links = [link for link in item.links if link.index not in served]
+        lanes = {link.from_lane for link in item.links if link.index in served}
+        never = [lane for lane in item.incoming_lanes if lane not in lanes]
+        require(
+            not never,
+            f"traffic light {item.id!r}: no phase gives green to the lanes {never}; add a phase "
+            'under [intersections] or use phases = "conflict-free"',
+        )
+        require(
+            not links,
+            f"traffic light {item.id!r}: the links {[link.index for link in links]} (from "
+            f"{sorted({link.from_lane for link in links})}) are green in no phase; vehicles that "
+            "turn there block their lane for ever",
+        )
+
+
+def _served(item: Intersection) -> set[int]:
+    may_go = GREEN | {"s"}
+    return {i for phase in item.phases for i, letter in enumerate(phase) if letter in may_go}
+
+
+def no_greens_conflict(case: ScenarioCase) -> None:
+    """No phase gives protected green to two through streams that cross."""
+    crossing = _crossing_streams(case.scenario)
+    for item in case.network.intersections:
+        for phase in item.phases:
+            green = [link for link in item.links if phase[link.index] == "G"]
+            for position, a in enumerate(green):
+                for b in green[position + 1 :]:
+                    require(
+                        a.direction != "s"
+                        or b.direction != "s"
+                        or (a.junction, a.request, b.request) not in crossing,
+                        f"traffic light {item.id!r}: phase {phase!r} gives green to the links "
+                        f"{a.index} and {b.index}, whose ways cross; write g for the one that "
+                        "must yield, or split the phase",
+                    )
+
+
+def _crossing_streams(scenario: Scenario) -> set[tuple[str, int, int]]:
+    """Junction and two rows of its right-of-way matrix that are foes, both ways round."""
+    found: set[tuple[str, int, int]] = set()
+    for junction in scenario.network.parse().iter("junction"):
+        for row in junction.iter("request"):
+            name, index = junction.get("id", ""), int(row.get("index", "0"))
+            for other, letter in enumerate(reversed(row.get("foes", ""))):
+                if letter == "1":
+                    found |= {(name, index, other), (name, other, index)}
+    return found
+
+
+def its_routes_exist(case: ScenarioCase) -> None:
+    """All routes use edges of the network, and somebody departs."""
+    demand = check_demand(case.scenario, case.network)
+    require(demand.vehicles or demand.flows, "nobody departs within the episode")
+
+
+def routes_are_connected(case: ScenarioCase) -> None:
+    """Each edge of a written route leads to the next one."""
+    leads = {
+        (item.get("from"), item.get("to"))
+        for item in case.scenario.network.parse().iter("connection")
+    }
+    for document in (*case.scenario.routes, *case.scenario.additional):
+        for who, edges in _routes(document.parse()):
+            for a, b in zip(edges, edges[1:], strict=False):
+                require(
+                    (a, b) in leads,
+                    f"{document.source}: {who} goes from edge {a!r} to {b!r}, but no connection "
+                    "leads there; route the demand again (duarouter)",
+                )
+
+
+def _routes(root: ET.Element) -> list[tuple[str, list[str]]]:
+    found: list[tuple[str, list[str]]] = []
+    for parent in root.iter():
+        for item in parent:
+            if item.tag == "route" and item.get("edges"):
+                name = item.get("id") or parent.get("id") or "?"
+                found.append((f"the route of {name!r}", item.get("edges", "").split()))
+    return found
+
+
+def vehicles_enter_early(case: ScenarioCase) -> None:
+    """Somebody enters within the first tenth of the episode."""
+    decisions = max(1, case.scenario.decisions // 10)
+    seconds = decisions * case.scenario.control.decision_interval_s
+    early = case.scenario.with_duration(seconds)
+    env = case.environment(early)
+    moment = begin(env, case.seed)
+    choose = random_actions(case.seed)
+    for step in range(decisions):
+        moment = proceed(env, choose(step, env, moment.infos))
+    scores = env.scores()
+    require(
+        scores.departed > 0,
+        f"no vehicle has entered in the first {seconds:g} s ({scores.backlog:g} are due); check "
+        "begin_s, departure times and departLane",
+    )
+
+
+def effects_change_it(case: ScenarioCase) -> None:
+    """V1 to V4 apply, change the hash, each in its own way, and run in SUMO."""
+    hashes = {case.scenario.hash: "sim"}
+    for name in SETTINGS:
+        changed = case.change(case.scenario, name)
+        other = hashes.setdefault(changed.hash, name)
+        require(
+            other == name,
+            f"{name} has the hash of {other}: the effects change nothing; they must reach every "
+            "vType in use and the default type",
+        )
+        env = case.environment(changed)
+        moment = begin(env, case.seed)
+        proceed(env, random_actions(case.seed)(0, env, moment.infos))
+
+
+def writing_keeps_it(case: ScenarioCase) -> None:
+    """Written to a directory and loaded again it has the same hash, in V4 too."""
+    for domain in ("sim", "V4"):
+        changed = case.change(case.scenario, domain)
+        with TemporaryDirectory(prefix="ugat_marl-check-") as folder:
+            again = load_scenario(changed.write(Path(folder) / "written-v1"))
+            require(
+                again.hash == changed.hash,
+                f"in {domain}, the scenario that was written and loaded has another hash: "
+                f"{again.hash[:12]} instead of {changed.hash[:12]}; write all files and settings",
+            )
+
+
+SCENARIO_CHECKS = (
+    it_loads,
+    its_network_can_be_controlled,
+    every_lane_gets_green,
+    no_greens_conflict,
+    its_routes_exist,
+    routes_are_connected,
+    vehicles_enter_early,
+    effects_change_it,
+    writing_keeps_it,
+)
+"""All checks of a scenario; each takes a `ScenarioCase`."""
+
+
+def check_scenario(name: str | Path | Scenario, seed: int = 1) -> list[Result]:
+    """Checks a scenario; simulates a tenth of an episode, and a decision in each of V1 to V4.
+
+    Args:
+        name: As for `ugat_marl.load_scenario`.
+        seed: Seed of the simulations.
+    """
+    return run_checks(SCENARIO_CHECKS, ScenarioCase(name, seed))

@@ -1,0 +1,201 @@
+"""A small environment without SUMO that keeps every rule of `ugat_marl.testing`.
+
+For fast tests of learners and wrappers, and the good subject that the kit's own tests break in one
+place each. Unequal intersections: queues grow by random arrivals, the green phase serves its lanes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from ugat_marl.errors import ActionError, EpisodeError
+from ugat_marl.metrics import Scores
+from ugat_marl.transitions import AgentLayout
+
+CAPACITY = 20
+"""Vehicles that fit on a lane."""
+
+
+class ToyTraffic(ParallelEnv[str, NDArray[np.float32], int]):
+    """Queues at three intersections, two of four lanes and one of three.
+
+    Phase k serves lanes k and k + 1. Reward: minus the queued vehicles of the intersection.
+
+    Args:
+        steps: Decisions in an episode.
+        served: Vehicles that leave a green lane per decision; another value is another domain.
+        arrivals: Mean arrivals per lane and decision.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "ugat_marl_toy_v1",
+        "render_modes": ["rgb_array"],
+        "is_parallelizable": True,
+    }
+    decision_interval_s = 10.0
+    domain = "sim"
+
+    def __init__(self, steps: int = 12, served: int = 3, arrivals: float = 1.0) -> None:
+        self.steps = steps
+        self.served = served
+        self.arrivals = arrivals
+        self.render_mode: str | None = "rgb_array"
+        self.agent_groups = {"cross": ["cross_0", "cross_1"], "tee": ["tee_0"]}
+        self.possible_agents = ["cross_0", "tee_0", "cross_1"]
+        self.agents: list[str] = []
+        self.intersection_of = {"cross_0": "A", "tee_0": "B", "cross_1": "C"}
+        self.layouts = {
+            agent: AgentLayout(3, 2) if agent == "tee_0" else AgentLayout(4, 3)
+            for agent in self.possible_agents
+        }
+        self.observation_spaces = {
+            agent: Box(0.0, 1.0, (layout.size,), np.float32)
+            for agent, layout in self.layouts.items()
+        }
+        self.action_spaces = {
+            agent: Discrete(layout.phases) for agent, layout in self.layouts.items()
+        }
+        size = sum(layout.size for layout in self.layouts.values())
+        self.state_space = Box(0.0, 1.0, (size,), np.float32)
+        self._generator = np.random.default_rng()
+        self._scores: Scores | None = None
+
+    def observation_space(self, agent: str) -> Box:
+        """The space of an agent's observations."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Discrete:
+        """The space of an agent's actions."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
+        """Empties the roads."""
+        if seed is not None:
+            self._generator = np.random.default_rng(seed)
+        self._traffic = np.random.default_rng(int(self._generator.integers(2**31)))
+        self.agents = self.possible_agents[:]
+        self._step = 0
+        self._left = self._arrived = 0
+        self._rewards: list[float] = []
+        self._scores = None
+        self._phase = dict.fromkeys(self.agents, 0)
+        self._queue = {a: np.zeros(self.layouts[a].features, np.int64) for a in self.agents}
+        return self._observe(), self._infos()
+
+    def step(
+        self, actions: Mapping[str, int]
+    ) -> tuple[
+        dict[str, NDArray[np.float32]],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Shows the chosen phases for one interval."""
+        if not self.agents:
+            raise EpisodeError("step() needs a running episode; call reset() first")
+        if set(actions) != set(self.agents):
+            raise ActionError(
+                f"actions for {sorted(actions)}; needed: one for each of {self.agents}"
+            )
+        for agent, action in actions.items():
+            if not self.action_spaces[agent].contains(action):
+                raise ActionError(f"action of {agent} is {action!r}; see its action space")
+        agents = self.agents
+        for agent in agents:
+            self._serve(agent, int(actions[agent]))
+        self._step += 1
+        rewards = {agent: -float(self._queue[agent].sum()) for agent in agents}
+        self._rewards.append(sum(rewards.values()) / len(rewards))
+        over = self._step >= self.steps
+        result = (
+            self._observe(),
+            rewards,
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, over),
+            self._infos(),
+        )
+        if over:
+            self._scores = self._measure()
+            self.agents = []
+        return result
+
+    def state(self) -> NDArray[np.float32]:
+        """All observations, one after the other."""
+        if not hasattr(self, "_queue"):
+            raise EpisodeError("state() has no meaning before the first reset()")
+        return np.concatenate(list(self._vectors().values()))
+
+    def scores(self) -> Scores:
+        """The measures of the episode that has ended; times are counted in decisions."""
+        if self._scores is None:
+            raise EpisodeError("scores() needs a whole episode")
+        return self._scores
+
+    def render(self) -> NDArray[np.uint8]:
+        """The queues as bars of pixels."""
+        lanes = np.concatenate(list(self._queue.values()))
+        bars = np.arange(CAPACITY)[:, None] >= lanes[None, :]
+        return np.repeat(np.where(bars, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
+
+    def close(self) -> None:
+        """Ends the episode."""
+        self.agents = []
+
+    def _serve(self, agent: str, phase: int) -> None:
+        queue = self._queue[agent]
+        come = self._traffic.poisson(self.arrivals, queue.size)
+        room = CAPACITY - queue
+        queue += np.minimum(come, room)
+        served = queue[phase : phase + 2]
+        gone = np.minimum(served, self.served)
+        served -= gone
+        self._phase[agent] = phase
+        self._left += int(gone.sum())
+        self._arrived += int(come.sum())
+
+    def _vectors(self) -> dict[str, NDArray[np.float32]]:
+        return {
+            agent: np.concatenate(
+                (self._queue[agent] / CAPACITY, np.eye(layout.phases)[self._phase[agent]])
+            ).astype(np.float32)
+            for agent, layout in self.layouts.items()
+        }
+
+    def _observe(self) -> dict[str, NDArray[np.float32]]:
+        return self._vectors()
+
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        return {
+            agent: {
+                "action_mask": np.ones(layout.phases, np.int8),
+                "executed_action": self._phase[agent],
+            }
+            for agent, layout in self.layouts.items()
+        }
+
+    def _measure(self) -> Scores:
+        reward = float(np.mean(self._rewards))
+        inside = float(sum(queue.sum() for queue in self._queue.values()))
+        due = float(self._arrived)
+        wait = -sum(self._rewards) * len(self.possible_agents) / max(due, 1.0)
+        return Scores(
+            att_s=wait * self.decision_interval_s,
+            att_finished_s=wait * self.decision_interval_s,
+            throughput=float(self._left),
+            reward=reward,
+            queue=-reward,
+            delay=0.0,
+            delay_s=wait * self.decision_interval_s,
+            due=due,
+            departed=float(self._left) + inside,
+            backlog=due - self._left - inside,
+        )
