@@ -18,13 +18,13 @@ from pettingzoo import ParallelEnv
 from ugat_marl import signals
 from ugat_marl.demand import check_demand
 from ugat_marl.effects import Domain, describe, in_domain, load
-from ugat_marl.errors import ActionError, EpisodeError, OptionError, UnknownNameError
+from ugat_marl.errors import ActionError, EpisodeError, UnknownNameError
 from ugat_marl.measurements import Snapshot
 from ugat_marl.metrics import EpisodeRecorder, Scores
 from ugat_marl.network import Network
 from ugat_marl.observations import Observer
 from ugat_marl.rendering import Picture
-from ugat_marl.rewards import RewardFunction, Rewarder
+from ugat_marl.rewards import Rewarder, RewardFunction
 from ugat_marl.scenario import Scenario
 from ugat_marl.simulator import LibsumoSimulator, Simulator, launch_of
 from ugat_marl.simulator_process import ProcessSimulator
@@ -155,6 +155,16 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
     def env_options(self) -> dict[str, Any]:
         """What a policy must know to be given the same observations elsewhere."""
         return {"observation": self.options.observation, "neighbours": self.options.neighbours}
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """What was measured after the last decision (or the reset)."""
+        return self._snapshot
+
+    @property
+    def phases(self) -> list[int]:
+        """Green phase each intersection shows or clears towards, in the order of the agents."""
+        return [state.phase for state in self._states]
 
     # --- episode ------------------------------------------------------------------------------
 
@@ -289,7 +299,7 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         self.layouts: dict[str, AgentLayout] = dict(
             zip(agents, self._observer.layouts, strict=True)
         )
-        spaces = {kind: space for kind, space in zip(kinds, self._observer.spaces, strict=True)}
+        spaces = dict(zip(kinds, self._observer.spaces, strict=True))
         self.observation_spaces = {a: spaces[k] for a, k in zip(agents, kinds, strict=True)}
         self.action_spaces = {a: Discrete(k[1]) for a, k in zip(agents, kinds, strict=True)}
         self._all_free = [np.ones(kind[1], dtype=np.int8) for kind in kinds]
@@ -354,9 +364,7 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         self._states = states
 
     def _observe(self) -> dict[str, NDArray[np.float32]]:
-        self._vectors = self._observer.observe(
-            self._snapshot, [state.phase for state in self._states]
-        )
+        self._vectors = self._observer.observe(self._snapshot, self.phases)
         return dict(zip(self.agents, self._vectors, strict=True))
 
     def _infos(self) -> dict[str, dict[str, Any]]:

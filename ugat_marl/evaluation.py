@@ -20,10 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.controllers import STANDARD_RULES, controller_for
-from ugat_marl.effects import Domain, describe
+from ugat_marl.controllers import STANDARD_RULES, controller_for, parse_spec
+from ugat_marl.effects import Domain, describe, in_domain
 from ugat_marl.env import TrafficEnv, parallel_env
+from ugat_marl.errors import CheckpointError
 from ugat_marl.files import write_whole
+from ugat_marl.learners.agents import AgentSet
+from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.metrics import MEASURES, Scores, bootstrap_interval
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Reporter, Silent
@@ -176,6 +179,8 @@ def evaluate(
         reporter: Shows progress.
         notes: Kept with the result.
     """
+    for domain in domains:
+        in_domain(scenario, domain)  # a wrong name is an error now, not in an hour
     workers = workers or os.cpu_count() or 1
     per_task = max(1, len(seeds) * len(policies) * len(domains) // (4 * workers))
     tasks = [
@@ -224,8 +229,6 @@ def best_rules(
 
 def rule_factory(spec: str) -> PolicyFactory:
     """A factory for a controller such as ``"largest-queue:30"``; the spelling is checked now."""
-    from ugat_marl.controllers import parse_spec
-
     parse_spec(spec)
     return _controller_factory(spec)
 
@@ -233,6 +236,30 @@ def rule_factory(spec: str) -> PolicyFactory:
 def fixed_policy(policy: Policy) -> PolicyFactory:
     """A factory that always gives the same, stateless, policy."""
     return lambda _env: policy
+
+
+def policy_factory(spec: str) -> PolicyFactory:
+    """A factory for what a user names: a rule, or the file of a trained policy.
+
+    Raises:
+        UnknownNameError: Neither a file nor a rule.
+        CheckpointError: The file is not a policy, or (when used) one of another scenario.
+    """
+    path = Path(spec)
+    if path.suffix != ".pt" and not path.is_file():
+        return rule_factory(spec)
+    policy = DQNPolicy.load(path)
+
+    def make(env: TrafficEnv) -> Policy:
+        fitting = parallel_env(env.scenario, **policy.env_options)
+        if AgentSet.of(fitting) != policy.agents:
+            raise CheckpointError(
+                f"{path} was trained for other intersections than those of scenario "
+                f"{env.scenario.id!r}: its agents are {policy.agents}, here {AgentSet.of(fitting)}"
+            )
+        return policy
+
+    return make
 
 
 def _controller_factory(spec: str) -> PolicyFactory:

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ugat_marl.observations import UNITS, Observer
 from ugat_marl.policy import Actions, AnyParallelEnv, Infos, Observations, Policy
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.transitions import Provenance, TransitionLog, TransitionRecorder
@@ -41,7 +43,7 @@ def roll_out(
     policy: Policy,
     seed: int,
     *,
-    record: bool = False,
+    record: Observer | None = None,
     on_step: StepCallback | None = None,
 ) -> Episode:
     """Plays one whole episode.
@@ -50,21 +52,25 @@ def roll_out(
         env: An environment made with the policy's `env_options`.
         policy: Who acts.
         seed: Fixes the simulation and the policy's own choices.
-        record: Whether to keep the transitions; needs an environment of the suite.
+        record: Keeps the transitions, with the observations this observer makes, which may be
+            others than the policy reads; needs an environment of the suite.
         on_step: Called after every decision.
     """
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
-    recorder = TransitionRecorder(provenance_of(env, seed)) if record else None
+    base: Any = env.unwrapped
+    recorder = TransitionRecorder(provenance_of(env, record, seed)) if record else None
+    seen = _recorded(base, record)
     steps, total = 0, 0.0
     while env.agents:
         agents = list(env.agents)
         actions = policy.act(observations, infos)
-        then, rewards, _, _, infos = env.step(actions)
+        observations, rewards, _, _, infos = env.step(actions)
         if recorder is not None:
             executed = {agent: int(infos[agent]["executed_action"]) for agent in agents}
-            recorder.record(0, steps, observations, actions, executed, rewards, then)
-        observations = then
+            then = _recorded(base, record)
+            recorder.record(0, steps, seen, actions, executed, rewards, then)
+            seen = then
         total += sum(rewards.values()) / len(agents)
         steps += 1
         if on_step is not None:
@@ -72,20 +78,35 @@ def roll_out(
     return Episode(steps, total / max(steps, 1), recorder.log() if recorder else None)
 
 
-def provenance_of(env: AnyParallelEnv, *seeds: int) -> Provenance:
-    """Where a log recorded in `env` (wrapped or not) comes from."""
+def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 0) -> Observer:
+    """An observer of the environment's network; by default one like the environment's own."""
     base: Any = env.unwrapped
-    observation = base.options.observation
+    if name is None:
+        name, neighbours = base.options.observation, base.options.neighbours
+    assert name is not None
+    return Observer(base.network, name, neighbours)
+
+
+def _recorded(base: Any, observer: Observer | None) -> dict[str, NDArray[np.float32]]:
+    if observer is None:
+        return {}
+    vectors = observer.observe(base.snapshot, base.phases)
+    return dict(zip(base.possible_agents, vectors, strict=True))
+
+
+def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Provenance:
+    """Where a log recorded in `env` (wrapped or not) through `observer` comes from."""
+    base: Any = env.unwrapped
     return Provenance(
         scenario=base.scenario.id,
         scenario_hash=base.scenario.hash,
         domain=base.domain,
         seeds=seeds,
         decision_interval_s=base.decision_interval_s,
-        observation=observation,
-        layouts=base.layouts,
+        observation=observer.name,
+        layouts=dict(zip(base.possible_agents, observer.layouts, strict=True)),
         versions={name: _version(name) for name in SIMULATING},
-        units={"observation": observation, "reward": str(base.options.reward)},
+        units={"observation": UNITS[observer.name], "reward": str(base.options.reward)},
     )
 
 

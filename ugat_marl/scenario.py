@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.util
 import json
 import tomllib
 import xml.etree.ElementTree as ET
@@ -285,18 +286,21 @@ def _names(text: str, directory: Path) -> list[str]:
     ]
 
 
-def _resco_configuration(name: str) -> Path:
-    """The ``.sumocfg`` of a RESCO map inside an installed sumo-rl, which is never imported."""
-    from importlib.util import find_spec
-
-    spec = find_spec("sumo_rl")
+def resco_maps() -> dict[str, Path]:
+    """The RESCO networks of an installed sumo-rl, which is read as files and never imported."""
+    spec = importlib.util.find_spec("sumo_rl")
     roots = list(spec.submodule_search_locations or []) if spec else []
-    if not roots:
+    files = [file for root in roots for file in Path(root).glob("nets/RESCO/*/*.sumocfg")]
+    return {file.parent.name: file for file in files}
+
+
+def _resco_configuration(name: str) -> Path:
+    maps = resco_maps()
+    if not maps:
         raise ScenarioError(
             f"resco:{name} needs the RESCO networks of the sumo-rl wheel; "
             "install them with: pip install 'ugat-marl[resco]'"
         )
-    maps = {file.parent.name: file for file in Path(roots[0]).glob("nets/RESCO/*/*.sumocfg")}
     if name not in maps:
         raise UnknownNameError("RESCO map", name, maps)
     return maps[name]

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
 
 from ugat_marl.controllers import STANDARD_RULES
 from ugat_marl.effects import describe, in_domain, load
@@ -68,7 +70,7 @@ class TransferConfig:
         dqn: Settings of the learner.
     """
 
-    scenario: str
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     real: str = "V4"
     sim: str = "sim"
     real_log: Path | None = None
@@ -80,7 +82,7 @@ class TransferConfig:
     evaluation_seeds: int = 5
     tuning_seeds: int = 2
     control: bool = True
-    ugat: UgatConfig = field(default_factory=UgatConfig)
+    ugat: Annotated[UgatConfig, arg(name="")] = field(default_factory=UgatConfig)
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
     def __post_init__(self) -> None:

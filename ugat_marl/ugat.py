@@ -22,7 +22,7 @@ from ugat_marl.grounding.inverse import InverseConfig
 from ugat_marl.grounding.transform import GroundedActionTransform
 from ugat_marl.grounding.wrapper import GroundedEnv
 from ugat_marl.policy import AnyParallelEnv, Learner, Policy
-from ugat_marl.rollout import Exploring, roll_out
+from ugat_marl.rollout import Exploring, observer_of, roll_out
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
 from ugat_marl.training import Run
@@ -113,10 +113,11 @@ class SimulatedWorld:
         if self._env is None:
             self._env = self._make_env()
         exploring = Exploring(policy, self._epsilon)
+        observer = observer_of(self._env)
         logs: list[TransitionLog] = []
         for episode in range(self._episodes):
             episode_seed = derive_seed(seed, "roll-out", self._name, iteration, episode)
-            log = roll_out(self._env, exploring, episode_seed, record=True).log
+            log = roll_out(self._env, exploring, episode_seed, record=observer).log
             assert log is not None
             logs.append(log)
         return TransitionLog.concatenate(logs)

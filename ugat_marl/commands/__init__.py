@@ -1,0 +1,1 @@
+"""The commands of ``ugat-marl``: each a dataclass whose fields are its options."""

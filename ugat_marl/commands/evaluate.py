@@ -1,0 +1,74 @@
+"""``ugat-marl evaluate``: any policies and rules in any domains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.effects import load
+from ugat_marl.errors import OptionError
+from ugat_marl.evaluation import evaluate, policy_factory
+from ugat_marl.progress import Bars
+from ugat_marl.report.tables import measures_table
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Plays policies in domains with several seeds; prints measures, gaps and regret.
+
+    Examples:
+        ugat-marl evaluate single-v1 --policies largest-queue:20 max-pressure programme
+        ugat-marl evaluate grid2x2-v1 --policies runs/demo/policies/ugat.pt --domains sim V4
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        policies: Rules (fixed-time:30, largest-queue:20, max-pressure:10, programme, random) and
+            files of trained policies.
+        domains: Domains; gaps are taken against the first.
+        seeds: Number of episodes of each policy in each domain.
+        first_seed: Seed of the first of them.
+        duration_s: Length of an episode in s; default: the scenario's own.
+        workers: Simulations at a time; default: one per core.
+        out: JSON file for the table and every episode.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    policies: tuple[str, ...] = ("programme", "largest-queue:20", "max-pressure:10", "random")
+    domains: tuple[str, ...] = ("sim", "V1", "V2", "V3", "V4")
+    seeds: int = 5
+    first_seed: int = 1000
+    duration_s: float | None = None
+    workers: int | None = None
+    out: Path | None = None
+
+    def run(self, console: Console) -> int:
+        """Evaluates and prints."""
+        for name in ("policies", "domains"):
+            if not getattr(self, name):
+                raise OptionError(f"--{name} needs at least one value")
+        if self.seeds < 1 or (self.workers is not None and self.workers < 1):
+            raise OptionError("--seeds and --workers must be at least 1")
+        found = evaluate(
+            load(self.scenario),
+            {_name(spec): policy_factory(spec) for spec in self.policies},
+            self.domains,
+            range(self.first_seed, self.first_seed + self.seeds),
+            duration_s=self.duration_s,
+            workers=self.workers,
+            reporter=Bars(console),
+        )
+        console.print(measures_table(found))
+        if self.out is not None:
+            found.write(self.out)
+            console.print(f"table: {self.out}", soft_wrap=True)
+        return 0
+
+
+def _name(spec: str) -> str:
+    """Short but distinct: the last two parts of a path."""
+    path = Path(spec)
+    return "/".join(path.with_suffix("").parts[-3::2]) if path.suffix == ".pt" else spec

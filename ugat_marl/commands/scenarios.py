@@ -1,0 +1,57 @@
+"""``ugat-marl scenarios``: what networks there are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from ugat_marl.demand import check_demand
+from ugat_marl.effects import ALIASES, SETTINGS, load
+from ugat_marl.errors import ScenarioError
+from ugat_marl.network import Network
+from ugat_marl.scenario import resco_maps, shipped_scenarios
+
+
+@dataclass(frozen=True)
+class Scenarios:
+    """Lists the scenarios and domains that can be named.
+
+    Examples:
+        ugat-marl scenarios
+    """
+
+    def run(self, console: Console) -> int:
+        """Prints the lists."""
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        for heading, justify in (
+            ("scenario", "left"), ("agents", "right"), ("phases", "right"), ("vehicles", "right"),
+            ("description", "left"),
+        ):  # fmt: skip
+            table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+        maps = [f"resco:{name}" for name in sorted(resco_maps())]
+        for name in (*(name for name, _ in shipped_scenarios()), *maps):
+            table.add_row(name, *_facts(name))
+        console.print(table)
+        if not maps:
+            console.print("RESCO networks: pip install 'ugat-marl[resco]'", markup=False)
+        aliases = {setting: alias for alias, setting in ALIASES.items()}
+        for setting, effects in SETTINGS.items():
+            values = ", ".join(map(str, effects))
+            console.print(f"domain {setting} ({aliases[setting]}): {values}")
+        return 0
+
+
+def _facts(name: str) -> list[str]:
+    try:
+        scenario = load(name)
+        network = Network.read(scenario)
+        demand = check_demand(scenario, network)
+    except ScenarioError as error:
+        return ["", "", "", f"[red]{error}"]
+    phases = [len(item.phases) for item in network.intersections]
+    spread = str(phases[0]) if len(set(phases)) == 1 else f"{min(phases)}-{max(phases)}"
+    vehicles = f"{demand.vehicles}{'+' if demand.flows else ''}"
+    return [str(len(phases)), spread, vehicles, scenario.settings.description]

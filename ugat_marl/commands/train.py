@@ -1,0 +1,55 @@
+"""``ugat-marl train``: train across the gap and print what was won."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import arg
+
+from ugat_marl.effects import describe
+from ugat_marl.progress import Bars
+from ugat_marl.report.pictures import transfer_picture
+from ugat_marl.report.tables import transfer_table
+from ugat_marl.training import METRICS, Metrics
+from ugat_marl.transfer import TransferConfig, transfer
+
+
+@dataclass(frozen=True)
+class Train:
+    """Trains policies by UGAT on a scenario and judges them in sim and in the real domain.
+
+    Examples:
+        ugat-marl train grid2x2-v1 --real V4
+        ugat-marl train resco:cologne3 --real V3 --seed 1 --out runs/cologne3
+        ugat-marl train path/to/my.sumocfg --real startup_delay=0.8+acceleration=1.2
+        ugat-marl train single-v1 --real none --real-log measured.parquet
+
+    Attributes:
+        config: What to train, where, and how to judge it.
+        out: Folder of the run; default: runs/SCENARIO-REAL-sSEED.
+        resume: Go on with the run in that folder.
+    """
+
+    config: Annotated[TransferConfig, arg(name="")]
+    out: Path | None = None
+    resume: bool = False
+
+    def run(self, console: Console) -> int:
+        """Trains, evaluates, prints the table, draws it."""
+        config = self.config
+        name = f"{Path(config.scenario.replace(':', '-')).stem}-{describe(config.real)}"
+        directory = self.out or Path("runs") / f"{name}-s{config.seed}"
+        found = transfer(config, directory, resume=self.resume, reporter=Bars(console))
+        picture = directory / "gap.png"
+        transfer_picture(found, Metrics.read(directory / METRICS), picture)
+        console.print(transfer_table(found))
+        console.print(
+            f"run: {directory}\ntable: {directory / 'table.json'}\npicture: {picture}\n"
+            f"policies: {directory / 'policies'}\n"
+            f"curves: tensorboard --logdir {directory}",
+            soft_wrap=True,
+        )
+        return 0
