@@ -24,7 +24,7 @@ from ugat_marl.scenario import Document, Scenario
 from ugat_marl.signals import Segment
 
 Plans = Mapping[str, Sequence[Segment]]
-"""Traffic light to what it shows in the coming seconds; lights that are left out go on as before."""
+"""Traffic light to what it shows in the coming seconds; lights left out go on as before."""
 
 _TRIPS, _ERRORS = "trips.xml", "errors.log"
 
@@ -125,14 +125,15 @@ def launch_of(
         "--additional-files": list(scenario.additional),
     }
     arguments: list[str] = []
+    taken: set[str] = set()
     for option, documents in files.items():
         if documents:
-            arguments += [option, ",".join(_on_disk(item, directory) for item in documents)]
+            arguments += [option, ",".join(_on_disk(item, directory, taken) for item in documents)]
     for option, value in settings.sumo.items():
         arguments += [f"--{option}", value]
     arguments += [
-        "--begin", f"{settings.begin_s:g}",
-        "--step-length", f"{settings.step_length_s:g}",
+        "--begin", repr(settings.begin_s),
+        "--step-length", repr(settings.step_length_s),
         "--seed", str(seed & 0x7FFFFFFF),
         "--time-to-teleport", "-1",
         "--tripinfo-output", str(directory / _TRIPS),
@@ -148,12 +149,16 @@ def launch_of(
     return Launch(tuple(arguments), str(directory), settings.begin_s, tuple(lanes), waiting, gui)
 
 
-def _on_disk(document: Document, directory: Path) -> str:
-    if document.path is not None:
+def _on_disk(document: Document, directory: Path, taken: set[str]) -> str:
+    """A path SUMO can open, written if need be: SUMO takes a comma for the end of a name."""
+    if document.path is not None and "," not in str(document.path.resolve()):
         return str(document.path.resolve())
-    path = directory / document.name
-    write_whole(path, document.read())
-    return str(path)
+    name = document.name.removesuffix(".gz").replace(",", "_")
+    while name in taken:
+        name = f"_{name}"
+    taken.add(name)
+    write_whole(directory / name, document.read())
+    return str(directory / name)
 
 
 class LibsumoSimulator:
@@ -283,7 +288,21 @@ def _errors_of(directory: Path) -> str:
 
 
 def read_trips(path: Path) -> Trips:
-    """Reads SUMO's tripinfo file, unfinished and undeparted vehicles included."""
+    """Reads SUMO's tripinfo file, unfinished and undeparted vehicles included.
+
+    Raises:
+        SimulatorError: SUMO did not write it, or not all of it.
+    """
+    try:
+        return _trips_in(path)
+    except (OSError, ET.ParseError) as error:
+        raise SimulatorError(
+            f"SUMO's report on its vehicles cannot be read ({error}); is there room left in "
+            f"{path.parent.parent}?"
+        ) from None
+
+
+def _trips_in(path: Path) -> Trips:
     rows: list[tuple[float, float, bool, bool]] = []
     for _, item in ET.iterparse(path):
         if item.tag == "tripinfo":

@@ -5,7 +5,8 @@ fresh worker for every episode: starting is cheap, and no episode sees what ran 
 process cannot fork, every episode starts a new interpreter. Neither looks at the user's
 ``__main__``. Parent and workers end when their socket closes, however the user's process ends.
 
-Messages are JSON with arrays behind it (see `ugat_marl.channel`), one round trip per decision.
+Messages are JSON with arrays behind it (see `ugat_marl.channel`), one round trip per decision; the
+other end is `ugat_marl.simulator_worker`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -21,14 +21,12 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
-from typing import Any, Literal, NoReturn
-
-import numpy as np
+from typing import IO, Any, ClassVar, Literal
 
 from ugat_marl.channel import Channel, ChannelClosed, Message
 from ugat_marl.errors import OptionError, SimulatorCrashed, SimulatorError
 from ugat_marl.measurements import Snapshot, Trips
-from ugat_marl.simulator import Launch, LibsumoSimulator, Plans, Simulator, VehiclePicture
+from ugat_marl.simulator import Launch, Plans, VehiclePicture
 
 StartMethod = Literal["forkserver", "spawn"]
 
@@ -38,6 +36,9 @@ _PATIENCE_S = 10.0
 
 class ProcessSimulator:
     """SUMO in a worker process; a fresh one for every episode.
+
+    A process that is forked while a simulation is under way does not own it: there the simulator
+    begins anew with the next `start`, and the simulation of the first process goes on.
 
     Args:
         start_method: ``"forkserver"`` (the default where processes can fork) or ``"spawn"``.
@@ -61,16 +62,16 @@ class ProcessSimulator:
             SimulatorCrashed: The process died.
         """
         self._end_worker()
-        if self._method == "forkserver":
-            if self._parent is None:
-                self._parent = _WarmParent.acquire()
-            self._worker = self._parent.fork()
-        else:
-            self._worker = _Worker.spawn()
+        self._worker = self._fork() if self._method == "forkserver" else _Worker.spawn()
         return _snapshot(self._ask("start", launch=launch.as_dict()))
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
-        """Simulates `seconds` under the given signals, in one round trip."""
+        """Simulates `seconds` under the given signals, in one round trip.
+
+        Raises:
+            SimulatorError: SUMO failed; its own words are in the message.
+            SimulatorCrashed: The process died.
+        """
         return _snapshot(self._ask("advance", seconds=seconds, plans=plans))
 
     def vehicles(self) -> VehiclePicture:
@@ -99,13 +100,30 @@ class ProcessSimulator:
         with contextlib.suppress(OSError, AttributeError):
             self.close()
 
+    def _fork(self) -> _Worker:
+        """A worker from the warm parent, from a new one if somebody killed it."""
+        for attempts_left in (1, 0):
+            if self._parent is None or not self._parent.alive:
+                self._parent = _WarmParent.acquire()
+            worker = self._parent.fork()
+            if worker is not None:
+                return worker
+            self._parent.end()
+            if not attempts_left:
+                break
+        raise SimulatorCrashed(
+            "the process that starts simulators cannot be started or was killed twice (out of "
+            "memory?); its own words are above, if it had any"
+        )
+
     def _end_worker(self) -> None:
         worker, self._worker = self._worker, None
         if worker is not None:
             worker.end()
 
     def _ask(self, what: str, **arguments: Any) -> Message:
-        assert self._worker is not None, f"{what} before start"
+        if self._worker is None or not self._worker.mine:
+            raise SimulatorError(f"{what}: no simulation is under way in this process; start one")
         try:
             reply = self._worker.channel.ask({"what": what, **arguments})
         except (ChannelClosed, OSError):
@@ -115,23 +133,43 @@ class ProcessSimulator:
             self._end_worker()
             raise
         if error := reply.header.get("error"):
+            self._end_worker()
             raise SimulatorError(error)
         return reply
 
 
 class _Worker:
-    """The user's end of one worker process."""
+    """The user's end of one worker process.
 
-    def __init__(self, channel: Channel, said: Any, pid: int, process: Any = None) -> None:
+    Args:
+        channel: The line to it.
+        said: What it prints.
+        pid: Its number.
+        process: The process, if it is a child of this one.
+    """
+
+    def __init__(
+        self,
+        channel: Channel,
+        said: IO[bytes],
+        pid: int,
+        process: subprocess.Popen[bytes] | None = None,
+    ) -> None:
         self.channel = channel
         self._said = said
         self._pid = pid
-        self._process: subprocess.Popen[bytes] | None = process
+        self._process = process
+        self._owner = os.getpid()
+
+    @property
+    def mine(self) -> bool:
+        """Whether this process started it, and not one that this one was forked from."""
+        return self._owner == os.getpid()
 
     @classmethod
     def spawn(cls) -> _Worker:
         """A new interpreter that serves one simulation on its standard streams."""
-        said = tempfile.TemporaryFile()
+        said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the worker
         process = subprocess.Popen(
             _command("spawned"),
             stdin=subprocess.PIPE,
@@ -147,6 +185,10 @@ class _Worker:
 
     def end(self) -> None:
         """Closes the channel, upon which the process exits, and waits for that."""
+        if not self.mine:
+            return
+        with contextlib.suppress(OSError, ValueError):
+            self.channel.send(Message({"what": "close"}, []))
         gone = self.channel.hang_up(_PATIENCE_S)
         if not gone:
             with contextlib.suppress(ProcessLookupError):
@@ -164,9 +206,9 @@ class _Worker:
         self._said.seek(0)
         words = " ".join(self._said.read().decode(errors="replace").split())[-2000:]
         self.end()
-        said = f"; it said: {words}" if words else "; it said nothing (killed, or out of memory?)"
+        said = f"it said: {words}" if words else "it said nothing (killed, or out of memory?)"
         return (
-            f"the simulator process {self._pid} died{status} during {doing!r}{said}. "
+            f"the simulator process {self._pid} died{status} during {doing!r}; {said}. "
             "Other environments go on; reset() starts this one afresh"
         )
 
@@ -174,14 +216,14 @@ class _Worker:
 class _WarmParent:
     """The process that forks the workers; one for all simulators of a user's process."""
 
-    _lock = threading.RLock()
-    _current: _WarmParent | None = None
+    _lock: ClassVar[threading.RLock] = threading.RLock()
+    _current: ClassVar[_WarmParent | None] = None
+    _told_of_forks: ClassVar[bool] = False
 
     def __init__(self) -> None:
         self._users = 0
         self._owner = os.getpid()
-        mine, its = socket.socketpair()
-        self._socket = mine
+        self._socket, its = socket.socketpair()
         with its:
             self._process = subprocess.Popen(
                 _command("parent", str(its.fileno())),
@@ -190,45 +232,56 @@ class _WarmParent:
                 env=_environment(),
                 **_own_session(),
             )
+        atexit.register(self.end)
 
     @classmethod
     def acquire(cls) -> _WarmParent:
         """The parent of this process, started if need be."""
+        if not cls._told_of_forks:
+            os.register_at_fork(after_in_child=cls._forget)
+            cls._told_of_forks = True
         with cls._lock:
-            parent = cls._current
-            if parent is None or parent._owner != os.getpid() or parent._process.poll() is not None:
-                parent = cls._current = cls()
-            parent._users += 1
-            return parent
+            if cls._current is None or not cls._current.alive:
+                cls._current = cls()
+            cls._current._users += 1
+            return cls._current
+
+    @classmethod
+    def _forget(cls) -> None:
+        """In a forked child: the lock may be held by a thread that does not exist here."""
+        cls._lock = threading.RLock()
+        cls._current = None
+
+    @property
+    def alive(self) -> bool:
+        """Whether it belongs to this process and runs."""
+        return self._owner == os.getpid() and self._process.poll() is None
 
     def release(self) -> None:
         """Gives the parent up; the last one to do so ends it."""
         with self._lock:
             self._users -= 1
-            if self._users == 0 and self._owner == os.getpid():
-                self._end()
+            if self._users == 0:
+                self.end()
 
-    def fork(self) -> _Worker:
-        """A fresh worker.
-
-        Raises:
-            SimulatorCrashed: The parent is gone.
-        """
+    def fork(self) -> _Worker | None:
+        """A fresh worker, or None if the parent is gone."""
         mine, its = socket.socketpair()
-        said = tempfile.TemporaryFile()
+        said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the worker
+        pid = b""
         with its, self._lock:
             try:
                 socket.send_fds(self._socket, [b"f"], [its.fileno(), said.fileno()])
-                pid = int.from_bytes(self._socket.recv(8), "little")
+                pid = self._socket.recv(8)
             except OSError:
-                pid = 0
+                pass
+            except BaseException:  # Ctrl-C: the answer to come would be taken for the next one's
+                self.end()
+                raise
         if not pid:
             mine.close()
             said.close()
-            raise SimulatorCrashed(
-                "the process that starts simulators is gone (killed, or out of memory?); "
-                "close() the environment and make a new one"
-            )
+            return None
         reader, writer = mine.makefile("rb"), mine.makefile("wb")
 
         def hang_up() -> None:
@@ -236,35 +289,33 @@ class _WarmParent:
                 mine.shutdown(socket.SHUT_WR)
             mine.close()
 
-        return _Worker(Channel(reader, writer, hang_up), said, pid)
+        return _Worker(Channel(reader, writer, hang_up), said, int.from_bytes(pid, "little"))
 
-    def _end(self) -> None:
-        self._socket.close()
-        try:
-            self._process.wait(timeout=_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        if _WarmParent._current is self:
-            _WarmParent._current = None
-
-
-def _end_parent_at_exit() -> None:
-    parent = _WarmParent._current
-    if parent is not None and parent._owner == os.getpid():
-        parent._end()
-
-
-atexit.register(_end_parent_at_exit)
+    def end(self) -> None:
+        """Ends the process; its workers go on. May be called again."""
+        if self._owner != os.getpid():
+            return
+        with self._lock:
+            atexit.unregister(self.end)
+            with contextlib.suppress(OSError):  # a forked child may hold the socket as well
+                self._socket.shutdown(socket.SHUT_RDWR)
+            self._socket.close()
+            try:
+                self._process.wait(timeout=_PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            if _WarmParent._current is self:
+                _WarmParent._current = None
 
 
 def _command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "ugat_marl.simulator_process", *arguments]
+    return [sys.executable, "-m", "ugat_marl.simulator_worker", *arguments]
 
 
 def _environment() -> dict[str, str]:
     """The environment, with this process's import path: a worker imports what its user imports."""
-    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
     return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
 
 
@@ -285,102 +336,3 @@ def _snapshot(reply: Message) -> Snapshot:
         header["departed"],
         header["backlog"],
     )
-
-
-# --- the worker's side -------------------------------------------------------------------------
-
-
-def _answer(simulator: Simulator, header: dict[str, Any]) -> Message:
-    what = header["what"]
-    if what == "start":
-        fields = header["launch"]
-        launch = Launch(
-            **{
-                **fields,
-                "arguments": tuple(fields["arguments"]),
-                "lanes": tuple(fields["lanes"]),
-            }
-        )
-        return _message(simulator.start(launch))
-    if what == "advance":
-        return _message(simulator.advance(header["seconds"], header["plans"]))
-    if what == "vehicles":
-        seen = simulator.vehicles()
-        rows = [*seen.position.T, seen.angle_deg, seen.length_m, seen.speed_mps]
-        return Message({}, [np.array(rows)])
-    if what == "signals":
-        return Message({"states": simulator.signals()}, [])
-    assert what == "finish", what
-    trips = simulator.finish()
-    rows = [trips.travel_time_s, trips.delay_s, trips.finished, trips.entered]
-    return Message({}, [np.array(rows, dtype=np.float64)])
-
-
-def _message(snapshot: Snapshot) -> Message:
-    header = {
-        "time_s": snapshot.time_s,
-        "departed": snapshot.departed,
-        "backlog": snapshot.backlog,
-    }
-    lanes = np.array([snapshot.vehicles, snapshot.halting, snapshot.mean_speed_mps])
-    return Message(header, [lanes, snapshot.waiting_s])
-
-
-def _work(channel: Channel) -> NoReturn:
-    """Serves one simulation until the channel closes, then removes SUMO's files and exits."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    simulator = LibsumoSimulator()
-    directory: str | None = None
-    try:
-        while True:
-            question = channel.receive()
-            if question.header["what"] == "start":
-                directory = question.header["launch"]["directory"]
-            try:
-                answer = _answer(simulator, question.header)
-            except SimulatorError as error:
-                answer = Message({"error": str(error)}, [])
-            channel.send(answer)
-    except (ChannelClosed, OSError):
-        pass
-    if directory is not None:
-        shutil.rmtree(directory, ignore_errors=True)
-    os._exit(0)  # no destructors: libsumo's may take long on a large network
-
-
-def _serve(descriptor: int) -> None:
-    """The warm parent: forks a worker for every pair of file descriptors that arrives."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # workers leave no zombies
-    with socket.socket(fileno=descriptor) as control:
-        while True:
-            try:
-                request, descriptors, _, _ = socket.recv_fds(control, 1, 2)
-            except OSError:
-                return
-            if not request:
-                return
-            pid = os.fork()
-            if pid == 0:
-                control.close()
-                os.dup2(descriptors[1], 1)
-                os.dup2(descriptors[1], 2)
-                line = socket.socket(fileno=descriptors[0])
-                _work(Channel(line.makefile("rb"), line.makefile("wb"), line.close))
-            for descriptor in descriptors:
-                os.close(descriptor)
-            control.sendall(pid.to_bytes(8, "little"))
-
-
-def _spawned() -> None:
-    """A worker of its own interpreter: SUMO may print, so the channel leaves standard output."""
-    reader, writer = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-    _work(Channel(reader, writer, writer.close))
-
-
-if __name__ == "__main__":
-    if sys.argv[1] == "parent":
-        _serve(int(sys.argv[2]))
-    else:
-        _spawned()
