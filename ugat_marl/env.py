@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 import warnings
@@ -317,6 +318,7 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         if self._simulator is None:
             self._simulator = _simulator(self.options.simulator)
         self._directory = Path(tempfile.mkdtemp(prefix="ugat_marl-"))
+        self._owner = os.getpid()
         launch = launch_of(
             self.scenario,
             seed,
@@ -360,8 +362,9 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
             states.append(after)
         if self.options.signals == "programme":
             plans, states = {}, self._states
+        agents, self.agents = self.agents, []  # the episode is over if SUMO fails
         self._snapshot: Snapshot = self._simulator.advance(self.decision_interval_s, plans)
-        self._states = states
+        self.agents, self._states = agents, states
 
     def _observe(self) -> dict[str, NDArray[np.float32]]:
         self._vectors = self._observer.observe(self._snapshot, self.phases)
@@ -390,12 +393,12 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         assert self._simulator is not None
         if self.render_mode == "rgb_array":
             self.render()
-        self._scores = self._recorder.scores(self._simulator.finish())
         self.agents = []
+        self._scores = self._recorder.scores(self._simulator.finish())
 
     def _remove_directory(self) -> None:
         directory, self._directory = self._directory, None
-        if directory is not None:
+        if directory is not None and self._owner == os.getpid():  # not in a forked child
             shutil.rmtree(directory, ignore_errors=True)
 
 

@@ -6,6 +6,7 @@ it is refused. `ugat_marl.simulator_process` gives the same interface in a proce
 
 from __future__ import annotations
 
+import os
 import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -172,6 +173,7 @@ class LibsumoSimulator:
         self._launch: Launch | None = None
         self._shown: dict[str, str] = {}
         self._time_s = 0.0
+        self._owner = 0
 
     def start(self, launch: Launch) -> Snapshot:
         """Starts a simulation.
@@ -187,6 +189,7 @@ class LibsumoSimulator:
                 'the other one, or use simulator="process", which runs any number'
             )
         program = "sumo-gui" if launch.gui else "sumo"
+        self._owner = os.getpid()
         self._launch = launch
         try:
             libsumo.start([program, *launch.arguments])
@@ -251,7 +254,8 @@ class LibsumoSimulator:
         """Ends the simulation of this object, if there is one."""
         if self._launch is not None:
             self._launch = None
-            if libsumo.simulation.isLoaded():
+            # A forked child has a copy of the simulation and the parent's open files.
+            if self._owner == os.getpid() and libsumo.simulation.isLoaded():
                 libsumo.simulation.close()
 
     def _snapshot(self) -> Snapshot:
