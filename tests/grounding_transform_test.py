@@ -189,9 +189,9 @@ def test_sixteen_intersections_are_grounded_fast_enough_to_ride_along() -> None:
     made.inverse.fitted.fill_(True)
     rows = made.stack.observations({a: np.ones(20, np.float32) for a in layouts})
     own, masks = np.zeros(16, np.int64), made.stack.masks({})
-    best = float("inf")
-    for _ in range(300):  # the fastest of many: other work on the machine must not decide
-        start = time.perf_counter()
+    taken: list[float] = []
+    for _ in range(300):
+        start = time.thread_time()  # of this thread alone: other work on the machine is not ours
         made(rows, own, masks)
-        best = min(best, time.perf_counter() - start)
-    assert best < 1e-3  # 0.25 ms on one core when nothing else runs
+        taken.append(time.thread_time() - start)
+    assert np.median(taken) < 1e-3  # 0.2 ms on one core of an EPYC

@@ -113,6 +113,7 @@ def split(data: StackedTransitions, every: int, stack: Stack) -> Split:
     return Split(train, held_out, kind)
 
 
+@one_thread()
 def fit(
     forward: ForwardModel,
     inverse: InverseModel,
@@ -138,9 +139,8 @@ def fit(
             scenario, observation or decision interval.
     """
     _refuse_mismatch(real, simulated)
-    with one_thread():
-        f = fit_forward(forward, real, config, seed, on_epoch)
-        h = fit_inverse(inverse, simulated, config, seed, on_epoch)
+    f = fit_forward(forward, real, config, seed, on_epoch)
+    h = fit_inverse(inverse, simulated, config, seed, on_epoch)
     ours, theirs = stack_log(simulated, inverse.stack), stack_log(real, inverse.stack)
     held_out = split(ours, config.held_out_every, inverse.stack).held_out
     held_out_real = split(theirs, config.held_out_every, inverse.stack).held_out
@@ -162,6 +162,7 @@ def _refuse_mismatch(real: TransitionLog, simulated: TransitionLog) -> None:
             )
 
 
+@one_thread()
 def fit_forward(
     model: ForwardModel,
     log: TransitionLog,
@@ -188,6 +189,7 @@ def fit_forward(
     return forward_report(model, data, parts.held_out, record)
 
 
+@one_thread()
 def fit_inverse(
     model: InverseModel,
     log: TransitionLog,

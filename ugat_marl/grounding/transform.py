@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ugat_marl.batched import one_thread
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.gate import Gate, GateConfig
@@ -81,6 +82,7 @@ class GroundedActionTransform:
         """Whether both models have been fitted; before that there is nothing to ground with."""
         return bool(self.forward.fitted) and bool(self.inverse.fitted)
 
+    @one_thread()
     @torch.no_grad()
     def __call__(
         self,
