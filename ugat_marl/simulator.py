@@ -286,7 +286,11 @@ class LibsumoSimulator:
 def _errors_of(directory: Path) -> str:
     """SUMO's error log in one line."""
     path = directory / _ERRORS
-    text = path.read_text(errors="replace") if path.exists() else ""
+    return one_line(path.read_text(errors="replace")) if path.exists() else ""
+
+
+def one_line(text: str) -> str:
+    """What SUMO printed as one line, without its formulas."""
     lines = [line.strip().removeprefix("Error: ") for line in text.splitlines()]
     return " ".join(line for line in lines if line and line != "Quitting (on error).")
 

@@ -26,7 +26,7 @@ from typing import IO, Any, ClassVar, Literal
 from ugat_marl.channel import Channel, ChannelClosed, Message
 from ugat_marl.errors import OptionError, SimulatorCrashed, SimulatorError
 from ugat_marl.measurements import Snapshot, Trips
-from ugat_marl.simulator import Launch, Plans, VehiclePicture
+from ugat_marl.simulator import Launch, Plans, VehiclePicture, one_line
 
 StartMethod = Literal["forkserver", "spawn"]
 
@@ -133,6 +133,7 @@ class ProcessSimulator:
             self._end_worker()
             raise
         if error := reply.header.get("error"):
+            error = self._worker.in_full(error)
             self._end_worker()
             raise SimulatorError(error)
         return reply
@@ -203,14 +204,23 @@ class _Worker:
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 status = f" with status {self._process.wait(timeout=_PATIENCE_S)}"
-        self._said.seek(0)
-        words = " ".join(self._said.read().decode(errors="replace").split())[-2000:]
+        words = self._words()
         self.end()
         said = f"it said: {words}" if words else "it said nothing (killed, or out of memory?)"
         return (
             f"the simulator process {self._pid} died{status} during {doing!r}; {said}. "
             "Other environments go on; reset() starts this one afresh"
         )
+
+    def in_full(self, error: str) -> str:
+        """An error with all that SUMO printed, of which its error log may have only the end."""
+        what, _, said = error.partition(": ")
+        words = self._words()
+        return f"{what}: {words}" if said in words else error
+
+    def _words(self) -> str:
+        self._said.seek(0)
+        return one_line(self._said.read().decode(errors="replace"))[-2000:]
 
 
 class _WarmParent:
