@@ -95,7 +95,7 @@ def _same_kind(found: pl.DataType, wanted: pl.DataType) -> bool:
     if isinstance(wanted, pl.List):
         if not isinstance(found, pl.List | pl.Array):
             return False
-        return found.inner in (pl.Float32, pl.Float64)
+        return found.inner.is_float()
     if wanted.is_integer():
         return found.is_integer()
     if wanted.is_float():
