@@ -9,10 +9,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ugat_marl.demand import check_demand
+from ugat_marl.demand import Demand, check_demand
 from ugat_marl.effects import SETTINGS, in_domain, load
 from ugat_marl.env import EnvOptions, TrafficEnv
 from ugat_marl.network import Intersection, Network
+from ugat_marl.phases import conflicting_greens
 from ugat_marl.scenario import Scenario, load_scenario
 from ugat_marl.signals import GREEN
 from ugat_marl.testing.episodes import begin, proceed, random_actions
@@ -36,7 +37,8 @@ class ScenarioCase:
     ) -> None:
         self.name = name
         self.seed = seed
-        self.change = change
+        self._change = change
+        self._domains: dict[str, Scenario] = {}
         self._failed: set[str] = set()
         self._envs: list[TrafficEnv] = []
 
@@ -57,6 +59,29 @@ class ScenarioCase:
     def network(self) -> Network:
         """Its network."""
         return self._once("_network", "its network cannot be used")
+
+    @cached_property
+    def _demand(self) -> Demand:
+        return check_demand(self.scenario, self.network)
+
+    @property
+    def demand(self) -> Demand:
+        """Its demand, all edges of which exist."""
+        return self._once("_demand", "its routes do not exist")
+
+    def in_domain(self, domain: str) -> Scenario:
+        """The scenario in a domain."""
+        if domain not in self._domains:
+            self._domains[domain] = self._change(self.scenario, domain)
+        return self._domains[domain]
+
+    def need_demand(self) -> None:
+        """For checks that simulate.
+
+        Raises:
+            NotChecked: The scenario cannot be simulated.
+        """
+        _ = self.demand
 
     def _once(self, attribute: str, why: str) -> Any:
         if attribute in self._failed:
@@ -114,43 +139,38 @@ def _served(item: Intersection) -> set[int]:
 
 
 def no_greens_conflict(case: ScenarioCase) -> None:
-    """No phase gives protected green to two through streams that cross."""
-    crossing = _crossing_streams(case.scenario)
+    """Neither a phase nor the network's own programme gives green to streams that cross."""
+    foes = _foes(case.scenario)
     for item in case.network.intersections:
-        for phase in item.phases:
-            green = [link for link in item.links if phase[link.index] == "G"]
-            for position, a in enumerate(green):
-                for b in green[position + 1 :]:
-                    require(
-                        a.direction != "s"
-                        or b.direction != "s"
-                        or (a.junction, a.request, b.request) not in crossing,
-                        f"traffic light {item.id!r}: phase {phase!r} gives green to the links "
-                        f"{a.index} and {b.index}, whose ways cross; write g for the one that "
-                        "must yield, or split the phase",
-                    )
+        shown = {"phase": item.phases, "programme": [state for _, state in item.programme]}
+        for what, states in shown.items():
+            for state in states:
+                pair = conflicting_greens(state, item.links, foes)
+                require(
+                    not pair,
+                    f"traffic light {item.id!r}: the {what} {state!r} gives protected green (G) to "
+                    f"the links {pair}, whose ways cross; write g for the one that must yield, or "
+                    "split the phase",
+                )
 
 
-def _crossing_streams(scenario: Scenario) -> set[tuple[str, int, int]]:
-    """Junction and two rows of its right-of-way matrix that are foes, both ways round."""
-    found: set[tuple[str, int, int]] = set()
+def _foes(scenario: Scenario) -> dict[str, list[int]]:
+    """Junction to a bit mask of foes for each row of its right-of-way matrix."""
+    found: dict[str, list[int]] = {}
     for junction in scenario.network.parse().iter("junction"):
-        for row in junction.iter("request"):
-            name, index = junction.get("id", ""), int(row.get("index", "0"))
-            for other, letter in enumerate(reversed(row.get("foes", ""))):
-                if letter == "1":
-                    found |= {(name, index, other), (name, other, index)}
+        rows = sorted(junction.iter("request"), key=lambda row: int(row.get("index", "0")))
+        found[junction.get("id", "")] = [int(row.get("foes", "0"), 2) for row in rows]
     return found
 
 
 def its_routes_exist(case: ScenarioCase) -> None:
     """All routes use edges of the network, and somebody departs."""
-    demand = check_demand(case.scenario, case.network)
-    require(demand.vehicles or demand.flows, "nobody departs within the episode")
+    require(case.demand.vehicles or case.demand.flows, "nobody departs within the episode")
 
 
 def routes_are_connected(case: ScenarioCase) -> None:
     """Each edge of a written route leads to the next one."""
+    case.need_demand()
     leads = {
         (item.get("from"), item.get("to"))
         for item in case.scenario.network.parse().iter("connection")
@@ -177,6 +197,7 @@ def _routes(root: ET.Element) -> list[tuple[str, list[str]]]:
 
 def vehicles_enter_early(case: ScenarioCase) -> None:
     """Somebody enters within the first tenth of the episode."""
+    case.need_demand()
     decisions = max(1, case.scenario.decisions // 10)
     seconds = decisions * case.scenario.control.decision_interval_s
     early = case.scenario.with_duration(seconds)
@@ -195,9 +216,10 @@ def vehicles_enter_early(case: ScenarioCase) -> None:
 
 def effects_change_it(case: ScenarioCase) -> None:
     """V1 to V4 apply, change the hash, each in its own way, and run in SUMO."""
+    case.need_demand()
     hashes = {case.scenario.hash: "sim"}
     for name in SETTINGS:
-        changed = case.change(case.scenario, name)
+        changed = case.in_domain(name)
         other = hashes.setdefault(changed.hash, name)
         require(
             other == name,
@@ -212,7 +234,7 @@ def effects_change_it(case: ScenarioCase) -> None:
 def writing_keeps_it(case: ScenarioCase) -> None:
     """Written to a directory and loaded again it has the same hash, in V4 too."""
     for domain in ("sim", "V4"):
-        changed = case.change(case.scenario, domain)
+        changed = case.in_domain(domain)
         with TemporaryDirectory(prefix="ugat_marl-check-") as folder:
             again = load_scenario(changed.write(Path(folder) / "written-v1"))
             require(
