@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import time
 from pathlib import Path
@@ -451,6 +452,10 @@ def test_masks_that_allow_nothing_or_have_the_wrong_length_are_errors():
 def test_impossible_settings_are_named(option: str, value: object):
     with pytest.raises(OptionError, match=rf"DQNConfig\.{option}"):
         DQNConfig(**{option: value})
+
+
+def test_settings_read_from_json_are_the_same_settings():
+    assert DQNConfig(**json.loads('{"hidden": [16, 16]}')) == DQNConfig(hidden=(16, 16))
 
 
 @pytest.mark.parametrize("longest", [1, 2, 5])

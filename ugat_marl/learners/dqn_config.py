@@ -52,6 +52,8 @@ class DQNConfig:
     reward_scale: float | None = None
 
     def __post_init__(self) -> None:
+        # a list, as JSON has it, would differ from the tuple of a checkpoint
+        object.__setattr__(self, "hidden", tuple(self.hidden))
         for name in (
             "batch_size",
             "replay_capacity",
