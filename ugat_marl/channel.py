@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import select
 import struct
-import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, BinaryIO
@@ -85,27 +87,33 @@ class Channel:
         return self.receive()
 
     def hang_up(self, patience_s: float) -> bool:
-        """Closes this end; returns whether the other end closed within `patience_s` seconds."""
-        gone = threading.Event()
+        """Closes this end; returns whether the other end closed within `patience_s` seconds.
 
-        def wait_for_end() -> None:
-            with contextlib.suppress(OSError, ValueError):
-                while self._reader.read(65536):
-                    pass
-            gone.set()
-
+        There is no thread in it: none can be started while the interpreter shuts down.
+        """
         with contextlib.suppress(OSError, ValueError):
             self._writer.flush()
         with contextlib.suppress(OSError, ValueError):
             self._close_writer()
-        thread = threading.Thread(target=wait_for_end, daemon=True)
-        thread.start()
-        thread.join(patience_s)
-        if gone.is_set():
+        gone = os.name == "nt" or self._closes(patience_s)  # Windows cannot wait on a pipe
+        if gone:
             self._reader.close()
             with contextlib.suppress(OSError, ValueError):
                 self._writer.close()
-        return gone.is_set()
+        return gone
+
+    def _closes(self, patience_s: float) -> bool:
+        """Reads on, without use for it, until the other end closes."""
+        deadline = time.monotonic() + patience_s
+        with contextlib.suppress(OSError, ValueError):
+            descriptor = self._reader.fileno()
+            waiting = select.poll()  # select.select knows no descriptor above 1023
+            waiting.register(descriptor, select.POLLIN)
+            while (left := deadline - time.monotonic()) > 0:
+                if waiting.poll(1000 * left) and not os.read(descriptor, 65536):
+                    return True
+            return False
+        return True
 
     def _exactly(self, count: int) -> bytes:
         data = self._reader.read(count)

@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 import warnings
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -83,7 +84,7 @@ class EnvOptions:
         return cls(**options)
 
 
-class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
+class TrafficEnv(ParallelEnv[str, Any, Any]):
     """Traffic signals of a road network, one agent per intersection.
 
     An action is the green phase of the next decision interval; yellow, all-red and minimum green
@@ -103,6 +104,9 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         intersection_of: Agent to SUMO's id of its traffic light.
         agent_groups: Group to its agents; agents of one group have the same spaces.
     """
+
+    observation_spaces: dict[str, Box]
+    action_spaces: dict[str, Discrete]
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own convention
         "name": "ugat_marl_v1",
@@ -131,7 +135,7 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         self._name_agents()
         self._state_space = self._joint_space()
         self._simulator: Simulator | None = None
-        self._directory: Path | None = None
+        self._remove: weakref.finalize[..., TrafficEnv] | None = None
         self._generator = np.random.default_rng()
         self.agents: list[str] = []
         self._scores: Scores | None = None
@@ -317,12 +321,13 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         self._remove_directory()
         if self._simulator is None:
             self._simulator = _simulator(self.options.simulator)
-        self._directory = Path(tempfile.mkdtemp(prefix="ugat_marl-"))
-        self._owner = os.getpid()
+        directory = Path(tempfile.mkdtemp(prefix="ugat_marl-"))
+        # Also at the end of the process, when nobody closes the environment.
+        self._remove = weakref.finalize(self, _remove_tree, directory, os.getpid())
         launch = launch_of(
             self.scenario,
             seed,
-            self._directory,
+            directory,
             self._lanes.ids,
             waiting=self._observer.needs_waiting or self._rewarder.needs_waiting,
             gui=self.render_mode == "human",
@@ -397,9 +402,9 @@ class TrafficEnv(ParallelEnv[str, NDArray[np.float32], int]):
         self._scores = self._recorder.scores(self._simulator.finish())
 
     def _remove_directory(self) -> None:
-        directory, self._directory = self._directory, None
-        if directory is not None and self._owner == os.getpid():  # not in a forked child
-            shutil.rmtree(directory, ignore_errors=True)
+        remove, self._remove = self._remove, None
+        if remove is not None:
+            remove()
 
 
 def parallel_env(
@@ -432,6 +437,12 @@ def _simulator(name: str) -> Simulator:
     if name == "inprocess":
         return LibsumoSimulator()
     return ProcessSimulator("spawn" if name == "spawn" else None)
+
+
+def _remove_tree(directory: Path, owner: int) -> None:
+    """Removes a folder, but not in a process that was forked from the one that made it."""
+    if os.getpid() == owner:
+        shutil.rmtree(directory, ignore_errors=True)
 
 
 def _letters(number: int) -> str:

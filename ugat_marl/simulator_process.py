@@ -116,10 +116,10 @@ class ProcessSimulator:
             "memory?); its own words are above, if it had any"
         )
 
-    def _end_worker(self) -> None:
+    def _end_worker(self, patience_s: float = _PATIENCE_S) -> None:
         worker, self._worker = self._worker, None
         if worker is not None:
-            worker.end()
+            worker.end(patience_s)
 
     def _ask(self, what: str, **arguments: Any) -> Message:
         if self._worker is None or not self._worker.mine:
@@ -130,7 +130,7 @@ class ProcessSimulator:
             worker, self._worker = self._worker, None
             raise SimulatorCrashed(worker.obituary(what)) from None
         except BaseException:  # Ctrl-C between question and answer: the two no longer match
-            self._end_worker()
+            self._end_worker(patience_s=0.0)
             raise
         if error := reply.header.get("error"):
             error = self._worker.in_full(error)
@@ -171,31 +171,38 @@ class _Worker:
     def spawn(cls) -> _Worker:
         """A new interpreter that serves one simulation on its standard streams."""
         said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the worker
-        process = subprocess.Popen(
+        process: subprocess.Popen[bytes] = subprocess.Popen(
             _command("spawned"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=said,
             env=_environment(),
-            **_own_session(),
+            start_new_session=True,  # Ctrl-C reaches the user's process alone, which ends this one
         )
         assert process.stdin is not None
         assert process.stdout is not None
         channel = Channel(process.stdout, process.stdin, process.stdin.close)
         return cls(channel, said, process.pid, process)
 
-    def end(self) -> None:
-        """Closes the channel, upon which the process exits, and waits for that."""
+    def end(self, patience_s: float = _PATIENCE_S) -> None:
+        """Closes the channel, upon which the process exits, and waits for that.
+
+        Args:
+            patience_s: After this many seconds the process is killed.
+        """
         if not self.mine:
             return
         with contextlib.suppress(OSError, ValueError):
             self.channel.send(Message({"what": "close"}, []))
-        gone = self.channel.hang_up(_PATIENCE_S)
-        if not gone:
+        if not self.channel.hang_up(patience_s):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self._pid, signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
         if self._process is not None:
-            self._process.wait()
+            try:
+                self._process.wait(_PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
         self._said.close()
 
     def obituary(self, doing: str) -> str:
@@ -213,10 +220,9 @@ class _Worker:
         )
 
     def in_full(self, error: str) -> str:
-        """An error with all that SUMO printed, of which its error log may have only the end."""
-        what, _, said = error.partition(": ")
+        """An error with what SUMO printed beside it: its error log may have only the end."""
         words = self._words()
-        return f"{what}: {words}" if said in words else error
+        return error if words in error else f"{error} {words}"
 
     def _words(self) -> str:
         self._said.seek(0)
@@ -240,7 +246,7 @@ class _WarmParent:
                 stdin=subprocess.DEVNULL,
                 pass_fds=(its.fileno(),),
                 env=_environment(),
-                **_own_session(),
+                start_new_session=True,
             )
         atexit.register(self.end)
 
@@ -327,11 +333,6 @@ def _environment() -> dict[str, str]:
     """The environment, with this process's import path: a worker imports what its user imports."""
     path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
     return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
-
-
-def _own_session() -> dict[str, Any]:
-    """Ctrl-C in a terminal reaches the user's process alone, which then ends the others."""
-    return {"start_new_session": True} if os.name == "posix" else {}
 
 
 def _snapshot(reply: Message) -> Snapshot:
