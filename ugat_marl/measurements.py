@@ -40,7 +40,8 @@ class Snapshot:
         time_s: Time on the scenario's clock.
         vehicles: Number of vehicles per lane, ``(lanes,)``.
         halting: Of these, slower than `HALTING_MPS`, ``(lanes,)``.
-        mean_speed_mps: Mean speed per lane; the speed limit where the lane is empty, ``(lanes,)``.
+        mean_speed_mps: Mean speed per lane; the speed limit the lane had at the start of the
+            episode where it is empty, ``(lanes,)``.
         waiting_s: Sum over the lane's vehicles of the seconds since each last moved, ``(lanes,)``;
             empty unless the simulator was started with `waiting`.
         departed: Vehicles that entered the network since the start of the episode.

@@ -173,6 +173,7 @@ class LibsumoSimulator:
         self._launch: Launch | None = None
         self._shown: dict[str, str] = {}
         self._time_s = 0.0
+        self._limits = np.empty(0)
         self._owner = 0
 
     def start(self, launch: Launch) -> Snapshot:
@@ -197,6 +198,8 @@ class LibsumoSimulator:
             self._fail("SUMO did not start", error)
         self._shown = {}
         self._time_s = launch.begin_s
+        limits = map(libsumo.lane.getMaxSpeed, launch.lanes)
+        self._limits = np.fromiter(limits, np.float64, len(launch.lanes))
         return self._snapshot()
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
@@ -261,17 +264,26 @@ class LibsumoSimulator:
     def _snapshot(self) -> Snapshot:
         assert self._launch is not None
         lanes, api = self._launch.lanes, libsumo.lane
+        vehicles = np.fromiter(map(api.getLastStepVehicleNumber, lanes), np.float64, len(lanes))
+        taken = np.flatnonzero(vehicles)
+        names = [lanes[index] for index in taken.tolist()]
 
-        def measure(what: Callable[[str], float]) -> NDArray[np.float64]:
-            return np.fromiter(map(what, lanes), np.float64, len(lanes))
+        def measure(
+            what: Callable[[str], float], empty: NDArray[np.float64]
+        ) -> NDArray[np.float64]:
+            """Asks only lanes with vehicles; most of a network is empty at any instant."""
+            values = empty.copy()
+            values[taken] = np.fromiter(map(what, names), np.float64, len(names))
+            return values
 
         statistic = libsumo.simulation.getParameter
+        none = np.zeros(len(lanes))
         return Snapshot(
             time_s=self._time_s,
-            vehicles=measure(api.getLastStepVehicleNumber),
-            halting=measure(api.getLastStepHaltingNumber),
-            mean_speed_mps=measure(api.getLastStepMeanSpeed),
-            waiting_s=measure(api.getWaitingTime) if self._launch.waiting else np.empty(0),
+            vehicles=vehicles,
+            halting=measure(api.getLastStepHaltingNumber, none),
+            mean_speed_mps=measure(api.getLastStepMeanSpeed, self._limits),
+            waiting_s=measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0),
             departed=int(statistic("", "stats.vehicles.inserted")),
             backlog=int(statistic("", "stats.vehicles.waiting")),
         )
