@@ -32,7 +32,8 @@ UNITS: dict[str, str] = {
     "pressure": "vehicles / lane capacity, incoming lane minus mean of the lanes its links lead to",
     "waiting": "waiting time summed over the lane's vehicles / (lane capacity * 100 s)",
     "density": "vehicles per incoming lane / lane capacity (lane length / 7.5 m)",
-    "movements": "halting per incoming, vehicles per incoming, vehicles per outgoing lane; each / lane capacity",
+    "movements": "halting per incoming, vehicles per incoming, vehicles per outgoing lane; "
+    "each / lane capacity",
 }  # fmt: skip
 """What one feature of each observation is. All are clipped to [0, 1] (pressure: [-1, 1])."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.progress import (
@@ -71,9 +71,11 @@ class Bars:
             bar = progress.add_task(name, total=total, note="")
 
             def advance(note: str = "") -> None:
-                progress.update(bar, advance=1, **({"note": note} if note else {}))
+                fields: dict[str, Any] = {"note": note} if note else {}
+                progress.update(bar, advance=1, **fields)
 
             yield advance
+            progress.update(bar, completed=total)  # the work may have ended early, by its own rule
 
     def say(self, text: str) -> None:
         """Writes a line."""

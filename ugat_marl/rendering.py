@@ -60,11 +60,12 @@ class Picture:
             self._vehicles.remove()
             self._vehicles = None
         if len(vehicles.length_m):
+            placed = vehicles.position, vehicles.angle_deg, vehicles.length_m
             self._vehicles = self._patches(
-                [_body(*row) for row in zip(vehicles.position, vehicles.angle_deg, vehicles.length_m, strict=True)],
+                [_body(*row) for row in zip(*placed, strict=True)],
                 facecolors=["#b2182b" if v < 0.1 else "#2166ac" for v in vehicles.speed_mps],
                 zorder=3,
-            )  # fmt: skip
+            )
             self._axes.add_collection(self._vehicles)
         letters = [states.get(tls, "")[index : index + 1] for tls, index, _ in self._stop_lines]
         self._lines.set_color([_COLOURS.get(letter, "#888888") for letter in letters])

@@ -25,15 +25,10 @@ from ugat_marl.simulator import Launch, LibsumoSimulator, Simulator
 def _answer(simulator: Simulator, header: dict[str, Any]) -> Message:
     what = header["what"]
     if what == "start":
-        fields = header["launch"]
-        launch = Launch(
-            **{
-                **fields,
-                "arguments": tuple(fields["arguments"]),
-                "lanes": tuple(fields["lanes"]),
-            }
-        )
-        return _message(simulator.start(launch))
+        fields: dict[str, Any] = dict(header["launch"])
+        for name in ("arguments", "lanes"):
+            fields[name] = tuple(fields[name])
+        return _message(simulator.start(Launch(**fields)))
     if what == "advance":
         return _message(simulator.advance(header["seconds"], header["plans"]))
     if what == "vehicles":

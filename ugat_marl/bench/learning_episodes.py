@@ -51,13 +51,16 @@ class Tape(BaseParallelWrapper[str, Vector, int]):
             self.env.step(actions)
 
 
-class Noise(ParallelEnv[str, Vector, int]):
+class Noise(ParallelEnv[str, Any, Any]):
     """An environment without traffic, whose agents have the spaces of others.
 
     Args:
         spaces: Observation size and number of actions of each agent.
         decisions: Length of an episode.
     """
+
+    observation_spaces: dict[str, Box]
+    action_spaces: dict[str, Discrete]
 
     metadata: dict[str, Any] = {"name": "noise_v0", "render_modes": []}  # noqa: RUF012
 

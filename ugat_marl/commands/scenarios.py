@@ -26,11 +26,10 @@ class Scenarios:
     def run(self, console: Console) -> int:
         """Prints the lists."""
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-        for heading, justify in (
-            ("scenario", "left"), ("agents", "right"), ("phases", "right"), ("vehicles", "right"),
-            ("description", "left"),
-        ):  # fmt: skip
-            table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+        table.add_column("scenario")
+        for heading in ("agents", "phases", "vehicles"):
+            table.add_column(heading, justify="right")
+        table.add_column("description")
         maps = [f"resco:{name}" for name in sorted(resco_maps())]
         for name in (*(name for name, _ in shipped_scenarios()), *maps):
             table.add_row(name, *_facts(name))

@@ -32,13 +32,15 @@ def environments_can_be_sent(case: EnvironmentCase) -> None:
     case.need_episode()
     env = case.make()
     # What a worker process does. The bytes were made one line before: nothing foreign is unpickled.
+    copy: AnyParallelEnv | None = None
     with Listening() as heard:
-        copy: AnyParallelEnv = ForkingPickler.loads(ForkingPickler.dumps(env))
+        copy = ForkingPickler.loads(ForkingPickler.dumps(env))  # pyright: ignore[reportAttributeAccessIssue]
     if heard.error is not None:
         raise ConformanceError(
             f"the environment cannot be pickled before reset() ({said(heard.error)}), so no vector "
             "environment can send it to a process; make files, sockets and lambdas in reset()"
         )
+    assert copy is not None
     try:
         require(
             copy.possible_agents == env.possible_agents,

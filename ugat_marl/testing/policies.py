@@ -141,7 +141,7 @@ def its_actions_are_phases(case: PolicyCase) -> None:
 
 def _is_phase(action: Any, count: int) -> bool:
     whole = isinstance(action, int | np.integer) and not isinstance(action, bool)
-    return whole and 0 <= action < count
+    return whole and bool(0 <= action < count)
 
 
 def it_respects_masks(case: PolicyCase) -> None:

@@ -22,7 +22,7 @@ CAPACITY = 20
 """Vehicles that fit on a lane."""
 
 
-class ToyTraffic(ParallelEnv[str, NDArray[np.float32], int]):
+class ToyTraffic(ParallelEnv[str, Any, Any]):
     """Queues at three intersections, two of four lanes and one of three.
 
     Phase k serves lanes k and k + 1. Reward: minus the queued vehicles of the intersection.
@@ -32,6 +32,9 @@ class ToyTraffic(ParallelEnv[str, NDArray[np.float32], int]):
         served: Vehicles that leave a green lane per decision; another value is another domain.
         arrivals: Mean arrivals per lane and decision.
     """
+
+    observation_spaces: dict[str, Box]
+    action_spaces: dict[str, Discrete]
 
     metadata: ClassVar[dict[str, Any]] = {
         "name": "ugat_marl_toy_v1",
