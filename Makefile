@@ -32,7 +32,10 @@ help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
 
 demo: environment
-	$(BIN)/ugat-marl train grid2x2-v1 --real V4 --preset demo --out runs/demo $(ARGS)
+	rm -rf runs/demo
+	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train grid2x2-v1 --real V4 --out runs/demo \
+		--pretrain-episodes 40 --iterations 3 --grounded-episodes 10 --sim-rollouts 2 --real-rollouts 2 \
+		--evaluation-seeds 5 --tuning-seeds 1 $(ARGS)
 
 test: environment-dev
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)

@@ -291,7 +291,7 @@ def _fit(state: State, config: UgatConfig, seed: int, run: Run, iteration: int) 
             TransitionLog.concatenate(state.simulated),
             config.fit,
             seed,
-            on_epoch=lambda _model, _epoch, _loss: go(),
+            on_epoch=lambda model, _epoch, loss: go(note=f"{model} {loss:.2g}"),
         )
     for warning in report.warnings:
         run.reporter.say(f"[yellow]round {iteration + 1}:[/yellow] {warning}")

@@ -1,0 +1,278 @@
+"""Algorithm 1 on a real scenario: what is stored, what is resumed, what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+
+import ugat_marl.transfer as transfer_module
+from ugat_marl.controllers import controller_for
+from ugat_marl.effects import load
+from ugat_marl.env import parallel_env
+from ugat_marl.errors import CheckpointError, LogError, OptionError
+from ugat_marl.grounding.fitting import FitConfig
+from ugat_marl.learners.dqn_config import DQNConfig
+from ugat_marl.learners.dqn_policy import DQNPolicy
+from ugat_marl.progress import Silent
+from ugat_marl.rollout import Exploring, observer_of, roll_out
+from ugat_marl.training import Metrics
+from ugat_marl.transfer import TransferConfig, transfer
+from ugat_marl.transitions import TransitionLog
+from ugat_marl.ugat import UgatConfig
+
+SMALL = TransferConfig(
+    scenario="single-v1",
+    real="V4",
+    duration_s=200,
+    evaluation_seeds=1,
+    tuning_seeds=1,
+    control=False,
+    ugat=UgatConfig(
+        pretrain_episodes=12,
+        iterations=2,
+        grounded_episodes=2,
+        sim_rollouts=2,
+        real_rollouts=2,
+        fit=FitConfig(epochs=3),
+    ),
+    dqn=DQNConfig(warmup_decisions=20, epsilon_decay_decisions=100),
+)
+FEW_RULES = ("largest-queue:20", "programme")
+
+
+@pytest.fixture(autouse=True)
+def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search for the best rule is not under test here."""
+    search = transfer_module.best_rules
+
+    def short(*args: Any, **options: Any) -> dict[str, str]:
+        return search(*args, **options, rules=FEW_RULES)
+
+    monkeypatch.setattr(transfer_module, "best_rules", short)
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run nobody disturbs."""
+    folder = tmp_path_factory.mktemp("unbroken") / "run"
+    search = transfer_module.best_rules
+    transfer_module.best_rules = lambda *a, **k: search(*a, **k, rules=FEW_RULES)
+    try:
+        transfer(SMALL, folder)
+    finally:
+        transfer_module.best_rules = search
+    return folder
+
+
+class Killed(Exception):
+    """Stands for a kill at one moment."""
+
+
+class KillAt(Silent):
+    """Raises when the n-th task of a name begins."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def task(self, name: str, total: int) -> Any:
+        if name == self._name:
+            raise Killed
+        return super().task(name, total)
+
+
+def weights(folder: Path, name: str) -> np.ndarray[Any, Any]:
+    return DQNPolicy.load(folder / "policies" / f"{name}.pt").parameters
+
+
+def test_a_run_leaves_what_it_promises(unbroken: Path) -> None:
+    table = json.loads((unbroken / "table.json").read_text())
+    assert {row["policy"] for row in table["summary"]} >= {"direct transfer", "UGAT"}
+    assert {row["domain"] for row in table["summary"]} == {"sim", "V4"}
+    metrics = Metrics.read(unbroken / "metrics.parquet")
+    names = {name for stage, _, name, _ in metrics.rows if stage == "iteration"}
+    for name in (
+        "forward/error", "forward/no_change", "forward/held_out_loss", "inverse/accuracy",
+        "inverse/held_out_loss", "calibration/auroc", "calibration/error_by_quantile/0",
+        "calibration/mean_u", "calibration/mean_u_off_data", "gate/acceptance",
+        "gate/change_rate", "gate/alpha", "gate/alpha/signal_0", "att_s/sim", "att_s/V4",
+    ):  # fmt: skip
+        assert name in names, name
+    episodes = [step for stage, step, name, _ in metrics.rows if (stage, name) == ("episode", "return")]  # fmt: skip  # noqa: E501
+    assert episodes == list(range(12 + 2 * 2))
+    assert list((unbroken / "tensorboard").glob("events*"))
+    assert not np.array_equal(weights(unbroken, "ugat"), weights(unbroken, "direct-transfer"))
+
+
+def test_alpha_starts_infinite_and_then_is_the_mean_of_u(unbroken: Path) -> None:
+    rows = {(step, name): value for _, step, name, value in Metrics.read(unbroken / "metrics.parquet").rows}  # fmt: skip  # noqa: E501
+    assert rows[1, "gate/alpha"] == np.inf
+    assert rows[1, "gate/acceptance"] == 1.0
+    assert rows[2, "gate/alpha"] == pytest.approx(rows[1, "gate/mean_u"])
+
+
+@pytest.mark.parametrize(
+    "moment",
+    [
+        "plain sim, episode 11-12",
+        "roll-outs, round 1",
+        "fitting f and h, round 2",
+        "grounded, round 2",
+    ],  # fmt: skip
+)
+def test_resuming_gives_the_numbers_of_an_unbroken_run(
+    moment: str, unbroken: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    with pytest.raises(Killed):
+        transfer(SMALL, folder, reporter=KillAt(moment))
+    transfer(SMALL, folder, resume=True)
+    for name in ("metrics.parquet",):
+        assert pl.read_parquet(folder / name).equals(pl.read_parquet(unbroken / name))
+    assert np.array_equal(weights(folder, "ugat"), weights(unbroken, "ugat"))
+    assert (folder / "table.json").read_text() == (unbroken / "table.json").read_text()
+
+
+def test_a_killed_process_resumes(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    command = [
+        sys.executable, "-m", "ugat_marl", "train", "single-v1", "--duration-s", "200", "--out",
+        str(folder), "--pretrain-episodes", "20", "--iterations", "1", "--grounded-episodes", "1",
+        "--fit.epochs", "2", "--no-control", "--evaluation-seeds", "1", "--tuning-seeds", "1",
+    ]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while not (folder / "checkpoint" / "state.json").exists():
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    state = json.loads((folder / "checkpoint" / "state.json").read_text())
+    assert state["pretrained"] == 10
+    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "direct transfer" in done.stdout
+    again = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert again.returncode == 2
+    assert "--resume" in again.stderr
+
+
+def cut_in_half(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def spoil(path: Path) -> None:
+    content = torch.load(path, weights_only=True)
+    content["tensors"]["weights"][0] = float("nan")
+    torch.save(content, path)
+
+
+@pytest.mark.parametrize(
+    ("file", "damage", "error"),
+    [
+        ("learner.pt", cut_in_half, CheckpointError),
+        ("learner.pt", spoil, CheckpointError),
+        ("grounding.pt", cut_in_half, CheckpointError),
+        ("real-000.parquet", cut_in_half, LogError),
+        ("metrics.parquet", cut_in_half, CheckpointError),
+    ],
+)
+def test_a_damaged_checkpoint_is_named_and_left_alone(
+    file: str,
+    damage: Callable[[Path], None],
+    error: type[Exception],
+    unbroken: Path,
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(unbroken, folder)
+    damage(folder / "checkpoint" / file)
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    with pytest.raises(error, match=file):
+        transfer(SMALL, folder, resume=True)
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
+
+
+def test_a_run_of_another_scenario_is_refused(unbroken: Path) -> None:
+    other = TransferConfig("grid2x2-v1", duration_s=200, ugat=SMALL.ugat, dqn=SMALL.dqn)
+    with pytest.raises(CheckpointError, match="holds another run: its scenario"):
+        transfer(other, unbroken, resume=True)
+    with pytest.raises(OptionError, match="--resume"):
+        transfer(SMALL, unbroken)
+
+
+def recorded(path: Path, scenario: str = "single-v1", observation: str = "count") -> Path:
+    probe = parallel_env(scenario, "V4", duration_s=200)
+    rule = controller_for("largest-queue:20", probe)
+    env = parallel_env(scenario, "V4", duration_s=200, **rule.env_options)
+    logs: list[TransitionLog] = []
+    for seed in (1, 2):
+        log = roll_out(env, Exploring(rule, 0.3), seed, record=observer_of(env, observation)).log
+        assert log is not None
+        logs.append(log)
+    env.close()
+    TransitionLog.concatenate(logs).write(path)
+    return path
+
+
+def test_a_recorded_log_takes_the_place_of_the_real_simulator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = recorded(tmp_path / "real.parquet")
+    started: list[Any] = []
+    make = transfer_module.make_world
+    monkeypatch.setattr(
+        transfer_module, "make_world", lambda *args: started.append(args[1]) or make(*args)
+    )
+    config = TransferConfig(
+        "single-v1", real="none", real_log=log, duration_s=200, evaluation_seeds=1,
+        tuning_seeds=1, control=False, ugat=SMALL.ugat, dqn=SMALL.dqn,
+    )  # fmt: skip
+    found = transfer(config, tmp_path / "run")
+    assert started == ["sim"]
+    assert found.domains == ["sim"]
+
+
+def test_a_log_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    for name, log in (
+        ("agents", recorded(tmp_path / "grid.parquet", "grid2x2-v1")),
+        ("observation", recorded(tmp_path / "queue.parquet", observation="queue")),
+    ):
+        config = TransferConfig("single-v1", real="none", real_log=log, duration_s=200)
+        with pytest.raises(LogError, match=name):
+            transfer(config, tmp_path / f"run-{name}")
+    cut_in_half(tmp_path / "queue.parquet")
+    config = TransferConfig("single-v1", real="none", real_log=tmp_path / "queue.parquet")
+    with pytest.raises(LogError, match=r"queue\.parquet"):
+        transfer(config, tmp_path / "run")
+    with pytest.raises(OptionError, match="real_log"):
+        TransferConfig("single-v1", real="none")
+
+
+def test_the_control_starts_from_direct_transfer(tmp_path: Path) -> None:
+    config = TransferConfig(
+        "single-v1", duration_s=100, evaluation_seeds=1, tuning_seeds=1,
+        ugat=UgatConfig(
+            pretrain_episodes=2, iterations=1, grounded_episodes=1, sim_rollouts=2,
+            real_rollouts=2, fit=FitConfig(epochs=1),
+        ),
+        dqn=DQNConfig(warmup_decisions=5),
+    )  # fmt: skip
+    found = transfer(config, tmp_path / "run")
+    assert "more plain sim" in found.policies
+    direct = weights(tmp_path / "run", "direct-transfer")
+    assert not np.array_equal(direct, weights(tmp_path / "run", "more-plain-sim"))
+    assert load("single-v1").hash == found.scenario_hash
