@@ -27,7 +27,7 @@ def transfer_table(found: Evaluation) -> RenderableType:
     table.add_column("policy", max_width=22)
     table.add_column(first, justify="right")
     for domain in others:
-        for heading in (domain, "gap", "regret"):
+        for heading in (domain, "Δ", "regret"):
             table.add_column(heading, justify="right")
     for policy in found.policies:
         cells = [_with_interval(found.estimate(policy, first, "att_s"))]
@@ -75,7 +75,7 @@ def _caption(found: Evaluation) -> str:
     keys = [f"best rule in {domain}" for domain in found.domains]
     lines = [f"{key}: {found.notes[key]}" for key in keys if key in found.notes]
     lines.append(
-        f"{_seeds(found)} seeds. gap: minus {found.domains[0]}. regret: ATT above the best of "
+        f"{_seeds(found)} seeds. Δ: minus {found.domains[0]}. regret: ATT above the best of "
         "these policies in that domain."
     )
     return "\n".join(lines)
