@@ -19,8 +19,8 @@ from ugat_marl.bench.memory import growth_of
 from ugat_marl.bench.memory_resets import family, look
 from ugat_marl.bench.rival import Rival
 from ugat_marl.bench.speed import find_scenario, require_same_work
-from ugat_marl.env import parallel_env
 from ugat_marl.errors import MeasurementError, OptionError
+from ugat_marl.traffic_env import parallel_env
 
 SCENARIO = "single-v1"
 

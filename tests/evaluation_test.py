@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from ugat_marl.effects import load
-from ugat_marl.env import parallel_env
 from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.evaluation import (
     Evaluation,
@@ -22,6 +21,7 @@ from ugat_marl.evaluation import (
 )
 from ugat_marl.learners.dqn import DQN
 from ugat_marl.metrics import Scores
+from ugat_marl.traffic_env import parallel_env
 
 BASE = Scores(100.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 5.0)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ugat_marl.controllers import controller_for
-from ugat_marl.env import TrafficEnv, parallel_env
 from ugat_marl.rollout import Exploring, observer_of, roll_out
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
 
 class Always:

@@ -21,13 +21,13 @@ import torch
 import ugat_marl.transfer as transfer_module
 from ugat_marl.controllers import controller_for
 from ugat_marl.effects import load
-from ugat_marl.env import parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError
 from ugat_marl.grounding.fitting import FitConfig
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.progress import Silent
 from ugat_marl.rollout import Exploring, observer_of, roll_out
+from ugat_marl.traffic_env import parallel_env
 from ugat_marl.training import Metrics
 from ugat_marl.transfer import TransferConfig, transfer
 from ugat_marl.transitions import TransitionLog

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ugat_marl.effects import load as load_scenario
-    from ugat_marl.env import TrafficEnv, env, parallel_env
+    from ugat_marl.traffic_env import TrafficEnv, env, parallel_env
     from ugat_marl.transitions import TransitionLog
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "TrafficEnv": ("ugat_marl.env", "TrafficEnv"),
+    "TrafficEnv": ("ugat_marl.traffic_env", "TrafficEnv"),
     "TransitionLog": ("ugat_marl.transitions", "TransitionLog"),
-    "env": ("ugat_marl.env", "env"),
+    "env": ("ugat_marl.traffic_env", "env"),
     "load_scenario": ("ugat_marl.effects", "load"),
-    "parallel_env": ("ugat_marl.env", "parallel_env"),
+    "parallel_env": ("ugat_marl.traffic_env", "parallel_env"),
 }
 
 __all__ = ["TrafficEnv", "TransitionLog", "__version__", "env", "load_scenario", "parallel_env"]

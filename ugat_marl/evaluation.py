@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from ugat_marl.controllers import STANDARD_RULES, controller_for, parse_spec
 from ugat_marl.effects import Domain, describe, in_domain
-from ugat_marl.env import TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError
 from ugat_marl.files import write_whole
 from ugat_marl.learners.agents import AgentSet
@@ -33,6 +32,7 @@ from ugat_marl.progress import Reporter, Silent
 from ugat_marl.rollout import roll_out
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import numpy_generator
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
 PolicyFactory = Callable[[TrafficEnv], Policy]
 """Makes a policy for an environment; controllers read the network from it."""

@@ -11,7 +11,6 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.controllers import STANDARD_RULES
 from ugat_marl.effects import describe, in_domain, load
-from ugat_marl.env import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import (
     TUNING_SEED,
@@ -29,6 +28,7 @@ from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenario import Scenario
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
 from ugat_marl.transitions import TransitionLog
 from ugat_marl.ugat import (

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ugat_marl.effects import Domain
-from ugat_marl.env import TrafficEnv, parallel_env
 from ugat_marl.errors import LogError, OptionError
 from ugat_marl.grounding.fitting import FitConfig, FitReport, fit
 from ugat_marl.grounding.forward import ForwardConfig
@@ -25,6 +24,7 @@ from ugat_marl.policy import AnyParallelEnv, Learner, Policy
 from ugat_marl.rollout import Exploring, observer_of, roll_out
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
 from ugat_marl.transitions import TransitionLog
 

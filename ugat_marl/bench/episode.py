@@ -9,10 +9,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.env import TrafficEnv, parallel_env
 from ugat_marl.measurements import Snapshot, Trips
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.simulator import Launch, LibsumoSimulator, Plans, VehiclePicture
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
 
 class RecordingSimulator:

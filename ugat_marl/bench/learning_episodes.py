@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from ugat_marl.env import TrafficEnv, parallel_env
 from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.seeding import torch_generator
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
 Vector = NDArray[np.float32]
 

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.env import parallel_env
 from ugat_marl.seeding import numpy_generator
+from ugat_marl.traffic_env import parallel_env
 
 Process = tuple[int, int, float]
 """Process id, its parent's id, resident memory in MiB."""

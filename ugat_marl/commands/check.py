@@ -9,7 +9,6 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.effects import load
-from ugat_marl.env import TrafficEnv, parallel_env
 from ugat_marl.progress import Bars
 from ugat_marl.testing import (
     Result,
@@ -19,6 +18,7 @@ from ugat_marl.testing import (
     failures,
     report,
 )
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
 
 @dataclass(frozen=True)

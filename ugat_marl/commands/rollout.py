@@ -10,12 +10,12 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.effects import load
-from ugat_marl.env import parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import policy_factory
 from ugat_marl.progress import Bars
 from ugat_marl.rollout import Exploring, observer_of, roll_out
 from ugat_marl.seeding import derive_seed
+from ugat_marl.traffic_env import parallel_env
 from ugat_marl.transitions import TransitionLog
 
 

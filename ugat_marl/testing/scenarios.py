@@ -11,13 +11,13 @@ from typing import Any
 
 from ugat_marl.demand import Demand, check_demand
 from ugat_marl.effects import SETTINGS, in_domain, load
-from ugat_marl.env import EnvOptions, TrafficEnv
 from ugat_marl.network import Intersection, Network
 from ugat_marl.phases import conflicting_greens
 from ugat_marl.scenario import Scenario, load_scenario
 from ugat_marl.signals import GREEN
 from ugat_marl.testing.episodes import begin, proceed, random_actions
 from ugat_marl.testing.results import NotChecked, Result, require, run_checks
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
 Change = Callable[[Scenario, str], Scenario]
 """Puts a scenario into a domain."""
@@ -93,7 +93,7 @@ class ScenarioCase:
 
     def environment(self, scenario: Scenario) -> TrafficEnv:
         """An environment of the scenario as it is."""
-        env = TrafficEnv(scenario, (), EnvOptions())
+        env = parallel_env(scenario)
         self._envs.append(env)
         return env
 

@@ -8,9 +8,8 @@ import tempfile
 import warnings
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
@@ -20,68 +19,19 @@ from pettingzoo import ParallelEnv
 from ugat_marl import signals
 from ugat_marl.demand import check_demand
 from ugat_marl.effects import Domain, describe, in_domain, load
-from ugat_marl.errors import ActionError, EpisodeError, UnknownNameError
+from ugat_marl.errors import ActionError, EpisodeError
 from ugat_marl.measurements import Snapshot
 from ugat_marl.metrics import EpisodeRecorder, Scores
+from ugat_marl.naming import group_names
 from ugat_marl.network import Network
 from ugat_marl.observations import Observer
+from ugat_marl.options import EnvOptions
 from ugat_marl.rendering import Picture
-from ugat_marl.rewards import Rewarder, RewardFunction
+from ugat_marl.rewards import Rewarder
 from ugat_marl.scenario import Scenario
 from ugat_marl.simulator import LibsumoSimulator, Simulator, launch_of
 from ugat_marl.simulator_process import ProcessSimulator
 from ugat_marl.transitions import AgentLayout
-
-RenderMode = Literal["human", "rgb_array"]
-
-
-@dataclass(frozen=True)
-class EnvOptions:
-    """Options of an environment.
-
-    Attributes:
-        observation: What an agent sees; see `ugat_marl.observations.UNITS`.
-        reward: ``"queue"``, ``"pressure"``, ``"waiting"`` or a function of two `IntersectionView`.
-        neighbours: How many roads away intersections are whose features and phase are seen too.
-        signals: ``"actions"``, or ``"programme"``: SUMO runs the network's own signal programme
-            and actions are ignored.
-        duration_s: Length of an episode in s; None for the scenario's own.
-        simulator: ``"process"`` (any number at once, reproducible to the bit), ``"spawn"`` (the
-            same without forking), or ``"inprocess"`` (one per process, a little faster).
-        render_mode: None, ``"rgb_array"`` (a picture from `render`) or ``"human"`` (sumo-gui).
-    """
-
-    observation: str = "count"
-    reward: str | RewardFunction = "queue"
-    neighbours: int = 0
-    signals: str = "actions"
-    duration_s: float | None = None
-    simulator: str = "process"
-    render_mode: str | None = None
-
-    def __post_init__(self) -> None:
-        for name, allowed in (
-            ("signals", ("actions", "programme")),
-            ("simulator", ("process", "spawn", "inprocess")),
-            ("render_mode", (None, *get_args(RenderMode))),
-        ):
-            value = getattr(self, name)
-            if value not in allowed:
-                names = [item for item in allowed if item]
-                raise UnknownNameError(f"value of option {name!r}:", str(value), names)
-
-    @classmethod
-    def of(cls, options: Mapping[str, Any]) -> EnvOptions:
-        """Options from keywords.
-
-        Raises:
-            UnknownNameError: No option of this name, or no such value.
-        """
-        known = [item.name for item in fields(cls)]
-        for name in options:
-            if name not in known:
-                raise UnknownNameError("option", name, known)
-        return cls(**options)
 
 
 class TrafficEnv(ParallelEnv[str, Any, Any]):
@@ -290,15 +240,12 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             (space.shape, len(item.phases), tuple(space.low))
             for space, item in zip(self._observer.spaces, items, strict=True)
         ]
-        distinct = list(dict.fromkeys(kinds))
-        self.agent_groups: dict[str, list[str]] = {}
-        self.possible_agents: list[str] = []
-        for kind in kinds:
-            number = distinct.index(kind)
-            group = "signal" if len(distinct) == 1 else f"signal{_letters(number)}"
-            members = self.agent_groups.setdefault(group, [])
-            members.append(f"{group}_{len(members)}")
-            self.possible_agents.append(members[-1])
+        groups = group_names(kinds)
+        names = {
+            place: f"{group}_{n}" for group, own in groups.items() for n, place in enumerate(own)
+        }
+        self.possible_agents = [names[place] for place in range(len(items))]
+        self.agent_groups = {group: [names[i] for i in own] for group, own in groups.items()}
         agents = self.possible_agents
         self.intersection_of = {a: item.id for a, item in zip(agents, items, strict=True)}
         self.layouts: dict[str, AgentLayout] = dict(
@@ -345,7 +292,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             if agent not in actions:
                 raise ActionError(f"no action for agent {agent!r}; every agent needs one")
             action = actions[agent]
-            if not self.action_spaces[agent].contains(action):
+            if not _is_phase(action, self.action_spaces[agent]):
                 last = self.action_spaces[agent].n - 1
                 raise ActionError(
                     f"action of agent {agent!r} is {action!r}; "
@@ -433,6 +380,11 @@ def env(scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any)
     return parallel_to_aec(parallel_env(scenario, domain, **options))
 
 
+def _is_phase(action: Any, space: Discrete) -> bool:
+    """Whether `space` contains `action`; a plain int, the usual case, is quickly told."""
+    return (type(action) is int and 0 <= action < space.n) or space.contains(action)
+
+
 def _simulator(name: str) -> Simulator:
     if name == "inprocess":
         return LibsumoSimulator()
@@ -443,13 +395,3 @@ def _remove_tree(directory: Path, owner: int) -> None:
     """Removes a folder, but not in a process that was forked from the one that made it."""
     if os.getpid() == owner:
         shutil.rmtree(directory, ignore_errors=True)
-
-
-def _letters(number: int) -> str:
-    """a, b, ..., z, aa, ab, ..."""
-    text = ""
-    number += 1
-    while number:
-        number, digit = divmod(number - 1, 26)
-        text = chr(ord("a") + digit) + text
-    return text

@@ -1,0 +1,35 @@
+"""Names of agents: the same prefix means the same kind."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+
+def group_names(kinds: Sequence[Hashable]) -> dict[str, list[int]]:
+    """Groups of equal kinds, in order of appearance.
+
+    Args:
+        kinds: The kind of each item.
+
+    Returns:
+        ``"signal"`` if all are of one kind, else ``"signala"``, ``"signalb"``, ..., each with the
+        positions of its items.
+    """
+    distinct = list(dict.fromkeys(kinds))
+    names = (
+        ["signal"] if len(distinct) == 1 else [f"signal{letters(i)}" for i in range(len(distinct))]
+    )
+    groups: dict[str, list[int]] = {name: [] for name in names}
+    for position, kind in enumerate(kinds):
+        groups[names[distinct.index(kind)]].append(position)
+    return groups
+
+
+def letters(number: int) -> str:
+    """a, b, ..., z, aa, ab, ..."""
+    text = ""
+    number += 1
+    while number:
+        number, digit = divmod(number - 1, 26)
+        text = chr(ord("a") + digit) + text
+    return text
