@@ -59,7 +59,7 @@ def relative_slowness(
 ) -> NDArray[np.float64]:
     """1 - v / v_max of each lane of `incoming`, clipped to [0, 1] (vehicles may speed a little)."""
     ratio = snapshot.mean_speed_mps[incoming] / lanes.speed_mps[incoming]
-    return np.clip(1.0 - ratio, 0.0, 1.0)
+    return np.minimum(np.maximum(1.0 - ratio, 0.0), 1.0)
 
 
 @dataclass

@@ -64,7 +64,7 @@ class Observer:
         )
         self._downstream = _downstream_matrix(network) if name == "pressure" else None
         self._gather, sizes = _gather(network, name)
-        self._features = _slices(sizes)
+        self._sizes = sizes
         self._phases = [len(item.phases) for item in items]
         self._near = _within(network, neighbours)
         self.layouts = [
@@ -77,7 +77,7 @@ class Observer:
         ]
         low = -1.0 if name == "pressure" else 0.0
         self.spaces = [self._space(index, low) for index in range(len(items))]
-        self._eyes = [np.eye(phases, dtype=np.float32) for phases in self._phases]
+        self._place()
 
     @property
     def needs_waiting(self) -> bool:
@@ -92,19 +92,39 @@ class Observer:
             phases: Green phase each intersection shows or clears towards.
 
         Returns:
-            For each intersection float32 ``(layout.size,)``, fresh arrays.
+            For each intersection float32 ``(layout.size,)``, parts of one fresh array.
         """
-        flat = self._flat(snapshot).astype(np.float32)
-        own = [
-            np.concatenate((flat[part], eye[phase]))
-            for part, eye, phase in zip(self._features, self._eyes, phases, strict=True)
-        ]
-        if not any(self._near):
-            return own
-        return [
-            np.concatenate((vector, *(own[j] for j in near)))
-            for vector, near in zip(own, self._near, strict=True)
-        ]
+        own = np.zeros(self._length, dtype=np.float32)
+        own[self._feature_places] = self._flat(snapshot)
+        own[self._first_phases + phases] = 1.0
+        seen = own if self._context is None else own[self._context]
+        return [seen[part] for part in self._parts]
+
+    def _place(self) -> None:
+        """Lays out ``features | phases`` of all intersections in one row, and who sees what of it.
+
+        Every number of a decision is then written by three assignments, however many intersections
+        there are.
+        """
+        features = [layout.features for layout in self.layouts]
+        widths = [f + phases for f, phases in zip(features, self._phases, strict=True)]
+        own = _slices(widths)
+        starts = np.array([part.start for part in own])
+        self._length = sum(widths)
+        self._first_phases = starts + features
+        self._feature_places = np.concatenate(
+            [np.arange(part.start, part.start + f) for part, f in zip(own, features, strict=True)]
+        )
+        self._context: NDArray[np.int64] | None = None
+        self._parts = own
+        if any(self._near):
+            places = np.arange(self._length)
+            seen = [
+                np.concatenate([places[own[j]] for j in (index, *near)])
+                for index, near in enumerate(self._near)
+            ]
+            self._context = np.concatenate(seen)
+            self._parts = _slices([len(part) for part in seen])
 
     def _flat(self, snapshot: Snapshot) -> NDArray[np.float64]:
         capacity = self._lanes.capacity
@@ -128,8 +148,7 @@ class Observer:
     def _space(self, index: int, low: float) -> Box:
         parts: list[NDArray[np.float32]] = []
         for j in (index, *self._near[index]):
-            features = self._features[j].stop - self._features[j].start
-            parts.append(np.full(features, low, dtype=np.float32))
+            parts.append(np.full(self._sizes[j], low, dtype=np.float32))
             parts.append(np.zeros(self._phases[j], dtype=np.float32))
         lows = np.concatenate(parts)
         return Box(lows, np.ones_like(lows), dtype=np.float32)

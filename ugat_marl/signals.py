@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ugat_marl.errors import OptionError, ScenarioError
 
@@ -43,8 +44,7 @@ class SignalTiming:
         return self.yellow_s + self.all_red_s
 
 
-@dataclass(frozen=True)
-class SignalState:
+class SignalState(NamedTuple):
     """Where the machine of one intersection stands.
 
     Attributes:
