@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import ClassVar
 
 from ugat_marl.errors import OptionError
@@ -44,7 +45,8 @@ class Effect:
         for item in fields(self):
             value, allowed = getattr(self, item.name), self.ranges[item.name]
             if not (
-                isinstance(value, (int, float))
+                isinstance(value, Real)
+                and not isinstance(value, bool)
                 and math.isfinite(value)
                 and allowed.low <= value <= allowed.high
             ):

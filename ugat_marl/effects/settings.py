@@ -14,7 +14,7 @@ from ugat_marl.effects.vehicles import (
     EmergencyDeceleration,
     StartupDelay,
 )
-from ugat_marl.errors import OptionError, UnknownNameError, nearest
+from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.scenario import Scenario, load_scenario
 
 Domain = str | Sequence[Effect]
@@ -57,8 +57,12 @@ def known_effects() -> Mapping[str, type[Effect]]:
     return dict(_EFFECTS)
 
 
-def effect_from(record: Mapping[str, Any]) -> Effect:
+def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
     """An effect from its name and parameters, as in ``[[effects]]`` of a scenario file.
+
+    Args:
+        record: ``{"name": ..., parameter: value, ...}``.
+        where: Where it stands, for errors.
 
     Raises:
         UnknownNameError: No effect of this name, or no parameter of this name.
@@ -67,14 +71,14 @@ def effect_from(record: Mapping[str, Any]) -> Effect:
     values = dict(record)
     name = str(values.pop("name", ""))
     if name not in _EFFECTS:
-        raise UnknownNameError("effect", name, _EFFECTS)
+        raise UnknownNameError(f"effect{where}", name, _EFFECTS)
     kind = _EFFECTS[name]
     parameters = [item.name for item in fields(kind)]
     for key in values:
         if key not in parameters:
-            raise UnknownNameError(f"parameter of effect {name!r}", key, parameters)
+            raise UnknownNameError(f"parameter of effect {name!r}{where}", key, parameters)
     if missing := [key for key in parameters if key not in values]:
-        raise OptionError(f"effect {name!r}: parameter {missing[0]!r} is missing")
+        raise OptionError(f"effect {name!r}{where}: parameter {missing[0]!r} is missing")
     return kind(**values)
 
 
@@ -87,27 +91,37 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
     """
     if not isinstance(domain, str):
         return tuple(domain)
-    if domain.lower() == "sim":
+    parts = [part.strip() for part in domain.split("+")]
+    if len(parts) > 1:
+        return tuple(effect for part in parts for effect in parse_domain(part))
+    name = parts[0].lower()
+    if name == "sim":
         return ()
-    settings = {name.lower(): name for name in SETTINGS} | ALIASES
-    if domain.lower() in settings:
-        return SETTINGS[settings[domain.lower()]]
-    if "=" not in domain:
-        known = ("sim", *SETTINGS, *ALIASES)
-        guess = nearest(domain, known)
-        example = "Effects work as well: startup_delay=0.5+acceleration=1.0"
-        raise UnknownNameError("domain", domain, known, "" if guess else example)
-    return tuple(_effect_from_text(text) for text in domain.split("+"))
+    settings = {setting.lower(): setting for setting in SETTINGS} | ALIASES
+    if name in settings:
+        return SETTINGS[settings[name]]
+    if "=" in name:
+        return (_effect_from_text(name),)
+    raise UnknownNameError(
+        "domain",
+        domain,
+        ("sim", *SETTINGS, *ALIASES),
+        "Effects (startup_delay=0.5+acceleration=1.0) and the directory of another scenario on the "
+        "same network work as well.",
+    )
 
 
 def _effect_from_text(text: str) -> Effect:
-    name, _, values = text.partition("=")
+    name, _, values = (part.strip() for part in text.partition("="))
     if name not in _EFFECTS:
         raise UnknownNameError("effect", name, _EFFECTS)
     parameters = [item.name for item in fields(_EFFECTS[name])]
     parts = values.split(",")
     if len(parts) != len(parameters):
-        raise OptionError(f"effect {name!r} takes {len(parameters)} value(s): {parameters}")
+        raise OptionError(
+            f"effect {name!r} takes {len(parameters)} value(s), {', '.join(parameters)}; "
+            f"got {values!r}"
+        )
     try:
         numbers = [float(part) for part in parts]
     except ValueError:
@@ -133,7 +147,8 @@ def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
 def load(name: str | Path | Scenario) -> Scenario:
     """Loads a scenario and applies the effects its own file lists (see `load_scenario`)."""
     scenario = name if isinstance(name, Scenario) else load_scenario(name)
-    effects = [effect_from(record) for record in scenario.settings.effects]
+    where = f" in scenario {scenario.id!r}"
+    effects = [effect_from(record, where) for record in scenario.settings.effects]
     plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
     return apply_effects(plain, effects)
 
@@ -144,9 +159,30 @@ def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
     Args:
         scenario: What `load` returned.
         domain: Effects, or the name of some, or the path of another scenario on the same network.
+
+    Raises:
+        UnknownNameError: No such setting or effect.
+        OptionError: An effect has an impossible value.
+        ScenarioError: A scenario named as a domain cannot be read or has other roads.
     """
     if isinstance(domain, str) and "=" not in domain:
         path = Path(domain).expanduser()
         if path.suffix == ".sumocfg" or (path / "scenario.toml").is_file():
-            return load(path)
+            other = load(path)
+            if _signals(other) != _signals(scenario):
+                raise ScenarioError(
+                    f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "
+                    "a domain must be on the same network, or a policy means nothing in it"
+                )
+            return other
     return apply_effects(scenario, parse_domain(domain))
+
+
+def _signals(scenario: Scenario) -> set[tuple[str, ...]]:
+    """What every letter of every signal stands for."""
+    keys = ("tl", "linkIndex", "from", "fromLane", "to", "toLane")
+    return {
+        tuple(item.get(key, "") for key in keys)
+        for item in scenario.network.parse().iter("connection")
+        if "tl" in item.attrib
+    }

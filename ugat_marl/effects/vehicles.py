@@ -21,7 +21,12 @@ DEFAULT_TYPES = (
 """Types SUMO defines itself. Only the first is used without being named."""
 
 DEFAULTS_FILE = "default-types.add.xml"
-_NOT_DRIVEN = frozenset({"pedestrian", "rail", "rail_electric", "rail_urban", "tram", "ship"})
+_NOT_DRIVEN = frozenset(
+    {
+        "pedestrian", "wheelchair", "container", "rail", "rail_electric", "rail_urban", "rail_fast",
+        "subway", "cable_car", "tram", "ship", "aircraft", "drone",
+    }
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,7 @@ class VehicleEffect(Effect):
 
     def apply(self, scenario: Scenario) -> Scenario:
         """Sets the attribute in every vehicle type, SUMO's default type included."""
-        value = f"{getattr(self, fields(self)[0].name):g}"
+        value = f"{getattr(self, fields(self)[0].name):.12g}"
         additional = scenario.additional
         if not additional or additional[0].name != DEFAULTS_FILE:
             additional = (_default_types(scenario), *additional)
@@ -114,4 +119,7 @@ def _with_attribute(document: Document, attribute: str, value: str) -> Document:
         return document
     for item in types:
         item.set(attribute, value)
+        for model in item:  # an old way to write a type, which overrules the attributes
+            if model.tag.startswith("carFollowing-") and attribute in model.attrib:
+                model.set(attribute, value)
     return document.edited(xml_bytes(root))
