@@ -18,6 +18,10 @@ class DQNConfig:
     terminate, the bootstrap value is shifted along. `reward_scale` replaces the measured scale (and
     the centre, by 0) for all agents.
 
+    The defaults were chosen on one network only (Hangzhou, one intersection, 60 episodes of 360
+    decisions, one or two seeds each): longer bouts of exploration, one-step targets and a short
+    decay learned faster; hidden layers of 64 were no better than of 48.
+
     Attributes:
         hidden: Sizes of the hidden layers of every agent's network.
         learning_rate: Step size of Adam.
@@ -36,7 +40,7 @@ class DQNConfig:
         reward_scale: Factor on all rewards; None measures it per agent.
     """
 
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = (48, 48)
     learning_rate: float = 1e-3
     discount: float = 0.95
     batch_size: int = 32
@@ -46,7 +50,7 @@ class DQNConfig:
     target_rate: float = 0.01
     epsilon_start: float = 1.0
     epsilon_end: float = 0.05
-    epsilon_decay_decisions: int = 7_200
+    epsilon_decay_decisions: int = 3_600
     sticky_decisions: int = 3
     huber_delta: float = 1.0
     reward_scale: float | None = None
