@@ -167,8 +167,9 @@ class Run:
         if self._board is None:
             from torch.utils.tensorboard import SummaryWriter
 
-            folder = str(self.directory / "tensorboard")
-            self._board = SummaryWriter(folder, purge_step=step if self.metrics.rows else None)
+            folder = self.directory / "tensorboard"
+            again = step if folder.exists() else None  # hides what a killed run logged from here on
+            self._board = SummaryWriter(str(folder), purge_step=again)
         return self._board
 
 

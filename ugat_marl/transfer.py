@@ -32,6 +32,7 @@ from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
 from ugat_marl.transitions import TransitionLog
 from ugat_marl.ugat import (
+    CHUNK,
     DIRECT_LEARNER,
     RecordedWorld,
     State,
@@ -223,17 +224,18 @@ def _train(
 
 def _control(config: TransferConfig, env: TrafficEnv, run: Run) -> Policy:
     """Direct transfer trained on, in plain sim, for as many episodes as the iterations had."""
-    path = run.directory / "control.pt"
-    if path.exists():
-        return DQNPolicy.load(path)
     learner = DQN.of(env, config.dqn, config.seed)
-    learner.load(run.directory / DIRECT_LEARNER)
-    episodes = config.ugat.iterations * config.ugat.grounded_episodes
-    with run.reporter.task("control: more plain sim", episodes) as advance:
-        learner.learn(env, episodes, config.seed, lambda _number, _numbers: advance())
-    policy = learner.policy()
-    policy.save(path)
-    return policy
+    progress, start = run.directory / "control-learner.pt", run.directory / DIRECT_LEARNER
+    learner.load(progress if progress.exists() else start)
+    ugat = config.ugat
+    left = ugat.pretrain_episodes + ugat.iterations * ugat.grounded_episodes - learner.episodes
+    with run.reporter.task("control: more plain sim", max(left, 0)) as advance:
+        while left > 0:
+            episodes = min(CHUNK, left)
+            learner.learn(env, episodes, config.seed, lambda _number, _numbers: advance())
+            learner.save(progress)
+            left -= episodes
+    return learner.policy()
 
 
 def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> dict[str, Any]:
