@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -276,3 +277,13 @@ def test_the_control_starts_from_direct_transfer(tmp_path: Path) -> None:
     direct = weights(tmp_path / "run", "direct-transfer")
     assert not np.array_equal(direct, weights(tmp_path / "run", "more-plain-sim"))
     assert load("single-v1").hash == found.scenario_hash
+
+
+def test_models_that_are_too_poor_are_not_obeyed(tmp_path: Path) -> None:
+    ugat = replace(SMALL.ugat, pretrain_episodes=1, iterations=1, least_accuracy=1.0)
+    transfer(replace(SMALL, ugat=ugat), tmp_path / "run")
+    rows = {n: v for _, _, n, v in Metrics.read(tmp_path / "run" / "metrics.parquet").rows}
+    assert rows["inverse/accuracy"] < 1.0
+    assert rows["gate/acceptance"] == 0.0
+    with pytest.raises(OptionError, match="least_accuracy"):
+        UgatConfig(least_accuracy=1.5)

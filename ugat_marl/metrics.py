@@ -51,8 +51,6 @@ MEASURES: dict[str, str] = {
 }
 """The five measures of the paper and delay in seconds, with their headings."""
 
-LARGER_IS_BETTER = frozenset({"throughput", "reward"})
-
 
 def relative_slowness(
     snapshot: Snapshot, lanes: LaneTable, incoming: NDArray[np.int64]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.measurements import HALTING_MPS
 from ugat_marl.network import Network
 from ugat_marl.simulator import VehiclePicture
 
@@ -63,7 +64,9 @@ class Picture:
             placed = vehicles.position, vehicles.angle_deg, vehicles.length_m
             self._vehicles = self._patches(
                 [_body(*row) for row in zip(*placed, strict=True)],
-                facecolors=["#b2182b" if v < 0.1 else "#2166ac" for v in vehicles.speed_mps],
+                facecolors=[
+                    "#b2182b" if v < HALTING_MPS else "#2166ac" for v in vehicles.speed_mps
+                ],
                 zorder=3,
             )
             self._axes.add_collection(self._vehicles)

@@ -46,6 +46,9 @@ class UgatConfig:
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
         rollout_epsilon: Chance of a random phase in these roll-outs.
+        least_accuracy: Held-out accuracy h must have at an intersection, and f and h must beat their
+            trivial rivals, before grounded actions are taken there; None obeys them from the start,
+            as the paper does.
         forward: Shape of f.
         inverse: Shape of h.
         fit: How f and h are fitted.
@@ -58,6 +61,7 @@ class UgatConfig:
     sim_rollouts: int = 3
     real_rollouts: int = 3
     rollout_epsilon: float = 0.3
+    least_accuracy: float | None = None
     forward: ForwardConfig = field(default_factory=ForwardConfig)
     inverse: InverseConfig = field(default_factory=InverseConfig)
     fit: FitConfig = field(default_factory=FitConfig)
@@ -73,8 +77,10 @@ class UgatConfig:
         ):
             if getattr(self, name) < least:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least {least}")
-        if not 0 <= self.rollout_epsilon <= 1:
-            raise OptionError(f"rollout_epsilon = {self.rollout_epsilon}: must be from 0 to 1")
+        for name in ("rollout_epsilon", "least_accuracy"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= 1:
+                raise OptionError(f"{name} = {value}: must be from 0 to 1")
 
 
 class World(Protocol):
@@ -222,6 +228,8 @@ def train_ugat(
         policy = state.learner.policy()
         _collect(state, sim, real, policy, i, seed, run)
         report = _fit(state, config, derive_seed(seed, "fit", i), run, i)
+        if config.least_accuracy is not None:
+            state.transform.gate.trust(report.trusted(config.least_accuracy))
         _learn(state, grounded, config.grounded_episodes, seed, run, f"grounded, round {i + 1}")
         gate = state.transform.gate.update()  # alpha of the next iteration
         run.log("iteration", i + 1, _numbers(report, gate, state, probe))
