@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 
 from ugat_marl.errors import ScenarioError
@@ -19,7 +21,7 @@ class Demand:
 
     Attributes:
         vehicles: Single vehicles and trips that depart within the episode.
-        flows: Flows, each of which makes many vehicles.
+        flows: Flows within the episode, each of which makes many vehicles.
     """
 
     vehicles: int
@@ -27,27 +29,33 @@ class Demand:
 
 
 def check_demand(scenario: Scenario, network: Network) -> Demand:
-    """Reads all route files and checks that their edges exist.
+    """Reads all route files and checks that they can be driven.
 
     Raises:
-        ScenarioError: A route uses an edge the network does not have, or no vehicle departs within
-            the episode.
+        ScenarioError: A route uses an edge the network does not have, vehicles are not in the order
+            of their departures, or no vehicle departs within the episode.
     """
     edges = {lane.edge for lane in network.lanes.values()}
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
     vehicles = flows = 0
     for document in (*scenario.routes, *scenario.additional):
+        latest = -math.inf
         for item in document.parse().iter():
             if item.tag in ("vehicle", "trip", "flow", "route"):
                 used = " ".join(item.get(key, "") for key in _ROUTED).split()
                 for edge in used:
                     if edge not in edges:
-                        raise _unknown_edge(document, item.tag, item.get("id", ""), edge, scenario)
-            if item.tag == "flow":
-                flows += 1
-            elif item.tag in ("vehicle", "trip"):
-                vehicles += begin <= _depart_s(item.get("depart", ""), document, begin) < end
+                        raise _unknown_edge(document, item, edge, scenario)
+            if item.tag in ("vehicle", "trip", "flow"):
+                depart = _depart_s(item, document, max(begin, latest))
+                if depart < latest and document in scenario.routes:
+                    raise _unsorted(document, item, depart, latest)
+                latest = max(latest, depart)
+                if item.tag == "flow":
+                    flows += depart < end and begin < _end_s(item, document)
+                else:
+                    vehicles += begin <= depart < end
     if not vehicles and not flows:
         files = ", ".join(document.source for document in scenario.routes)
         raise ScenarioError(
@@ -57,23 +65,45 @@ def check_demand(scenario: Scenario, network: Network) -> Demand:
     return Demand(vehicles, flows)
 
 
+def _who(item: ET.Element) -> str:
+    name = item.get("id", "")
+    return f"<{item.tag}" + (f" id={name!r}" if name else "") + ">"
+
+
 def _unknown_edge(
-    document: Document, tag: str, name: str, edge: str, scenario: Scenario
+    document: Document, item: ET.Element, edge: str, scenario: Scenario
 ) -> ScenarioError:
-    who = f"<{tag}" + (f" id={name!r}" if name else "") + ">"
     return ScenarioError(
-        f"{document.source}: {who} uses the edge {edge!r}, which {scenario.network.source} does "
-        "not have; were the routes made for another network?"
+        f"{document.source}: {_who(item)} uses the edge {edge!r}, which {scenario.network.source} "
+        "does not have; were the routes made for another network?"
     )
 
 
-def _depart_s(text: str, document: Document, begin_s: float) -> float:
-    """Seconds; a triggered departure counts as one at the beginning."""
-    if text in _NO_TIME:
-        return begin_s
+def _unsorted(document: Document, item: ET.Element, depart: float, latest: float) -> ScenarioError:
+    return ScenarioError(
+        f"{document.source}: {_who(item)} departs at {depart:g} s but stands after one of "
+        f"{latest:g} s, and SUMO would leave it out; sort the file by departure (SUMO's "
+        "tools/route/sort_routes.py does)"
+    )
+
+
+def _depart_s(item: ET.Element, document: Document, triggered_s: float) -> float:
+    """Seconds; of a departure that something else triggers, `triggered_s`."""
+    key, default = ("begin", "0") if item.tag == "flow" else ("depart", "")
+    text = item.get(key, default)
+    return triggered_s if text in _NO_TIME else _seconds(text, key, item, document)
+
+
+def _end_s(item: ET.Element, document: Document) -> float:
+    text = item.get("end")
+    return math.inf if text is None else _seconds(text, "end", item, document)
+
+
+def _seconds(text: str, key: str, item: ET.Element, document: Document) -> float:
     try:
         return seconds_of(text)
     except ValueError:
         raise ScenarioError(
-            f"{document.source}: depart={text!r} is not a time; give seconds or h:m:s"
+            f"{document.source}: {key}={text!r} of {_who(item)} is not a time; "
+            "give seconds or h:m:s"
         ) from None

@@ -14,7 +14,7 @@ from ugat_marl.files import parse_xml
 from ugat_marl.measurements import LaneTable
 from ugat_marl.phases import Link, conflict_free_phases, conflicting_greens, programme_phases
 from ugat_marl.scenario import Scenario
-from ugat_marl.signals import check_phases
+from ugat_marl.signals import STATES, check_phases
 
 VEHICLE_SPACE_M = 7.5
 """Room of a queued default vehicle: 5 m length plus 2.5 m gap."""
@@ -94,7 +94,20 @@ class Network:
         document = scenario.network
         root = parse_xml(document.read(), document.source)
         if root.tag != "net":
-            raise ScenarioError(f"{document.source}: the root is <{root.tag}>, not <net>")
+            raise ScenarioError(
+                f"{document.source}: a SUMO network begins with <net>, this with <{root.tag}>"
+            )
+        try:
+            return cls._of(root, scenario)
+        except (ValueError, IndexError, KeyError) as error:
+            raise ScenarioError(
+                f"{document.source}: a value is missing or is not what SUMO writes there "
+                f"({error}); build the network again with netconvert"
+            ) from None
+
+    @classmethod
+    def _of(cls, root: ET.Element, scenario: Scenario) -> Network:
+        document = scenario.network
         lanes = _lanes(root)
         links = _links(root)
         programmes = _programmes(root, scenario)
@@ -103,6 +116,7 @@ class Network:
                 f"scenario {scenario.id!r}: intersections.{unknown[0]} is not a traffic light of "
                 f"{document.source}; it has: {', '.join(sorted(links)) or 'none'}"
             )
+        _check_lanes(links, lanes, document.source)
         foes = _foes(root)
         reachable = _neighbours(links, root)
         positions = _positions(root)
@@ -170,14 +184,8 @@ def _phases_of(
     source = own.phases if own else scenario.control.phases
     width = max(link.index for link in links) + 1
     where = f"scenario {scenario.id!r}, traffic light {tls!r}"
-    for _, state in programme:
-        if len(state) < width:
-            raise ScenarioError(
-                f"{where}: a state of its programme has {len(state)} letters ({state!r}), but it "
-                f"controls {width} links; write one letter per link into the <tlLogic>"
-            )
     if programme:
-        width = len(programme[0][1])
+        width = _check_programme(programme, width, links, foes, where)
     if source == "conflict-free":
         phases = conflict_free_phases(links, foes, width, where)
     elif source == "programme":
@@ -186,12 +194,56 @@ def _phases_of(
         phases = source
     check_phases(phases, width, where)
     for phase in phases:
-        if pair := conflicting_greens(phase, links, foes):
-            raise ScenarioError(
-                f"{where}: phase {phase!r} gives protected green (G) to the conflicting links "
-                f"{pair[0]} and {pair[1]}; write g for the one that must yield"
-            )
+        _check_greens(phase, links, foes, f"{where}: phase")
     return phases
+
+
+def _check_programme(
+    programme: Sequence[tuple[float, str]],
+    width: int,
+    links: Sequence[Link],
+    foes: Mapping[str, Sequence[int]],
+    where: str,
+) -> int:
+    """Refuses a programme SUMO or traffic could not live with; returns the letters of its states.
+
+    There may be more letters than links of vehicles: those of pedestrian crossings.
+    """
+    letters = len(programme[0][1])
+    for index, (_, state) in enumerate(programme):
+        what = f"{where}: state {index} of its programme ({state!r})"
+        if len(state) < width or len(state) != letters:
+            raise ScenarioError(
+                f"{what} has {len(state)} letters, but "
+                + (f"it controls {width} links" if len(state) < width else f"state 0 has {letters}")
+                + "; write one letter per link into every <phase> of the <tlLogic>"
+            )
+        if unknown := sorted(set(state) - STATES):
+            raise ScenarioError(f"{what} has unknown letters {unknown}; allowed: {sorted(STATES)}")
+        _check_greens(state, links, foes, f"{where}: state {index} of its programme")
+    return letters
+
+
+def _check_greens(
+    state: str, links: Sequence[Link], foes: Mapping[str, Sequence[int]], what: str
+) -> None:
+    if pair := conflicting_greens(state, links, foes):
+        raise ScenarioError(
+            f"{what} ({state!r}) gives protected green (G) to the links {pair[0]} and {pair[1]}, "
+            "whose paths cross; write g for the one that must yield"
+        )
+
+
+def _check_lanes(
+    links: Mapping[str, Sequence[Link]], lanes: Mapping[str, Lane], source: str
+) -> None:
+    for tls, own in links.items():
+        for lane in (name for link in own for name in (link.from_lane, link.to_lane)):
+            if lane not in lanes:
+                raise ScenarioError(
+                    f"{source}: traffic light {tls!r} controls a connection over lane {lane!r}, "
+                    "which the network does not have; build it again with netconvert"
+                )
 
 
 def _lanes(root: ET.Element) -> dict[str, Lane]:
