@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
-from ugat_marl.errors import UnknownNameError
+from ugat_marl.errors import OptionError, UnknownNameError
 
 RenderMode = Literal["human", "rgb_array"]
 
@@ -45,6 +45,10 @@ class EnvOptions:
             if value not in allowed:
                 names = [item for item in allowed if item]
                 raise UnknownNameError(f"value of option {name!r}:", str(value), names)
+        if not isinstance(self.neighbours, int) or self.neighbours < 0:
+            raise OptionError(
+                f"neighbours = {self.neighbours!r}: must be 0 or a number of roads, such as 1"
+            )
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> EnvOptions:

@@ -189,6 +189,11 @@ class LibsumoSimulator:
                 "this process already runs a SUMO simulation, and libsumo holds only one: close "
                 'the other one, or use simulator="process", which runs any number'
             )
+        if launch.gui and os.name == "posix" and not os.environ.get("DISPLAY"):
+            raise SimulatorError(  # sumo-gui would end this whole process
+                'render_mode "human" opens a window, but there is no display (DISPLAY is not set); '
+                'use render_mode "rgb_array"'
+            )
         program = "sumo-gui" if launch.gui else "sumo"
         self._owner = os.getpid()
         self._launch = launch

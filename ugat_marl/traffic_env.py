@@ -53,6 +53,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         layouts: Agent to the parts of its observation.
         intersection_of: Agent to SUMO's id of its traffic light.
         agent_groups: Group to its agents; agents of one group have the same spaces.
+        np_random: Draws the seeds of episodes; SuperSuit's frame_skip draws from it too.
     """
 
     observation_spaces: dict[str, Box]
@@ -86,7 +87,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._state_space = self._joint_space()
         self._simulator: Simulator | None = None
         self._remove: weakref.finalize[..., TrafficEnv] | None = None
-        self._generator = np.random.default_rng()
+        self.np_random = np.random.default_rng()
         self.agents: list[str] = []
         self._scores: Scores | None = None
         self._picture: Picture | None = None
@@ -133,8 +134,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             options: Not used.
         """
         if seed is not None:
-            self._generator = np.random.default_rng(seed)
-        self._start(int(self._generator.integers(2**31)))
+            self.np_random = np.random.default_rng(seed)
+        self._start(int(self.np_random.integers(2**31)))
         self.agents = self.possible_agents[:]
         self._scores = None
         self._decision = 0
@@ -167,6 +168,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             EpisodeError: The episode has not begun or is over.
             SimulatorError: SUMO failed.
         """
+        if not actions and self._scores is not None:  # after the end; SuperSuit's black_death asks
+            return {}, {}, {}, {}, {}
         requested = self._checked(actions)
         before = self._snapshot
         self._advance(requested)

@@ -103,6 +103,8 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         dict[str, dict[str, Any]],
     ]:
         """Shows the chosen phases for one interval."""
+        if not actions and self._scores is not None:
+            return {}, {}, {}, {}, {}
         if not self.agents:
             raise EpisodeError("step() needs a running episode; call reset() first")
         if set(actions) != set(self.agents):
