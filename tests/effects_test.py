@@ -141,7 +141,7 @@ def test_numbers_of_numpy_are_numbers() -> None:
         ({"name": "acceleration"}, "effect 'acceleration': parameter 'mps2' is missing"),
         (
             {"name": "acceleration", "mps": 1},
-            "unknown parameter of effect 'acceleration' 'mps'. Did you mean 'mps2'",
+            "unknown parameter of effect 'acceleration': 'mps'. Did you mean 'mps2'",
         ),
     ],
 )

@@ -31,6 +31,7 @@ class UnknownNameError(UgatMarlError, ValueError):
     def __init__(self, kind: str, name: str, allowed: Iterable[str], hint: str = "") -> None:
         self.kind = kind
         self.name = name
+        self.hint = hint
         self.allowed = sorted(set(allowed))
         near = nearest(name, self.allowed)
         guess = f" Did you mean {near!r}?" if near else ""
@@ -39,8 +40,8 @@ class UnknownNameError(UgatMarlError, ValueError):
             f"unknown {kind} {name!r}.{guess} Known: {listed}.{' ' + hint if hint else ''}"
         )
 
-    def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str]]]:
-        return (type(self), (self.kind, self.name, self.allowed))
+    def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str], str]]:
+        return (type(self), (self.kind, self.name, self.allowed, self.hint))
 
 
 class OptionError(UgatMarlError, ValueError):

@@ -172,7 +172,7 @@ def load_scenario(name: str | Path) -> Scenario:
     shipped = dict(shipped_scenarios())
     if text in shipped:
         return _load_directory(shipped[text])
-    if path.is_dir():
+    if text and path.is_dir():
         raise ScenarioError(f"{path}: a directory without scenario.toml is not a scenario")
     raise UnknownNameError(
         "scenario", text, shipped, "A directory, a .sumocfg file and resco:<map> work as well."

@@ -71,12 +71,14 @@ def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
     values = dict(record)
     name = str(values.pop("name", ""))
     if name not in _EFFECTS:
-        raise UnknownNameError(f"effect{where}", name, _EFFECTS)
+        raise UnknownNameError("effect", name, _EFFECTS, where and f"It stands{where}.")
     kind = _EFFECTS[name]
     parameters = [item.name for item in fields(kind)]
     for key in values:
         if key not in parameters:
-            raise UnknownNameError(f"parameter of effect {name!r}{where}", key, parameters)
+            raise UnknownNameError(
+                f"parameter of effect {name!r}:", key, parameters, where and f"It stands{where}."
+            )
     if missing := [key for key in parameters if key not in values]:
         raise OptionError(f"effect {name!r}{where}: parameter {missing[0]!r} is missing")
     return kind(**values)
