@@ -131,7 +131,7 @@ def test_alpha_starts_infinite_and_then_is_the_mean_of_u(unbroken: Path) -> None
         "roll-outs, round 1",
         "fitting f and h, round 2",
         "grounded, round 2",
-    ],  # fmt: skip
+    ],
 )
 def test_resuming_gives_the_numbers_of_an_unbroken_run(
     moment: str, unbroken: Path, tmp_path: Path
