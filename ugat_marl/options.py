@@ -45,10 +45,9 @@ class EnvOptions:
             if value not in allowed:
                 names = [item for item in allowed if item]
                 raise UnknownNameError(f"value of option {name!r}:", str(value), names)
-        if not isinstance(self.neighbours, int) or self.neighbours < 0:
-            raise OptionError(
-                f"neighbours = {self.neighbours!r}: must be 0 or a number of roads, such as 1"
-            )
+        roads: Any = self.neighbours
+        if not isinstance(roads, int) or roads < 0:
+            raise OptionError(f"neighbours = {roads!r}: must be 0 or a number of roads, such as 1")
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> EnvOptions:
