@@ -17,7 +17,6 @@ import pytest
 from ugat_marl import parallel_env
 from ugat_marl.measurements import HALTING_MPS, LaneTable, Snapshot, Trips
 from ugat_marl.metrics import (
-    LARGER_IS_BETTER,
     MEASURES,
     EpisodeRecorder,
     Scores,
@@ -196,7 +195,6 @@ def test_means_over_decisions_intersections_and_lanes() -> None:
 def test_every_measure_is_a_score() -> None:
     names = set(Scores.__dataclass_fields__)
     assert set(MEASURES) <= names
-    assert set(MEASURES) >= LARGER_IS_BETTER
     assert HALTING_MPS == 0.1
 
 
