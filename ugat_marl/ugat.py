@@ -46,9 +46,9 @@ class UgatConfig:
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
         rollout_epsilon: Chance of a random phase in these roll-outs.
-        least_accuracy: Held-out accuracy h must have at an intersection, and f and h must beat their
-            trivial rivals, before grounded actions are taken there; None obeys them from the start,
-            as the paper does.
+        least_accuracy: Held-out accuracy h must have at an intersection before grounded actions
+            are taken there (f and h must beat their trivial rivals, too); None obeys them from the
+            start, as the paper does.
         forward: Shape of f.
         inverse: Shape of h.
         fit: How f and h are fitted.
