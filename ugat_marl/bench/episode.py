@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from ugat_marl.effects import load
 from ugat_marl.measurements import Snapshot, Trips
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.simulator import Launch, LibsumoSimulator, Plans, VehiclePicture
@@ -89,27 +90,33 @@ class RecordingSimulator:
 
 
 def random_actions(env: TrafficEnv, seed: int) -> list[dict[str, int]]:
-    """Actions of a whole episode, drawn before the clock runs."""
+    """Actions of a whole episode, drawn before the clock runs.
+
+    The first decision keeps every first phase, as sumo-rl does whatever it is told.
+    """
     generator = numpy_generator(seed, "bench", "actions")
     agents = env.possible_agents
     counts = [int(env.action_space(agent).n) for agent in agents]
-    drawn = generator.integers(counts, size=(env.scenario.decisions, len(counts))).tolist()
-    return [dict(zip(agents, row, strict=True)) for row in drawn]
+    drawn = generator.integers(counts, size=(env.scenario.decisions, len(counts)))
+    drawn[0] = 0
+    return [dict(zip(agents, row, strict=True)) for row in drawn.tolist()]
 
 
 def episode(request: dict[str, Any]) -> dict[str, Any]:
     """Runs one episode.
 
     Args:
-        request: ``scenario``, ``duration_s``, ``seed``, ``simulator`` (see `EnvOptions`), and
-            ``record``: a folder, if a request for the bare replay is wanted.
+        request: ``scenario``, ``control`` (changes to its timing), ``duration_s``, ``seed``,
+            ``simulator`` (see `EnvOptions`), and ``record``: a folder, if requests for the bare
+            replay and for sumo-rl are wanted.
 
     Returns:
-        Wall seconds of the reset and of all steps (the scores included), and the vehicles that
-        entered and arrived.
+        Wall seconds of the reset and of all steps (the scores included), seconds of CPU this very
+        process used for the latter, and the vehicles that entered and arrived.
     """
     simulator, seed = request["simulator"], request["seed"]
-    env = parallel_env(request["scenario"], duration_s=request["duration_s"], simulator=simulator)
+    scenario = load(request["scenario"]).with_control(**request["control"])
+    env = parallel_env(scenario, duration_s=request["duration_s"], simulator=simulator)
     actions = random_actions(env, seed)
     recorder = RecordingSimulator(Path(request["record"])) if request["record"] else None
     if recorder is not None:
@@ -118,19 +125,25 @@ def episode(request: dict[str, Any]) -> dict[str, Any]:
         env.reset(seed=seed)  # starts the warm parent, once in the life of a user's process
     began = time.perf_counter()
     env.reset(seed=seed)
-    started = time.perf_counter()
+    started, computed = time.perf_counter(), time.process_time()
     for action in actions:
         env.step(action)
     scores = env.scores()
-    stepped = time.perf_counter()
-    bare = recorder.bare_request() if recorder is not None else None
+    stepped, computed = time.perf_counter(), time.process_time() - computed
+    recorded: dict[str, Any] = {}
+    if recorder is not None:
+        lights = [
+            {env.intersection_of[agent]: action for agent, action in row.items()} for row in actions
+        ]
+        recorded = {"bare": recorder.bare_request(), "actions": lights}
     env.close()
     return {
         "start_s": started - began,
         "steps_s": stepped - started,
+        "cpu_s": computed,
         "entered": int(scores.departed),
         "arrived": int(scores.throughput),
-        "bare": bare,
+        **recorded,
     }
 
 

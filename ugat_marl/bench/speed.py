@@ -5,22 +5,20 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.bench.measured import in_fresh_process
 from ugat_marl.bench.report import Report, Spread, Target, require_positive
 from ugat_marl.bench.rival import PETTINGZOO, SUMO_RL, Rival, rival
-from ugat_marl.effects import load
-from ugat_marl.errors import MeasurementError
-from ugat_marl.scenario import Scenario
+from ugat_marl.bench.tasks import SUMO_RL_TIMING, Run, Task, find_scenario, require_same_work
 
 BARE, INPROCESS, PROCESS = "libsumo alone", "ugat-marl in-process", "ugat-marl worker process"
-RIVAL, RIVAL_LEAN = f"sumo-rl {SUMO_RL}", f"sumo-rl {SUMO_RL}, no metrics"
+RIVAL, RIVAL_LEAN = f"sumo-rl {SUMO_RL}", f"sumo-rl {SUMO_RL} without metrics"
+OWN_TIMING, RIVAL_TIMING = "own", "sumo-rl's"
 
-_FOLDER = Path(__file__).parent
-Measure = Callable[[], dict[str, Any]]
+Variant = tuple[str, str]
+"""Whose signal timing, and who does the work."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +28,8 @@ class EnvBench:
     Every measured episode has a process of its own. A round measures all variants one after the
     other, each round beginning with another one, and ratios are taken within a round. SUMO alone
     replays the very signal states the environment showed, at the same seconds, with the same
-    options and no output; the same vehicles enter and arrive, or the bench fails.
+    options and no output; the same vehicles enter and arrive, or the bench fails. sumo-rl gets the
+    same actions, and the environment its clearance times, so that both have the same traffic.
 
     Attributes:
         scenarios: What to simulate.
@@ -69,12 +68,8 @@ class EnvBench:
             notes += [remark] if remark else []
             with tempfile.TemporaryDirectory(prefix="ugat_marl-bench-") as folder:
                 runs = self._rounds(self._variants(scenario, Path(folder), other))
-            speeds = {
-                variant: [self.duration_s / run["steps_s"] for run in own]
-                for variant, own in runs.items()
-            }
-            rows += [_row(name, variant, own, speeds) for variant, own in runs.items()]
-            targets += _targets(name, speeds)
+            rows += [self._row(name, variant, runs) for variant in runs]
+            targets += _targets(name, runs)
         if other is not None:
             notes += [_RIVAL_METHOD.format(sumo_rl=SUMO_RL, pettingzoo=PETTINGZOO)]
         report = Report("env", asdict(self), rows, targets, notes)
@@ -84,124 +79,89 @@ class EnvBench:
 
     def _variants(
         self, scenario: str | Path, folder: Path, other: Rival | None
-    ) -> dict[str, Measure]:
-        loaded = load(scenario)
-        request = {
-            "scenario": str(scenario),
-            "duration_s": self.duration_s,
-            "seed": self.seed,
-            "record": None,
-        }
-
-        def own(simulator: str, record: Path | None = None) -> dict[str, Any]:
-            asked = {**request, "simulator": simulator, "record": record and str(record)}
-            return in_fresh_process(["-m", "ugat_marl.bench.episode"], asked)
-
-        recorded = own("inprocess", folder)
-        variants: dict[str, Measure] = {
-            BARE: lambda: in_fresh_process([_FOLDER / "bare.py"], recorded["bare"]),
-            INPROCESS: lambda: own("inprocess"),
-            PROCESS: lambda: own("process"),
-        }
-        if other is not None:
-            asked = _rival_request(loaded, self.duration_s, self.seed, folder)
-            for variant, infos in ((RIVAL, True), (RIVAL_LEAN, False)):
-                variants[variant] = lambda infos=infos: in_fresh_process(
-                    [_FOLDER / "sumo_rl_episode.py"],
-                    {**asked, "infos": infos},
-                    python=other.python,
-                    variables=other.variables(),
-                )
+    ) -> dict[Variant, Callable[[], Run]]:
+        timings = {OWN_TIMING: {}, RIVAL_TIMING: SUMO_RL_TIMING} if other else {OWN_TIMING: {}}
+        variants: dict[Variant, Callable[[], Run]] = {}
+        for timing, control in timings.items():
+            own = folder / timing
+            own.mkdir()
+            task = Task.record(scenario, control, own, duration_s=self.duration_s, seed=self.seed)
+            variants[timing, BARE] = task.by_libsumo
+            variants[timing, INPROCESS] = partial(task.by_suite, "inprocess")
+            variants[timing, PROCESS] = partial(task.by_suite, "process")
+            if other is not None and timing == RIVAL_TIMING:
+                variants[timing, RIVAL] = partial(task.by_sumo_rl, other, metrics=True)
+                variants[timing, RIVAL_LEAN] = partial(task.by_sumo_rl, other, metrics=False)
         return variants
 
-    def _rounds(self, variants: Mapping[str, Measure]) -> dict[str, list[dict[str, Any]]]:
-        names = list(variants)
-        runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+    def _rounds(self, variants: Mapping[Variant, Callable[[], Run]]) -> dict[Variant, list[Run]]:
+        order = list(variants)
+        runs: dict[Variant, list[Run]] = {variant: [] for variant in order}
         for number in range(self.rounds):
-            first = number % len(names)
-            for name in names[first:] + names[:first]:
-                runs[name].append(variants[name]())
-            require_same_work({name: runs[name][-1] for name in (BARE, INPROCESS, PROCESS)})
+            first = number % len(order)
+            for variant in order[first:] + order[:first]:
+                runs[variant].append(variants[variant]())
+            _check_round({variant: own[-1] for variant, own in runs.items()})
         return runs
+
+    def _row(
+        self, scenario: str, variant: Variant, runs: Mapping[Variant, list[Run]]
+    ) -> dict[str, Any]:
+        timing, who = variant
+        own = runs[variant]
+        speeds = _speeds(own)
+        return {
+            "scenario": scenario,
+            "timing": timing,
+            "who": who,
+            "simulated s / s": Spread.of([self.duration_s * speed for speed in speeds]),
+            "ratio to libsumo": Spread.of_ratios(speeds, _speeds(runs[timing, BARE])),
+            "own CPU [s]": Spread.of([run["cpu_s"] for run in own]),
+            "reset [s]": Spread.of([run["start_s"] for run in own]),
+            "entered": own[-1]["entered"],
+            "arrived": own[-1]["arrived"],
+        }
 
 
 _METHOD = (
     "Speeds and ratios are over all steps, the closing of SUMO and the scores included, loading of "
-    "the network excluded (column 'reset'). Actions are random. Median (first-third quartile)."
+    "the network excluded (column 'reset'). Actions are random, the same for all that share a "
+    "timing. Median (first-third quartile); ratios within a round."
 )
 _RIVAL_METHOD = (
-    "sumo-rl {sumo_rl} runs under PettingZoo {pettingzoo} with libsumo, decides as often, for as "
-    "many seconds, by random actions of its own phases, with its default observation, reward, "
-    "yellow and minimum green; 'no metrics' leaves out the metrics it collects at every step."
+    "sumo-rl {sumo_rl} runs under PettingZoo {pettingzoo} with libsumo, and with its default "
+    "observation, reward, metrics, clearance and minimum green, which the suite is given as well "
+    "for this comparison. SUMO alone shows how much faster any environment could be."
 )
+_SAME_TRAFFIC = 0.02
 
 
-def find_scenario(name: str, other: Rival | None) -> tuple[str | Path, str | None]:
-    """Where to load a scenario from, and what to tell the reader about it.
+def _check_round(runs: Mapping[Variant, Run]) -> None:
+    """The same vehicles to the last one in the suite and SUMO alone; nearly so in sumo-rl.
 
-    RESCO networks come from an installed sumo-rl wheel, from the environment the bench made for
-    sumo-rl, or are replaced by the shipped 4x4 grid.
+    (It keeps a green protected through a yellow after which it is permissive; the suite does not.)
     """
-    if not name.startswith("resco:") or find_spec("sumo_rl") is not None:
-        return name, None
-    if other is not None:
-        found = sorted((other.networks / name.removeprefix("resco:")).glob("*.sumocfg"))
-        if found:
-            return found[0], None
-    return "grid4x4-v1", (
-        f"{name} is not installed (pip install 'ugat-marl[resco]'): grid4x4-v1 was measured instead"
-    )
+    for timing in dict.fromkeys(timing for timing, _ in runs):
+        own = {who: run for (whose, who), run in runs.items() if whose == timing}
+        require_same_work({who: own[who] for who in (BARE, INPROCESS, PROCESS)})
+        require_same_work(own, _SAME_TRAFFIC)
 
 
-def require_same_work(runs: Mapping[str, Mapping[str, Any]]) -> None:
-    """Refuses to compare episodes in which different numbers of vehicles entered or arrived.
-
-    Raises:
-        MeasurementError: They differ.
-    """
-    work = {name: (run["entered"], run["arrived"]) for name, run in runs.items()}
-    if len(set(work.values())) > 1:
-        raise MeasurementError(
-            f"not the same work, (entered, arrived) vehicles differ: {work}; "
-            "is the simulation reproducible, and was the package changed meanwhile?"
-        )
+def _speeds(runs: list[Run]) -> list[float]:
+    """Episodes per wall second."""
+    return [1.0 / run["steps_s"] for run in runs]
 
 
-def _rival_request(
-    scenario: Scenario, duration_s: float, seed: int, folder: Path
-) -> dict[str, Any]:
-    written = scenario.write(folder / "scenario")
-    return {
-        "network": str(written / scenario.network.name),
-        "routes": ",".join(str(written / document.name) for document in scenario.routes),
-        "begin_s": scenario.settings.begin_s,
-        "duration_s": duration_s,
-        "decision_interval_s": scenario.control.decision_interval_s,
-        "seed": seed,
-    }
+def _targets(scenario: str, runs: Mapping[Variant, list[Run]]) -> list[Target]:
+    def target(timing: str, above: str, below: str, limit: float) -> Target:
+        ratios = Spread.of_ratios(_speeds(runs[timing, above]), _speeds(runs[timing, below]))
+        name = f"{scenario}, {timing} timing: {above} / {below}"
+        return Target(name, ratios.median, limit, at_least=True)
 
-
-def _row(
-    scenario: str,
-    variant: str,
-    runs: list[dict[str, Any]],
-    speeds: Mapping[str, list[float]],
-) -> dict[str, Any]:
-    return {
-        "scenario": scenario,
-        "variant": variant,
-        "simulated s / s": Spread.of(speeds[variant]),
-        "ratio to libsumo": Spread.of_ratios(speeds[variant], speeds[BARE]),
-        "reset [s]": Spread.of([run["start_s"] for run in runs]),
-        "entered": runs[-1]["entered"],
-        "arrived": runs[-1]["arrived"],
-    }
-
-
-def _targets(scenario: str, speeds: Mapping[str, list[float]]) -> list[Target]:
-    def target(above: str, below: str, limit: float) -> Target:
-        ratio = Spread.of_ratios(speeds[above], speeds[below]).median
-        return Target(f"{scenario}: {above} / {below}", ratio, limit, at_least=True)
-
-    targets = [target(INPROCESS, BARE, 0.85), target(PROCESS, BARE, 0.75)]
-    return targets + [target(PROCESS, name, 2.0) for name in (RIVAL, RIVAL_LEAN) if name in speeds]
+    targets = [
+        target(OWN_TIMING, INPROCESS, BARE, 0.85),
+        target(OWN_TIMING, PROCESS, BARE, 0.75),
+    ]
+    if (RIVAL_TIMING, RIVAL) in runs:
+        targets.append(target(RIVAL_TIMING, PROCESS, RIVAL, 2.0))
+    return targets

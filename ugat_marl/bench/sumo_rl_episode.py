@@ -1,4 +1,4 @@
-"""Measured program: an episode of sumo-rl with random actions.
+"""Measured program: an episode of sumo-rl.
 
 Runs in an environment of its own (see `ugat_marl.bench.rival`), without this suite.
 """
@@ -6,7 +6,6 @@ Runs in an environment of its own (see `ugat_marl.bench.rival`), without this su
 from __future__ import annotations
 
 import json
-import random
 import sys
 import time
 from pathlib import Path
@@ -18,10 +17,13 @@ def episode(request: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         request: ``network``, ``routes``, ``begin_s``, ``duration_s``, ``decision_interval_s``,
-            ``seed``, and ``infos``: whether it collects its default metrics for every step.
+            ``yellow_s``, ``min_green_s``, ``seed`` (of SUMO), ``actions`` (one mapping of traffic
+            light to green phase per decision; lights left out keep their only phase), and
+            ``infos``: whether it collects its default metrics at every step.
 
     Returns:
-        Wall seconds of the reset and of stepping to the end, and the vehicles that arrived.
+        Wall seconds of the reset and of stepping to the end, seconds of CPU for the latter, and the
+        vehicles that entered and arrived.
     """
     import sumo_rl  # pyright: ignore[reportMissingImports]
 
@@ -31,6 +33,8 @@ def episode(request: dict[str, Any]) -> dict[str, Any]:
         begin_time=int(request["begin_s"]),
         num_seconds=int(request["duration_s"]),
         delta_time=int(request["decision_interval_s"]),
+        yellow_time=int(request["yellow_s"]),
+        min_green=int(request["min_green_s"]),
         sumo_seed=int(request["seed"]),
         sumo_warnings=False,
         add_system_info=request["infos"],
@@ -39,24 +43,24 @@ def episode(request: dict[str, Any]) -> dict[str, Any]:
     )
     began = time.perf_counter()
     env.reset(seed=int(request["seed"]))
-    started = time.perf_counter()
-    choices = random.Random(request["seed"])
-    phases = {agent: int(env.action_space(agent).n) for agent in env.agents}
-    decisions = 0
-    while env.agents:
-        env.step({agent: choices.randrange(count) for agent, count in phases.items()})
-        decisions += 1
+    started, computed = time.perf_counter(), time.process_time()
+    agents = env.agents
+    for row in request["actions"]:
+        env.step({agent: row.get(agent, 0) for agent in agents})
+    over = not env.agents
     statistic = env.unwrapped.env.sumo.simulation.getParameter
     entered = int(statistic("", "stats.vehicles.inserted"))
     running = int(statistic("", "stats.vehicles.running"))
     env.close()
-    ended = time.perf_counter()
+    ended, computed = time.perf_counter(), time.process_time() - computed
+    if not over:
+        raise SystemExit("the actions do not last to the end of the episode")
     return {
         "start_s": started - began,
         "steps_s": ended - started,
+        "cpu_s": computed,
         "entered": entered,
         "arrived": entered - running,
-        "decisions": decisions,
     }
 
 
