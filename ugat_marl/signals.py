@@ -105,6 +105,21 @@ def advance(
     assert 0 <= requested < len(phases)
     if requested == state.phase and not state.clearing:
         return state.later(seconds), [(seconds, phases[requested])]
+    if not state.clearing:  # a long green behaves like one of the minimum: few cases to remember
+        state = SignalState(state.phase, state.origin, min(state.elapsed_s, timing.min_green_s))
+    after, shown = _course(tuple(phases), state, requested, seconds, timing)
+    return after, list(shown)
+
+
+@functools.lru_cache(maxsize=65536)
+def _course(
+    phases: tuple[str, ...],
+    state: SignalState,
+    requested: int,
+    seconds: float,
+    timing: SignalTiming,
+) -> tuple[SignalState, tuple[Segment, ...]]:
+    """`advance`, remembered: the machine is in few states, and asked many times in each."""
     shown: list[Segment] = []
     left = seconds
     while left > _INSTANT_S:
@@ -112,7 +127,7 @@ def advance(
         if segment[0] > 0:
             _append(shown, segment)
         left -= segment[0]
-    return state, shown
+    return state, tuple(shown)
 
 
 def _next_segment(
