@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import UnknownNameError
-from ugat_marl.measurements import LaneTable, Snapshot
+from ugat_marl.measurements import Snapshot
 from ugat_marl.network import Network
 
 RewardName = Literal["queue", "pressure", "waiting"]
@@ -61,8 +61,8 @@ class Rewarder:
         lanes = network.lane_table()
         self._incoming = [lanes.indices(item.incoming_lanes) for item in network.intersections]
         self._outgoing = [lanes.indices(item.outgoing_lanes) for item in network.intersections]
-        self._sum_in = _incidence(self._incoming, lanes)
-        self._sum_out = _incidence(self._outgoing, lanes)
+        self._sum_in = _Sums(self._incoming)
+        self._sum_out = _Sums(self._outgoing)
 
     @property
     def needs_waiting(self) -> bool:
@@ -72,12 +72,12 @@ class Rewarder:
     def rewards(self, before: Snapshot, after: Snapshot) -> list[float]:
         """The rewards of all intersections, in the network's order."""
         if self._reward == "queue":
-            return (-(self._sum_in @ after.halting)).tolist()
+            return (-self._sum_in(after.halting)).tolist()
         if self._reward == "pressure":
-            difference = self._sum_in @ after.vehicles - self._sum_out @ after.vehicles
+            difference = self._sum_in(after.vehicles) - self._sum_out(after.vehicles)
             return (-np.abs(difference)).tolist()
         if self._reward == "waiting":
-            return (self._sum_in @ before.waiting_s - self._sum_in @ after.waiting_s).tolist()
+            return (self._sum_in(before.waiting_s) - self._sum_in(after.waiting_s)).tolist()
         assert callable(self._reward)
         return [
             float(self._reward(self._view(before, index), self._view(after, index)))
@@ -96,9 +96,12 @@ class Rewarder:
         )
 
 
-def _incidence(groups: list[NDArray[np.int64]], lanes: LaneTable) -> NDArray[np.float64]:
-    """0/1 matrix ``(intersections, lanes)``."""
-    matrix = np.zeros((len(groups), len(lanes.ids)))
-    for row, own in zip(matrix, groups, strict=True):
-        row[own] = 1.0
-    return matrix
+class _Sums:
+    """From one value per lane to the sum over each group of lanes; no group is empty."""
+
+    def __init__(self, groups: Sequence[NDArray[np.int64]]) -> None:
+        self._members = np.concatenate(groups)
+        self._starts = np.cumsum([0, *map(len, groups[:-1])])
+
+    def __call__(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.add.reduceat(values[self._members], self._starts)
