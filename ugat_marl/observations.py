@@ -96,7 +96,7 @@ class Observer:
         """
         own = np.zeros(self._length, dtype=np.float32)
         own[self._feature_places] = self._flat(snapshot)
-        own[self._first_phases + phases] = 1.0
+        own[self._first_phases + np.array(phases)] = 1.0
         seen = own if self._context is None else own[self._context]
         return [seen[part] for part in self._parts]
 
@@ -111,7 +111,7 @@ class Observer:
         own = _slices(widths)
         starts = np.array([part.start for part in own])
         self._length = sum(widths)
-        self._first_phases = starts + features
+        self._first_phases = starts + np.array(features)
         self._feature_places = np.concatenate(
             [np.arange(part.start, part.start + f) for part, f in zip(own, features, strict=True)]
         )

@@ -45,10 +45,10 @@ class Effect:
         for item in fields(self):
             value, allowed = getattr(self, item.name), self.ranges[item.name]
             if not (
-                isinstance(value, Real)
-                and not isinstance(value, bool)
+                not isinstance(value, bool)
+                and isinstance(value, Real)
                 and math.isfinite(value)
-                and allowed.low <= value <= allowed.high
+                and allowed.low <= float(value) <= allowed.high
             ):
                 raise OptionError(
                     f"effect {self.name!r}: {item.name} = {value!r} is outside "
