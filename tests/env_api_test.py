@@ -267,3 +267,21 @@ def test_two_vector_environments_in_one_process(make: Any) -> None:
     assert differ  # seeds 5 and 6
     one.close()
     two.close()
+
+
+def test_vector_environments_in_processes_of_their_own(scenarios: dict[str, Scenario]) -> None:
+    """The environment is copied to two processes, each of which starts SUMO in a third."""
+    env = ugat_marl.parallel_env(scenarios["grid2x2-v1"], duration_s=10 * STEPS)
+    one = supersuit.pettingzoo_env_to_vec_env_v1(env)
+    two = supersuit.concat_vec_envs_v1(one, 2, num_cpus=2, base_class="gymnasium")
+    seen, _ = two.reset(seed=5)
+    alone, _ = one.reset(seed=5)
+    actions = np.ones(two.num_envs, dtype=np.int64)
+    for _ in range(STEPS - 1):
+        np.testing.assert_array_equal(seen[:4], alone)
+        two.step_async(actions)
+        seen, *_ = two.step_wait()
+        alone, *_ = one.step(actions[:4])
+    assert not hasattr(two, "seed")  # SuperSuit's fault: PPO(seed=...) of SB3 fails
+    one.close()
+    two.close()

@@ -492,6 +492,17 @@ def test_the_toy_environment_passes() -> None:
     parallel_api_test(ToyTraffic(), num_cycles=30)
 
 
+def test_the_toy_environment_loses_no_vehicle() -> None:
+    env = ToyTraffic(steps=30)
+    episode = EnvironmentCase(lambda: env, seed=4).episode
+    queued = -sum(episode.moments[-1].parts["rewards"].values())
+    scores = env.scores()
+    assert scores.due == scores.departed + scores.backlog > 200
+    assert scores.departed == scores.throughput + queued
+    empty = EnvironmentCase(lambda: ToyTraffic(arrivals=0)).episode
+    assert not any(sum(moment.parts["rewards"].values()) for moment in empty.moments[1:])
+
+
 @pytest.mark.parametrize("scenario", ["single-v1", "grid2x2-v1", "mixed-v1"])
 def test_the_suites_environments_pass(scenario: str) -> None:
     assert not failures(check_environment(lambda: ugat_marl.parallel_env(scenario, duration_s=150)))
