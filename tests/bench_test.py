@@ -62,7 +62,7 @@ def test_growth() -> None:
 
 
 def test_a_report_is_written_whole_with_the_machine(tmp_path: Path) -> None:
-    rows = [{"what": "a", "speed": Spread.of([1.0, 2.0]), "missing": math.nan}]
+    rows = [{"what": "a [s]", "speed": Spread.of([1.0, 2.0]), "missing": math.nan}]
     report = Report("env", {"seed": 3, "out": tmp_path}, rows, [Target("t", 1.0, 2.0, True)])
     report.write(tmp_path / "deep" / "report.json")
     read = json.loads((tmp_path / "deep" / "report.json").read_text())
@@ -76,7 +76,9 @@ def test_a_report_is_written_whole_with_the_machine(tmp_path: Path) -> None:
     assert {"cpu", "versions", "date", "command"} <= set(read["machine"])
     console = Console(width=100, record=True)
     console.print(report.tables())
-    assert "MISSED" in console.export_text()
+    printed = console.export_text()
+    assert "MISSED" in printed
+    assert "a [s]" in printed
 
 
 def test_descendants_and_nobody_else_are_counted() -> None:

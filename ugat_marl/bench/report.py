@@ -121,9 +121,11 @@ class Report:
     def tables(self) -> Group:
         """Rows, targets and notes for a terminal."""
         columns = list(self.rows[0]) if self.rows else []
-        table = Table(*columns, title=f"bench {self.bench}", title_justify="left")
+        table = Table(title=f"bench {self.bench}", title_justify="left")
+        for column in columns:
+            table.add_column(Text(column))
         for row in self.rows:
-            table.add_row(*(_cell(row[column]) for column in columns))
+            table.add_row(*(Text(_cell(row[column])) for column in columns))
         lines = [
             Text(str(target), style="green" if target.met else "red") for target in self.targets
         ]
