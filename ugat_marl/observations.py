@@ -53,7 +53,7 @@ class Observer:
 
     def __init__(self, network: Network, name: str = "count", neighbours: int = 0) -> None:
         if name not in get_args(ObservationName):
-            raise UnknownNameError("observation", name, get_args(ObservationName))
+            raise UnknownNameError("observation", str(name), get_args(ObservationName))
         if neighbours < 0:
             raise OptionError(f"neighbours = {neighbours}: must be 0 or a number of roads")
         self.name = name

@@ -53,9 +53,9 @@ class Rewarder:
     """
 
     def __init__(self, network: Network, reward: str | RewardFunction = "queue") -> None:
-        if isinstance(reward, str) and reward not in get_args(RewardName):
+        if not callable(reward) and reward not in get_args(RewardName):
             raise UnknownNameError(
-                "reward", reward, get_args(RewardName), "A function works as well."
+                "reward", str(reward), get_args(RewardName), "A function works as well."
             )
         self._reward = reward
         lanes = network.lane_table()

@@ -92,6 +92,13 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
         OptionError: An effect has an impossible value.
     """
     if not isinstance(domain, str):
+        given: Sequence[Any] = domain
+        for item in given:
+            if not isinstance(item, Effect):
+                raise OptionError(
+                    f"domain {domain!r}: {item!r} is not an effect; give a name such as 'V1' on "
+                    "its own, or a list of effects such as [StartupDelay(0.5)]"
+                )
         return tuple(domain)
     parts = [part.strip() for part in domain.split("+")]
     if len(parts) > 1:
