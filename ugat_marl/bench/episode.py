@@ -38,8 +38,9 @@ class RecordingSimulator:
     def start(self, launch: Launch) -> Snapshot:
         """Starts a simulation and forgets what was noted."""
         self.launch, self._now, self._shown, self.switches = launch, launch.begin_s, {}, []
+        snapshot = self._simulator.start(launch)
         shutil.copytree(launch.directory, self._folder, dirs_exist_ok=True)
-        return self._simulator.start(launch)
+        return snapshot
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
         """Simulates `seconds` and notes every change of a signal."""

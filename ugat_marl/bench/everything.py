@@ -9,6 +9,7 @@ from ugat_marl.bench.learning import LearningBench
 from ugat_marl.bench.memory import MemoryBench
 from ugat_marl.bench.report import Report
 from ugat_marl.bench.speed import EnvBench
+from ugat_marl.progress import Reporter
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,11 @@ class AllBench:
     memory: MemoryBench = field(default_factory=MemoryBench)
     out: Path | None = None
 
-    def run(self) -> list[Report]:
+    def run(self, reporter: Reporter | None = None) -> list[Report]:
         """Measures all of them; each report is written as soon as it is there.
+
+        Args:
+            reporter: Is told how far the measuring has come.
 
         Raises:
             MeasurementError: A measured process failed.
@@ -38,5 +42,5 @@ class AllBench:
             bench: EnvBench | LearningBench | MemoryBench = getattr(self, name)
             if self.out is not None and bench.out is None:
                 bench = replace(bench, out=self.out / f"{name}.json")
-            reports.append(bench.run())
+            reports.append(bench.run(reporter))
         return reports

@@ -8,6 +8,7 @@ from typing import Any
 
 from ugat_marl.bench.measured import in_fresh_process
 from ugat_marl.bench.report import Report, Spread, Target, require_positive
+from ugat_marl.progress import Reporter, Silent
 
 _PROGRAM = ["-m", "ugat_marl.bench.learning_episodes"]
 
@@ -49,15 +50,19 @@ class LearningBench:
             repetitions=self.repetitions,
         )
 
-    def run(self) -> Report:
+    def run(self, reporter: Reporter | None = None) -> Report:
         """Measures, and writes `out` if it is given.
+
+        Args:
+            reporter: Is told what is being measured.
 
         Raises:
             MeasurementError: The measured process failed.
         """
         asked = asdict(self)
         asked.pop("out")
-        found = in_fresh_process(_PROGRAM, asked)
+        with (reporter or Silent()).task(f"learning on {self.scenario}", 1):
+            found = in_fresh_process(_PROGRAM, asked)
         agents = found["agents"]
         training, plain = Spread.of(found["training_s"]), Spread.of(found["plain_s"])
         overhead = Spread.of_ratios(found["training_s"], found["plain_s"])

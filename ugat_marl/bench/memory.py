@@ -9,6 +9,7 @@ from typing import Any
 from ugat_marl.bench.measured import in_fresh_process
 from ugat_marl.bench.report import Report, Target, require_positive
 from ugat_marl.errors import OptionError
+from ugat_marl.progress import Reporter, Silent
 
 SIMULATORS = ("process", "inprocess")
 
@@ -40,8 +41,11 @@ class MemoryBench:
                 f"bench memory: resets = {self.resets}: must be more than settled ({self.settled})"
             )
 
-    def run(self) -> Report:
+    def run(self, reporter: Reporter | None = None) -> Report:
         """Measures, and writes `out` if it is given.
+
+        Args:
+            reporter: Is told what is being measured.
 
         Raises:
             MeasurementError: The measured process failed.
@@ -50,7 +54,8 @@ class MemoryBench:
         targets: list[Target] = []
         for simulator in SIMULATORS:
             asked = {**asdict(self), "out": None, "simulator": simulator}
-            found = in_fresh_process(["-m", "ugat_marl.bench.memory_resets"], asked)
+            with (reporter or Silent()).task(f"resets, {simulator}", 1):
+                found = in_fresh_process(["-m", "ugat_marl.bench.memory_resets"], asked)
             for what in found["early"]:
                 early, late = float(found["early"][what]), float(found["late"][what])
                 growth = 100 * growth_of(early, late)

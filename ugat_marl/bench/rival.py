@@ -12,6 +12,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,8 +53,12 @@ class Rival:
         return {"SUMO_HOME": str(sumo.SUMO_HOME), "LIBSUMO_AS_TRACI": "1", "PYTHONPATH": ""}
 
 
-def rival(cache: Path) -> Rival:
+def rival(cache: Path, say: Callable[[str], None]) -> Rival:
     """The environment below `cache`, installed if it is not there yet.
+
+    Args:
+        cache: Where such environments are kept.
+        say: Is told before anything is installed.
 
     Raises:
         MeasurementError: Installing failed; pip's words are in the message.
@@ -65,6 +70,7 @@ def rival(cache: Path) -> Rival:
     record = folder / "installed.json"
     python = folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     if not record.exists():
+        say(f"installing {', '.join(wanted)} into {folder} (some 500 MB, once)")
         _install(folder, python, wanted)
         write_whole(record, json.dumps(_found(python)))
     found = json.loads(record.read_text())

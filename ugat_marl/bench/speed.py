@@ -12,6 +12,7 @@ from typing import Any
 from ugat_marl.bench.report import Report, Spread, Target, require_positive
 from ugat_marl.bench.rival import PETTINGZOO, SUMO_RL, Rival, rival
 from ugat_marl.bench.tasks import SUMO_RL_TIMING, Run, Task, find_scenario, require_same_work
+from ugat_marl.progress import Advance, Reporter, Silent
 
 BARE, INPROCESS, PROCESS = "libsumo alone", "ugat-marl in-process", "ugat-marl worker process"
 RIVAL, RIVAL_LEAN = f"sumo-rl {SUMO_RL}", f"sumo-rl {SUMO_RL} without metrics"
@@ -53,13 +54,17 @@ class EnvBench:
     def __post_init__(self) -> None:
         require_positive("env", rounds=self.rounds, scenarios=len(self.scenarios))
 
-    def run(self) -> Report:
+    def run(self, reporter: Reporter | None = None) -> Report:
         """Measures, and writes `out` if it is given.
+
+        Args:
+            reporter: Is told how far the measuring has come.
 
         Raises:
             MeasurementError: A measured process failed, or did not do the same work.
         """
-        other = rival(self.cache) if self.sumo_rl else None
+        reporter = reporter or Silent()
+        other = rival(self.cache, reporter.say) if self.sumo_rl else None
         notes = [_METHOD]
         rows: list[dict[str, Any]] = []
         targets: list[Target] = []
@@ -67,7 +72,9 @@ class EnvBench:
             scenario, remark = find_scenario(name, other)
             notes += [remark] if remark else []
             with tempfile.TemporaryDirectory(prefix="ugat_marl-bench-") as folder:
-                runs = self._rounds(self._variants(scenario, Path(folder), other))
+                variants = self._variants(scenario, Path(folder), other)
+                with reporter.task(name, self.rounds * len(variants)) as advance:
+                    runs = self._rounds(variants, advance)
             rows += [self._row(name, variant, runs) for variant in runs]
             targets += _targets(name, runs)
         if other is not None:
@@ -94,13 +101,16 @@ class EnvBench:
                 variants[timing, RIVAL_LEAN] = partial(task.by_sumo_rl, other, metrics=False)
         return variants
 
-    def _rounds(self, variants: Mapping[Variant, Callable[[], Run]]) -> dict[Variant, list[Run]]:
+    def _rounds(
+        self, variants: Mapping[Variant, Callable[[], Run]], advance: Advance
+    ) -> dict[Variant, list[Run]]:
         order = list(variants)
         runs: dict[Variant, list[Run]] = {variant: [] for variant in order}
         for number in range(self.rounds):
             first = number % len(order)
             for variant in order[first:] + order[:first]:
                 runs[variant].append(variants[variant]())
+                advance()
             _check_round({variant: own[-1] for variant, own in runs.items()})
         return runs
 
