@@ -190,11 +190,12 @@ def test_edited_files_are_written_and_others_are_not_copied(
 ) -> None:
     scenario = load(crossing())
     own = tmp_path / "own"
-    own.mkdir()
-    launch = launch_of(scenario, 7, own, LANES)
-    assert list(own.iterdir()) == []
+    assert launch_of(scenario, 7, own, LANES).files == ()
     launch = launch_of(apply_effects(scenario, [StartupDelay(1)]), 7, own, LANES)
+    assert not own.exists()
+    launch.write()
     assert {file.name for file in own.iterdir()} == {"default-types.add.xml", "demand.rou.xml"}
+    assert own.stat().st_mode & 0o777 == 0o700
     arguments = dict(zip(launch.arguments[::2], launch.arguments[1::2], strict=True))
     assert arguments["--seed"] == "7"
     assert arguments["--net-file"] == str(scenario.network.path)

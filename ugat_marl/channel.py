@@ -81,11 +81,6 @@ class Channel:
             offset += 8 * size
         return Message(header, arrays)
 
-    def ask(self, header: dict[str, Any]) -> Message:
-        """Sends a question without arrays and waits for the answer."""
-        self.send(Message(header, []))
-        return self.receive()
-
     def hang_up(self, patience_s: float) -> bool:
         """Closes this end; returns whether the other end closed within `patience_s` seconds.
 

@@ -10,7 +10,7 @@ import os
 import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -41,6 +41,7 @@ class Launch:
         lanes: Lanes to measure.
         waiting: Whether to measure waiting times as well.
         gui: Whether to open a window.
+        files: Names and content of the scenario's edited files.
     """
 
     arguments: tuple[str, ...]
@@ -49,10 +50,17 @@ class Launch:
     lanes: tuple[str, ...]
     waiting: bool = False
     gui: bool = False
+    files: tuple[tuple[str, bytes], ...] = ()
+
+    def write(self) -> None:
+        """Makes the folder and puts the files into it."""
+        Path(self.directory).mkdir(mode=0o700, exist_ok=True)
+        for name, content in self.files:
+            write_whole(Path(self.directory) / name, content)
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields, for JSON."""
-        return asdict(self)
+        """The fields for JSON, without the files, which have been written by then."""
+        return {**asdict(replace(self, files=())), "files": ()}
 
 
 @dataclass(frozen=True)
@@ -109,12 +117,12 @@ def launch_of(
     waiting: bool = False,
     gui: bool = False,
 ) -> Launch:
-    """Writes a scenario's edited files to `directory` and lists SUMO's options.
+    """Lists SUMO's options, and the files that have to be written for it; writes nothing.
 
     Args:
         scenario: What to simulate.
         seed: SUMO's seed; any 31-bit integer.
-        directory: An existing folder that belongs to the simulation.
+        directory: A folder for the simulation alone; it is made when the simulation starts.
         lanes: Lanes to measure.
         waiting: Whether to measure waiting times.
         gui: Whether to open a window.
@@ -126,10 +134,11 @@ def launch_of(
         "--additional-files": list(scenario.additional),
     }
     arguments: list[str] = []
-    taken: set[str] = set()
+    written: dict[str, bytes] = {}
     for option, documents in files.items():
         if documents:
-            arguments += [option, ",".join(_on_disk(item, directory, taken) for item in documents)]
+            paths = [_on_disk(item, directory, written) for item in documents]
+            arguments += [option, ",".join(paths)]
     for option, value in settings.sumo.items():
         arguments += [f"--{option}", value]
     arguments += [
@@ -147,18 +156,25 @@ def launch_of(
     ]  # fmt: skip
     if gui:
         arguments += ["--start", "true", "--quit-on-end", "true"]
-    return Launch(tuple(arguments), str(directory), settings.begin_s, tuple(lanes), waiting, gui)
+    return Launch(
+        tuple(arguments),
+        str(directory),
+        settings.begin_s,
+        tuple(lanes),
+        waiting,
+        gui,
+        tuple(written.items()),
+    )
 
 
-def _on_disk(document: Document, directory: Path, taken: set[str]) -> str:
-    """A path SUMO can open, written if need be: SUMO takes a comma for the end of a name."""
+def _on_disk(document: Document, directory: Path, written: dict[str, bytes]) -> str:
+    """A path SUMO can open, of a file to write if need be: a comma ends a name for SUMO."""
     if document.path is not None and "," not in str(document.path.resolve()):
         return str(document.path.resolve())
     name = document.name.removesuffix(".gz").replace(",", "_")
-    while name in taken:
+    while name in written:
         name = f"_{name}"
-    taken.add(name)
-    write_whole(directory / name, document.read())
+    written[name] = document.read()
     return str(directory / name)
 
 
@@ -194,6 +210,7 @@ class LibsumoSimulator:
                 'render_mode "human" opens a window, but there is no display (DISPLAY is not set); '
                 'use render_mode "rgb_array"'
             )
+        launch.write()
         program = "sumo-gui" if launch.gui else "sumo"
         self._owner = os.getpid()
         self._launch = launch

@@ -63,6 +63,9 @@ class ProcessSimulator:
         """
         self._end_worker()
         self._worker = self._fork() if self._method == "forkserver" else _Worker.spawn()
+        # The worker removes the folder when it ends, so it knows of it before there is one.
+        self._tell("own", directory=launch.directory)
+        launch.write()
         return _snapshot(self._ask("start", launch=launch.as_dict()))
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
@@ -121,19 +124,33 @@ class ProcessSimulator:
         if worker is not None:
             worker.end(patience_s)
 
-    def _ask(self, what: str, **arguments: Any) -> Message:
-        if self._worker is None or not self._worker.mine:
+    def _tell(self, what: str, **arguments: Any) -> _Worker:
+        """Sends a message to the worker that runs a simulation for this process."""
+        worker = self._worker
+        if worker is None or not worker.mine:
             raise SimulatorError(f"{what}: no simulation is under way in this process; start one")
         try:
-            reply = self._worker.channel.ask({"what": what, **arguments})
+            worker.channel.send(Message({"what": what, **arguments}, []))
+        except OSError:
+            self._worker = None
+            raise SimulatorCrashed(worker.obituary(what)) from None
+        except BaseException:  # Ctrl-C in the middle of a message
+            self._end_worker(patience_s=0.0)
+            raise
+        return worker
+
+    def _ask(self, what: str, **arguments: Any) -> Message:
+        worker = self._tell(what, **arguments)
+        try:
+            reply = worker.channel.receive()
         except (ChannelClosed, OSError):
-            worker, self._worker = self._worker, None
+            self._worker = None
             raise SimulatorCrashed(worker.obituary(what)) from None
         except BaseException:  # Ctrl-C between question and answer: the two no longer match
             self._end_worker(patience_s=0.0)
             raise
         if error := reply.header.get("error"):
-            error = self._worker.in_full(error)
+            error = worker.in_full(error)
             self._end_worker()
             raise SimulatorError(error)
         return reply

@@ -60,8 +60,9 @@ def _work(channel: Channel) -> NoReturn:
     directory: str | None = None
     with contextlib.suppress(ChannelClosed):
         while (question := _hear(channel)).header["what"] != "close":
-            if question.header["what"] == "start":
-                directory = question.header["launch"]["directory"]
+            if question.header["what"] == "own":
+                directory = question.header["directory"]
+                continue
             try:
                 answer = _answer(simulator, question.header)
             except SimulatorError as error:

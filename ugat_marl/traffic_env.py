@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import tempfile
 import warnings
@@ -192,9 +193,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     def state(self) -> NDArray[np.float32]:
         """All observations, one after the other; also after the last step."""
-        if not hasattr(self, "_vectors"):
+        if not hasattr(self, "_states"):
             raise EpisodeError("state() has no meaning before the first reset()")
-        return np.concatenate(self._vectors)
+        return np.concatenate(self._observer.observe(self._snapshot, self.phases))
 
     def scores(self) -> Scores:
         """The measures of the episode that has ended.
@@ -271,8 +272,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._remove_directory()
         if self._simulator is None:
             self._simulator = _simulator(self.options.simulator)
-        directory = Path(tempfile.mkdtemp(prefix="ugat_marl-"))
-        # Also at the end of the process, when nobody closes the environment.
+        directory = Path(tempfile.gettempdir()) / f"ugat_marl-{secrets.token_hex(8)}"
         self._remove = weakref.finalize(self, _remove_tree, directory, os.getpid())
         launch = launch_of(
             self.scenario,
@@ -322,8 +322,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.agents, self._states = agents, states
 
     def _observe(self) -> dict[str, NDArray[np.float32]]:
-        self._vectors = self._observer.observe(self._snapshot, self.phases)
-        return dict(zip(self.agents, self._vectors, strict=True))
+        seen = self._observer.observe(self._snapshot, self.phases)
+        return dict(zip(self.agents, seen, strict=True))
 
     def _infos(self) -> dict[str, dict[str, Any]]:
         infos: dict[str, dict[str, Any]] = {}
@@ -395,6 +395,6 @@ def _simulator(name: str) -> Simulator:
 
 
 def _remove_tree(directory: Path, owner: int) -> None:
-    """Removes a folder, but not in a process that was forked from the one that made it."""
+    """Removes a folder, though nobody closed its environment; not in a forked child, however."""
     if os.getpid() == owner:
         shutil.rmtree(directory, ignore_errors=True)
