@@ -147,6 +147,21 @@ def test_a_masked_grounded_action_is_not_executed() -> None:
             assert infos["a_0"]["accepted"] == (infos["a_0"]["grounded_action"] == own)
 
 
+def test_a_learner_may_scale_what_it_was_given_in_place() -> None:
+    told: list[list[dict[str, int]]] = []
+    for scale in (False, True):
+        env = GroundedEnv(Crossing(), transform())
+        seen, infos = env.reset(seed=1)
+        while env.agents:
+            if scale:
+                for agent in LAYOUTS:
+                    seen[agent] *= 100
+                    infos[agent]["action_mask"].fill(0)
+            seen, _, _, _, infos = env.step({"a_0": 3, "b_0": 1})
+        told.append(env.unwrapped.told)
+    assert told[0] == told[1]
+
+
 def test_an_episode_is_an_epoch_of_the_gate() -> None:
     env = GroundedEnv(Crossing(), transform("dynamic", window_epochs=1))
     seen: list[float] = []

@@ -445,6 +445,20 @@ class ReusesItsDict(Giving):
         results[1] = self.kept
 
 
+@breaks("what_was_given_may_be_changed")
+class KeepsWhatItGives(ToyTraffic):
+    def _observe(self):
+        self.given = super()._observe()
+        return self.given
+
+    def state(self):
+        if self._step == 0:  # wrong from the first step on
+            return super().state()
+        return np.concatenate(
+            [self.given.get(a, np.zeros(v.size)) for a, v in self.layouts.items()]
+        ).astype(np.float32)
+
+
 @breaks("pictures_are_pictures")
 class DrawsFloats(ToyTraffic):
     def render(self):

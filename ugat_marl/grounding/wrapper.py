@@ -39,8 +39,6 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         super().__init__(env)
         _refuse_misfit(env, transform)
         self.transform = transform
-        self._observations: dict[str, Any] = {}
-        self._infos: Infos = {}
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -48,8 +46,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         """Starts an episode of the wrapped environment."""
         self.transform.gate.end_epoch()
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._observations = observations
-        self._infos = infos
+        self._notice(observations, infos)
         return observations, _extended(infos, self.env.agents)
 
     def step(
@@ -71,17 +68,22 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
             return self.env.step(actions)
         stack = self.transform.stack
         own = np.array([self._action(agent, actions) for agent in stack.agents])
-        masks = {a: self._infos.get(a, {}).get("action_mask") for a in stack.agents}
-        outcome = self.transform(stack.observations(self._observations), own, stack.masks(masks))
+        outcome = self.transform(self._seen, own, self._allowed)
         executed = dict(zip(stack.agents, outcome.executed.tolist(), strict=True))
         observations, rewards, terminations, truncations, infos = self.env.step(executed)
-        self._observations = observations
-        self._infos = infos
-        if not self.env.agents:
+        if self.env.agents:
+            self._notice(observations, infos)
+        else:
             self.transform.gate.end_epoch()
         columns = (outcome.grounded.tolist(), outcome.u.tolist(), outcome.accepted.tolist())
         taken = dict(zip(stack.agents, zip(*columns, strict=True), strict=True))
         return observations, rewards, terminations, truncations, _extended(infos, acting, taken)
+
+    def _notice(self, observations: dict[str, Any], infos: Infos) -> None:
+        """Keeps what the next grounding needs, in copies: learners scale observations in place."""
+        stack = self.transform.stack
+        self._seen = stack.observations(observations)
+        self._allowed = stack.masks({a: infos.get(a, {}).get("action_mask") for a in stack.agents})
 
     def _action(self, agent: str, actions: dict[str, Any]) -> int:
         phases = self.transform.stack.layouts[agent].phases

@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.testing.episodes import EnvironmentCase, Moment, different, random_actions
+from ugat_marl.testing.episodes import (
+    EnvironmentCase,
+    Moment,
+    begin,
+    different,
+    proceed,
+    random_actions,
+)
 from ugat_marl.testing.results import ConformanceError, Listening, require
 
 COMMON = "__common__"
@@ -229,6 +236,36 @@ def results_are_fresh(case: EnvironmentCase) -> None:
         previous = moment
 
 
+def what_was_given_may_be_changed(case: EnvironmentCase) -> None:
+    """Overwriting observations, infos and results does not reach into the environment."""
+    env = case.make()
+    moment = begin(env, case.seed)
+    choose = random_actions(case.seed)
+    for step, expected in enumerate(case.episode.moments[:-1]):
+        state = np.array(env.state())
+        actions = choose(step, env, moment.infos)
+        for agent in env.agents:
+            _overwrite(moment.given["observations"][agent])
+            _overwrite(moment.given["infos"][agent].get("action_mask"))
+        for part in moment.given.values():
+            part.clear()
+        require(
+            np.array_equal(state, env.state()),
+            f"{_when(step)}, overwriting the observations that were given changed state(); "
+            "learners scale in place, so keep copies",
+        )
+        require(
+            tuple(env.agents) == expected.agents,
+            f"{_when(step)}, clearing what was given changed env.agents; keep copies",
+        )
+        moment = proceed(env, actions)
+
+
+def _overwrite(array: Any) -> None:
+    if isinstance(array, np.ndarray) and array.flags.writeable:
+        array.fill(0)
+
+
 def _shares_an_array(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     return any(
         isinstance(value, np.ndarray | dict) and before.get(key) is value
@@ -304,6 +341,7 @@ BEHAVIOUR = (
     everybody_acts_to_the_end,
     values_are_plain,
     results_are_fresh,
+    what_was_given_may_be_changed,
     pictures_are_pictures,
     wrong_actions_are_refused,
 )
