@@ -87,3 +87,18 @@ def test_exploration_has_its_rate_and_keeps_to_the_mask() -> None:
     policy.reset(1)
     again = [policy.act(observations, infos)[a] for _ in range(2000) for a in agents]
     assert again == chosen
+
+
+def test_a_log_names_agents_as_the_environment_that_will_read_it() -> None:
+    """On unequal intersections names depend on who is seen; a log follows its own observer."""
+    rule = controller_for("largest-queue:20", parallel_env("mixed-v1", duration_s=50))
+    env = parallel_env("mixed-v1", duration_s=50, **rule.env_options)
+    reader = parallel_env("mixed-v1", duration_s=50, neighbours=1)
+    try:
+        log = roll_out(env, rule, 3, record=observer_of(env, "count", 1)).log
+        assert log is not None
+        assert dict(log.provenance.layouts) == dict(reader.layouts)
+        assert log.agents == tuple(reader.possible_agents)
+        assert env.possible_agents == parallel_env("mixed-v1").possible_agents
+    finally:
+        env.close()

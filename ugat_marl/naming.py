@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 
 
 def group_names(kinds: Sequence[Hashable]) -> dict[str, list[int]]:
@@ -23,6 +23,12 @@ def group_names(kinds: Sequence[Hashable]) -> dict[str, list[int]]:
     for position, kind in enumerate(kinds):
         groups[names[distinct.index(kind)]].append(position)
     return groups
+
+
+def member_names(groups: Mapping[str, Sequence[int]]) -> tuple[str, ...]:
+    """``<group>_<n>`` for every position, in the order of the positions."""
+    names = {place: f"{name}_{n}" for name, own in groups.items() for n, place in enumerate(own)}
+    return tuple(names[place] for place in sorted(names))
 
 
 def letters(number: int) -> str:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.measurements import Snapshot
+from ugat_marl.naming import group_names, member_names
 from ugat_marl.network import Network
 from ugat_marl.transitions import AgentLayout
 
@@ -48,7 +49,11 @@ class Observer:
 
     Attributes:
         layouts: Sizes of the parts of each intersection's vector, in the network's order.
-        spaces: A float32 `Box` for each intersection.
+        spaces: A float32 `Box` for each intersection; one object for equal ones.
+        groups: Group to the positions of its intersections. One group has the same lanes and
+            phases, and so the same spaces under every observation: the names of agents do not
+            depend on what is observed.
+        agents: ``<group>_<n>`` for each intersection.
     """
 
     def __init__(self, network: Network, name: str = "count", neighbours: int = 0) -> None:
@@ -75,8 +80,16 @@ class Observer:
             )
             for size, phases, near in zip(sizes, self._phases, self._near, strict=True)
         ]
+        sizes_of = [(len(i.incoming_lanes), len(i.outgoing_lanes), len(i.phases)) for i in items]
+        kinds = [
+            (sizes_of[index], *(sizes_of[j] for j in near)) for index, near in enumerate(self._near)
+        ]
+        self.groups = group_names(kinds)
+        self.agents = member_names(self.groups)
         low = -1.0 if name == "pressure" else 0.0
-        self.spaces = [self._space(index, low) for index in range(len(items))]
+        spaces = {own[0]: self._space(own[0], low) for own in self.groups.values()}
+        first = {place: own[0] for own in self.groups.values() for place in own}
+        self.spaces = [spaces[first[index]] for index in range(len(items))]
         self._place()
 
     @property

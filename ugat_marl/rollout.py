@@ -58,24 +58,19 @@ def roll_out(
     """
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
-    base: Any = env.unwrapped
-    recorder = TransitionRecorder(provenance_of(env, record, seed)) if record else None
-    seen = _recorded(base, record)
+    recording = _Recording(env, record, seed) if record else None
     steps, total = 0, 0.0
     while env.agents:
         agents = list(env.agents)
         actions = policy.act(observations, infos)
         observations, rewards, _, _, infos = env.step(actions)
-        if recorder is not None:
-            executed = {agent: int(infos[agent]["executed_action"]) for agent in agents}
-            then = _recorded(base, record)
-            recorder.record(0, steps, seen, actions, executed, rewards, then)
-            seen = then
+        if recording is not None:
+            recording.add(actions, rewards, infos)
         total += sum(rewards.values()) / len(agents)
         steps += 1
         if on_step is not None:
             on_step(steps)
-    return Episode(steps, total / max(steps, 1), recorder.log() if recorder else None)
+    return Episode(steps, total / max(steps, 1), recording.log() if recording else None)
 
 
 def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 0) -> Observer:
@@ -87,11 +82,34 @@ def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 
     return Observer(base.network, name, neighbours)
 
 
-def _recorded(base: Any, observer: Observer | None) -> dict[str, NDArray[np.float32]]:
-    if observer is None:
-        return {}
-    vectors = observer.observe(base.snapshot, base.phases)
-    return dict(zip(base.possible_agents, vectors, strict=True))
+class _Recording:
+    """The transitions of one episode as an observer sees them; agents have the observer's names."""
+
+    def __init__(self, env: AnyParallelEnv, observer: Observer, seed: int) -> None:
+        self._base: Any = env.unwrapped
+        self._observer = observer
+        self._recorder = TransitionRecorder(provenance_of(env, observer, seed))
+        self._names = dict(zip(self._base.possible_agents, observer.agents, strict=True))
+        self._seen = self._look()
+        self._step = 0
+
+    def add(self, actions: Actions, rewards: Mapping[str, float], infos: Infos) -> None:
+        then = self._look()
+        executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
+        by_agent = (self._renamed(values) for values in (actions, executed, rewards))
+        self._recorder.record(0, self._step, self._seen, *by_agent, then)
+        self._seen = then
+        self._step += 1
+
+    def log(self) -> TransitionLog:
+        return self._recorder.log()
+
+    def _look(self) -> dict[str, NDArray[np.float32]]:
+        vectors = self._observer.observe(self._base.snapshot, self._base.phases)
+        return dict(zip(self._observer.agents, vectors, strict=True))
+
+    def _renamed(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {self._names[agent]: value for agent, value in values.items()}
 
 
 def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Provenance:
@@ -104,7 +122,7 @@ def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Prove
         seeds=seeds,
         decision_interval_s=base.decision_interval_s,
         observation=observer.name,
-        layouts=dict(zip(base.possible_agents, observer.layouts, strict=True)),
+        layouts=dict(zip(observer.agents, observer.layouts, strict=True)),
         versions={name: _version(name) for name in SIMULATING},
         units={"observation": UNITS[observer.name], "reward": str(base.options.reward)},
     )

@@ -23,7 +23,6 @@ from ugat_marl.effects import Domain, describe, in_domain, load
 from ugat_marl.errors import ActionError, EpisodeError
 from ugat_marl.measurements import Snapshot
 from ugat_marl.metrics import EpisodeRecorder, Scores
-from ugat_marl.naming import group_names
 from ugat_marl.network import Network
 from ugat_marl.observations import Observer
 from ugat_marl.options import EnvOptions
@@ -238,27 +237,19 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     # --- parts --------------------------------------------------------------------------------
 
     def _name_agents(self) -> None:
-        """Agents are named ``<group>_<n>``; the same group means the same spaces."""
-        items = self.network.intersections
-        kinds = [
-            (space.shape, len(item.phases), tuple(space.low))
-            for space, item in zip(self._observer.spaces, items, strict=True)
-        ]
-        groups = group_names(kinds)
-        names = {
-            place: f"{group}_{n}" for group, own in groups.items() for n, place in enumerate(own)
+        """Agents are named by their observer; the same group means the same spaces."""
+        observer, items = self._observer, self.network.intersections
+        agents = self.possible_agents = list(observer.agents)
+        self.agent_groups = {
+            group: [agents[place] for place in own] for group, own in observer.groups.items()
         }
-        self.possible_agents = [names[place] for place in range(len(items))]
-        self.agent_groups = {group: [names[i] for i in own] for group, own in groups.items()}
-        agents = self.possible_agents
         self.intersection_of = {a: item.id for a, item in zip(agents, items, strict=True)}
-        self.layouts: dict[str, AgentLayout] = dict(
-            zip(agents, self._observer.layouts, strict=True)
-        )
-        spaces = dict(zip(kinds, self._observer.spaces, strict=True))
-        self.observation_spaces = {a: spaces[k] for a, k in zip(agents, kinds, strict=True)}
-        self.action_spaces = {a: Discrete(k[1]) for a, k in zip(agents, kinds, strict=True)}
-        self._all_free = [np.ones(kind[1], dtype=np.int8) for kind in kinds]
+        self.layouts: dict[str, AgentLayout] = dict(zip(agents, observer.layouts, strict=True))
+        self.observation_spaces = dict(zip(agents, observer.spaces, strict=True))
+        phases = [len(item.phases) for item in items]
+        actions = {count: Discrete(count) for count in phases}
+        self.action_spaces = {a: actions[count] for a, count in zip(agents, phases, strict=True)}
+        self._all_free = [np.ones(count, dtype=np.int8) for count in phases]
 
     def _joint_space(self) -> Box:
         spaces = list(self.observation_spaces.values())
