@@ -96,8 +96,8 @@ class _Recording:
     def add(self, actions: Actions, rewards: Mapping[str, float], infos: Infos) -> None:
         then = self._look()
         executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
-        by_agent = (self._renamed(values) for values in (actions, executed, rewards))
-        self._recorder.record(0, self._step, self._seen, *by_agent, then)
+        acted, served, got = map(self._renamed, (actions, executed, rewards))
+        self._recorder.record(0, self._step, self._seen, acted, served, got, then)
         self._seen = then
         self._step += 1
 
