@@ -70,6 +70,9 @@ def test_everything_is_written(found: Evaluation, tmp_path: Path) -> None:
     row = next(r for r in content["summary"] if (r["policy"], r["domain"]) == ("slow", "V4"))
     assert row["att_s_gap"]["mean"] == 55.0
     assert row["regret_s"]["mean"] == 25.0
+    single = Evaluation("toy", "0", found.results[:1], {})
+    single.write(tmp_path / "table.json")  # without an interval
+    assert '"low": null' in (tmp_path / "table.json").read_text()
 
 
 def test_how_many_run_at_once_changes_nothing() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import json
+import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -144,8 +145,17 @@ class Evaluation:
         }
 
     def write(self, path: Path) -> None:
-        """Writes `as_dict` as JSON, whole or not at all."""
-        write_whole(path, json.dumps(self.as_dict(), indent=1, allow_nan=True) + "\n")
+        """Writes `as_dict` as JSON, whole or not at all; what has no value is null."""
+        content = json.dumps(_without_nan(self.as_dict()), indent=1, allow_nan=False)
+        write_whole(path, content + "\n")
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 @dataclass(frozen=True)
