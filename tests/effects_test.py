@@ -185,6 +185,10 @@ WORLDS: dict[str, dict[str, str]] = {
         "types": '<vType id="r1"/><vTypeDistribution id="mix" vTypes="r1 DEFAULT_VEHTYPE"/>',
         "type": "mix",
     },
+    "distribution with another of SUMO's types": {
+        "types": '<vType id="r1"/><vTypeDistribution id="mix" vTypes="r1 DEFAULT_TAXITYPE"/>',
+        "type": "mix",
+    },
     "type elsewhere": {"additional": TYPED, "type": "van"},
     "type written in the old way": {"types": OLD, "type": "old"},
     "another model": {"types": '<vType id="idm" carFollowModel="IDM"/>', "type": "idm"},

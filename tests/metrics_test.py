@@ -48,7 +48,7 @@ def play(directory: Path, phases: Sequence[int]) -> tuple[Scores, list[Snapshot]
         snapshots: list[Snapshot] = []
         for phase in phases:
             env.step({"signal_0": phase})
-            snapshots.append(env._snapshot)
+            snapshots.append(env.snapshot)
         return env.scores(), snapshots
     finally:
         env.close()

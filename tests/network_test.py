@@ -138,6 +138,14 @@ def test_every_link_is_green_in_some_phase(name: str, networks: Networks) -> Non
 
 
 @pytest.mark.parametrize("name", PHASES)
+def test_rows_of_the_matrix_are_the_links(name: str, networks: Networks) -> None:
+    """netconvert numbers the letters of a light as the rows of its junction's matrix."""
+    for item in networks[name][1].intersections:
+        assert [link.request for link in item.links] == [link.index for link in item.links]
+        assert {link.junction for link in item.links} == {item.id}
+
+
+@pytest.mark.parametrize("name", PHASES)
 def test_shipped_programmes_are_sound(name: str, networks: Networks) -> None:
     """Yellow after every green that ends, and no two protected greens whose paths cross."""
     scenario, network = networks[name]
@@ -301,6 +309,18 @@ def test_without_internal_lanes_the_programme_still_works(tmp_path: Path) -> Non
     assert len(Network.read(scenario).intersections[0].phases) == 2
     with pytest.raises(ScenarioError, match=r"traffic light 'A': .*use phases = \"programme\""):
         Network.read(scenario.with_control(phases="conflict-free"))
+
+
+def test_a_way_through_with_two_lanes_has_two_rows(tmp_path: Path) -> None:
+    nodes = node("A", 0, 0, "traffic_light") + node("a", -200, 0) + node("b", 200, 0)
+    nodes += node("c", 0, 200) + node("d", 0, -200)
+    edges = "".join(
+        f'<edge id="{name}" from="{name[0]}" to="{name[1]}" numLanes="{lanes}"/>'
+        for name, lanes in (("aA", 2), ("Ab", 2), ("cA", 1), ("Ad", 1))
+    )
+    (item,) = Network.read(load(netconvert(tmp_path, nodes, edges))).intersections
+    assert any(link.from_lane == "aA_1" for link in item.links)
+    assert [link.request for link in item.links] == [link.index for link in item.links]
 
 
 # --- networks that are not ours -------------------------------------------------------------------

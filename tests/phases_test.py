@@ -179,6 +179,14 @@ def test_movements_that_share_a_letter_are_green_together() -> None:
     assert set(phases) == {"Grr", "rGr", "rrG"}
 
 
+@pytest.mark.parametrize(("partial", "whole"), [("L", "l"), ("t", "l"), ("R", "r")])
+def test_a_partial_turn_belongs_to_the_turn_it_resembles(partial: str, whole: str) -> None:
+    """Both are one movement: what crosses one of them stops both."""
+    links = [link(0, "a", whole), link(1, "a", partial, 1), link(2, "b", "s"), link(3, "c", "s")]
+    foes = matrix(4, {(1, 2), (0, 3), (2, 3)})
+    assert set(conflict_free_phases(links, foes, 4, "here")) == {"GGrr", "rrGr", "rrrG"}
+
+
 def test_letters_beyond_the_links_stay_red() -> None:
     links = [link(0, "a", "s"), link(1, "b", "s")]
     assert conflict_free_phases(links, matrix(2, {(0, 1)}), 4, "here") == ("Grrr", "rGrr")

@@ -380,7 +380,7 @@ def test_an_interruption_between_question_and_answer(crossing: Crossing, tempora
     assert eventually(lambda: not alive(pid))
     env.reset(seed=0)
     env.step({"signal_0": 0})
-    assert env._snapshot.time_s == 10
+    assert env.snapshot.time_s == 10
     env.close()
     assert list(temporary.iterdir()) == []
 
@@ -413,7 +413,7 @@ class Script:
         return found
 
     def leaves_nothing(self) -> bool:
-        return eventually(lambda: not self.relatives() and not list(self.temporary.iterdir()), 2)
+        return eventually(lambda: not self.relatives() and not list(self.temporary.iterdir()))
 
 
 @pytest.fixture
@@ -470,6 +470,30 @@ def test_nothing_is_left_when_the_user_s_process_ends(
     _, said = script.process.communicate(timeout=20)
     assert script.leaves_nothing()
     assert "simulator_worker" not in said  # no traceback but the user's own
+
+
+BUSY = """
+from ugat_marl import parallel_env
+print("running")
+while True:
+    env = parallel_env({path!r}, "V1")
+    env.reset()
+    env.step({{"signal_0": 0}})
+    env.close()
+"""
+
+
+@needs_proc
+@pytest.mark.parametrize("pause_s", [0.1, 0.5])
+def test_nothing_is_left_of_a_start_that_was_killed(
+    pause_s: float, crossing: Crossing, run_script: Callable[[str], Script]
+) -> None:
+    script = run_script(BUSY.format(path=str(crossing())))
+    script.wait_for("running")
+    time.sleep(pause_s)
+    os.killpg(script.process.pid, signal.SIGKILL)
+    script.process.communicate(timeout=20)
+    assert script.leaves_nothing()
 
 
 @needs_proc
@@ -543,7 +567,7 @@ def test_a_forked_child_leaves_its_parent_s_simulation_alone(
     env.reset(seed=3)
     for _ in range(5):
         env.step({"signal_0": 0})
-    half = env._snapshot
+    half = env.snapshot
     context = multiprocessing.get_context("fork")
     mine, its = context.Pipe()
 
@@ -571,7 +595,7 @@ def test_a_forked_child_leaves_its_parent_s_simulation_alone(
     assert answers["own"] == answers["reset"] == expected
     # The parent's own simulation never noticed.
     env.step({"signal_0": 0})
-    assert env._snapshot.time_s == half.time_s + 10
+    assert env.snapshot.time_s == half.time_s + 10
     env.close()
     assert list(temporary.iterdir()) == []
 

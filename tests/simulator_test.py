@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -61,6 +62,35 @@ def test_plans_are_shown_to_the_second(
     # A light that is left out goes on showing what it showed.
     assert simulator.advance(1, {}).time_s == 17
     assert simulator.signals() == {"C": "rG"}
+
+
+@pytest.mark.parametrize("step", [0.5, 0.1])
+def test_plans_hold_at_fractions_of_a_second(
+    step: float, simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
+) -> None:
+    directory = crossing(
+        vehicles=car("east", 0, 490, 0),
+        toml=lambda text: text.replace("duration_s", f"step_length_s = {step}\nduration_s"),
+    )
+    started(simulator, directory, tmp_path)
+    for _ in range(7):  # sums of tenths: 0.7 + 0.1 is not 0.8
+        simulator.advance(step, {"C": [(step, "Gr")]})
+    green_s = 3 * step
+    simulator.advance(10 * step, {"C": [(7 * step, "rr"), (green_s, "rG")]})
+    assert libsumo.simulation.getTime() == pytest.approx(17 * step)
+    assert simulator.vehicles().speed_mps.tolist() == pytest.approx([2.5 * green_s])
+
+
+def test_a_second_simulation_knows_nothing_of_the_first(
+    simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
+) -> None:
+    directory = crossing()
+    for _ in range(2):
+        started(simulator, directory, tmp_path)
+        assert simulator.signals() == {"C": "Gr"}
+        simulator.advance(1, {"C": [(1.0, "rr")]})
+        assert simulator.signals() == {"C": "rr"}
+        assert simulator.advance(0.0, {}).time_s == 1
 
 
 def test_without_plans_the_programme_runs(
@@ -219,6 +249,20 @@ def test_edited_files_of_one_name_are_kept_apart(
     scenario = apply_effects(load(directory), [Acceleration(1.0)])
     simulator.start(launch_of(scenario, 1, own, LANES))
     assert simulator.advance(5, {}).departed == 2
+
+
+def test_packed_files_run_as_they_are(
+    simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
+) -> None:
+    directory = crossing(toml=lambda text: text.replace('.xml"', '.xml.gz"'))
+    for name in ("network.net.xml", "demand.rou.xml"):
+        (directory / f"{name}.gz").write_bytes(gzip.compress((directory / name).read_bytes()))
+        (directory / name).unlink()
+    scenario = load(directory)
+    for number, effects in enumerate(([], [Acceleration(1.0)])):
+        own = tmp_path / f"own{number}"
+        simulator.start(launch_of(apply_effects(scenario, effects), 1, own, LANES))
+        assert simulator.advance(5, {}).departed == 2
 
 
 @pytest.mark.parametrize("name", ["with blank", "with,comma", "with;semicolon", "mit-ü", "a'b"])
