@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import itertools
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from ugat_marl import parallel_env
 from ugat_marl.effects import Acceleration, StartupDelay, apply_effects, load
 from ugat_marl.errors import SimulatorBusy, SimulatorError
+from ugat_marl.signals import GREEN
 from ugat_marl.simulator import LibsumoSimulator, launch_of, read_trips
 
 Crossing = Callable[..., Path]
@@ -210,6 +212,48 @@ def test_an_option_sumo_does_not_know(
     directory = crossing(toml=lambda text: text + '[sumo]\nlateral-revolution = "0.8"\n')
     with pytest.raises(SimulatorError, match=r"SUMO did not start: .*command ?line"):
         started(simulator, directory, tmp_path)
+
+
+# --- the signals SUMO really shows
+
+
+def test_what_sumo_shows_keeps_every_rule() -> None:
+    """Random requests every second on unequal intersections, read back from SUMO each second."""
+    scenario = load("mixed-v1").with_control(decision_interval_s=1, min_green_s=4)
+    env = parallel_env(scenario, simulator="inprocess", duration_s=150)
+    generator = np.random.default_rng(2)
+    shown: list[dict[str, str]] = []
+    env.reset(seed=2)
+    wanted = dict.fromkeys(env.agents, 0)
+    while env.agents:
+        for agent in env.agents:
+            if generator.random() < 0.15:
+                wanted[agent] = int(generator.integers(env.action_space(agent).n))
+        env.step(wanted)
+        if env.agents:
+            assert env._simulator is not None
+            shown.append(env._simulator.signals())
+    env.close()
+    changes = 0
+    for item in env.network.intersections:
+        phases = set(item.phases)
+        green_since = dict.fromkeys(range(len(item.phases[0])), -1000)
+        for second, (before, after) in enumerate(
+            itertools.pairwise(states[item.id] for states in shown)
+        ):
+            changes += before != after
+            for link, (a, b) in enumerate(zip(before, after, strict=True)):
+                if a in GREEN and b not in GREEN:
+                    assert b == "y", f"{item.id}, link {link}: {before} -> {after}"
+                    assert second + 1 - green_since[link] >= 4
+                if a == "y" and b != "y":
+                    assert b == "r"
+                    yellow = [states[item.id][link] for states in shown[second - 2 : second + 1]]
+                    assert yellow == ["y"] * 3
+                if a not in GREEN and b in GREEN:
+                    green_since[link] = second + 1
+                    assert after in phases
+    assert changes > 100
 
 
 # --- launching
