@@ -36,6 +36,7 @@ class EnvBench:
         scenarios: What to simulate.
         rounds: Repetitions; medians and quartiles are over these.
         duration_s: Simulated seconds per episode.
+        decision_interval_s: Seconds from decision to decision; None for the scenario's own (10).
         seed: Seed of the simulation and of the random actions.
         sumo_rl: Whether to compare with sumo-rl, which is installed into an environment of its own
             the first time.
@@ -46,6 +47,7 @@ class EnvBench:
     scenarios: tuple[str, ...] = ("resco:grid4x4", "resco:cologne8")
     rounds: int = 7
     duration_s: float = 3600.0
+    decision_interval_s: float | None = None
     seed: int = 1
     sumo_rl: bool = True
     cache: Path = Path(".cache")
@@ -87,7 +89,11 @@ class EnvBench:
     def _variants(
         self, scenario: str | Path, folder: Path, other: Rival | None
     ) -> dict[Variant, Callable[[], Run]]:
-        timings = {OWN_TIMING: {}, RIVAL_TIMING: SUMO_RL_TIMING} if other else {OWN_TIMING: {}}
+        every = self.decision_interval_s
+        interval = {} if every is None else {"decision_interval_s": every}
+        timings = {OWN_TIMING: interval}
+        if other is not None:
+            timings[RIVAL_TIMING] = {**SUMO_RL_TIMING, **interval}
         variants: dict[Variant, Callable[[], Run]] = {}
         for timing, control in timings.items():
             own = folder / timing
@@ -118,16 +124,19 @@ class EnvBench:
         self, scenario: str, variant: Variant, runs: Mapping[Variant, list[Run]]
     ) -> dict[str, Any]:
         timing, who = variant
-        own = runs[variant]
+        own, bare = runs[variant], runs[timing, BARE]
         speeds = _speeds(own)
+        decisions = own[-1]["decisions"]
+        beyond = [run["steps_s"] - alone["steps_s"] for run, alone in zip(own, bare, strict=True)]
         return {
             "scenario": scenario,
             "timing": timing,
             "who": who,
             "simulated s / s": Spread.of([self.duration_s * speed for speed in speeds]),
-            "ratio to libsumo": Spread.of_ratios(speeds, _speeds(runs[timing, BARE])),
-            "own CPU [s]": Spread.of([run["cpu_s"] for run in own]),
-            "reset [s]": Spread.of([run["start_s"] for run in own]),
+            "ratio to libsumo": Spread.of_ratios(speeds, _speeds(bare)),
+            "ratio by CPU": "-" if who == PROCESS else _ratio_by_cpu(own, bare),
+            "beyond SUMO [ms/decision]": Spread.of([1e3 * x / decisions for x in beyond]).median,
+            "reset [s]": Spread.of([run["start_s"] for run in own]).median,
             "entered": own[-1]["entered"],
             "arrived": own[-1]["arrived"],
         }
@@ -136,7 +145,9 @@ class EnvBench:
 _METHOD = (
     "Speeds and ratios are over all steps, the closing of SUMO and the scores included, loading of "
     "the network excluded (column 'reset'). Actions are random, the same for all that share a "
-    "timing. Median (first-third quartile); ratios within a round."
+    "timing. Median (first-third quartile); ratios within a round. 'By CPU' leaves out the seconds "
+    "in which other processes had the processor; 'beyond SUMO' is what a decision takes longer "
+    "than in SUMO alone."
 )
 _RIVAL_METHOD = (
     "sumo-rl {sumo_rl} runs under PettingZoo {pettingzoo} with libsumo, and with its default "
@@ -160,6 +171,11 @@ def _check_round(runs: Mapping[Variant, Run]) -> None:
 def _speeds(runs: list[Run]) -> list[float]:
     """Episodes per wall second."""
     return [1.0 / run["steps_s"] for run in runs]
+
+
+def _ratio_by_cpu(runs: list[Run], bare: list[Run]) -> Spread:
+    """The ratio of speeds if only the seconds counted in which the processor was theirs."""
+    return Spread.of_ratios([run["cpu_s"] for run in bare], [run["cpu_s"] for run in runs])
 
 
 def _targets(scenario: str, runs: Mapping[Variant, list[Run]]) -> list[Target]:

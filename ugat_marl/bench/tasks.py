@@ -15,7 +15,8 @@ from ugat_marl.errors import MeasurementError
 
 _FOLDER = Path(__file__).parent
 Run = dict[str, Any]
-"""``start_s``, ``steps_s`` (wall), ``cpu_s``, ``entered`` and ``arrived`` vehicles."""
+"""Wall seconds ``start_s`` and ``steps_s``, ``cpu_s``, ``decisions``; vehicles ``entered`` and
+``arrived``."""
 
 SUMO_RL_TIMING: Mapping[str, float] = {"yellow_s": 2.0, "all_red_s": 0.0, "min_green_s": 5.0}
 """The clearance and minimum green sumo-rl has by default; it knows no all-red."""
@@ -82,20 +83,24 @@ class Task:
 
     def by_libsumo(self) -> Run:
         """SUMO alone shows the recorded signal states."""
-        return in_fresh_process([_FOLDER / "bare.py"], self.bare)
+        return self._counted(in_fresh_process([_FOLDER / "bare.py"], self.bare))
 
     def by_suite(self, simulator: str) -> Run:
         """The environment, its simulator in this or in another process."""
-        return _episode({**self.request, "simulator": simulator})
+        return self._counted(_episode({**self.request, "simulator": simulator}))
 
     def by_sumo_rl(self, rival: Rival, *, metrics: bool) -> Run:
         """sumo-rl with the same actions, with or without the metrics it collects by default."""
-        return in_fresh_process(
+        run = in_fresh_process(
             [_FOLDER / "sumo_rl_episode.py"],
             {**self.sumo_rl, "infos": metrics},
             python=rival.python,
             variables=rival.variables(),
         )
+        return self._counted(run)
+
+    def _counted(self, run: Run) -> Run:
+        return {**run, "decisions": len(self.sumo_rl["actions"])}
 
 
 def _episode(request: Mapping[str, Any]) -> dict[str, Any]:
