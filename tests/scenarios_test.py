@@ -264,7 +264,8 @@ def test_readme_states_headroom_of_at_least_15_percent(name: str) -> None:
     table = {row[0]: row for row in rows}
     assert list(table) == ["sim", "V1", "V2", "V3", "V4"]
     assert float(table["V4"][lost].rstrip("%")) >= 15
-    assert float(table["sim"][-1]) <= 1, "vehicles never get in, under the best rule in sim"
+    too_late = sum(departs > 3599 for _, departs, _, _ in vehicles(name))
+    assert float(table["sim"][-1]) <= too_late, "vehicles never get in, under the best rule in sim"
 
 
 def test_headroom_is_there_when_measured() -> None:
