@@ -80,4 +80,4 @@ def _curves(axes: Any, found: Evaluation, metrics: Metrics) -> None:
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylim(bottom=0)
     axes.set_title("UGAT, one seed after each iteration", fontsize=9)
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.14))
