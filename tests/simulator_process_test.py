@@ -497,6 +497,23 @@ def test_nothing_is_left_of_a_start_that_was_killed(
 
 
 @needs_proc
+def test_nothing_is_left_though_a_forked_child_survives(
+    crossing: Crossing, run_script: Callable[[str], Script]
+) -> None:
+    """The child inherits the lines to the simulators, so that they do not close."""
+    text = ENDLESS.format(path=str(crossing()), simulators=["process", "spawn"])
+    fork = 'import os, time\nif os.fork() == 0:\n    time.sleep(60)\nprint("running")'
+    script = run_script(text.replace('print("running")', fork))
+    script.wait_for("running")
+    assert len(script.relatives()) == 2 + 1 + 2  # the script, its child, warm parent, two workers
+    script.process.kill()
+    script.process.wait()
+    assert eventually(lambda: len(script.relatives()) == 1 and not list(script.temporary.iterdir()))
+    (child,) = script.relatives()
+    os.kill(child, signal.SIGKILL)
+
+
+@needs_proc
 def test_a_script_needs_no_guard_and_need_not_close(
     crossing: Crossing, run_script: Callable[[str], Script]
 ) -> None:

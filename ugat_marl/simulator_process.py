@@ -3,7 +3,7 @@
 A warm parent, started with the first simulation and gone with the last, has SUMO loaded and forks a
 fresh worker for every episode: starting is cheap, and no episode sees what ran before. Where a
 process cannot fork, every episode starts a new interpreter. Neither looks at the user's
-``__main__``. Parent and workers end when their socket closes, however the user's process ends.
+``__main__``. Parent and workers end with the user's process, however that ends.
 
 Messages are JSON with arrays behind it (see `ugat_marl.channel`), one round trip per decision; the
 other end is `ugat_marl.simulator_worker`.
@@ -189,7 +189,7 @@ class _Worker:
         """A new interpreter that serves one simulation on its standard streams."""
         said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the worker
         process: subprocess.Popen[bytes] = subprocess.Popen(
-            _command("spawned"),
+            _command("spawned", str(os.getpid())),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=said,
@@ -259,7 +259,7 @@ class _WarmParent:
         self._socket, its = socket.socketpair()
         with its:
             self._process = subprocess.Popen(
-                _command("parent", str(its.fileno())),
+                _command("parent", str(its.fileno()), str(self._owner)),
                 stdin=subprocess.DEVNULL,
                 pass_fds=(its.fileno(),),
                 env=_environment(),

@@ -1,7 +1,8 @@
 """The other end of `ugat_marl.simulator_process`: what runs in the processes it starts.
 
 ``parent`` is warm: SUMO is loaded, and it forks a worker for every pair of file descriptors that
-arrives. ``spawned`` is a worker in an interpreter of its own. Both end when their socket closes.
+arrives. ``spawned`` is a worker in an interpreter of its own. All of them end when their line
+closes, or when the user's process is gone though a child it forked still holds the line open.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import shutil
 import signal
 import socket
 import sys
+import threading
+import time
 from typing import Any, NoReturn
 
 import numpy as np
@@ -20,6 +23,9 @@ from ugat_marl.channel import Channel, ChannelClosed, Message
 from ugat_marl.errors import SimulatorError
 from ugat_marl.measurements import Snapshot
 from ugat_marl.simulator import Launch, LibsumoSimulator, Simulator
+
+_LOOK_EVERY_S = 1.0
+"""How often a process looks whether the one it works for is still there."""
 
 
 def _answer(simulator: Simulator, header: dict[str, Any]) -> Message:
@@ -53,47 +59,89 @@ def _message(snapshot: Snapshot) -> Message:
     return Message(header, [lanes, snapshot.waiting_s])
 
 
-def _work(channel: Channel) -> NoReturn:
-    """Serves one simulation until the channel closes, then removes SUMO's files and exits."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    simulator = LibsumoSimulator()
-    directory: str | None = None
-    with contextlib.suppress(ChannelClosed):
-        while (question := _hear(channel)).header["what"] != "close":
-            if question.header["what"] == "own":
-                directory = question.header["directory"]
-                continue
-            try:
-                answer = _answer(simulator, question.header)
-            except SimulatorError as error:
-                answer = Message({"error": str(error)}, [])
-            _tell(channel, answer)
-    if directory is not None:
-        shutil.rmtree(directory, ignore_errors=True)
-    os._exit(0)  # no destructors: libsumo's may take long on a large network
+class _Worker:
+    """Serves one simulation until the channel closes.
+
+    Args:
+        channel: The line to the user's process.
+        parent: Number of the process that started this one.
+        user: Number of the user's process.
+    """
+
+    def __init__(self, channel: Channel, parent: int, user: int) -> None:
+        self._channel = channel
+        self._parent = parent
+        self._user = user
+        self._directory: str | None = None
+
+    def run(self) -> NoReturn:
+        """Answers questions, then removes SUMO's files and exits."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        threading.Thread(target=self._watch, daemon=True).start()
+        simulator = LibsumoSimulator()
+        with contextlib.suppress(ChannelClosed):
+            while (question := self._hear()).header["what"] != "close":
+                if question.header["what"] == "own":
+                    self._directory = question.header["directory"]
+                    continue
+                try:
+                    answer = _answer(simulator, question.header)
+                except SimulatorError as error:
+                    answer = Message({"error": str(error)}, [])
+                self._tell(answer)
+        self._leave()
+
+    def _watch(self) -> None:
+        while not _abandoned(self._parent, self._user):
+            time.sleep(_LOOK_EVERY_S)
+        self._leave()
+
+    def _leave(self) -> NoReturn:
+        if self._directory is not None:
+            shutil.rmtree(self._directory, ignore_errors=True)
+        os._exit(0)  # no destructors: libsumo's may take long on a large network
+
+    def _hear(self) -> Message:
+        try:
+            return self._channel.receive()
+        except OSError:
+            raise ChannelClosed from None
+
+    def _tell(self, answer: Message) -> None:
+        try:
+            self._channel.send(answer)
+        except OSError:
+            raise ChannelClosed from None
 
 
-def _hear(channel: Channel) -> Message:
+def _abandoned(parent: int, user: int) -> bool:
+    """Whether this process lost its parent because the user's process ended.
+
+    A warm parent may be killed alone; then its workers go on.
+    """
+    if os.getppid() == parent:
+        return False
     try:
-        return channel.receive()
-    except OSError:
-        raise ChannelClosed from None
+        os.kill(user, 0)
+    except (ProcessLookupError, PermissionError):  # gone, or its number is somebody else's by now
+        return True
+    return False
 
 
-def _tell(channel: Channel, answer: Message) -> None:
-    try:
-        channel.send(answer)
-    except OSError:
-        raise ChannelClosed from None
-
-
-def _serve(descriptor: int) -> None:
+def _serve(descriptor: int, user: int) -> None:
     """The warm parent: forks a worker for every pair of file descriptors that arrives."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # workers leave no zombies
+    here = os.getpid()
     with socket.socket(fileno=descriptor) as control, contextlib.suppress(ConnectionError):
+        control.settimeout(_LOOK_EVERY_S)
         while True:
-            request, descriptors, _, _ = socket.recv_fds(control, 1, 2)
+            try:
+                request, descriptors, _, _ = socket.recv_fds(control, 1, 2)
+            except TimeoutError:
+                if _abandoned(user, user):
+                    return
+                continue
             if not request:
                 return
             pid = os.fork()
@@ -102,21 +150,22 @@ def _serve(descriptor: int) -> None:
                 os.dup2(descriptors[1], 1)
                 os.dup2(descriptors[1], 2)
                 line = socket.socket(fileno=descriptors[0])
-                _work(Channel(line.makefile("rb"), line.makefile("wb"), line.close))
+                channel = Channel(line.makefile("rb"), line.makefile("wb"), line.close)
+                _Worker(channel, here, user).run()
             for descriptor in descriptors:
                 os.close(descriptor)
             control.sendall(pid.to_bytes(8, "little"))
 
 
-def _spawned() -> None:
+def _spawned(user: int) -> None:
     """A worker of its own interpreter: SUMO may print, so the channel leaves standard output."""
     reader, writer = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    _work(Channel(reader, writer, writer.close))
+    _Worker(Channel(reader, writer, writer.close), user, user).run()
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "parent":
-        _serve(int(sys.argv[2]))
+        _serve(int(sys.argv[2]), int(sys.argv[3]))
     else:
-        _spawned()
+        _spawned(int(sys.argv[2]))
