@@ -56,8 +56,13 @@ def relative_slowness(
     snapshot: Snapshot, lanes: LaneTable, incoming: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """1 - v / v_max of each lane of `incoming`, clipped to [0, 1] (vehicles may speed a little)."""
-    ratio = snapshot.mean_speed_mps[incoming] / lanes.speed_mps[incoming]
-    return np.minimum(np.maximum(1.0 - ratio, 0.0), 1.0)
+    return _slowness(snapshot.mean_speed_mps[incoming], lanes.speed_mps[incoming])
+
+
+def _slowness(
+    speed_mps: NDArray[np.float64], limit_mps: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.minimum(np.maximum(1.0 - speed_mps / limit_mps, 0.0), 1.0)
 
 
 @dataclass
@@ -74,6 +79,7 @@ class EpisodeRecorder:
 
     def __post_init__(self) -> None:
         self._all = np.concatenate(self.incoming)
+        self._limits = self.lanes.speed_mps[self._all]
         self._decisions = 0
         self._reward = self._queue = self._delay = 0.0
 
@@ -82,7 +88,7 @@ class EpisodeRecorder:
         self._decisions += 1
         self._reward += mean_reward
         self._queue += float(snapshot.halting[self._all].sum()) / len(self.incoming)
-        self._delay += float(relative_slowness(snapshot, self.lanes, self._all).mean())
+        self._delay += float(_slowness(snapshot.mean_speed_mps[self._all], self._limits).mean())
 
     def scores(self, trips: Trips) -> Scores:
         """The scores of the episode that ended with `trips`."""
