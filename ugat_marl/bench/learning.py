@@ -84,8 +84,8 @@ class LearningBench:
         notes = [
             f"{self.scenario}, {agents} agents, {found['decisions']} decisions and "
             f"{found['updates']} updates per training episode. Median (first-third quartile).",
-            f"Learning adds {1e3 * added / found['decisions']:.2f} ms to a decision. Random actions "
-            "jam the network, which makes SUMO slow and the ratio small.",
+            f"Learning adds {1e3 * added / found['decisions']:.2f} ms to a decision. "
+            "Random actions jam the network, which makes SUMO slow and the ratio small.",
         ]
         report = Report("learning", asdict(self), rows, targets, notes)
         if self.out is not None:
