@@ -146,7 +146,9 @@ def _one_line(box: str) -> str:
 
 
 def _bench(command: Any, console: Console) -> int:
-    reports = command.run()
+    from ugat_marl.progress import Bars
+
+    reports = command.run(Bars(console))
     reports = reports if isinstance(reports, list) else [reports]
     for report in reports:
         console.print(report.tables())

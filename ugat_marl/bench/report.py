@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich import box
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -88,6 +89,7 @@ class Report:
         targets: Figures to reach.
         notes: What a reader must know to judge the numbers.
         machine: CPU, Python, versions, date and command line.
+        by: Columns of `rows` that part them into tables.
     """
 
     bench: str
@@ -96,6 +98,7 @@ class Report:
     targets: Sequence[Target]
     notes: Sequence[str] = ()
     machine: Mapping[str, Any] = field(default_factory=machine_facts)
+    by: tuple[str, ...] = ()
 
     @property
     def met(self) -> bool:
@@ -119,17 +122,29 @@ class Report:
         write_whole(path, json.dumps(self.as_dict(), indent=2, allow_nan=False) + "\n")
 
     def tables(self) -> Group:
-        """Rows, targets and notes for a terminal."""
-        columns = list(self.rows[0]) if self.rows else []
-        table = Table(title=f"bench {self.bench}", title_justify="left")
-        for column in columns:
-            table.add_column(Text(column))
+        """Rows, targets and notes for a terminal of 80 columns.
+
+        One table for each value of `by`; of a spread the median, as the JSON file holds the rest.
+        """
+        groups: dict[str, list[Mapping[str, Any]]] = {}
         for row in self.rows:
-            table.add_row(*(Text(_cell(row[column])) for column in columns))
+            groups.setdefault(", ".join(str(row[column]) for column in self.by), []).append(row)
         lines = [
             Text(str(target), style="green" if target.met else "red") for target in self.targets
         ]
-        return Group(table, *lines, *(Text(note, style="dim") for note in self.notes))
+        notes = (Text(note, style="dim") for note in self.notes)
+        return Group(*(self._table(*group) for group in groups.items()), *lines, *notes)
+
+    def _table(self, name: str, rows: Sequence[Mapping[str, Any]]) -> Table:
+        columns = [column for column in rows[0] if column not in self.by]
+        title = f"bench {self.bench}" + (f": {name}" if name else "")
+        table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+        for column in columns:
+            numbers = not isinstance(rows[0][column], str)
+            table.add_column(Text(column), justify="right" if numbers else "left")
+        for row in rows:
+            table.add_row(*(Text(_cell(row[column])) for column in columns))
+        return table
 
 
 def require_positive(bench: str, **options: float) -> None:
@@ -152,6 +167,8 @@ def _short(number: float) -> str:
 
 
 def _cell(value: Any) -> str:
+    if isinstance(value, Spread):
+        return _short(value.median)
     return _short(value) if isinstance(value, float) else str(value)
 
 

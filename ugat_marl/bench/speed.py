@@ -82,7 +82,7 @@ class EnvBench:
             notes += [_ceiling(name, runs)] if other is not None else []
         if other is not None:
             notes += [_RIVAL_METHOD.format(sumo_rl=SUMO_RL, pettingzoo=PETTINGZOO)]
-        report = Report("env", asdict(self), rows, targets, notes)
+        report = Report("env", asdict(self), rows, targets, notes, by=("scenario", "timing"))
         if self.out is not None:
             report.write(self.out)
         return report
