@@ -64,8 +64,7 @@ def test_every_command_explains_itself(
     assert end.value.code == 0
     text = capsys.readouterr().out
     assert f"usage: ugat-marl {command}" in text
-    if not command.startswith("bench"):
-        assert f"    ugat-marl {command}" in text, "no example"
+    assert f"    ugat-marl {command}" in text, "no example"
 
 
 def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,9 @@ from ugat_marl.progress import Reporter
 class AllBench:
     """All benches, one after the other.
 
+    Examples:
+        ugat-marl bench all --env.rounds 3 --out bench
+
     Attributes:
         env: Options of ``bench env``.
         learning: Options of ``bench learning``.

@@ -21,6 +21,9 @@ class LearningBench:
     same actions, which are random, so that the traffic is the same to the vehicle. Both alternate
     in one process, with the environment's simulator in its worker process.
 
+    Examples:
+        ugat-marl bench learning --out learning.json
+
     Attributes:
         scenario: What to simulate.
         rounds: Pairs of episodes; medians and quartiles are over these.

@@ -18,6 +18,9 @@ SIMULATORS = ("process", "inprocess")
 class MemoryBench:
     """Memory, processes and open files over many resets of one environment.
 
+    Examples:
+        ugat-marl bench memory --resets 50
+
     Attributes:
         scenario: What to simulate.
         resets: Resets in all.

@@ -90,6 +90,7 @@ class Report:
         notes: What a reader must know to judge the numbers.
         machine: CPU, Python, versions, date and command line.
         by: Columns of `rows` that part them into tables.
+        aside: Columns for the JSON file alone.
     """
 
     bench: str
@@ -99,6 +100,7 @@ class Report:
     notes: Sequence[str] = ()
     machine: Mapping[str, Any] = field(default_factory=machine_facts)
     by: tuple[str, ...] = ()
+    aside: tuple[str, ...] = ()
 
     @property
     def met(self) -> bool:
@@ -136,12 +138,14 @@ class Report:
         return Group(*(self._table(*group) for group in groups.items()), *lines, *notes)
 
     def _table(self, name: str, rows: Sequence[Mapping[str, Any]]) -> Table:
-        columns = [column for column in rows[0] if column not in self.by]
+        columns = [column for column in rows[0] if column not in (*self.by, *self.aside)]
         title = f"bench {self.bench}" + (f": {name}" if name else "")
         table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
         for column in columns:
             numbers = not isinstance(rows[0][column], str)
-            table.add_column(Text(column), justify="right" if numbers else "left")
+            table.add_column(
+                Text(column), justify="right" if numbers else "left", no_wrap=not numbers
+            )
         for row in rows:
             table.add_row(*(Text(_cell(row[column])) for column in columns))
         return table

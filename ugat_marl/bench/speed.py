@@ -32,6 +32,9 @@ class EnvBench:
     options and no output; the same vehicles enter and arrive, or the bench fails. sumo-rl gets the
     same actions, and the environment its clearance times, so that both have the same traffic.
 
+    Examples:
+        ugat-marl bench env --rounds 3 --out speed.json
+
     Attributes:
         scenarios: What to simulate.
         rounds: Repetitions; medians and quartiles are over these.
@@ -82,7 +85,15 @@ class EnvBench:
             notes += [_ceiling(name, runs)] if other is not None else []
         if other is not None:
             notes += [_RIVAL_METHOD.format(sumo_rl=SUMO_RL, pettingzoo=PETTINGZOO)]
-        report = Report("env", asdict(self), rows, targets, notes, by=("scenario", "timing"))
+        report = Report(
+            "env",
+            asdict(self),
+            rows,
+            targets,
+            notes,
+            by=("scenario", "timing"),
+            aside=("entered", "arrived"),
+        )
         if self.out is not None:
             report.write(self.out)
         return report

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.batched import one_thread
+from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.gate import Gate, GateConfig
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.stacked import Stack
-from ugat_marl.learners.checkpoint import read_checkpoint, write_checkpoint
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import AgentLayout
 

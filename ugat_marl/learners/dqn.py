@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.batched import one_thread
+from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
-from ugat_marl.learners.checkpoint import read_checkpoint, write_checkpoint
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import (
     DQNPolicy,

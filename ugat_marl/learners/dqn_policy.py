@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.batched import BatchedMLP
+from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError
 from ugat_marl.learners.agents import AgentSet
-from ugat_marl.learners.checkpoint import read_checkpoint, write_checkpoint
 from ugat_marl.policy import Actions, Infos, Observations
 
 _KIND = "ugat_marl.dqn_policy"

@@ -67,8 +67,16 @@ def measures_table(found: Evaluation) -> RenderableType:
                 gaps = [found.gap(policy, domain, measure) for measure in MEASURES]
                 table.add_row(*_dim(f"  gap to {found.domains[0]}", *map(_signed, gaps)))
         blocks.append(table)
+        blocks += [Text(line, style="dim") for line in _backlog(found, domain)]
     blocks.append(Text(_legend(found), style="dim"))
     return Group(*blocks)
+
+
+def _backlog(found: Evaluation, domain: str) -> list[str]:
+    """Who kept vehicles out of the network, which throughput and queue do not show."""
+    waiting = {name: found.estimate(name, domain, "backlog").mean for name in found.policies}
+    kept_out = [f"{name} {_number(mean)}" for name, mean in waiting.items() if mean >= 0.5]
+    return [f"vehicles due that never entered: {', '.join(kept_out)}"] if kept_out else []
 
 
 def _caption(found: Evaluation) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from pickle import UnpicklingError
@@ -12,7 +13,11 @@ import torch
 from ugat_marl.errors import CheckpointError
 from ugat_marl.files import replacing
 
-_UNREADABLE = (OSError, EOFError, RuntimeError, ValueError, KeyError, UnpicklingError)
+_UNREADABLE = (
+    OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
+    AssertionError, UnpicklingError, zipfile.BadZipFile,
+)  # fmt: skip
+"""What torch raises on files that are not what it wrote."""
 
 
 def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
@@ -35,6 +40,7 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"{path}: no such checkpoint file")
     try:
+        _require_sums(path)
         content = torch.load(path, map_location="cpu", weights_only=True)
     except _UNREADABLE as error:
         first_line = (str(error).splitlines() or [type(error).__name__])[0]
@@ -47,6 +53,14 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
         raise CheckpointError(f"{path}: holds {found!r}, expected {kind!r}; give the right file")
     require_finite(content, str(path), "cannot be used: take an earlier checkpoint or train again")
     return content
+
+
+def _require_sums(path: Path) -> None:
+    """Compares the check sums of the archive, which torch does not: a flipped bit is an error."""
+    with zipfile.ZipFile(path) as archive:
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"check sum of {damaged} is wrong")
 
 
 def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> None:
