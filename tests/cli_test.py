@@ -44,6 +44,8 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["evaluate", "single-v1", "--domains", "startup_dealy=1"], "'startup_delay'"),
         (["evaluate", "single-v1", "--domains", "startup_delay=-1"], "[0, 10] s"),
         (["evaluate", "single-v1", "--seeds", "0"], "at least 1"),
+        (["evaluate", "single-v1", "--domains", "V4", "snow"], "listed twice"),
+        (["evaluate", "single-v1", "--policies", "random", "random"], "twice"),
         (["check", "nowhere.sumocfg"], "nowhere.sumocfg"),
         (["rollout", "single-v1"], "--out"),
     ],

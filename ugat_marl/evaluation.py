@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from ugat_marl.controllers import STANDARD_RULES, controller_for, parse_spec
 from ugat_marl.effects import Domain, describe, in_domain
-from ugat_marl.errors import CheckpointError
+from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.files import write_whole
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.metrics import MEASURES, Scores, bootstrap_interval
 from ugat_marl.policy import Policy
-from ugat_marl.progress import Reporter, Silent
+from ugat_marl.progress import Advance, Reporter, Silent
 from ugat_marl.rollout import roll_out
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import numpy_generator
@@ -175,6 +175,7 @@ def evaluate(
     duration_s: float | None = None,
     workers: int | None = None,
     reporter: Reporter | None = None,
+    title: str = "evaluating",
     notes: Mapping[str, str] | None = None,
 ) -> Evaluation:
     """Plays every policy in every domain with every seed, spread over the cores.
@@ -187,8 +188,12 @@ def evaluate(
         duration_s: Length of an episode; None for the scenario's own.
         workers: Simulations at a time; None for the number of cores.
         reporter: Shows progress.
+        title: What to call the work there.
         notes: Kept with the result.
     """
+    names = [describe(domain) for domain in domains]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
     for domain in domains:
         in_domain(scenario, domain)  # a wrong name is an error now, not in an hour
     workers = workers or os.cpu_count() or 1
@@ -199,7 +204,8 @@ def evaluate(
         for name, make in policies.items()
         for start in range(0, len(seeds), per_task)
     ]
-    results = _play_all(scenario, tasks, duration_s, workers, reporter or Silent())
+    with (reporter or Silent()).task(title, len(seeds) * len(policies) * len(domains)) as advance:
+        results = _play_all(scenario, tasks, duration_s, workers, advance)
     order = {
         (name, describe(domain)): i for i, (name, domain) in enumerate(_pairs(policies, domains))
     }
@@ -230,6 +236,7 @@ def best_rules(
         duration_s=duration_s,
         workers=workers,
         reporter=reporter,
+        title="best rule of each domain",
     )
     return {
         domain: min(rules, key=lambda rule: found.estimate(rule, domain, "att_s").mean)
@@ -287,27 +294,25 @@ def _play_all(
     tasks: Sequence[_Task],
     duration_s: float | None,
     workers: int,
-    reporter: Reporter,
+    advance: Advance,
 ) -> list[Result]:
     """Threads suffice: the simulations run in processes of their own."""
     stop = threading.Event()
-    episodes = sum(len(task.seeds) for task in tasks)
+    lock = threading.Lock()
     results: list[Result] = []
-    with reporter.task("evaluating", episodes) as advance:
-        lock = threading.Lock()
 
-        def done() -> None:
-            with lock:
-                advance()
+    def done() -> None:
+        with lock:
+            advance()
 
-        pool = concurrent.futures.ThreadPoolExecutor(workers)
-        try:
-            running = [pool.submit(_play, scenario, t, duration_s, stop, done) for t in tasks]
-            for future in concurrent.futures.as_completed(running):
-                results += future.result()
-        finally:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
+    pool = concurrent.futures.ThreadPoolExecutor(workers)
+    try:
+        running = [pool.submit(_play, scenario, t, duration_s, stop, done) for t in tasks]
+        for future in concurrent.futures.as_completed(running):
+            results += future.result()
+    finally:
+        stop.set()
+        pool.shutdown(cancel_futures=True)
     return results
 
 

@@ -163,7 +163,6 @@ def judge(
     reporter: Reporter,
 ) -> Evaluation:
     """Evaluates policies beside the rules that are best in each domain."""
-    reporter.say("searching the best rule of each domain")
     rules = best_rules(
         scenario,
         config.domains,

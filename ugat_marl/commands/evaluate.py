@@ -50,6 +50,8 @@ class Evaluate:
         for name in ("policies", "domains"):
             if not getattr(self, name):
                 raise OptionError(f"--{name} needs at least one value")
+        if len(set(map(_name, self.policies))) < len(self.policies):
+            raise OptionError(f"--policies holds one twice: {' '.join(self.policies)}")
         if self.seeds < 1 or (self.workers is not None and self.workers < 1):
             raise OptionError("--seeds and --workers must be at least 1")
         found = evaluate(
