@@ -29,6 +29,7 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["bench", "enf"], "'env'"),
         (["train", "singel-v1"], "'single-v1'"),
         (["train", "single-v1", "--real", "V44"], "'V4'"),
+        (["train", "single-v1", "--real", "sim"], "the simulation itself"),
         (["train", "single-v1", "--rael", "V4"], "'--real'"),
         (["train", "single-v1", "--iteratoins", "4"], "'--iterations'"),
         (["train", "single-v1", "--gate.moed", "static"], "'--gate.mode'"),

@@ -90,6 +90,10 @@ class TransferConfig:
         for name in ("evaluation_seeds", "tuning_seeds"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if describe(self.real) == describe(self.sim):
+            raise OptionError(
+                f"real = {self.real!r} is the simulation itself; name another domain, such as V4"
+            )
         if self.real == "none" and self.real_log is None:
             raise OptionError('real = "none" needs a real_log: something must be known of the real')
 
