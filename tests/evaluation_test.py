@@ -51,6 +51,7 @@ def test_gap_is_paired_by_seed_and_regret_is_against_the_best_there(found: Evalu
     assert found.estimate("slow", "sim", "att_s").mean == 105.0
     assert found.gap("slow", "V4", "att_s").mean == 55.0
     assert found.regret("slow", "V4").mean == 25.0
+    assert found.estimate("slow", "V4", "att_s").median == 160.0
     assert found.regret("fast", "V4").mean == 0.0
     gap = found.gap("slow", "V4", "att_s")  # the two differences are 50 and 60
     assert (gap.low, gap.high) == (50.0, 60.0)

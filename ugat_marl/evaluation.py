@@ -61,17 +61,18 @@ class Result:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean over seeds with a 95 % bootstrap interval (nan for a single seed)."""
+    """Mean over seeds with a 95 % bootstrap interval (nan for a single seed), and the median."""
 
     mean: float
     low: float
     high: float
+    median: float
 
     @classmethod
     def of(cls, values: NDArray[np.float64]) -> Estimate:
         """The estimate from one value per seed."""
         low, high = bootstrap_interval(values, numpy_generator(0, "bootstrap"))
-        return cls(float(values.mean()), low, high)
+        return cls(float(values.mean()), low, high, float(np.median(values)))
 
 
 @dataclass(frozen=True)

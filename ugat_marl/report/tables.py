@@ -82,11 +82,23 @@ def _backlog(found: Evaluation, domain: str) -> list[str]:
 def _caption(found: Evaluation) -> str:
     keys = [f"best rule in {domain}" for domain in found.domains]
     lines = [f"{key}: {found.notes[key]}" for key in keys if key in found.notes]
+    lines += _medians(found)
     lines.append(
         f"{_seeds(found)} seeds. Δ: minus {found.domains[0]}. regret: ATT above the best of "
         "these policies in that domain."
     )
     return "\n".join(lines)
+
+
+def _medians(found: Evaluation) -> list[str]:
+    """Medians where a few locked-up episodes carry the mean away."""
+    lines: list[str] = []
+    for domain in found.domains:
+        both = {name: found.estimate(name, domain, "att_s") for name in found.policies}
+        if any(abs(e.mean - e.median) > 0.1 * e.median for e in both.values()):
+            values = ", ".join(f"{name} {_number(e.median)}" for name, e in both.items())
+            lines.append(f"medians in {domain}: {values}")
+    return lines
 
 
 def _legend(found: Evaluation) -> str:

@@ -1,0 +1,70 @@
+"""Tables and pictures of evaluations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+from rich.console import Console, RenderableType
+
+from ugat_marl.evaluation import Evaluation, Result
+from ugat_marl.metrics import Scores
+from ugat_marl.report.pictures import transfer_picture
+from ugat_marl.report.tables import measures_table, transfer_table
+from ugat_marl.training import Metrics
+
+BASE = Scores(0.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 0.0)
+ATT = {
+    "direct transfer": ((100.0, 102.0, 101.0), (150.0, 151.0, 900.0)),
+    "UGAT": ((99.0, 100.0, 98.0), (130.0, 131.0, 132.0)),
+    "rule largest-queue:40": ((120.0, 121.0, 119.0), (125.0, 126.0, 124.0)),
+}
+
+
+@pytest.fixture
+def found() -> Evaluation:
+    results = tuple(
+        Result(policy, domain, seed, replace(BASE, att_s=att, backlog=7.0 * (att > 800)))
+        for policy, domains in ATT.items()
+        for domain, values in zip(("sim", "V4"), domains, strict=True)
+        for seed, att in enumerate(values)
+    )
+    return Evaluation("grid2x2-v1", "0", results, {"best rule in V4": "largest-queue:40"})
+
+
+def printed(table: RenderableType) -> str:
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
+    console.print(table)
+    return console.export_text()
+
+
+def test_the_transfer_table_says_it_all_in_80_columns(found: Evaluation) -> None:
+    text = printed(transfer_table(found))
+    assert max(map(len, text.splitlines())) <= 80
+    row = next(line for line in text.splitlines() if "UGAT" in line)
+    for cell in ("99.0", "131", "+32.0", "6.0"):
+        assert cell in row
+    assert "best rule in V4: largest-queue:40" in text
+    assert "medians in V4: direct transfer 151" in " ".join(text.split())
+    assert "medians in sim" not in text
+
+
+def test_the_measures_table_tells_who_was_kept_out(found: Evaluation) -> None:
+    text = printed(measures_table(found))
+    assert max(map(len, text.splitlines())) <= 80
+    assert "never entered: direct transfer 2.3" in text
+    assert "gap to sim" in text
+    assert text.count("95 % interval") == 6
+
+
+def test_the_picture_is_a_picture(found: Evaluation, tmp_path: Path) -> None:
+    metrics = Metrics(
+        [("iteration", i, f"att_s/{d}", 100.0) for i in (0, 1) for d in ("sim", "V4")]
+    )
+    path = tmp_path / "deep" / "gap.png"
+    transfer_picture(found, metrics, path)
+    pixels = matplotlib.image.imread(path)
+    assert pixels.shape[:2] == (504, 1200)
+    assert pixels.std() > 0.05
