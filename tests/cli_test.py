@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.__main__ import COMMANDS, main
+from ugat_marl.commands.evaluate import names_of
 from ugat_marl.transitions import TransitionLog
 
 
@@ -49,6 +50,13 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["evaluate", "single-v1", "--policies", "random", "random"], "twice"),
         (["check", "nowhere.sumocfg"], "nowhere.sumocfg"),
         (["rollout", "single-v1"], "--out"),
+        (["rollout", "single-v1", "--out", "."], "is a folder"),
+        (["evaluate", "single-v1", "--out", "/dev/null/x.json"], "cannot be written"),
+        (["evaluate", "single-v1", "--first-seed", "-5"], "negative"),
+        (["evaluate", "single-v1", "--policies", "."], "is a folder"),
+        (["train", "single-v1", "--out", "/dev/null/run"], "cannot be written"),
+        (["train", "single-v1", "--out", ""], "empty"),
+        (["train", "single-v1", "--fit.learning-rate", "inf"], "finite"),
     ],
 )
 def test_a_wrong_call_is_one_line_with_the_nearest_name(
@@ -121,3 +129,17 @@ def test_a_recorded_log_trains(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_a_sound_scenario_passes_the_check(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "single-v1", "--duration-s", "100"]) == 0
     assert "single-v1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("policies", "names"),
+    [
+        (("random", "largest-queue:20"), ["random", "largest-queue:20"]),
+        (("policies/ugat.pt", "policies/direct.pt"), ["ugat", "direct"]),
+        (("a/x/ugat.pt", "a/y/ugat.pt", "random"), ["x/ugat", "y/ugat", "random"]),
+    ],
+)
+def test_policies_in_a_table_have_short_names_that_differ(
+    policies: tuple[str, ...], names: list[str]
+) -> None:
+    assert names_of(policies) == names

@@ -287,7 +287,7 @@ def test_too_little_data_and_foreign_data_are_refused() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"scenario": "elsewhere"}, {"observation": "queue"}, {"decision_interval_s": 5.0}],
+    [{"observation": "queue"}, {"decision_interval_s": 5.0}],
 )
 def test_logs_that_cannot_be_composed_are_refused(change: dict) -> None:
     f, h = models()

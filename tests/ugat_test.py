@@ -29,7 +29,7 @@ from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.progress import Silent
 from ugat_marl.rollout import Exploring, observer_of, roll_out
 from ugat_marl.traffic_env import parallel_env
-from ugat_marl.training import Metrics
+from ugat_marl.training import Metrics, Run
 from ugat_marl.transfer import TransferConfig, transfer
 from ugat_marl.transitions import TransitionLog
 from ugat_marl.ugat import UgatConfig
@@ -234,10 +234,13 @@ def test_a_recorded_log_takes_the_place_of_the_real_simulator(
 ) -> None:
     log = recorded(tmp_path / "real.parquet")
     started: list[Any] = []
-    make = transfer_module.make_world
-    monkeypatch.setattr(
-        transfer_module, "make_world", lambda *args: started.append(args[1]) or make(*args)
-    )
+    world = transfer_module.SimulatedWorld
+
+    def counting(*args: Any) -> Any:
+        started.append(args[1])
+        return world(*args)
+
+    monkeypatch.setattr(transfer_module, "SimulatedWorld", counting)
     config = TransferConfig(
         "single-v1", real="none", real_log=log, duration_s=200, evaluation_seeds=1,
         tuning_seeds=1, control=False, ugat=SMALL.ugat, dqn=SMALL.dqn,
@@ -287,3 +290,41 @@ def test_models_that_are_too_poor_are_not_obeyed(tmp_path: Path) -> None:
     assert rows["gate/acceptance"] == 0.0
     with pytest.raises(OptionError, match="least_accuracy"):
         UgatConfig(least_accuracy=1.5)
+
+
+def test_another_directory_can_be_the_real_world(tmp_path: Path) -> None:
+    street = load("single-v1").write(tmp_path / "street")
+    config = replace(
+        SMALL, real=str(street), ugat=replace(SMALL.ugat, pretrain_episodes=1, iterations=1)
+    )
+    found = transfer(config, tmp_path / "run")
+    assert found.domains == ["sim", str(street)]
+
+
+def test_what_is_refused_leaves_the_folder_free(tmp_path: Path) -> None:
+    log = recorded(tmp_path / "grid.parquet", "grid2x2-v1")
+    config = replace(SMALL, real="none", real_log=log)
+    with pytest.raises(LogError, match="agents"):
+        transfer(config, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_two_processes_do_not_train_in_one_folder(tmp_path: Path) -> None:
+    run = Run(tmp_path / "run", {"a": 1}, False, Silent())
+    with pytest.raises(OptionError, match="another process"):
+        Run(tmp_path / "run", {"a": 1}, True, Silent())
+    run.close()
+    Run(tmp_path / "run", {"a": 1}, True, Silent()).close()
+
+
+def test_a_changed_log_is_another_run(tmp_path: Path) -> None:
+    log = recorded(tmp_path / "real.parquet")
+    ugat = replace(SMALL.ugat, pretrain_episodes=1, iterations=1)
+    config = replace(SMALL, real="none", real_log=log, ugat=ugat)
+    transfer(config, tmp_path / "run")
+    moved = tmp_path / "moved.parquet"
+    shutil.copy(log, moved)
+    transfer(replace(config, real_log=moved), tmp_path / "run", resume=True)
+    TransitionLog.concatenate([TransitionLog.read(log)] * 2).write(log)
+    with pytest.raises(CheckpointError, match="real_log"):
+        transfer(config, tmp_path / "run", resume=True)

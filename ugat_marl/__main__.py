@@ -142,6 +142,8 @@ def _one_line(box: str) -> str:
     lines = [re.sub(r"[│╭╮╰╯]", " ", line).strip() for line in box.splitlines()]
     until = next((i for i, line in enumerate(lines) if line.startswith("──")), len(lines))
     words = " ".join(re.sub(r"─+", " ", line) for line in lines[:until])
+    words = re.sub(r"^\s*(Value error|Invalid choice|Required options)\s", "", words)
+    words = re.sub(r"Error parsing config[\w.]*:", "", words)
     return " ".join(words.split()).rstrip(".")
 
 

@@ -68,6 +68,10 @@ class EpisodeError(UgatMarlError, RuntimeError):
     """`step`, `state` or `scores` was called at a moment of the episode when it has no meaning."""
 
 
+class OutputError(UgatMarlError, OSError):
+    """A file or folder cannot be written."""
+
+
 class LogError(UgatMarlError):
     """A transition log cannot be read or does not fit the scenario."""
 

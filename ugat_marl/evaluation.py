@@ -197,7 +197,9 @@ def evaluate(
         raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
     for domain in domains:
         in_domain(scenario, domain)  # a wrong name is an error now, not in an hour
-    workers = workers or os.cpu_count() or 1
+    for make in policies.values():
+        make(parallel_env(scenario, domains[0], duration_s=duration_s))  # and so is a wrong policy
+    workers = workers or _usable_cores()
     per_task = max(1, len(seeds) * len(policies) * len(domains) // (4 * workers))
     tasks = [
         _Task(name, make, domain, tuple(seeds[start : start + per_task]))
@@ -264,6 +266,8 @@ def policy_factory(spec: str) -> PolicyFactory:
         CheckpointError: The file is not a policy, or (when used) one of another scenario.
     """
     path = Path(spec)
+    if path.is_dir():
+        raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
     if path.suffix != ".pt" and not path.is_file():
         return rule_factory(spec)
     policy = DQNPolicy.load(path)
@@ -282,6 +286,12 @@ def policy_factory(spec: str) -> PolicyFactory:
 
 def _controller_factory(spec: str) -> PolicyFactory:
     return lambda env: controller_for(spec, env)
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _pairs(
@@ -308,9 +318,13 @@ def _play_all(
 
     pool = concurrent.futures.ThreadPoolExecutor(workers)
     try:
-        running = [pool.submit(_play, scenario, t, duration_s, stop, done) for t in tasks]
-        for future in concurrent.futures.as_completed(running):
-            results += future.result()
+        running = {pool.submit(_play, scenario, t, duration_s, stop, done) for t in tasks}
+        while running:  # wakes up now and then, so that Ctrl-C is heard
+            finished, running = concurrent.futures.wait(
+                running, timeout=0.2, return_when=concurrent.futures.FIRST_COMPLETED
+            )
+            for future in finished:
+                results += future.result()
     finally:
         stop.set()
         pool.shutdown(cancel_futures=True)

@@ -17,13 +17,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.parsers import expat
 
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import OutputError, ScenarioError
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a temporary path beside `path`; it replaces `path` if the block ends normally."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    require_writable(path)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
     os.close(handle)
     temporary = Path(name)
@@ -35,6 +35,24 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_writable(path: Path) -> None:
+    """Refuses a path that cannot become a file; makes the folder it lies in.
+
+    Raises:
+        OutputError: It is a folder, or its own folder cannot be made or written to.
+    """
+    if path.is_dir() or not path.name:
+        raise OutputError(f"{str(path)!r} is a folder; give the name of a file")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror}); give another place"
+        ) from None
 
 
 def write_whole(path: Path, content: bytes | str) -> None:

@@ -79,4 +79,4 @@ class Bars:
 
     def say(self, text: str) -> None:
         """Writes a line."""
-        self._console.print(text, highlight=False)
+        self._console.print(text, highlight=False, markup=False)

@@ -56,7 +56,7 @@ class ScenarioFile(pydantic.BaseModel):
     routes: Annotated[tuple[str, ...], Field(min_length=1)]
     additional: tuple[str, ...] = ()
     begin_s: Annotated[float, Field(ge=0)] = 0.0
-    duration_s: Annotated[float, Field(gt=0)] = 3600.0
+    duration_s: Annotated[float, Field(gt=0, le=1e7)] = 3600.0
     step_length_s: Annotated[float, Field(ge=0.001, le=10)] = 1.0
     control: ControlSettings = ControlSettings()
     intersections: dict[str, IntersectionSettings] = {}

@@ -20,7 +20,7 @@ from pettingzoo import ParallelEnv
 from ugat_marl import signals
 from ugat_marl.demand import check_demand
 from ugat_marl.effects import Domain, describe, in_domain, load
-from ugat_marl.errors import ActionError, EpisodeError
+from ugat_marl.errors import ActionError, EpisodeError, OptionError
 from ugat_marl.measurements import Snapshot
 from ugat_marl.metrics import EpisodeRecorder, Scores
 from ugat_marl.network import Network
@@ -133,6 +133,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             seed: Fixes the simulation to the bit; without it the seed is drawn from the one before.
             options: Not used.
         """
+        if seed is not None and seed < 0:
+            raise OptionError(f"seed = {seed}: must not be negative")
         if seed is not None:
             self.np_random = np.random.default_rng(seed)
         self._start(int(self.np_random.integers(2**31)))

@@ -7,18 +7,19 @@ stage it repeats and ends with the same file as an unbroken one.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import polars as pl
 
 from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.files import replacing, write_whole
+from ugat_marl.files import replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
 
 CHECKPOINT = "checkpoint"
@@ -89,7 +90,10 @@ class Run:
         self._board: Any = None
         identity = json.loads(json.dumps(identity, sort_keys=True))
         file = directory / "run.json"
-        if file.exists():
+        require_writable(file)
+        self._lock = _locked(directory)
+        _remove_remains(directory)
+        if file.exists() and self.resumable:
             if not resume:
                 raise OptionError(
                     f"{directory} holds a run already; use --resume to go on with it, or another "
@@ -98,7 +102,6 @@ class Run:
             _refuse_other(file, identity)
         else:
             write_whole(file, json.dumps(identity, indent=1) + "\n")
-        _remove_remains(directory)
 
     @property
     def resumable(self) -> bool:
@@ -158,7 +161,8 @@ class Run:
                 board.add_scalar(f"{stage}/{name}", value, step)
 
     def close(self) -> None:
-        """Ends the TensorBoard file."""
+        """Ends the TensorBoard file and gives the folder free."""
+        self._lock.close()
         if self._board is not None:
             self._board.close()
             self._board = None
@@ -171,6 +175,23 @@ class Run:
             again = step if folder.exists() else None  # hides what a killed run logged from here on
             self._board = SummaryWriter(str(folder), purge_step=again)
         return self._board
+
+
+def _locked(directory: Path) -> IO[str]:
+    """A file that stays locked as long as it is open, also by a process that is killed."""
+    lock = (directory / ".lock").open("w")
+    if importlib.util.find_spec("fcntl") is not None:  # not on Windows
+        import fcntl
+
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            raise OptionError(
+                f"{directory}: another process is training in this folder; wait for it, or use "
+                "another --out"
+            ) from None
+    return lock
 
 
 def _refuse_other(file: Path, identity: Mapping[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -34,14 +35,12 @@ from ugat_marl.transitions import TransitionLog
 from ugat_marl.ugat import (
     CHUNK,
     DIRECT_LEARNER,
-    RecordedWorld,
     State,
     UgatConfig,
-    World,
-    make_world,
     restore,
     train_ugat,
 )
+from ugat_marl.worlds import RecordedWorld, SimulatedWorld, World
 
 EVALUATION_SEED = 1000
 """First seed of the reported episodes; apart from those of training and of the search for rules."""
@@ -60,7 +59,7 @@ class TransferConfig:
         sim: The simulation to train in; "sim", or a domain like `real`.
         real_log: Recorded transitions that take the place of roll-outs in the real domain.
         seed: Root of every random choice in training.
-        observation: What agents see: count, queue, pressure, waiting, density.
+        observation: What agents see: count, queue, pressure, waiting, density, movements.
         reward: What agents want: queue, pressure, waiting.
         neighbours: How many roads away intersections are seen too.
         duration_s: Length of an episode in s; default: the scenario's own.
@@ -124,7 +123,7 @@ def transfer(
 
     Args:
         config: What to do.
-        directory: Folder of the run; ``table.json``, ``metrics.parquet``, ``policy.pt``,
+        directory: Folder of the run; ``table.json``, ``metrics.parquet``, ``policies``,
             TensorBoard files and checkpoints go there.
         resume: Go on with the run in the folder.
         reporter: Shows progress.
@@ -133,13 +132,15 @@ def transfer(
     scenario = load(config.scenario)
     env = parallel_env(scenario, config.sim, **config.env_options)
     real_log = TransitionLog.read(config.real_log) if config.real_log else None
-    identity = _identity(config, scenario, env)
+    if real_log is not None:
+        RecordedWorld(real_log, env)  # does it fit? asked before anything is written
+        _say_if_from_elsewhere(real_log, config, reporter)
+    learner = DQN.of(env, config.dqn, config.seed)
+    transform = GroundedActionTransform(
+        env.layouts, config.seed, config.ugat.forward, config.ugat.inverse, config.ugat.gate
+    )
+    run = Run(directory, _identity(config, scenario, env), resume, reporter)
     try:
-        run = Run(directory, identity, resume, reporter)
-        learner = DQN.of(env, config.dqn, config.seed)
-        transform = GroundedActionTransform(
-            env.layouts, config.seed, config.ugat.forward, config.ugat.inverse, config.ugat.gate
-        )
         state = State(learner, transform)
         restore(state, run, DQNPolicy.load)
         policy = _train(config, scenario, env, real_log, state, run)
@@ -151,13 +152,22 @@ def transfer(
             policies[CONTROL] = _control(config, env, run)
     finally:
         env.close()
+        run.close()
     for name, trained in policies.items():
         if isinstance(trained, DQNPolicy):
             trained.save(directory / "policies" / f"{name.replace(' ', '-').lower()}.pt")
-    run.close()
     table = judge(config, scenario, policies, reporter)
     table.write(directory / "table.json")
     return table
+
+
+def _say_if_from_elsewhere(log: TransitionLog, config: TransferConfig, reporter: Reporter) -> None:
+    recorded = log.provenance.domain
+    if config.real != "none" and recorded != describe(config.real):
+        reporter.say(
+            f"note: the real log was recorded in {recorded!r}, the policies are judged in "
+            f"{describe(config.real)!r}"
+        )
 
 
 def judge(
@@ -213,11 +223,17 @@ def _train(
         )
         return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
 
-    sim: World = make_world(scenario, config.sim, config.ugat, config.env_options, "sim")
+    def world(domain: str, name: str, episodes: int) -> SimulatedWorld:
+        def make() -> TrafficEnv:
+            return parallel_env(scenario, domain, **config.env_options)
+
+        return SimulatedWorld(make, name, episodes, config.ugat.rollout_epsilon)
+
+    sim: World = world(config.sim, "sim", config.ugat.sim_rollouts)
     if real_log is not None:
         real: World = RecordedWorld(real_log, env)
     else:
-        real = make_world(scenario, config.real, config.ugat, config.env_options, "real")
+        real = world(config.real, "real", config.ugat.real_rollouts)
     try:
         return train_ugat(state, env, sim, real, config.ugat, config.seed, run, probe)
     finally:
@@ -241,11 +257,16 @@ def _control(config: TransferConfig, env: TrafficEnv, run: Run) -> Policy:
     return learner.policy()
 
 
+def _digest(path: Path) -> str:
+    """A log is the same if its content is, wherever it lies."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> dict[str, Any]:
     settings = asdict(config)
     for judging in ("evaluation_seeds", "tuning_seeds", "control"):
         settings.pop(judging)
-    settings["real_log"] = str(config.real_log) if config.real_log else None
+    settings["real_log"] = _digest(config.real_log) if config.real_log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":
         hashes["real"] = in_domain(scenario, config.real).hash

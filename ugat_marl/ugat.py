@@ -7,13 +7,13 @@ for Traffic Signal Control, CDC 2023.
 from __future__ import annotations
 
 import concurrent.futures
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from ugat_marl.effects import Domain
-from ugat_marl.errors import LogError, OptionError
+from ugat_marl.errors import OptionError
 from ugat_marl.grounding.fitting import FitConfig, FitReport, fit
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig, GateReport
@@ -21,12 +21,10 @@ from ugat_marl.grounding.inverse import InverseConfig
 from ugat_marl.grounding.transform import GroundedActionTransform
 from ugat_marl.grounding.wrapper import GroundedEnv
 from ugat_marl.policy import AnyParallelEnv, Learner, Policy
-from ugat_marl.rollout import Exploring, observer_of, roll_out
-from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
-from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
 from ugat_marl.transitions import TransitionLog
+from ugat_marl.worlds import World
 
 CHUNK = 10
 """Episodes of plain training between two checkpoints."""
@@ -81,92 +79,6 @@ class UgatConfig:
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:
                 raise OptionError(f"{name} = {value}: must be from 0 to 1")
-
-
-class World(Protocol):
-    """Where transitions come from."""
-
-    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
-        """The transitions this iteration adds; None if there are no more."""
-        ...
-
-    def close(self) -> None:
-        """Gives up what the world holds."""
-        ...
-
-
-class SimulatedWorld:
-    """Roll-outs in a domain.
-
-    Args:
-        make_env: Makes an environment of the domain.
-        name: Distinguishes the seeds of two worlds.
-        episodes: Roll-outs per iteration.
-        epsilon: Chance of a random phase.
-    """
-
-    def __init__(
-        self, make_env: Callable[[], TrafficEnv], name: str, episodes: int, epsilon: float
-    ) -> None:
-        self._make_env = make_env
-        self._name = name
-        self._episodes = episodes
-        self._epsilon = epsilon
-        self._env: TrafficEnv | None = None
-
-    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
-        """Plays the iteration's episodes and returns their transitions."""
-        if self._env is None:
-            self._env = self._make_env()
-        exploring = Exploring(policy, self._epsilon)
-        observer = observer_of(self._env)
-        logs: list[TransitionLog] = []
-        for episode in range(self._episodes):
-            episode_seed = derive_seed(seed, "roll-out", self._name, iteration, episode)
-            log = roll_out(self._env, exploring, episode_seed, record=observer).log
-            assert log is not None
-            logs.append(log)
-        return TransitionLog.concatenate(logs)
-
-    def close(self) -> None:
-        """Ends the simulation."""
-        if self._env is not None:
-            self._env.close()
-            self._env = None
-
-
-class RecordedWorld:
-    """A log that was measured or recorded before; no simulator stands in for the street.
-
-    Args:
-        log: The transitions.
-        env: The simulation they are to be compared with.
-
-    Raises:
-        LogError: The log's agents, observation or decision interval are not those of `env`.
-    """
-
-    def __init__(self, log: TransitionLog, env: TrafficEnv) -> None:
-        own = log.provenance
-        for what, found, wanted in (
-            ("agents and observation sizes", dict(own.layouts), dict(env.layouts)),
-            ("observation", own.observation, env.options.observation),
-            ("decision interval", own.decision_interval_s, env.decision_interval_s),
-        ):
-            if found != wanted:
-                raise LogError(
-                    f"the real log's {what} are {found}, the simulation's {wanted}; record it on "
-                    f"{env.scenario.id!r} with the same options"
-                )
-        self._log = log
-
-    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
-        """The whole log at the first iteration, nothing afterwards."""
-        del policy, seed
-        return self._log if iteration == 0 else None
-
-    def close(self) -> None:
-        """Nothing to give up."""
 
 
 @dataclass
@@ -231,7 +143,7 @@ def train_ugat(
         if config.least_accuracy is not None:
             state.transform.gate.trust(report.trusted(config.least_accuracy))
         _learn(state, grounded, config.grounded_episodes, seed, run, f"grounded, round {i + 1}")
-        gate = state.transform.gate.update()  # alpha of the next iteration
+        gate = _update_alpha(state, run)
         run.log("iteration", i + 1, _numbers(report, gate, state, probe))
         state.iteration += 1
         save(state, run)
@@ -282,6 +194,13 @@ def _collect(
         concurrent.futures.ThreadPoolExecutor(2) as pool,
     ):
         running = [pool.submit(world.collect, policy, iteration, seed) for world in (sim, real)]
+        try:
+            while concurrent.futures.wait(running, timeout=0.2).not_done:
+                pass  # wakes up now and then, so that Ctrl-C is heard
+        except BaseException:
+            sim.stop()
+            real.stop()
+            raise
         for future, data in zip(running, (state.simulated, state.real), strict=True):
             log = future.result()
             if log is not None:
@@ -302,7 +221,17 @@ def _fit(state: State, config: UgatConfig, seed: int, run: Run, iteration: int) 
             on_epoch=lambda model, _epoch, loss: go(note=f"{model} {loss:.2g}"),
         )
     for warning in report.warnings:
-        run.reporter.say(f"[yellow]round {iteration + 1}:[/yellow] {warning}")
+        run.reporter.say(f"round {iteration + 1}: {warning}")
+    return report
+
+
+def _update_alpha(state: State, run: Run) -> GateReport:
+    """Sets alpha for the next iteration; what the gate warns of is said beside the bars."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        report = state.transform.gate.update()
+    if report.warning:
+        run.reporter.say(report.warning)
     return report
 
 
@@ -322,8 +251,7 @@ def save(state: State, run: Run) -> None:
         state.learner.save(folder / "learner.pt")
         state.transform.save(folder / "grounding.pt")
         if state.direct is not None:
-            save_policy(state.direct, folder / "direct.pt")
-        save_policy(state.learner.policy(), folder / "policy.pt")
+            _save_policy(state.direct, folder / "direct.pt")
         for name, logs in (("sim", state.simulated), ("real", state.real)):
             for number, log in enumerate(logs):
                 log.write(folder / f"{name}-{number:03}.parquet")
@@ -358,27 +286,10 @@ def _logs(folder: Path, name: str) -> list[TransitionLog]:
     return [TransitionLog.read(path) for path in sorted(folder.glob(f"{name}-*.parquet"))]
 
 
-def save_policy(policy: Any, path: Path) -> None:
-    """Writes a policy that knows how to save itself; others are rebuilt from their learner."""
-    if hasattr(policy, "save"):
-        policy.save(path)
-
-
-def make_world(
-    scenario: Scenario, domain: Domain, config: UgatConfig, options: Mapping[str, Any], name: str
-) -> SimulatedWorld:
-    """Roll-outs in a domain of a scenario.
-
-    Args:
-        scenario: The scenario.
-        domain: The domain.
-        config: How many roll-outs, and how exploratory.
-        options: Options of the environment.
-        name: ``"sim"`` for what fills D_sim, ``"real"`` for D_real.
-    """
-    return SimulatedWorld(
-        lambda: parallel_env(scenario, domain, **options),
-        name,
-        config.sim_rollouts if name == "sim" else config.real_rollouts,
-        config.rollout_epsilon,
-    )
+def _save_policy(policy: Any, path: Path) -> None:
+    if not hasattr(policy, "save"):
+        raise OptionError(
+            f"a checkpoint needs policies that can be saved: give {type(policy).__name__} a method "
+            "save(path)"
+        )
+    policy.save(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import evaluate, policy_factory
+from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
 from ugat_marl.report.tables import measures_table
 
@@ -50,13 +52,17 @@ class Evaluate:
         for name in ("policies", "domains"):
             if not getattr(self, name):
                 raise OptionError(f"--{name} needs at least one value")
-        if len(set(map(_name, self.policies))) < len(self.policies):
+        if len(set(self.policies)) < len(self.policies):
             raise OptionError(f"--policies holds one twice: {' '.join(self.policies)}")
+        if self.out is not None:
+            require_writable(self.out)
+        if self.first_seed < 0:
+            raise OptionError("--first-seed must not be negative")
         if self.seeds < 1 or (self.workers is not None and self.workers < 1):
             raise OptionError("--seeds and --workers must be at least 1")
         found = evaluate(
             load(self.scenario),
-            {_name(spec): policy_factory(spec) for spec in self.policies},
+            dict(zip(names_of(self.policies), map(policy_factory, self.policies), strict=True)),
             self.domains,
             range(self.first_seed, self.first_seed + self.seeds),
             duration_s=self.duration_s,
@@ -70,7 +76,14 @@ class Evaluate:
         return 0
 
 
-def _name(spec: str) -> str:
-    """Short but distinct: the last two parts of a path."""
-    path = Path(spec)
-    return "/".join(path.with_suffix("").parts[-3::2]) if path.suffix == ".pt" else spec
+def names_of(policies: Sequence[str]) -> list[str]:
+    """What to call policies in the table: files by the shortest path endings that differ."""
+    paths = [Path(spec.removesuffix(".pt")).parts for spec in policies]
+    for length in range(1, max(map(len, paths)) + 1):
+        names = ["/".join(parts[-length:]) for parts in paths]
+        if len(set(names)) == len(names):
+            break
+    else:
+        names = list(policies)
+    files = [Path(spec).suffix == ".pt" for spec in policies]
+    return [name if file else spec for name, file, spec in zip(names, files, policies, strict=True)]

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import policy_factory
+from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
 from ugat_marl.rollout import Exploring, observer_of, roll_out
 from ugat_marl.seeding import derive_seed
@@ -54,6 +55,7 @@ class Rollout:
         """Records and writes."""
         if self.episodes < 1 or not 0 <= self.epsilon <= 1:
             raise OptionError("--episodes must be at least 1 and --epsilon from 0 to 1")
+        require_writable(self.out)
         scenario = load(self.scenario)
         probe = parallel_env(scenario, self.domain, duration_s=self.duration_s)
         policy = policy_factory(self.policy)(probe)

@@ -49,7 +49,7 @@ def _facts(name: str) -> list[str]:
         network = Network.read(scenario)
         demand = check_demand(scenario, network)
     except ScenarioError as error:
-        return ["", "", "", f"[red]{error}"]
+        return ["", "", "", str(error)]
     phases = [len(item.phases) for item in network.intersections]
     spread = str(phases[0]) if len(set(phases)) == 1 else f"{min(phases)}-{max(phases)}"
     vehicles = f"{demand.vehicles}{'+' if demand.flows else ''}"

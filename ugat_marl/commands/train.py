@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +11,7 @@ from rich.console import Console
 from tyro.conf import arg
 
 from ugat_marl.effects import describe
+from ugat_marl.errors import OptionError
 from ugat_marl.progress import Bars
 from ugat_marl.report.pictures import transfer_picture
 from ugat_marl.report.tables import transfer_table
@@ -40,7 +42,9 @@ class Train:
     def run(self, console: Console) -> int:
         """Trains, evaluates, prints the table, draws it."""
         config = self.config
-        name = f"{Path(config.scenario.replace(':', '-')).stem}-{describe(config.real)}"
+        if self.out == Path():
+            raise OptionError("--out is empty; give the name of a folder")
+        name = "-".join(re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in _names(config))
         directory = self.out or Path("runs") / f"{name}-s{config.seed}"
         found = transfer(config, directory, resume=self.resume, reporter=Bars(console))
         picture = directory / "gap.png"
@@ -53,3 +57,9 @@ class Train:
             soft_wrap=True,
         )
         return 0
+
+
+def _names(config: TransferConfig) -> tuple[str, str]:
+    """Scenario and real domain; of paths the last part."""
+    scenario, real = config.scenario, describe(config.real)
+    return Path(scenario).name.removesuffix(".sumocfg"), Path(real).name

@@ -8,6 +8,7 @@ and a warm start never meets a held-out episode it was trained on.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -76,11 +77,11 @@ class FitConfig:
                 raise OptionError(f"fit {name} is {getattr(self, name)}; allowed: >= {least}")
         if self.held_out_every < 2:
             raise OptionError(f"fit held_out_every is {self.held_out_every}; allowed: >= 2")
-        if not self.learning_rate > 0:
-            raise OptionError(f"fit learning_rate is {self.learning_rate}; allowed: > 0")
+        if not 0 < self.learning_rate < math.inf:
+            raise OptionError(f"fit learning_rate is {self.learning_rate}; allowed: > 0, finite")
         for name in ("kl_weight", "off_data_weight"):
-            if not getattr(self, name) >= 0:
-                raise OptionError(f"fit {name} is {getattr(self, name)}; allowed: >= 0")
+            if not 0 <= getattr(self, name) < math.inf:
+                raise OptionError(f"fit {name} is {getattr(self, name)}; allowed: >= 0, finite")
 
 
 @dataclass(frozen=True)
@@ -152,8 +153,8 @@ def fit(
 
 
 def _refuse_mismatch(real: TransitionLog, simulated: TransitionLog) -> None:
-    """Models of different networks, state spaces or intervals cannot be composed."""
-    for name in ("scenario", "observation", "decision_interval_s"):
+    """Models of different state spaces or intervals cannot be composed."""
+    for name in ("observation", "decision_interval_s"):
         one, two = getattr(real.provenance, name), getattr(simulated.provenance, name)
         if one != two:
             raise LogError(

@@ -18,9 +18,9 @@ def transfer_table(found: Evaluation) -> RenderableType:
     first, *others = found.domains
     table = Table(
         box=box.SIMPLE_HEAD,
-        title=f"{found.scenario}: average travel time in s (95 % interval)",
+        title=Text(f"{found.scenario}: average travel time in s (95 % interval)"),
         title_justify="left",
-        caption=_caption(found),
+        caption=Text(_caption(found)),
         caption_justify="left",
         pad_edge=False,
     )
@@ -37,7 +37,7 @@ def transfer_table(found: Evaluation) -> RenderableType:
                 _signed(found.gap(policy, domain, "att_s")),
                 _number(found.regret(policy, domain).mean),
             ]
-        table.add_row(policy, *cells)
+        table.add_row(Text(policy), *cells)
     return table
 
 
@@ -47,7 +47,7 @@ def measures_table(found: Evaluation) -> RenderableType:
     for domain in found.domains:
         table = Table(
             box=box.SIMPLE_HEAD,
-            title=f"{found.scenario} in {domain}",
+            title=Text(f"{found.scenario} in {domain}"),
             title_justify="left",
             pad_edge=False,
             padding=(0, 1, 0, 0),
@@ -59,7 +59,7 @@ def measures_table(found: Evaluation) -> RenderableType:
         for policy in found.policies:
             estimates = [found.estimate(policy, domain, measure) for measure in MEASURES]
             estimates.append(found.regret(policy, domain))
-            table.add_row(policy, *(_number(e.mean) for e in estimates))
+            table.add_row(Text(policy), *(_number(e.mean) for e in estimates))
             if not math.isnan(estimates[0].low):
                 halves = (f"±{_number((e.high - e.low) / 2)}" for e in estimates)
                 table.add_row(*_dim("  95 % interval", *halves))
@@ -83,6 +83,8 @@ def _caption(found: Evaluation) -> str:
     keys = [f"best rule in {domain}" for domain in found.domains]
     lines = [f"{key}: {found.notes[key]}" for key in keys if key in found.notes]
     lines += _medians(found)
+    if len(found.domains) == 1:
+        return "\n".join([*lines, f"{_seeds(found)} seeds"])
     lines.append(
         f"{_seeds(found)} seeds. Δ: minus {found.domains[0]}. regret: ATT above the best of "
         "these policies in that domain."

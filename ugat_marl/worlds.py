@@ -1,0 +1,125 @@
+"""Where transitions come from: roll-outs in a domain, or a log of the street."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+from ugat_marl.errors import LogError
+from ugat_marl.policy import Policy
+from ugat_marl.rollout import Exploring, observer_of, roll_out
+from ugat_marl.seeding import derive_seed
+from ugat_marl.traffic_env import TrafficEnv
+from ugat_marl.transitions import TransitionLog
+
+
+class Stopped(Exception):
+    """Another thread failed, or the user interrupted."""
+
+
+class World(Protocol):
+    """Where transitions come from."""
+
+    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
+        """The transitions this iteration adds; None if there are no more."""
+        ...
+
+    def stop(self) -> None:
+        """Ends a `collect` that is under way in another thread, with `Stopped`."""
+        ...
+
+    def close(self) -> None:
+        """Gives up what the world holds."""
+        ...
+
+
+class SimulatedWorld:
+    """Roll-outs in a domain.
+
+    Args:
+        make_env: Makes an environment of the domain.
+        name: Distinguishes the seeds of two worlds.
+        episodes: Roll-outs per iteration.
+        epsilon: Chance of a random phase.
+    """
+
+    def __init__(
+        self, make_env: Callable[[], TrafficEnv], name: str, episodes: int, epsilon: float
+    ) -> None:
+        self._make_env = make_env
+        self._name = name
+        self._episodes = episodes
+        self._epsilon = epsilon
+        self._env: TrafficEnv | None = None
+        self._stop = threading.Event()
+
+    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
+        """Plays the iteration's episodes and returns their transitions."""
+        if self._env is None:
+            self._env = self._make_env()
+
+        def go_on(_step: int) -> None:
+            if self._stop.is_set():
+                raise Stopped
+
+        exploring = Exploring(policy, self._epsilon)
+        observer = observer_of(self._env)
+        logs: list[TransitionLog] = []
+        for episode in range(self._episodes):
+            episode_seed = derive_seed(seed, "roll-out", self._name, iteration, episode)
+            log = roll_out(self._env, exploring, episode_seed, record=observer, on_step=go_on).log
+            assert log is not None
+            logs.append(log)
+        return TransitionLog.concatenate(logs)
+
+    def stop(self) -> None:
+        """Ends the roll-out that is under way."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Ends the simulation."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+
+class RecordedWorld:
+    """A log that was measured or recorded before; no simulator stands in for the street.
+
+    Args:
+        log: The transitions.
+        env: The simulation they are to be compared with.
+
+    Raises:
+        LogError: The log's agents, observation or decision interval are not those of `env`.
+    """
+
+    def __init__(self, log: TransitionLog, env: TrafficEnv) -> None:
+        own = log.provenance
+        for what, found, wanted in (
+            ("agents", list(own.layouts), list(env.layouts)),
+            *(
+                (f"sizes at {agent}", own.layouts.get(agent), layout)
+                for agent, layout in env.layouts.items()
+            ),
+            ("observation", own.observation, env.options.observation),
+            ("decision interval", own.decision_interval_s, env.decision_interval_s),
+        ):
+            if found != wanted:
+                raise LogError(
+                    f"the real log's {what} are {found}, the simulation's {wanted}; record it on "
+                    f"{env.scenario.id!r} with the same options"
+                )
+        self._log = log
+
+    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
+        """The whole log at the first iteration, nothing afterwards."""
+        del policy, seed
+        return self._log if iteration == 0 else None
+
+    def stop(self) -> None:
+        """Nothing is under way."""
+
+    def close(self) -> None:
+        """Nothing to give up."""
