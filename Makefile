@@ -18,7 +18,7 @@ JOBS ?= auto
 CANDIDATES := python3 python3.13 python3.12 python3.11 python3.14 python
 PYTHON ?= $(shell for p in $(CANDIDATES); do \
 	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$p" && break; done)
-ENVIRONMENT = "$(PYTHON)" tools/environment.py
+ENVIRONMENT = "$(PYTHON)" .ci/environment.py
 
 # Nothing outside .venv is imported: not the source tree, not the user's own packages.
 unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV

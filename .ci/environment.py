@@ -1,6 +1,6 @@
 """Makes `.venv` fit to run the suite, with nothing but Python: create, install, repair.
 
-Run by `make`: ``python tools/environment.py [extra ...]``. The dependencies come from the wheel
+Run by `make`: ``python .ci/environment.py [extra ...]``. The dependencies come from the wheel
 built from this checkout, in the versions of ``constraints.txt``. What was installed is written down
 in ``.venv/ugat-marl.json`` as the very last step, so that a second run with nothing changed does
 nothing, a changed source only replaces the wheel, and an interrupted run is started afresh.
