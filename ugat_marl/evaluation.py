@@ -30,7 +30,7 @@ from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.metrics import MEASURES, Scores, bootstrap_interval
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Advance, Reporter, Silent
-from ugat_marl.rollout import roll_out
+from ugat_marl.rollout import roll_out, until
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
@@ -197,8 +197,9 @@ def evaluate(
         raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
     for domain in domains:
         in_domain(scenario, domain)  # a wrong name is an error now, not in an hour
+    probe = parallel_env(scenario, domains[0], duration_s=duration_s)
     for make in policies.values():
-        make(parallel_env(scenario, domains[0], duration_s=duration_s))  # and so is a wrong policy
+        make(probe)  # and so is a wrong policy
     workers = workers or _usable_cores()
     per_task = max(1, len(seeds) * len(policies) * len(domains) // (4 * workers))
     tasks = [
@@ -331,10 +332,6 @@ def _play_all(
     return results
 
 
-class _Stopped(Exception):
-    """Another task failed, or the user interrupted."""
-
-
 def _play(
     scenario: Scenario,
     task: _Task,
@@ -342,17 +339,13 @@ def _play(
     stop: threading.Event,
     done: Callable[[], None],
 ) -> list[Result]:
-    def check(_step: int) -> None:
-        if stop.is_set():
-            raise _Stopped
-
     probe = parallel_env(scenario, task.domain, duration_s=duration_s)
     policy = task.make(probe)
     env = parallel_env(scenario, task.domain, duration_s=duration_s, **policy.env_options)
     results: list[Result] = []
     try:
         for seed in task.seeds:
-            roll_out(env, policy, seed, on_step=check)
+            roll_out(env, policy, seed, on_step=until(stop))
             results.append(Result(task.name, env.domain, seed, env.scores()))
             done()
     finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -36,6 +37,20 @@ class Episode:
 
 StepCallback = Callable[[int], None]
 """Called with the number of decisions made so far."""
+
+
+class Stopped(Exception):
+    """A roll-out was ended: another thread failed, or the user interrupted."""
+
+
+def until(stop: threading.Event) -> StepCallback:
+    """A callback that ends a roll-out, with `Stopped`, at the next decision after `stop` is set."""
+
+    def check(_step: int) -> None:
+        if stop.is_set():
+            raise Stopped
+
+    return check
 
 
 def roll_out(

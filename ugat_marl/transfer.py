@@ -131,10 +131,11 @@ def transfer(
     reporter = reporter or Silent()
     scenario = load(config.scenario)
     env = parallel_env(scenario, config.sim, **config.env_options)
-    real_log = TransitionLog.read(config.real_log) if config.real_log else None
-    if real_log is not None:
-        RecordedWorld(real_log, env)  # does it fit? asked before anything is written
-        _say_if_from_elsewhere(real_log, config, reporter)
+    recorded: RecordedWorld | None = None
+    if config.real_log is not None:
+        log = TransitionLog.read(config.real_log)
+        recorded = RecordedWorld(log, env)  # refuses a misfit before anything is written
+        _say_if_from_elsewhere(log, config, reporter)
     learner = DQN.of(env, config.dqn, config.seed)
     transform = GroundedActionTransform(
         env.layouts, config.seed, config.ugat.forward, config.ugat.inverse, config.ugat.gate
@@ -143,7 +144,7 @@ def transfer(
     try:
         state = State(learner, transform)
         restore(state, run, DQNPolicy.load)
-        policy = _train(config, scenario, env, real_log, state, run)
+        policy = _train(config, scenario, env, recorded, state, run)
         policies: dict[str, Policy] = {}
         if state.direct is not None:
             policies[DIRECT] = state.direct
@@ -208,7 +209,7 @@ def _train(
     config: TransferConfig,
     scenario: Scenario,
     env: TrafficEnv,
-    real_log: TransitionLog | None,
+    recorded: RecordedWorld | None,
     state: State,
     run: Run,
 ) -> Policy:
@@ -230,10 +231,7 @@ def _train(
         return SimulatedWorld(make, name, episodes, config.ugat.rollout_epsilon)
 
     sim: World = world(config.sim, "sim", config.ugat.sim_rollouts)
-    if real_log is not None:
-        real: World = RecordedWorld(real_log, env)
-    else:
-        real = world(config.real, "real", config.ugat.real_rollouts)
+    real: World = recorded or world(config.real, "real", config.ugat.real_rollouts)
     try:
         return train_ugat(state, env, sim, real, config.ugat, config.seed, run, probe)
     finally:

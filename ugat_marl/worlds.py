@@ -8,14 +8,10 @@ from typing import Protocol
 
 from ugat_marl.errors import LogError
 from ugat_marl.policy import Policy
-from ugat_marl.rollout import Exploring, observer_of, roll_out
+from ugat_marl.rollout import Exploring, observer_of, roll_out, until
 from ugat_marl.seeding import derive_seed
 from ugat_marl.traffic_env import TrafficEnv
 from ugat_marl.transitions import TransitionLog
-
-
-class Stopped(Exception):
-    """Another thread failed, or the user interrupted."""
 
 
 class World(Protocol):
@@ -58,17 +54,14 @@ class SimulatedWorld:
         """Plays the iteration's episodes and returns their transitions."""
         if self._env is None:
             self._env = self._make_env()
-
-        def go_on(_step: int) -> None:
-            if self._stop.is_set():
-                raise Stopped
-
         exploring = Exploring(policy, self._epsilon)
         observer = observer_of(self._env)
         logs: list[TransitionLog] = []
         for episode in range(self._episodes):
             episode_seed = derive_seed(seed, "roll-out", self._name, iteration, episode)
-            log = roll_out(self._env, exploring, episode_seed, record=observer, on_step=go_on).log
+            log = roll_out(
+                self._env, exploring, episode_seed, record=observer, on_step=until(self._stop)
+            ).log
             assert log is not None
             logs.append(log)
         return TransitionLog.concatenate(logs)
