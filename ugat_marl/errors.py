@@ -76,6 +76,10 @@ class LogError(UgatMarlError):
     """A transition log cannot be read or does not fit the scenario."""
 
 
+class MeasuredDataError(UgatMarlError):
+    """Measured data of the street are missing, damaged, or contradict themselves or the network."""
+
+
 class MeasurementError(UgatMarlError):
     """A measured process of a bench failed, or did other work than what it is compared with."""
 

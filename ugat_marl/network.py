@@ -173,6 +173,22 @@ class Network:
         )
 
 
+def signal_widths(scenario: Scenario) -> dict[str, int]:
+    """How many letters the state of each traffic light has, controlled by an agent or not.
+
+    Raises:
+        ScenarioError: The network is not well-formed.
+    """
+    root = parse_xml(scenario.network.read(), scenario.network.source)
+    programmes = _programmes(root, scenario)
+    return {
+        tls: len(programmes[tls][0][1])
+        if tls in programmes
+        else max(link.index for link in links) + 1
+        for tls, links in _links(root).items()
+    }
+
+
 def _phases_of(
     scenario: Scenario,
     tls: str,
@@ -181,7 +197,7 @@ def _phases_of(
     foes: Mapping[str, Sequence[int]],
 ) -> tuple[str, ...]:
     own = scenario.settings.intersections.get(tls)
-    source = own.phases if own else scenario.control.phases
+    source = own.phases if own and own.phases is not None else scenario.control.phases
     width = max(link.index for link in links) + 1
     where = f"scenario {scenario.id!r}, traffic light {tls!r}"
     if programme:

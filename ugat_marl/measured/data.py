@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
+from polars import selectors
 
 DetectorKind = Literal["advance", "stop", "exit"]
 Split = Literal["fit", "heldout"]
@@ -147,19 +148,40 @@ class Measured:
 
     @property
     def hash(self) -> str:
-        """SHA-256 over detectors, signals and detections, as 64 hex digits."""
-        digest = hashlib.sha256(repr(self.detectors).encode())
+        """SHA-256 over all that was measured, as 64 hex digits.
+
+        Times count to the millisecond, as the files hold them, so that what was written and read
+        again has the hash that it had.
+        """
+        digest = hashlib.sha256()
+        for item in self.detectors:
+            zone = (item.id, item.lane, float(item.position_m), float(item.length_m), item.kind)
+            digest.update(repr(zone).encode())
         for period in self.periods:
-            head = (period.id, period.begin_s, period.end_s, period.split)
-            digest.update(repr((head, sorted(period.signals.items()))).encode())
+            head = (period.id, float(period.begin_s), float(period.end_s), period.split)
+            digest.update(repr(head).encode())
+            for tls, log in sorted(period.signals.items()):
+                shown = [(round(float(since), 3) + 0.0, state) for since, state in log]
+                digest.update(repr((tls, shown)).encode())
             for name, passages in sorted(period.passages.items()):
-                digest.update(name.encode())
-                for column in (passages.on_s, passages.off_s, passages.speed_mps):
-                    digest.update(np.ascontiguousarray(column).tobytes())
+                if len(passages):
+                    digest.update(f"{name} {len(passages)}".encode())
+                    for times in (passages.on_s, passages.off_s):
+                        digest.update(_canonical(np.round(times, 3)))
+                    digest.update(_canonical(passages.speed_mps) + _canonical(passages.length_m))
         for frame in (self.lanes, self.trajectories, self.counts):
             if frame is not None:
-                digest.update(frame.write_csv().encode())
+                numbers = selectors.numeric().cast(pl.Float64)
+                table = frame.select(sorted(frame.columns)).with_columns(numbers)
+                digest.update(
+                    table.with_columns(selectors.float().fill_nan(None)).write_csv().encode()
+                )
         return digest.hexdigest()
+
+
+def _canonical(numbers: NDArray[np.float64]) -> bytes:
+    """The bytes of numbers, with one way to write NaN and one to write zero."""
+    return np.where(np.isnan(numbers), np.nan, numbers + 0.0).astype("<f8").tobytes()
 
 
 def split_periods(count: int) -> tuple[Split, ...]:
