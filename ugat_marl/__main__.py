@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("commands.train:Train", "train by UGAT across the gap, print what was won"),
     "evaluate": ("commands.evaluate:Evaluate", "policies and rules in any domains: measures, gaps"),
     "rollout": ("commands.rollout:Rollout", "record transitions as a Parquet log"),
+    "record": ("commands.record:Record", "measure a domain as a street is measured"),
     "check": ("commands.check:Check", "is a scenario sound, its environment conformant?"),
     "scenarios": ("commands.scenarios:Scenarios", "the networks and domains that can be named"),
     "bench env": ("bench.speed:EnvBench", "speed against SUMO alone and sumo-rl"),
@@ -65,14 +66,13 @@ def _run(given: list[str], console: Console) -> int:
         console.print(f"ugat-marl {__version__}")
         return 0
     name, rest = given[0], given[1:]
-    if name == "bench":
-        parts = {key.split()[1] for key in COMMANDS if key.startswith("bench ")}
+    if parts := {key.split()[1] for key in COMMANDS if key.startswith(f"{name} ")}:
         if not rest or rest[0] in ("-h", "--help"):
-            _print_help(console, "bench ")
+            _print_help(console, f"{name} ")
             return 0 if rest else USAGE_ERROR
         if rest[0] not in parts:
-            raise UnknownNameError("bench", rest[0], parts)
-        name, rest = f"bench {rest[0]}", rest[1:]
+            raise UnknownNameError(name, rest[0], parts)
+        name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in COMMANDS:
         names = {key.split()[0] for key in COMMANDS}
         raise UnknownNameError("command", name, names, "ugat-marl --help explains them.")

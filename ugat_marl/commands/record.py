@@ -1,0 +1,83 @@
+"""``ugat-marl record``: measured data of any domain under any controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.effects import load
+from ugat_marl.evaluation import policy_factory
+from ugat_marl.files import require_writable
+from ugat_marl.measured.writing import write_measured
+from ugat_marl.progress import Bars
+from ugat_marl.recording import record
+
+
+@dataclass(frozen=True)
+class Record:
+    """Measures a domain as a street is measured: detections and signals, day after day.
+
+    Examples:
+        ugat-marl record single-v1 --domain V4 --policy fixed-time:30 --out v4
+        ugat-marl record single-v1 --domain headway=1.4 --periods 3 --lanes --out slow
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        out: Directory to write; see docs/measured-data.md.
+        domain: World to measure.
+        policy: A rule or the file of a trained policy.
+        periods: Number of days; the last 40 % are marked as held out.
+        seed: Root of the seeds of all days.
+        duration_s: Length of a day in s; default: the scenario's own.
+        same_demand: Every day has the scenario's own vehicles; without it they are drawn again.
+        detector_length_m: Length of the detection zones in m; 0 for points.
+        speeds: Whether the detectors measure speeds and lengths.
+        lanes: Also vehicles, halting and mean speed per lane and second.
+        trajectories: Also the position of every vehicle at every second.
+        workers: Simulations at a time; default: one per core.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    out: Path
+    domain: str = "sim"
+    policy: str = "fixed-time:30"
+    periods: int = 5
+    seed: int = 0
+    duration_s: float | None = None
+    same_demand: bool = False
+    detector_length_m: float = 0.0
+    speeds: bool = True
+    lanes: bool = False
+    trajectories: bool = False
+    workers: int | None = None
+
+    def run(self, console: Console) -> int:
+        """Records and writes."""
+        require_writable(self.out / "periods.csv")
+        measured = record(
+            load(self.scenario),
+            self.domain,
+            policy_factory(self.policy),
+            periods=self.periods,
+            seed=self.seed,
+            duration_s=self.duration_s,
+            same_demand=self.same_demand,
+            detector_length_m=self.detector_length_m,
+            speeds=self.speeds,
+            lanes=self.lanes,
+            trajectories=self.trajectories,
+            workers=self.workers,
+            reporter=Bars(console),
+        )
+        write_measured(measured, self.out)
+        seen = sum(len(item) for period in measured.periods for item in period.passages.values())
+        console.print(
+            f"{seen} passages over {len(measured.detectors)} detectors in {self.periods} "
+            f"period(s): {self.out}",
+            soft_wrap=True,
+        )
+        return 0
