@@ -7,7 +7,12 @@ import tomllib
 from pathlib import Path
 
 from ugat_marl.effects import effect_from
-from ugat_marl.scenario_settings import ControlSettings, ScenarioFile, validated
+from ugat_marl.scenario_settings import (
+    ControlSettings,
+    IntersectionSettings,
+    ScenarioFile,
+    validated,
+)
 
 PAGE = (Path(__file__).parent.parent / "docs" / "scenario-file.md").read_text()
 
@@ -16,14 +21,15 @@ def test_every_key_of_a_scenario_file_is_documented() -> None:
     written = set(re.findall(r"^\| `([\w.<>]+)` \|", PAGE, flags=re.MULTILINE))
     keys = set(ScenarioFile.model_fields) - {"control", "intersections", "sumo"}
     keys |= {f"control.{name}" for name in ControlSettings.model_fields}
-    assert written == keys | {"intersections.<id>.phases", "sumo.<option>"}
+    keys |= {f"intersections.<id>.{name}" for name in IntersectionSettings.model_fields}
+    assert written == keys | {"sumo.<option>"}
 
 
 def test_the_defaults_on_the_page_are_those_of_the_code() -> None:
     rows = re.findall(
         r"^\| `control\.(\w+)` \| [^|]+ \| s \| ([\d.]+) \|", PAGE, flags=re.MULTILINE
     )
-    assert len(rows) == 4
+    assert len(rows) == 5
     for name, value in rows:
         assert getattr(ControlSettings(), name) == float(value)
 

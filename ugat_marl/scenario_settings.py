@@ -36,6 +36,8 @@ class ControlSettings(pydantic.BaseModel):
     all_red_s: Annotated[float, Field(ge=0, le=60)] = 2.0
     min_green_s: Annotated[float, Field(ge=0, le=600)] = 5.0
     phases: PhaseSource = "programme"
+    late_green_s: Annotated[float, Field(ge=0, le=60, exclude_if=lambda value: value == 0)] = 0.0
+    """Traffic on every link starts so much later than its green, to which the agent is blind."""
 
 
 class IntersectionSettings(pydantic.BaseModel):
@@ -43,7 +45,10 @@ class IntersectionSettings(pydantic.BaseModel):
 
     model_config = _STRICT
 
-    phases: PhaseSource
+    phases: PhaseSource | None = None
+    late_green_s: Annotated[
+        float | None, Field(ge=0, le=60, exclude_if=lambda value: value is None)
+    ] = None
 
 
 class ScenarioFile(pydantic.BaseModel):

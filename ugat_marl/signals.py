@@ -7,7 +7,8 @@ does not change its mind while clearing. It knows nothing of SUMO.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -179,6 +180,128 @@ def _ending(before: str, after: str, cleared: str) -> str:
     if before in GREEN:
         return cleared
     return before if before == after else "r"
+
+
+class LateGreen(NamedTuple):
+    """What `with_late_green` has to remember about one traffic light.
+
+    Attributes:
+        commanded: State commanded last, one letter per link.
+        shown: State shown last.
+        waiting_s: Seconds until each link's green is shown; 0 if nothing is held back.
+        owed_s: Late green not yet given to each link, less than one step.
+    """
+
+    commanded: str
+    shown: str
+    waiting_s: tuple[float, ...]
+    owed_s: tuple[float, ...]
+
+    @classmethod
+    def after(cls, state: str) -> LateGreen:
+        """A light that has shown `state` for long."""
+        nothing = (0.0,) * len(state)
+        return cls(state, state, nothing, nothing)
+
+
+def with_late_green(
+    segments: Sequence[Segment], late_s: float, step_s: float, before: LateGreen
+) -> tuple[LateGreen, list[Segment]]:
+    """Traffic that starts late: every link that turns green stays red for `late_s` first.
+
+    The time is lost at the start of the green, the end stays where it is. Greens are held back by
+    whole steps, since a simulation knows nothing in between; what is left over is added to the
+    link's next green, so that the mean over many greens is `late_s`. A green shorter than its delay
+    is not shown, nor the yellow behind it.
+
+    Args:
+        segments: What is commanded.
+        late_s: Time lost, in s.
+        step_s: Length of a simulation step.
+        before: What is remembered of what was commanded before.
+
+    Returns:
+        What to remember, and what is shown: segments of the same total duration.
+    """
+    shown: list[Segment] = []
+    state = before
+    for duration, commanded in segments:
+        state = _commanded(state, commanded, late_s, step_s)
+        left = duration
+        while left > _INSTANT_S:
+            visible = "".join(
+                held if wait > _INSTANT_S else letter
+                for letter, held, wait in zip(commanded, state.shown, state.waiting_s, strict=True)
+            )
+            waits = [wait for wait in state.waiting_s if wait > _INSTANT_S]
+            part = min([left, *(wait for wait in waits if wait < math.inf)])
+            _append(shown, (part, visible))
+            waiting = tuple(max(wait - part, 0.0) for wait in state.waiting_s)
+            state = LateGreen(commanded, visible, waiting, state.owed_s)
+            left -= part
+    return state, shown
+
+
+def with_late_greens(
+    plans: Mapping[str, list[Segment]],
+    late_s: Mapping[str, float],
+    step_s: float,
+    before: dict[str, LateGreen],
+) -> dict[str, list[Segment]]:
+    """`with_late_green` for many traffic lights; lights that `late_s` leaves out are in time.
+
+    Args:
+        plans: Traffic light to what is commanded.
+        late_s: Traffic light to the time lost, in s.
+        step_s: Length of a simulation step.
+        before: Traffic light to what is remembered of it; brought up to date.
+    """
+    shown = dict(plans)
+    for tls, late in late_s.items():
+        if tls in plans:
+            before[tls], shown[tls] = with_late_green(plans[tls], late, step_s, before[tls])
+    return shown
+
+
+def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -> LateGreen:
+    """The memory at the moment at which `commanded` begins, `shown` holding what waits."""
+    if commanded == state.commanded:
+        return state
+    shown, waiting, owed = list(state.shown), list(state.waiting_s), list(state.owed_s)
+    for link, (old, new) in enumerate(zip(state.commanded, commanded, strict=True)):
+        if new in GREEN and old not in GREEN:
+            total = owed[link] + late_s
+            steps = math.floor(total / step_s + _INSTANT_S)
+            waiting[link], owed[link] = steps * step_s, total - steps * step_s
+            shown[link] = "s" if old == "s" else "r"
+        elif new in YELLOW and (
+            waiting[link] == math.inf or (old in GREEN and shown[link] not in GREEN)
+        ):
+            waiting[link] = math.inf  # its green was never shown
+        elif new not in GREEN:
+            waiting[link] = 0.0
+    return LateGreen(commanded, "".join(shown), tuple(waiting), tuple(owed))
+
+
+def delayed_log(
+    log: Sequence[tuple[float, str]], late_s: float, step_s: float
+) -> tuple[tuple[float, str], ...]:
+    """`with_late_green` for what a traffic light showed: ``(since_s, state)`` at every change."""
+    if len(log) < 2:
+        return tuple(log)
+    state = LateGreen.after(log[0][1])
+    delayed = [(float(log[0][0]), log[0][1])]
+    for (since, commanded), until in zip(
+        log[1:], [*(since for since, _ in log[2:]), math.inf], strict=True
+    ):
+        duration = until - since if until < math.inf else late_s + 2 * step_s
+        state, shown = with_late_green([(duration, commanded)], late_s, step_s, state)
+        time = since
+        for seconds, visible in shown:
+            if visible != delayed[-1][1]:
+                delayed.append((time, visible))
+            time += seconds
+    return tuple(delayed)
 
 
 def check_phases(phases: Sequence[str], links: int, source: str) -> None:

@@ -20,6 +20,7 @@ from pettingzoo import ParallelEnv
 from ugat_marl import signals
 from ugat_marl.demand import check_demand
 from ugat_marl.effects import Domain, describe, in_domain, load
+from ugat_marl.effects.signals import late_greens, with_late_programmes
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
 from ugat_marl.measurements import Snapshot
 from ugat_marl.metrics import EpisodeRecorder, Scores
@@ -80,6 +81,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._timing = signals.SignalTiming(
             control.yellow_s, control.all_red_s, control.min_green_s
         )
+        self._late_s = late_greens(self.scenario)
         self._lanes = self.network.lane_table()
         self._observer = Observer(self.network, options.observation, options.neighbours)
         self._rewarder = Rewarder(self.network, options.reward)
@@ -142,9 +144,11 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._scores = None
         self._decision = 0
         self._states = [signals.initial_state(self._timing) for _ in self.agents]
+        lights = self.network.intersections
+        self._held = {item.id: signals.LateGreen.after(item.phases[0]) for item in lights}
         self._recorder = EpisodeRecorder(
             self._lanes,
-            [self._lanes.indices(item.incoming_lanes) for item in self.network.intersections],
+            [self._lanes.indices(item.incoming_lanes) for item in lights],
         )
         return self._observe(), self._infos()
 
@@ -268,7 +272,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         directory = Path(tempfile.gettempdir()) / f"ugat_marl-{secrets.token_hex(8)}"
         self._remove = weakref.finalize(self, _remove_tree, directory, os.getpid())
         launch = launch_of(
-            self.scenario,
+            with_late_programmes(self.scenario),
             seed,
             directory,
             self._lanes.ids,
@@ -310,6 +314,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             states.append(after)
         if self.options.signals == "programme":
             plans, states = {}, self._states
+        step_s = self.scenario.settings.step_length_s
+        plans = signals.with_late_greens(plans, self._late_s, step_s, self._held)
         agents, self.agents = self.agents, []  # the episode is over if SUMO fails
         self._snapshot: Snapshot = self._simulator.advance(self.decision_interval_s, plans)
         self.agents, self._states = agents, states

@@ -4,7 +4,20 @@ The same value makes a "real" domain different from the simulation, is what a di
 is what repairs a model.
 """
 
-from ugat_marl.effects.base import Effect, Parameter
+from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text
+from ugat_marl.effects.demand import DemandLevel, DemandSurge, DemandTiming
+from ugat_marl.effects.detectors import (
+    ClockDrift,
+    DetectorEffect,
+    Dropout,
+    SignalClock,
+    Stuck,
+    Swapped,
+    Undercount,
+    observed,
+    owners,
+)
+from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
 from ugat_marl.effects.settings import (
     ALIASES,
     SETTINGS,
@@ -17,30 +30,71 @@ from ugat_marl.effects.settings import (
     load,
     parse_domain,
 )
+from ugat_marl.effects.signals import AllRedTime, LateGreen, YellowTime
+from ugat_marl.effects.turning import Turning
 from ugat_marl.effects.vehicles import (
     Acceleration,
     Deceleration,
+    DriverModel,
     EmergencyDeceleration,
+    GapAcceptance,
+    Headway,
+    Imperfection,
+    LaneDiscipline,
+    MinGap,
+    ReactionStep,
+    RedRunning,
     StartupDelay,
     VehicleEffect,
+    YellowRunning,
 )
 
 __all__ = [
     "ALIASES",
+    "EVERYWHERE",
     "SETTINGS",
     "Acceleration",
+    "AllRedTime",
+    "ClockDrift",
     "Deceleration",
+    "DemandLevel",
+    "DemandSurge",
+    "DemandTiming",
+    "DesiredSpeed",
+    "DetectorEffect",
     "Domain",
+    "DriverModel",
+    "Dropout",
     "Effect",
     "EmergencyDeceleration",
+    "GapAcceptance",
+    "Headway",
+    "HeavyShare",
+    "Imperfection",
+    "LaneDiscipline",
+    "LateGreen",
+    "MinGap",
     "Parameter",
+    "ReactionStep",
+    "RedRunning",
+    "SignalClock",
+    "SpeedSpread",
     "StartupDelay",
+    "Stuck",
+    "Swapped",
+    "Text",
+    "Turning",
+    "Undercount",
     "VehicleEffect",
+    "YellowRunning",
+    "YellowTime",
     "apply_effects",
     "describe",
     "effect_from",
     "in_domain",
     "known_effects",
     "load",
+    "observed",
+    "owners",
     "parse_domain",
 ]

@@ -8,11 +8,32 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.effects.base import Effect
+from ugat_marl.effects.demand import DemandLevel, DemandSurge, DemandTiming
+from ugat_marl.effects.detectors import (
+    ClockDrift,
+    Dropout,
+    SignalClock,
+    Stuck,
+    Swapped,
+    Undercount,
+)
+from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
+from ugat_marl.effects.signals import AllRedTime, LateGreen, YellowTime
+from ugat_marl.effects.turning import Turning
 from ugat_marl.effects.vehicles import (
     Acceleration,
     Deceleration,
+    DriverModel,
     EmergencyDeceleration,
+    GapAcceptance,
+    Headway,
+    Imperfection,
+    LaneDiscipline,
+    MinGap,
+    ReactionStep,
+    RedRunning,
     StartupDelay,
+    YellowRunning,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.scenario import Scenario, load_scenario
@@ -48,8 +69,16 @@ ALIASES: dict[str, str] = {
 }
 
 _EFFECTS: dict[str, type[Effect]] = {
-    kind.name: kind for kind in (Acceleration, Deceleration, EmergencyDeceleration, StartupDelay)
-}
+    kind.name: kind
+    for kind in (
+        Acceleration, Deceleration, EmergencyDeceleration, StartupDelay, Headway, MinGap,
+        Imperfection, ReactionStep, DesiredSpeed, SpeedSpread, YellowRunning, RedRunning,
+        GapAcceptance, LaneDiscipline, HeavyShare, DriverModel,
+        LateGreen, YellowTime, AllRedTime,
+        DemandLevel, DemandSurge, DemandTiming, Turning,
+        Undercount, SignalClock, ClockDrift, Stuck, Dropout, Swapped,
+    )
+}  # fmt: skip
 
 
 def known_effects() -> Mapping[str, type[Effect]]:
@@ -100,17 +129,16 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
                     "its own, or a list of effects such as [StartupDelay(0.5)]"
                 )
         return tuple(domain)
-    parts = [part.strip() for part in domain.split("+")]
+    parts = _parts(domain)
     if len(parts) > 1:
         return tuple(effect for part in parts for effect in parse_domain(part))
     name = parts[0].lower()
     if name == "sim":
         return ()
-    settings = {setting.lower(): setting for setting in SETTINGS} | ALIASES
-    if name in settings:
-        return SETTINGS[settings[name]]
+    if name in _names():
+        return SETTINGS[_names()[name]]
     if "=" in name:
-        return (_effect_from_text(name),)
+        return (_effect_from_text(parts[0]),)
     raise UnknownNameError(
         "domain",
         domain,
@@ -120,22 +148,45 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
     )
 
 
+def _names() -> dict[str, str]:
+    """Settings by all the names they have, in small letters."""
+    return {setting.lower(): setting for setting in SETTINGS} | ALIASES
+
+
+def _parts(domain: str) -> list[str]:
+    """The parts of a domain between plus signs, but for those in the id of an edge or lane."""
+    parts: list[str] = []
+    for part in domain.split("+"):
+        name = parts[-1].partition("=")[0].strip().lower() if parts else ""
+        kind = _EFFECTS.get(name)
+        new = "=" in part or part.strip().lower() in {"", "sim", *_names()}
+        if kind is not None and kind.texts and not new:
+            parts[-1] += f"+{part}"
+        else:
+            parts.append(part)
+    return [part.strip() for part in parts]
+
+
 def _effect_from_text(text: str) -> Effect:
     name, _, values = (part.strip() for part in text.partition("="))
+    name = name.lower()
     if name not in _EFFECTS:
         raise UnknownNameError("effect", name, _EFFECTS)
-    parameters = [item.name for item in fields(_EFFECTS[name])]
-    parts = values.split(",")
+    kind = _EFFECTS[name]
+    parameters = [item.name for item in fields(kind)]
+    parts = [part.strip() for part in values.split(",")]
     if len(parts) != len(parameters):
         raise OptionError(
             f"effect {name!r} takes {len(parameters)} value(s), {', '.join(parameters)}; "
             f"got {values!r}"
         )
-    try:
-        numbers = [float(part) for part in parts]
-    except ValueError:
-        raise OptionError(f"effect {name!r}: {values!r} is not a number") from None
-    return _EFFECTS[name](*numbers)
+    given: dict[str, Any] = {}
+    for parameter, part in zip(parameters, parts, strict=True):
+        try:
+            given[parameter] = part if parameter in kind.texts else float(part)
+        except ValueError:
+            raise OptionError(f"effect {name!r}: {part!r} is not a number") from None
+    return kind(**given)
 
 
 def describe(domain: Domain) -> str:

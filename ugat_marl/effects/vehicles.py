@@ -8,25 +8,30 @@ silently ignored when it is set through TraCI.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Parameter
-from ugat_marl.files import xml_bytes
-from ugat_marl.scenario import Document, Scenario
+from ugat_marl.effects.base import Effect, Parameter, Text
+from ugat_marl.effects.documents import edit_scenario, with_default_types
+from ugat_marl.scenario import Scenario
 
-DEFAULT_TYPES = (
-    "DEFAULT_VEHTYPE", "DEFAULT_TAXITYPE", "DEFAULT_BIKETYPE", "DEFAULT_RAILTYPE",
-)  # fmt: skip
-"""Types SUMO defines itself. Only the first is used without being named."""
-
-DEFAULTS_FILE = "default-types.add.xml"
 _NOT_DRIVEN = frozenset(
     {
         "pedestrian", "wheelchair", "container", "rail", "rail_electric", "rail_urban", "rail_fast",
         "subway", "cable_car", "tram", "ship", "aircraft", "drone",
     }
 )  # fmt: skip
+
+DRIVER_MODELS = (
+    "Krauss", "KraussOrig1", "KraussPS", "KraussX", "PWagner2009", "BKerner", "IDM", "IDMM",
+    "EIDM", "Wiedemann", "W99", "Daniel1", "ACC", "CACC",
+)  # fmt: skip
+"""SUMO's car-following models that need no parameters of their own and drive on a common street."""
+
+
+def driven_types(root: ET.Element) -> list[ET.Element]:
+    """All vehicle types of a document that drive on the road."""
+    return [item for item in root.iter("vType") if item.get("vClass") not in _NOT_DRIVEN]
 
 
 @dataclass(frozen=True)
@@ -37,16 +42,21 @@ class VehicleEffect(Effect):
 
     def apply(self, scenario: Scenario) -> Scenario:
         """Sets the attribute in every vehicle type, SUMO's default type included."""
-        value = f"{getattr(self, fields(self)[0].name):.12g}"
-        additional = scenario.additional
-        if not additional or additional[0].name != DEFAULTS_FILE:
-            additional = (_default_types(scenario), *additional)
-        return replace(
-            scenario,
-            additional=tuple(_with_attribute(item, self.attribute, value) for item in additional),
-            routes=tuple(_with_attribute(item, self.attribute, value) for item in scenario.routes),
-            applied=(*scenario.applied, str(self)),
-        )
+        number = getattr(self, fields(self)[0].name)
+        value = f"{number:.12g}"
+
+        def change(root: ET.Element) -> bool:
+            types = driven_types(root)
+            for item in types:
+                item.set(self.attribute, value)
+                for model in item:  # an old way to write a type, which overrules the attributes
+                    if model.tag.startswith("carFollowing-") and self.attribute in model.attrib:
+                        model.set(self.attribute, value)
+            return bool(types)
+
+        return edit_scenario(
+            with_default_types(scenario), change, "<vType", applied=str(self)
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -93,33 +103,118 @@ class StartupDelay(VehicleEffect):
     seconds: float
 
 
-def _default_types(scenario: Scenario) -> Document:
-    """Declares the default types in use, unless the scenario declares them itself."""
-    declared: set[str] = set()
-    named: set[str] = {DEFAULT_TYPES[0]}
-    for document in (*scenario.additional, *scenario.routes):
-        for item in document.parse().iter():
-            if item.tag == "vType":
-                declared.add(item.get("id", ""))
-            named |= {item.get("type", ""), *item.get("vTypes", "").split()}
-    root = ET.Element("additional")
-    for name in DEFAULT_TYPES:
-        if name in named and name not in declared:
-            vehicle_class = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi"}.get(name)
-            attributes = {"id": name} | ({"vClass": vehicle_class} if vehicle_class else {})
-            if name != "DEFAULT_RAILTYPE":
-                ET.SubElement(root, "vType", attributes)
-    return Document(DEFAULTS_FILE, None, xml_bytes(root))
+@dataclass(frozen=True)
+class Headway(VehicleEffect):
+    """Time gap drivers keep to the vehicle in front, in s (SUMO's `tau`; default 1)."""
+
+    name: ClassVar[str] = "headway"
+    attribute: ClassVar[str] = "tau"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.1, 10.0)}
+    seconds: float
 
 
-def _with_attribute(document: Document, attribute: str, value: str) -> Document:
-    root = document.parse()
-    types = [item for item in root.iter("vType") if item.get("vClass") not in _NOT_DRIVEN]
-    if not types:
-        return document
-    for item in types:
-        item.set(attribute, value)
-        for model in item:  # an old way to write a type, which overrules the attributes
-            if model.tag.startswith("carFollowing-") and attribute in model.attrib:
-                model.set(attribute, value)
-    return document.edited(xml_bytes(root))
+@dataclass(frozen=True)
+class MinGap(VehicleEffect):
+    """Empty space in front of a standing vehicle, in m (default 2.5)."""
+
+    name: ClassVar[str] = "min_gap"
+    attribute: ClassVar[str] = "minGap"
+    ranges: ClassVar[dict[str, Parameter]] = {"metres": Parameter("m", 0.1, 20.0)}
+    metres: float
+
+
+@dataclass(frozen=True)
+class Imperfection(VehicleEffect):
+    """How unevenly drivers follow, 0 is perfect (`sigma` of Krauss' model; default 0.5)."""
+
+    name: ClassVar[str] = "imperfection"
+    attribute: ClassVar[str] = "sigma"
+    ranges: ClassVar[dict[str, Parameter]] = {"sigma": Parameter("", 0.0, 1.0)}
+    sigma: float
+
+
+@dataclass(frozen=True)
+class ReactionStep(VehicleEffect):
+    """Drivers decide only every so many s (`actionStepLength`), rounded to simulation steps."""
+
+    name: ClassVar[str] = "reaction_step"
+    attribute: ClassVar[str] = "actionStepLength"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.1, 5.0)}
+    seconds: float
+
+
+@dataclass(frozen=True)
+class YellowRunning(VehicleEffect):
+    """Drivers pass a light that has been yellow for at most so many s though they could stop.
+
+    SUMO's `jmDriveAfterYellowTime`; by default nobody does.
+    """
+
+    name: ClassVar[str] = "yellow_running"
+    attribute: ClassVar[str] = "jmDriveAfterYellowTime"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 10.0)}
+    seconds: float
+
+
+@dataclass(frozen=True)
+class RedRunning(VehicleEffect):
+    """Drivers pass a light that has been red for at most so many s.
+
+    SUMO's `jmDriveAfterRedTime`; by default nobody does.
+    """
+
+    name: ClassVar[str] = "red_running"
+    attribute: ClassVar[str] = "jmDriveAfterRedTime"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 10.0)}
+    seconds: float
+
+
+@dataclass(frozen=True)
+class GapAcceptance(VehicleEffect):
+    """Time gap to a vehicle with priority that is enough to go first, in s (`jmTimegapMinor`).
+
+    The default is 1; it matters to permitted turns (g) and minor roads.
+    """
+
+    name: ClassVar[str] = "gap_acceptance"
+    attribute: ClassVar[str] = "jmTimegapMinor"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 20.0)}
+    seconds: float
+
+
+@dataclass(frozen=True)
+class LaneDiscipline(VehicleEffect):
+    """How early drivers change to the lane of their turn (`lcStrategic`; default 1, 0 is late)."""
+
+    name: ClassVar[str] = "lane_discipline"
+    attribute: ClassVar[str] = "lcStrategic"
+    ranges: ClassVar[dict[str, Parameter]] = {"strategic": Parameter("", 0.0, 100.0)}
+    strategic: float
+
+
+@dataclass(frozen=True)
+class DriverModel(Effect):
+    """The car-following model of all vehicles (`carFollowModel`; SUMO's default is Krauss).
+
+    Parameters the other model does not know stay in the types, and SUMO passes over them.
+    """
+
+    name: ClassVar[str] = "driver_model"
+    texts: ClassVar[dict[str, Text]] = {"model": Text("model", allowed=DRIVER_MODELS)}
+    model: str
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Sets the model in every vehicle type, SUMO's default type included."""
+
+        def change(root: ET.Element) -> bool:
+            types = driven_types(root)
+            for item in types:
+                for old in [x for x in item if x.tag.startswith("carFollowing-")]:
+                    item.attrib.update(old.attrib)
+                    item.remove(old)
+                item.set("carFollowModel", self.model)
+            return bool(types)
+
+        return edit_scenario(
+            with_default_types(scenario), change, "<vType", applied=str(self)
+        )  # fmt: skip

@@ -1,0 +1,339 @@
+"""Effects on how many vehicles depart, and when.
+
+They work on single vehicles, trips and flows alike. Which vehicles are left out, or get a twin, is
+decided by a hash of their ids: those kept at a level of 0.8 contain those kept at 0.6.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text, draw
+from ugat_marl.effects.documents import (
+    DEPARTING,
+    depart_s,
+    edit_scenario,
+    mentions,
+    seconds_text,
+    sort_departures,
+)
+from ugat_marl.effects.places import places_of
+from ugat_marl.scenario import Scenario
+from ugat_marl.scenario_settings import seconds_of
+
+TAGS = ("<vehicle", "<trip", "<flow")
+"""A document without these has no demand."""
+
+TWIN_S = 15.0
+"""A twin departs up to this much before or after its original."""
+
+_FACTOR = Parameter("", 0.0, 20.0)
+_TIME = Parameter("s", 0.0, 1e7)
+_EXPONENTIAL = re.compile(r"\s*exp\((.*)\)\s*")
+
+
+@dataclass
+class Routes:
+    """The routes that stand apart from the vehicles that take them.
+
+    Attributes:
+        edges: Route to its edges.
+        first: Route, or distribution of routes, to its first edge.
+    """
+
+    edges: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    first: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Routes:
+        """Reads all routes that vehicles of a scenario may refer to."""
+        documents = (*scenario.additional, *scenario.routes)
+        found = cls()
+        if not any(mentions(document, "route=", "route =") for document in documents):
+            return found
+        distributions: list[ET.Element] = []
+        for document in documents:
+            if mentions(document, "<route "):
+                root = document.parse()
+                named = (item for item in root.iter("route") if "id" in item.attrib)
+                found.edges |= {x.get("id", ""): _edges(x) for x in named}
+                distributions += list(root.iter("routeDistribution"))
+        found.first = {name: edges[0] for name, edges in found.edges.items() if edges}
+        for item in distributions:
+            inner = [_edges(x) for x in item.iter("route")]
+            inner += [found.edges.get(x, ()) for x in item.get("routes", "").split()]
+            first = {edges[0] for edges in inner if edges}
+            if len(first) == 1:
+                found.first[item.get("id", "")] = next(iter(first))
+        return found
+
+    def edges_of(self, item: ET.Element) -> tuple[str, ...]:
+        """The edges of a vehicle or flow; none if SUMO has yet to find its way."""
+        own = item.find("route")
+        return _edges(own) if own is not None else self.edges.get(item.get("route", ""), ())
+
+    def origin(self, item: ET.Element) -> str | None:
+        """The edge a vehicle, trip or flow starts on; None if only SUMO knows."""
+        own = item.find("route")
+        if own is not None:
+            return next(iter(_edges(own)), None)
+        return self.first.get(item.get("route", "")) or item.get("from")
+
+
+def _edges(item: ET.Element) -> tuple[str, ...]:
+    return tuple(item.get("edges", "").split())
+
+
+@dataclass(frozen=True)
+class DemandLevel(Effect):
+    """So many times as many vehicles start on an edge, or everywhere (``"*"``)."""
+
+    name: ClassVar[str] = "demand_level"
+    ranges: ClassVar[dict[str, Parameter]] = {"factor": _FACTOR}
+    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
+    edge: str
+    factor: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Leaves out or doubles vehicles, and changes the rates of flows.
+
+        Raises:
+            UnknownNameError: No such edge.
+        """
+        return _scaled(scenario, self, self.edge, (0.0, math.inf), self.factor)
+
+
+@dataclass(frozen=True)
+class DemandSurge(Effect):
+    """So many times as many vehicles start on an edge (``"*"``: everywhere) during a while."""
+
+    name: ClassVar[str] = "demand_surge"
+    ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME, "factor": _FACTOR}
+    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
+    edge: str
+    begin_s: float
+    end_s: float
+    factor: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Leaves out or doubles vehicles that depart then; flows are cut into parts.
+
+        Raises:
+            UnknownNameError: No such edge.
+        """
+        return _scaled(scenario, self, self.edge, (self.begin_s, self.end_s), self.factor)
+
+
+@dataclass(frozen=True)
+class DemandTiming(Effect):
+    """Vehicles that start on an edge (``"*"``: everywhere) depart so much later, in s.
+
+    Those that would depart before the scenario begins are left out.
+    """
+
+    name: ClassVar[str] = "demand_timing"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -7200.0, 7200.0)}
+    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
+    edge: str
+    seconds: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Shifts departures.
+
+        Raises:
+            UnknownNameError: No such edge.
+        """
+        earliest = scenario.settings.begin_s
+
+        def shifted(item: ET.Element) -> list[ET.Element]:
+            begin = depart_s(item)
+            if math.isnan(begin):
+                return [item]
+            key = "begin" if item.tag == "flow" else "depart"
+            if begin >= earliest:  # others take no part in the simulation anyway
+                begin += self.seconds
+            if item.tag == "flow":
+                if end := item.get("end"):
+                    until = seconds_of(end) + self.seconds
+                    if until <= earliest:
+                        return []
+                    item.set("end", seconds_text(until))
+                begin = max(begin, earliest)
+            elif begin < earliest:
+                return []
+            item.set(key, seconds_text(begin))
+            return [item]
+
+        return replace_departing(scenario, self, self.edge, shifted)
+
+
+def replace_departing(
+    scenario: Scenario,
+    effect: Effect,
+    edge: str,
+    becomes: Callable[[ET.Element], list[ET.Element]],
+) -> Scenario:
+    """Puts others in the place of the vehicles, trips and flows that start on `edge`.
+
+    Args:
+        scenario: It does not change itself.
+        effect: What is noted as applied.
+        edge: Where they start, or ``"*"``.
+        becomes: What stands for each of them afterwards.
+
+    Raises:
+        UnknownNameError: No such edge.
+    """
+    routes = Routes()
+    if edge != EVERYWHERE:
+        places = places_of(scenario)
+        places.check(effect.name, "edge", edge, places.edges)
+        routes = Routes.of(scenario)
+
+    def change(root: ET.Element) -> bool:
+        children: list[ET.Element] = []
+        found = False
+        for item in root:
+            if item.tag in DEPARTING and (edge == EVERYWHERE or routes.origin(item) == edge):
+                found = True
+                children += becomes(item)
+            else:
+                children.append(item)
+        if found:
+            root[:] = children
+            sort_departures(root)
+        return found
+
+    return edit_scenario(scenario, change, *TAGS, applied=str(effect))
+
+
+def scaled_flow(item: ET.Element, factor: float, end_s: float) -> ET.Element | None:
+    """The same flow with another rate; None if nothing is left of it.
+
+    Args:
+        item: A ``<flow>``.
+        factor: What its rate is multiplied by.
+        end_s: When it ends if it does not say so.
+    """
+    if factor <= 0:
+        return None
+    flow = copy.deepcopy(item)
+    if number := flow.get("number"):
+        if "end" not in flow.attrib and any(key in flow.attrib for key in _RATES):
+            seconds = _seconds_of_number(flow, float(number))
+            flow.set("end", seconds_text(depart_s(flow) + seconds))
+            del flow.attrib["number"]
+        else:
+            count = round(float(number) * factor)
+            flow.set("number", str(count))
+            return flow if count else None
+    for key in ("vehsPerHour", "perHour"):
+        if text := flow.get(key):
+            flow.set(key, f"{float(text) * factor:.12g}")
+    if text := flow.get("period"):
+        rate = _EXPONENTIAL.fullmatch(text)
+        flow.set(
+            "period",
+            f"exp({float(rate[1]) * factor:.12g})" if rate else f"{float(text) / factor:.12g}",
+        )
+    if text := flow.get("probability"):
+        share = float(text) * factor
+        if share <= 1:
+            flow.set("probability", f"{share:.12g}")
+        else:  # more than one in a second can only be said as a rate
+            del flow.attrib["probability"]
+            flow.set("period", f"exp({share:.12g})")
+    flow.attrib.setdefault("end", seconds_text(end_s))
+    return flow
+
+
+_RATES = ("vehsPerHour", "perHour", "period", "probability")
+
+
+def _seconds_of_number(flow: ET.Element, number: float) -> float:
+    """How long a flow of so many vehicles lasts at its rate."""
+    rates: Mapping[str, Callable[[float], float]] = {
+        "vehsPerHour": lambda x: 3600 / x,
+        "perHour": lambda x: 3600 / x,
+        "probability": lambda x: 1 / x,
+        "period": lambda x: x,
+    }
+    for key, period in rates.items():
+        if text := flow.get(key):
+            exponential = _EXPONENTIAL.fullmatch(text)
+            return number * (1 / float(exponential[1]) if exponential else period(float(text)))
+    return 0.0
+
+
+def _scaled(
+    scenario: Scenario, effect: Effect, edge: str, window: tuple[float, float], factor: float
+) -> Scenario:
+    begin, end = window
+    settings = scenario.settings
+    over = settings.begin_s + settings.duration_s
+    salt = f"{effect.name} {edge}"
+    least = max(settings.begin_s, begin)
+
+    def scaled(item: ET.Element) -> list[ET.Element]:
+        if item.tag == "flow":
+            return _scaled_window(item, window, factor, over)
+        depart = depart_s(item)
+        if not (math.isnan(depart) or begin <= depart < end):
+            return [item]
+        name = item.get("id", "")
+        count = math.floor(factor) + (draw(salt, name) < factor - math.floor(factor))
+        found = [item] if count else []
+        for number in range(1, count):
+            twin = copy.deepcopy(item)
+            twin.set("id", f"{name}+{number}")
+            if not math.isnan(depart):
+                shift = TWIN_S * (2 * draw(salt, "when", name, str(number)) - 1)
+                time = depart + shift
+                if not least <= time < end:
+                    time = depart - shift
+                twin.set("depart", seconds_text(round(max(time, least), 2)))
+            found.append(twin)
+        return found
+
+    return replace_departing(scenario, effect, edge, scaled)
+
+
+def _scaled_window(
+    item: ET.Element, window: tuple[float, float], factor: float, over_s: float
+) -> list[ET.Element]:
+    """A flow in up to three parts: before, within and after the window."""
+    begin = depart_s(item)
+    if math.isnan(begin):
+        return [item]
+    end = seconds_of(item.get("end", "")) if item.get("end") else math.inf
+    if math.isinf(end):
+        number = float(item.get("number", "inf"))
+        by_rate = any(key in item.attrib for key in _RATES)
+        lasts = _seconds_of_number(item, number) if by_rate and number < math.inf else math.inf
+        end = min(begin + lasts, max(over_s, begin))
+    first, last = max(begin, window[0]), min(end, window[1])
+    if first >= last:
+        return [item]
+    if first == begin and last == end:
+        whole = scaled_flow(item, factor, over_s)
+        return [] if whole is None else [whole]
+    parts = ((begin, first, 1.0, ""), (first, last, factor, "+surge"), (last, end, 1.0, "+after"))
+    found: list[ET.Element] = []
+    for start, stop, rate, suffix in parts:
+        part = copy.deepcopy(item)
+        part.set("id", f"{item.get('id', '')}{suffix if start > begin else ''}")
+        part.set("begin", seconds_text(start))
+        part.set("end", seconds_text(stop))
+        number = part.attrib.pop("number", None)
+        if number is not None and not any(key in part.attrib for key in _RATES):
+            part.set("period", f"{(end - begin) / float(number):.12g}")
+        scaled = scaled_flow(part, rate, stop) if stop > start else None
+        if scaled is not None:
+            found.append(scaled)
+    return found

@@ -1,0 +1,261 @@
+"""Effects on what is measured, and not on the traffic: clocks, misses, and broken detectors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text, draw
+from ugat_marl.effects.places import places_of
+from ugat_marl.errors import UnknownNameError
+from ugat_marl.measured.data import Detector, Passages, Period
+from ugat_marl.scenario import Scenario
+
+_TIME = Parameter("s", 0.0, 1e7)
+_CLOCK = Text("traffic light", everywhere=True)
+
+Owner = Mapping[str, str]
+"""Detector to the traffic light whose controller records it."""
+
+
+def owners(scenario: Scenario, detectors: Sequence[Detector]) -> dict[str, str]:
+    """The traffic light of every detector: the one at the end of its lane, or behind it.
+
+    An exit detector belongs to the light it stands behind, any other to the light it leads to.
+    Detectors at no traffic light are left out.
+    """
+    places = places_of(scenario)
+    found: dict[str, str] = {}
+    for item in detectors:
+        first, second = (places.begins, places.ends)[:: 1 if item.kind == "exit" else -1]
+        light = first.get(item.lane) or second.get(item.lane)
+        if light is not None:
+            found[item.id] = light
+    return found
+
+
+@dataclass(frozen=True)
+class DetectorEffect(Effect):
+    """An effect on what is measured; the simulation itself is not touched."""
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Notes the effect; the scenario runs as before.
+
+        Raises:
+            UnknownNameError: No such traffic light.
+        """
+        for key, text in self.texts.items():
+            name = getattr(self, key)
+            if text.kind == "traffic light" and name != EVERYWHERE:
+                places = places_of(scenario)
+                places.check(self.name, text.kind, name, places.lights)
+        return replace(scenario, applied=(*scenario.applied, str(self)))
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """What would have been measured instead.
+
+        Args:
+            period: What was measured; it does not change itself.
+            detectors: All detectors.
+            owner: Detector to its traffic light, see `owners`.
+
+        Raises:
+            UnknownNameError: No such detector.
+        """
+        raise TypeError(f"{type(self).__name__} does not say what it does")
+
+
+@dataclass(frozen=True)
+class Undercount(DetectorEffect):
+    """A detector, or every one (``"*"``), misses this share of the vehicles."""
+
+    name: ClassVar[str] = "undercount"
+    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    texts: ClassVar[dict[str, Text]] = {"place": Text("detector", everywhere=True)}
+    place: str
+    share: float
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Leaves out passages, chosen by a hash of the detector and their number and time."""
+        del owner
+
+        def thinned(name: str, passages: Passages) -> Passages:
+            times = np.where(np.isnan(passages.on_s), passages.off_s, passages.on_s)
+            kept = [
+                draw("undercount", name, str(n), f"{time:.3f}") >= self.share
+                for n, time in enumerate(times.tolist())
+            ]
+            return passages.at(np.array(kept, dtype=np.bool_))
+
+        return _edited(period, _named(self, self.place, detectors), thinned)
+
+
+@dataclass(frozen=True)
+class SignalClock(DetectorEffect):
+    """Stamps of the detectors at a traffic light are ahead of its signals' clock, in s."""
+
+    name: ClassVar[str] = "signal_clock"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -60.0, 60.0)}
+    texts: ClassVar[dict[str, Text]] = {"place": _CLOCK}
+    place: str
+    seconds: float
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Shifts all stamps of the detectors."""
+        del detectors
+        shift = self.seconds
+        return _edited(period, _at(self.place, period, owner), lambda _, p: _moved(p, shift, shift))
+
+
+@dataclass(frozen=True)
+class ClockDrift(DetectorEffect):
+    """The clock of the detectors at a traffic light gains so much, in s per hour of a period."""
+
+    name: ClassVar[str] = "clock_drift"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds_per_hour": Parameter("s/h", -60.0, 60.0)}
+    texts: ClassVar[dict[str, Text]] = {"place": _CLOCK}
+    place: str
+    seconds_per_hour: float
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Shifts stamps in proportion to the time since the period began."""
+        del detectors
+        rate = self.seconds_per_hour / 3600.0
+
+        def drifted(name: str, passages: Passages) -> Passages:
+            del name
+            on, off = passages.on_s - period.begin_s, passages.off_s - period.begin_s
+            return _moved(passages, rate * on, rate * off)
+
+        return _edited(period, _at(self.place, period, owner), drifted)
+
+
+@dataclass(frozen=True)
+class Stuck(DetectorEffect):
+    """A detector is on for a whole while, whatever passes."""
+
+    name: ClassVar[str] = "stuck"
+    ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
+    texts: ClassVar[dict[str, Text]] = {"detector": Text("detector")}
+    detector: str
+    begin_s: float
+    end_s: float
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """One long passage without speed takes the place of all that were on then."""
+        del owner
+        names = _named(self, self.detector, detectors)
+        begin, end = max(self.begin_s, period.begin_s), min(self.end_s, period.end_s)
+        if begin >= end:
+            return period
+        long = Passages(np.array([begin]), np.array([end]), np.array([np.nan]), np.array([np.nan]))
+
+        def held(name: str, passages: Passages) -> Passages:
+            del name
+            rest = passages.at(~_within(passages, begin, end))
+            parts = [
+                np.concatenate([getattr(rest, key), getattr(long, key)])
+                for key in ("on_s", "off_s", "speed_mps", "length_m")
+            ]
+            times = np.where(np.isnan(parts[0]), parts[1], parts[0])
+            return Passages(*parts).at(np.argsort(times, kind="stable"))
+
+        return _edited(period, names, held)
+
+
+@dataclass(frozen=True)
+class Dropout(DetectorEffect):
+    """A detector reports nothing for a while."""
+
+    name: ClassVar[str] = "dropout"
+    ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
+    texts: ClassVar[dict[str, Text]] = {"detector": Text("detector")}
+    detector: str
+    begin_s: float
+    end_s: float
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Leaves out all passages of that time."""
+        del owner
+
+        def silent(name: str, passages: Passages) -> Passages:
+            del name
+            return passages.at(~_within(passages, self.begin_s, self.end_s))
+
+        return _edited(period, _named(self, self.detector, detectors), silent)
+
+
+@dataclass(frozen=True)
+class Swapped(DetectorEffect):
+    """Two detectors are taken for each other."""
+
+    name: ClassVar[str] = "swapped"
+    texts: ClassVar[dict[str, Text]] = {"detector": Text("detector"), "other": Text("detector")}
+    detector: str
+    other: str
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Exchanges the passages of the two."""
+        del owner
+        (one,), (two,) = (_named(self, x, detectors) for x in (self.detector, self.other))
+        passages = {name: x for name, x in period.passages.items() if name not in (one, two)}
+        for name, source in ((one, two), (two, one)):
+            if source in period.passages:
+                passages[name] = period.passages[source]
+        return replace(period, passages=passages)
+
+
+def observed(
+    period: Period,
+    effects: Sequence[Effect],
+    detectors: Sequence[Detector],
+    owner: Owner,
+) -> Period:
+    """Applies the effects on measurement among `effects`, one after the other."""
+    for effect in effects:
+        if isinstance(effect, DetectorEffect):
+            period = effect.observe(period, detectors, owner)
+    return period
+
+
+def _named(effect: Effect, place: str, detectors: Sequence[Detector]) -> set[str]:
+    known = {item.id for item in detectors}
+    if place == EVERYWHERE:
+        return known
+    if place not in known:
+        raise UnknownNameError("detector", place, known, f"Effect {effect.name!r} names it.")
+    return {place}
+
+
+def _at(place: str, period: Period, owner: Owner) -> set[str]:
+    """The detectors recorded by one traffic light's controller, or by all."""
+    return {x for x in period.passages if place in (EVERYWHERE, owner.get(x))}
+
+
+def _edited(period: Period, names: set[str], change: Callable[[str, Passages], Passages]) -> Period:
+    """The period with other passages at some detectors; one left without any is left out."""
+    passages = dict(period.passages)
+    for name in sorted(names):
+        changed = change(name, passages.get(name, Passages.none()))
+        if len(changed):
+            passages[name] = changed
+        else:
+            passages.pop(name, None)
+    return replace(period, passages=passages)
+
+
+def _moved(
+    passages: Passages, on: float | NDArray[np.float64], off: float | NDArray[np.float64]
+) -> Passages:
+    return replace(passages, on_s=passages.on_s + on, off_s=passages.off_s + off)
+
+
+def _within(passages: Passages, begin_s: float, end_s: float) -> NDArray[np.bool_]:
+    """Whether a passage began in the window, or was under way when it did."""
+    on = np.where(np.isnan(passages.on_s), -np.inf, passages.on_s)
+    off = np.where(np.isnan(passages.off_s), np.inf, passages.off_s)
+    return (on < end_s) & (off > begin_s)

@@ -1,0 +1,256 @@
+"""Effects on what the fleet is made of: desired speeds, their spread, and long vehicles."""
+
+from __future__ import annotations
+
+import copy
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from statistics import NormalDist, fmean
+from typing import ClassVar
+
+from ugat_marl.effects.base import Effect, Parameter, draw
+from ugat_marl.effects.demand import TAGS, scaled_flow
+from ugat_marl.effects.documents import (
+    DEFAULT_TYPES,
+    DEPARTING,
+    edit,
+    edit_scenario,
+    mentions,
+    with_default_types,
+)
+from ugat_marl.effects.vehicles import driven_types
+from ugat_marl.scenario import Scenario
+
+_LEAST, _GREATEST = 0.2, 2.0
+"""SUMO cuts speedFactor there unless a type says otherwise."""
+
+_HEAVY = "heavy."
+_NORMAL = re.compile(r"\s*norm(c?)\(([^)]*)\)\s*")
+_STEADY = frozenset({"bus", "emergency", "ignoring", "army", "authority"})
+_CALM = frozenset({"truck", "trailer", "coach", "delivery", "taxi"})
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """The distribution of speedFactor in a vehicle type: normal, cut at both ends."""
+
+    mean: float
+    deviation: float
+    least: float = _LEAST
+    greatest: float = _GREATEST
+
+    def write(self, item: ET.Element) -> None:
+        """Puts the distribution into a type, in SUMO's words."""
+        values = (self.mean, self.deviation, self.least, self.greatest)
+        item.attrib.pop("speedDev", None)
+        item.set("speedFactor", f"normc({','.join(f'{value:.8g}' for value in values)})")
+
+    @classmethod
+    def of(cls, item: ET.Element, general: float | None) -> Speeds:
+        """Reads a type as SUMO does.
+
+        Args:
+            item: A ``<vType>``.
+            general: SUMO's option ``default.speeddev``, if it is set.
+        """
+        mean, deviation, least, greatest = 1.0, default_deviation(item, general), _LEAST, _GREATEST
+        text = item.get("speedFactor", "")
+        if normal := _NORMAL.fullmatch(text):
+            numbers = [float(part) for part in normal[2].split(",")]
+            mean, deviation = numbers[0], numbers[1] if len(numbers) > 1 else 0.0
+            if len(numbers) > 3:
+                least, greatest = numbers[2], numbers[3]
+        elif text:
+            mean = float(text)
+        if own := item.get("speedDev"):
+            deviation = float(own)
+        return cls(mean, deviation, least, greatest)
+
+
+def default_deviation(item: ET.Element, general: float | None) -> float:
+    """The deviation of speedFactor of a type that does not say it, by its vehicle class."""
+    if general is not None and general >= 0:
+        return general
+    kind = item.get("vClass", "passenger")
+    return 0.0 if kind in _STEADY else 0.05 if kind in _CALM else 0.1
+
+
+@dataclass(frozen=True)
+class DesiredSpeed(Effect):
+    """Drivers want to be so many times as fast: speedFactor of all types and of each vehicle."""
+
+    name: ClassVar[str] = "desired_speed"
+    ranges: ClassVar[dict[str, Parameter]] = {"factor": Parameter("", 0.2, 3.0)}
+    factor: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Multiplies every speedFactor."""
+
+        def typed(old: Speeds) -> Speeds:
+            x = self.factor
+            return Speeds(old.mean * x, old.deviation * x, old.least * x, old.greatest * x)
+
+        return _with_speeds(scenario, self, typed, lambda _, value, __: value * self.factor)
+
+
+@dataclass(frozen=True)
+class SpeedSpread(Effect):
+    """The deviation of drivers' desired speeds, as a share of the limit (default 0.1)."""
+
+    name: ClassVar[str] = "speed_spread"
+    ranges: ClassVar[dict[str, Parameter]] = {"deviation": Parameter("", 0.0, 0.8)}
+    deviation: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Sets the deviation of all types; single vehicles move away from their type's mean.
+
+        A vehicle of a type without spread is given one by a hash of its id.
+        """
+
+        def typed(old: Speeds) -> Speeds:
+            return replace(old, deviation=self.deviation)
+
+        def single(name: str, value: float, old: Speeds) -> float:
+            if old.deviation > 0:
+                place = (value - old.mean) / old.deviation
+            else:
+                place = NormalDist().inv_cdf(min(max(draw(self.name, name), 1e-9), 1 - 1e-9))
+            value = old.mean + place * self.deviation
+            return min(max(value, old.least), old.greatest)
+
+        return _with_speeds(scenario, self, typed, single)
+
+
+@dataclass(frozen=True)
+class HeavyShare(Effect):
+    """This share of the passenger cars are trucks, 12 m long and slow to speed up.
+
+    A truck is in all else like the car it takes the place of, so that effects applied before
+    hold for it too. Effects on acceleration and deceleration applied after it set those of trucks.
+    """
+
+    name: ClassVar[str] = "heavy_share"
+    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    share: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Gives vehicles chosen by a hash of their ids, and a part of each flow, truck types."""
+        scenario = with_default_types(scenario)
+        over = scenario.settings.begin_s + scenario.settings.duration_s
+        cars = _cars(scenario)
+        used: dict[str, ET.Element] = {}
+
+        def heavy(item: ET.Element) -> list[ET.Element]:
+            kind = item.get("type", DEFAULT_TYPES[0])
+            if item.tag not in DEPARTING or kind not in cars:
+                return [item]
+            name = item.get("id", "")
+            truck = f"{_HEAVY}{cars[kind].get('id')}"
+            if item.tag != "flow":
+                if draw(self.name, name) < self.share:
+                    used[truck] = cars[kind]
+                    item.set("type", truck)
+                return [item]
+            used[truck] = cars[kind]
+            rest = scaled_flow(item, 1 - self.share, over)
+            part = scaled_flow(item, self.share, over)
+            if part is not None:
+                part.attrib |= {"id": f"{name}+heavy", "type": truck}
+            return [flow for flow in (rest, part) if flow is not None]
+
+        def change(root: ET.Element) -> bool:
+            parts = [heavy(item) for item in root]
+            root[:] = [item for part in parts for item in part]
+            return any(len(part) != 1 or part[0].tag in DEPARTING for part in parts)
+
+        scenario = edit_scenario(scenario, change, *TAGS, applied=str(self))
+
+        def with_trucks(root: ET.Element) -> bool:
+            present = {item.get("id") for item in root.iter("vType")}
+            trucks = [_truck(used[name], name) for name in sorted(set(used) - present)]
+            root.extend(trucks)
+            return bool(trucks)
+
+        types, *others = scenario.additional
+        return replace(scenario, additional=(*edit((types,), with_trucks, ""), *others))
+
+
+def _cars(scenario: Scenario) -> dict[str, ET.Element]:
+    """Types and distributions of passenger cars; a distribution with the first of its cars."""
+    found: dict[str, ET.Element] = {}
+    distributions: list[ET.Element] = []
+    for document in (*scenario.additional, *scenario.routes):
+        if mentions(document, "<vType"):
+            root = document.parse()
+            for item in root.iter("vType"):
+                name = item.get("id", "")
+                car = item.get("vClass", "passenger") == "passenger"
+                if car and not name.startswith(_HEAVY):
+                    found[name] = item
+            distributions += list(root.iter("vTypeDistribution"))
+    for item in distributions:
+        members = [x.get("id", "") for x in item.iter("vType")] + item.get("vTypes", "").split()
+        cars = [found[name] for name in members if name in found]
+        if cars:
+            found[item.get("id", "")] = cars[0]
+    return found
+
+
+def _truck(car: ET.Element, name: str) -> ET.Element:
+    truck = copy.deepcopy(car)
+    truck.attrib.pop("probability", None)
+    for model in truck:
+        for key in ("accel", "decel"):
+            model.attrib.pop(key, None)
+    truck.attrib |= {
+        "id": name, "length": "12", "accel": "1", "decel": "3.5", "guiShape": "truck",
+        "maxSpeed": "36.11",
+    }  # fmt: skip
+    return truck
+
+
+def _with_speeds(
+    scenario: Scenario,
+    effect: Effect,
+    typed: Callable[[Speeds], Speeds],
+    single: Callable[[str, float, Speeds], float],
+) -> Scenario:
+    """Changes the speeds of all types, and of the vehicles that have their own."""
+    scenario = with_default_types(scenario)
+    general = scenario.settings.sumo.get("default.speeddev")
+    known = _speeds(scenario, float(general) if general is not None else None)
+    usual = Speeds(1.0, 0.1)
+
+    def change(root: ET.Element) -> bool:
+        types = driven_types(root)
+        for item in types:
+            typed(known[item.get("id", "")]).write(item)
+        own = [x for x in root if x.tag in DEPARTING and "speedFactor" in x.attrib]
+        for item in own:
+            kind = known.get(item.get("type", DEFAULT_TYPES[0]), usual)
+            value = single(item.get("id", ""), float(item.get("speedFactor", "1")), kind)
+            item.set("speedFactor", f"{value:.6g}")
+        return bool(types or own)
+
+    return edit_scenario(scenario, change, "<vType", "speedFactor", applied=str(effect))
+
+
+def _speeds(scenario: Scenario, general: float | None) -> dict[str, Speeds]:
+    """Type to its speeds, and distribution of types to the mean of theirs."""
+    found: dict[str, Speeds] = {}
+    distributions: list[ET.Element] = []
+    for document in (*scenario.additional, *scenario.routes):
+        if mentions(document, "<vType"):
+            root = document.parse()
+            for item in root.iter("vType"):
+                found[item.get("id", "")] = Speeds.of(item, general)
+            distributions += list(root.iter("vTypeDistribution"))
+    for item in distributions:
+        members = [x.get("id", "") for x in item.iter("vType")] + item.get("vTypes", "").split()
+        if inner := [found[name] for name in members if name in found]:
+            found[item.get("id", "")] = Speeds(
+                fmean(x.mean for x in inner), fmean(x.deviation for x in inner)
+            )
+    return found

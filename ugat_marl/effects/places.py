@@ -1,0 +1,165 @@
+"""The places of a network that effects name: edges, lanes, traffic lights, and where they lead."""
+
+from __future__ import annotations
+
+import functools
+import heapq
+import math
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+from ugat_marl.errors import UnknownNameError
+from ugat_marl.files import parse_xml
+from ugat_marl.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class LanePlace:
+    """A lane: its edge, index, length and speed limit, and whether passenger cars may use it."""
+
+    edge: str
+    index: int
+    length_m: float
+    speed_mps: float
+    cars: bool
+
+
+@dataclass(frozen=True)
+class Places:
+    """What a network consists of, outside of its junctions.
+
+    Attributes:
+        lanes: Lanes by id.
+        edges: Edge to its lanes, from right to left.
+        following: Edge to the edges a car can go on to.
+        lights: Ids of the traffic lights.
+        ends: Lane to the traffic light it leads to.
+        begins: Lane to the traffic light it comes from.
+    """
+
+    lanes: Mapping[str, LanePlace]
+    edges: Mapping[str, tuple[str, ...]]
+    following: Mapping[str, tuple[str, ...]]
+    lights: Collection[str]
+    ends: Mapping[str, str]
+    begins: Mapping[str, str]
+
+    def check(self, effect: str, kind: str, name: str, known: Collection[str]) -> None:
+        """Refuses a place that does not exist.
+
+        Raises:
+            UnknownNameError: `name` is not among `known`.
+        """
+        if name not in known:
+            hint = f"Effect {effect!r} names it."
+            raise UnknownNameError(kind, name, known, hint)
+
+    def seconds(self, edge: str) -> float:
+        """Time to drive along an edge at its limit."""
+        lanes = [self.lanes[lane] for lane in self.edges[edge]]
+        fastest = max(lane.speed_mps for lane in lanes)
+        return lanes[0].length_m / max(fastest, 0.1)
+
+    def path(self, start: str, end: str) -> tuple[str, ...] | None:
+        """The fastest way over empty streets, both edges included; None if there is none."""
+        if start not in self.edges or end not in self.edges:
+            return None
+        return self.ways(start).get(end)
+
+    @functools.lru_cache(maxsize=4096)  # noqa: B019 - instances are few and live long
+    def ways(self, start: str) -> dict[str, tuple[str, ...]]:
+        """Every edge that can be reached from `start`, and the fastest way there."""
+        before: dict[str, str] = {}
+        best = {start: 0.0}
+        done: set[str] = set()
+        queue = [(0.0, start)]
+        while queue:
+            cost, edge = heapq.heappop(queue)
+            if edge in done:
+                continue
+            done.add(edge)
+            for other in self.following.get(edge, ()):
+                reached = cost + self.seconds(other)
+                if reached < best.get(other, math.inf):
+                    best[other], before[other] = reached, edge
+                    heapq.heappush(queue, (reached, other))
+        return {edge: _trace(before, start, edge) for edge in done}
+
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+
+def places_of(scenario: Scenario) -> Places:
+    """The places of a scenario's network.
+
+    Raises:
+        ScenarioError: The network is not well-formed.
+    """
+    return _places(scenario.network.read(), scenario.network.source)
+
+
+@functools.lru_cache(maxsize=8)
+def _places(content: bytes, source: str) -> Places:
+    root = parse_xml(content, source)
+    lanes: dict[str, LanePlace] = {}
+    edges: dict[str, tuple[str, ...]] = {}
+    for edge in root.iter("edge"):
+        if edge.get("function") in ("internal", "crossing", "walkingarea", "connector"):
+            continue
+        name = edge.get("id", "")
+        own = edge.findall("lane")
+        edges[name] = tuple(lane.get("id", "") for lane in own)
+        for index, lane in enumerate(own):
+            lanes[lane.get("id", "")] = LanePlace(
+                name,
+                index,
+                float(lane.get("length", "0")),
+                float(lane.get("speed", "0")),
+                _cars(lane),
+            )
+    following: dict[str, dict[str, None]] = defaultdict(dict)
+    lights = {item.get("id", ""): None for item in root.iter("tlLogic")}
+    ends: dict[str, str] = {}
+    begins: dict[str, str] = {}
+    for item in root.iter("connection"):
+        start, end = item.get("from", ":"), item.get("to", ":")
+        if start not in edges or end not in edges:
+            continue
+        entry = f"{start}_{item.get('fromLane')}"
+        leaving = f"{end}_{item.get('toLane')}"
+        if (entry not in lanes or lanes[entry].cars) and (
+            leaving not in lanes or lanes[leaving].cars
+        ):
+            following[start][end] = None
+        if light := item.get("tl"):
+            lights[light] = None
+            ends.setdefault(entry, light)
+            begins.setdefault(leaving, light)
+    return Places(
+        lanes,
+        edges,
+        {edge: tuple(found) for edge, found in following.items()},
+        tuple(lights),
+        ends,
+        begins,
+    )
+
+
+def _cars(lane: ET.Element) -> bool:
+    allowed, forbidden = lane.get("allow"), lane.get("disallow", "")
+    if allowed is not None:
+        return bool({"passenger", "all"} & set(allowed.split()))
+    return not {"passenger", "all"} & set(forbidden.split())
+
+
+def _trace(before: Mapping[str, str], start: str, edge: str) -> tuple[str, ...]:
+    found = [edge]
+    while edge != start:
+        edge = before[edge]
+        found.append(edge)
+    return tuple(reversed(found))

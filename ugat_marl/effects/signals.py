@@ -1,0 +1,151 @@
+"""Effects on traffic lights: traffic that starts late, and other clearance times."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text
+from ugat_marl.effects.documents import edit, seconds_text
+from ugat_marl.effects.places import places_of
+from ugat_marl.errors import ScenarioError
+from ugat_marl.scenario import Scenario
+from ugat_marl.scenario_settings import seconds_of, validated
+from ugat_marl.signals import LateGreen as Held
+from ugat_marl.signals import with_late_green
+
+
+@dataclass(frozen=True)
+class LateGreen(Effect):
+    """Every link that turns green stays red for so long first: start-up lost time, in s.
+
+    Controllers are blind to it: what they command and observe is the green. It is a setting of the
+    scenario, `late_green_s`, which the environment keeps in what it sends to SUMO.
+    """
+
+    name: ClassVar[str] = "late_green"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 30.0)}
+    texts: ClassVar[dict[str, Text]] = {"place": Text("traffic light", everywhere=True)}
+    place: str
+    seconds: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Sets the late green of one traffic light, or of all of them.
+
+        Raises:
+            UnknownNameError: No such traffic light.
+        """
+        settings = scenario.settings.model_dump()
+        own = {tls: dict(item) for tls, item in settings["intersections"].items()}
+        if self.place == EVERYWHERE:
+            settings["control"] = {**settings["control"], "late_green_s": self.seconds}
+            for item in own.values():
+                item.pop("late_green_s", None)
+        else:
+            places = places_of(scenario)
+            places.check(self.name, "traffic light", self.place, places.lights)
+            own[self.place] = {**own.get(self.place, {}), "late_green_s": self.seconds}
+        settings["intersections"] = {tls: item for tls, item in own.items() if item}
+        return replace(
+            scenario,
+            settings=validated(settings, f"scenario {scenario.id!r}"),
+            applied=(*scenario.applied, str(self)),
+        )
+
+
+@dataclass(frozen=True)
+class YellowTime(Effect):
+    """The yellow of all signals the agents control lasts so many s, in whole steps."""
+
+    name: ClassVar[str] = "yellow_time"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 20.0)}
+    seconds: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Sets `control.yellow_s`."""
+        return _with_control(scenario, self, "yellow_s", self.seconds)
+
+
+@dataclass(frozen=True)
+class AllRedTime(Effect):
+    """The all-red of all signals the agents control lasts so many s, in whole steps."""
+
+    name: ClassVar[str] = "all_red_time"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 20.0)}
+    seconds: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Sets `control.all_red_s`."""
+        return _with_control(scenario, self, "all_red_s", self.seconds)
+
+
+def late_greens(scenario: Scenario) -> dict[str, float]:
+    """Traffic light to its late green in s, those in time left out."""
+    general = scenario.control.late_green_s
+    own = scenario.settings.intersections
+    if not general and not own:
+        return {}
+    found = dict.fromkeys(places_of(scenario).lights, general) if general else {}
+    found |= {tls: x.late_green_s for tls, x in own.items() if x.late_green_s is not None}
+    return {tls: seconds for tls, seconds in found.items() if seconds > 0}
+
+
+def with_late_programmes(scenario: Scenario) -> Scenario:
+    """The scenario with late green in the programmes SUMO runs by itself, for the simulator only.
+
+    Phases that agents choose from are read from the scenario as it was. A programme knows only
+    whole steps, and the same ones in each cycle: the late green is rounded to them.
+
+    Raises:
+        ScenarioError: A programme jumps between its phases, so that none of them can be split.
+    """
+    late = late_greens(scenario)
+    if not late:
+        return scenario
+    step = scenario.settings.step_length_s
+
+    def change(root: ET.Element) -> bool:
+        logics = [item for item in root.iter("tlLogic") if item.get("id") in late]
+        for item in logics:
+            seconds = round(late[item.get("id", "")] / step) * step
+            _delay(item, seconds, step, scenario.id)
+        return bool(logics)
+
+    return replace(
+        scenario,
+        network=edit((scenario.network,), change, "<tlLogic")[0],
+        additional=edit(scenario.additional, change, "<tlLogic"),
+    )
+
+
+def _with_control(scenario: Scenario, effect: Effect, key: str, seconds: float) -> Scenario:
+    step = scenario.settings.step_length_s
+    changed = scenario.with_control(**{key: round(seconds / step) * step})
+    return replace(changed, applied=(*scenario.applied, str(effect)))
+
+
+def _delay(logic: ET.Element, late_s: float, step_s: float, scenario: str) -> None:
+    """Splits every phase of a programme in which something turns green."""
+    phases = logic.findall("phase")
+    if late_s <= 0 or not phases:
+        return
+    if any("next" in phase.attrib for phase in phases):
+        raise ScenarioError(
+            f"scenario {scenario!r}: late green in the programme of traffic light "
+            f"{logic.get('id')!r}, whose phases name their successors (next=...), is not possible"
+        )
+    cycle = [(seconds_of(item.get("duration", "0")), item.get("state", "")) for item in phases]
+    held, _ = with_late_green(cycle, late_s, step_s, Held.after(cycle[-1][1]))
+    for phase, segment in zip(phases, cycle, strict=True):
+        held, shown = with_late_green([segment], late_s, step_s, held)
+        place = list(logic).index(phase)
+        for extra, (seconds, state) in enumerate(shown[:-1]):
+            attributes = {"duration": seconds_text(seconds), "state": state}
+            logic.insert(place + extra, ET.Element("phase", attributes))
+        lost = sum(seconds for seconds, _ in shown[:-1])
+        phase.set("state", shown[-1][1] if shown else segment[1])
+        for key in ("duration", "minDur", "maxDur"):
+            if key in phase.attrib:
+                left = max(seconds_of(phase.get(key, "0")) - lost, step_s)
+                phase.set(key, seconds_text(left))

@@ -1,0 +1,166 @@
+"""The effect that vehicles turn otherwise at one place."""
+
+from __future__ import annotations
+
+import copy
+import xml.etree.ElementTree as ET
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from typing import ClassVar
+
+from ugat_marl.effects.base import Effect, Parameter, Text, draw
+from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
+from ugat_marl.effects.documents import DEPARTING, edit_scenario, mentions, sort_departures
+from ugat_marl.effects.places import Places, places_of
+from ugat_marl.errors import UnknownNameError
+from ugat_marl.scenario import Scenario
+
+Way = tuple[str, ...]
+
+_ENDS = ("arrivalLane", "arrivalPos", "arrivalEdge", "arrivalPosLat", "arrivalSpeed")
+
+
+@dataclass(frozen=True)
+class Turning(Effect):
+    """This share of the vehicles that leave an edge otherwise now take `to_edge`.
+
+    From there they go on like vehicles that already do so; where nobody did, along the fastest way
+    out of the network. Trips are given the fastest way over empty streets first.
+    """
+
+    name: ClassVar[str] = "turning"
+    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    texts: ClassVar[dict[str, Text]] = {"from_edge": Text("edge"), "to_edge": Text("edge")}
+    from_edge: str
+    to_edge: str
+    share: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Changes the routes of vehicles, trips and flows.
+
+        Raises:
+            UnknownNameError: No such edge, or no way from the one to the other.
+        """
+        places = places_of(scenario)
+        places.check(self.name, "edge", self.from_edge, places.edges)
+        places.check(self.name, "edge", self.to_edge, places.edges)
+        ahead = places.following.get(self.from_edge, ())
+        if self.to_edge not in ahead:
+            raise UnknownNameError(
+                f"edge behind {self.from_edge!r}:", self.to_edge, ahead,
+                f"Effect {self.name!r} names it.",
+            )  # fmt: skip
+        routes = Routes.of(scenario)
+
+        def way(item: ET.Element) -> Way:
+            return routes.edges_of(item) or _fastest(item, places)
+
+        tails = self._tails(scenario, way, places)
+        over = scenario.settings.begin_s + scenario.settings.duration_s
+
+        def change(root: ET.Element) -> bool:
+            children: list[ET.Element] = []
+            for item in root:
+                children += self._turned(item, way, tails, over)
+            changed = len(children) != len(root) or any(
+                a is not b for a, b in zip(children, root, strict=True)
+            )
+            if changed:
+                root[:] = children
+                sort_departures(root)
+            return changed
+
+        return edit_scenario(scenario, change, *TAGS, applied=str(self))
+
+    def _tails(
+        self, scenario: Scenario, way: Callable[[ET.Element], Way], places: Places
+    ) -> Counter[Way]:
+        """How vehicles that take the turn today go on, and how many do."""
+        found: Counter[Way] = Counter()
+        for document in (*scenario.additional, *scenario.routes):
+            if not mentions(document, *TAGS):
+                continue
+            for item in document.parse():
+                edges = way(item) if item.tag in DEPARTING else ()
+                for index, pair in enumerate(pairwise(edges)):
+                    if pair == (self.from_edge, self.to_edge):
+                        found[edges[index + 1 :]] += 1
+                        break
+        return found or Counter({_way_out(self.to_edge, places): 1})
+
+    def _turned(
+        self,
+        item: ET.Element,
+        way: Callable[[ET.Element], Way],
+        tails: Counter[Way],
+        over_s: float,
+    ) -> list[ET.Element]:
+        """What stands for one element of a route file afterwards."""
+        if item.tag not in DEPARTING:
+            return [item]
+        edges = way(item)
+        place = next((n for n, edge in enumerate(edges[:-1]) if edge == self.from_edge), None)
+        if place is None or edges[place + 1] == self.to_edge:
+            return [item]
+        name = item.get("id", "")
+        salt = f"{self.name} {self.from_edge} {self.to_edge}"
+        if item.tag != "flow":
+            if draw(salt, name) >= self.share:
+                return [item]
+            return [_with_route(item, (*edges[: place + 1], *_drawn(tails, salt, name)))]
+        parts = [scaled_flow(item, 1 - self.share, over_s)]
+        turned = scaled_flow(item, self.share, over_s)
+        total = sum(tails.values())
+        for number, (tail, count) in enumerate(sorted(tails.items())):
+            part = scaled_flow(turned, count / total, over_s) if turned is not None else None
+            if part is not None:
+                part.set("id", f"{name}+turning{number or ''}")
+                part = _with_route(part, (*edges[: place + 1], *tail))
+            parts.append(part)
+        return [part for part in parts if part is not None]
+
+
+def _drawn(tails: Counter[Way], salt: str, name: str) -> Way:
+    """One of the ways on, as often as vehicles took it."""
+    ways = sorted(tails)
+    bounds = list(accumulate(tails[way] for way in ways))
+    return ways[bisect_right(bounds, draw(salt, "way", name) * bounds[-1])]
+
+
+def _fastest(item: ET.Element, places: Places) -> Way:
+    """The way of a trip over empty streets; none if it does not say where from and to."""
+    stations = [item.get("from", ""), *item.get("via", "").split(), item.get("to", "")]
+    if not stations[0] or not stations[-1]:
+        return ()
+    found: list[str] = [stations[0]]
+    for start, end in pairwise(stations):
+        part = places.path(start, end)
+        if part is None:
+            return ()
+        found += part[1:]
+    return tuple(found)
+
+
+def _way_out(start: str, places: Places) -> Way:
+    """The fastest way to an edge from which no other can be reached."""
+    ways = [way for way in places.ways(start).values() if not places.following.get(way[-1])]
+    return min(ways, key=lambda way: sum(map(places.seconds, way)), default=(start,))
+
+
+def _with_route(item: ET.Element, edges: Way) -> ET.Element:
+    """The same vehicle or flow on another route; stops elsewhere are left out."""
+    made = copy.deepcopy(item)
+    if made.tag == "trip":
+        made.tag = "vehicle"
+    for key in ("route", "from", "to", "via", *_ENDS):
+        made.attrib.pop(key, None)
+    for child in list(made):
+        lane = child.get("lane", "").rpartition("_")[0]
+        if child.tag == "route" or (child.tag == "stop" and lane not in edges):
+            made.remove(child)
+    route = ET.Element("route", {"edges": " ".join(edges)})
+    made.insert(0, route)
+    return made
