@@ -21,8 +21,6 @@ from ugat_marl.scenario import Scenario
 
 TOLERANCE_M = 0.1
 """How far a zone may reach beyond its lane: networks give lengths to the centimetre."""
-SHORT_S = 300.0
-"""A shorter period holds too few signal cycles to judge anything."""
 
 
 def periods_of(path: Path, frame: pl.DataFrame, scenario: Scenario) -> tuple[Period, ...]:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
+import sys
+import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -186,14 +190,19 @@ def _check_columns(path: Path, table: Table, given: list[str], found: list[Findi
             near = nearest(name, unknown)
             guess = f" (is it {near!r}?)" if near else ""
             raise MeasuredDataError(
-                f"{path}: no column {name!r}{guess}; it has {', '.join(given) or 'none'}, and "
-                f"needs {', '.join(table.columns)}"
+                f"{path}: no column {name!r}{guess}; it has {_listed(given)}, and needs "
+                f"{', '.join(table.columns)}"
             )
     for name in unknown:
         missing = [column for column in table.optional if column not in given]
         near = nearest(name, missing)
         guess = f"; if it means {near!r}, rename it" if near else ""
         found.append(Finding(f"{path.name}: column {name!r} is not read{guess}"))
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(name.split("\n")[0][:30] for name in names[:12])
+    return shown + (" ..." if len(names) > 12 else "")
 
 
 def _read_parquet(path: Path) -> pl.DataFrame:
@@ -206,11 +215,35 @@ def _read_parquet(path: Path) -> pl.DataFrame:
             "copy it again"
         )
     try:
-        return pl.read_parquet(io.BytesIO(content))
+        with _quietly():
+            return pl.read_parquet(io.BytesIO(content))
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         raise MeasuredDataError(
             f"{path}: damaged Parquet file ({_first_line(error)}); copy or export it again"
         ) from None
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Keeps a block that fails from writing to standard error.
+
+    Threads of polars print their own stack traces there before Python learns of the error.
+    """
+    sys.stderr.flush()
+    try:
+        kept = os.dup(2)
+    except OSError:  # no standard error at all
+        yield
+        return
+    with tempfile.TemporaryFile() as said:
+        try:
+            os.dup2(said.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        said.seek(0)
+        os.write(2, said.read())
 
 
 def _read_csv(path: Path, found: list[Finding]) -> pl.DataFrame:
