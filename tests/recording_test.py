@@ -10,10 +10,14 @@ import numpy as np
 import polars as pl
 import pytest
 
+from ugat_marl.__main__ import main
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import policy_factory
 from ugat_marl.measured.data import Measured
+from ugat_marl.measured.reading import read_measured
+from ugat_marl.measured.writing import write_measured
+from ugat_marl.network import Network
 from ugat_marl.recording import record
 
 Crossing = Callable[..., Path]
@@ -135,6 +139,35 @@ def test_an_effect_shows_in_what_is_measured(crossing: Crossing) -> None:
     assert after.speed_mps.mean() < before.speed_mps.mean() - 1
 
 
+def test_controllers_log_the_green_they_command_though_traffic_starts_late(data: Path) -> None:
+    in_time = measure(data / "crossing", same_demand=True).periods[0]
+    late = measure(data / "crossing", "late_green=*,4", same_demand=True).periods[0]
+    assert late.signals == in_time.signals
+    before, after = (item.passages["exit:C_E_0"] for item in (in_time, late))
+    assert after.on_s[0] == pytest.approx(before.on_s[0] + 4, abs=1)
+    own = measure(data / "crossing", "late_green=*,4", "programme", same_demand=True).periods[0]
+    assert own.signals["C"][:2] == ((0.0, "Gr"), (40.0, "rG"))
+
+
+def test_effects_on_detectors_show_in_what_is_measured(data: Path) -> None:
+    true = measure(data / "crossing", same_demand=True).periods[0].passages
+    shifted = measure(data / "crossing", "signal_clock=C,3", same_demand=True).periods[0].passages
+    assert shifted["advance:S_C_0"].on_s == pytest.approx(true["advance:S_C_0"].on_s + 3)
+    swapped = "swapped=advance:S_C_0,advance:W_C_0"
+    seen = measure(data / "crossing", swapped, same_demand=True).periods[0].passages
+    assert (seen["advance:S_C_0"].on_s == true["advance:W_C_0"].on_s).all()
+
+
+def test_no_vehicle_comes_on_two_days(data: Path) -> None:
+    # Effects choose vehicles by name; the trucks of one day are not those of the next.
+    days = measure(data / "crossing", periods=2, trajectories=True).trajectories
+    assert days is not None
+    one, two = (set(day["vehicle_id"]) for day in days.partition_by("period_id"))
+    assert one
+    assert two
+    assert not one & two
+
+
 def test_another_scenario_can_be_the_world(crossing: Crossing) -> None:
     own = crossing()
     other = crossing(edit=lambda text: text.replace('speed="10', 'speed="5'))
@@ -165,3 +198,29 @@ def test_detectors_may_measure_no_speeds(data: Path) -> None:
 def test_impossible_requests_are_refused(data: Path, wrong: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match="must"):
         measure(data / "crossing", **wrong)
+
+
+def test_what_is_written_is_read_again(data: Path, tmp_path: Path) -> None:
+    scenario = load(data / "crossing")
+    found = measure(data / "crossing", periods=3, lanes=True, trajectories=True)
+    write_measured(found, tmp_path / "measured")
+    again = read_measured(tmp_path / "measured", scenario, Network.read(scenario))
+    assert [(p.id, p.split, p.signals) for p in again.periods] == [
+        (p.id, p.split, dict(p.signals)) for p in found.periods
+    ]
+    for period, before in zip(again.periods, found.periods, strict=True):
+        assert {k: len(v) for k, v in period.passages.items()} == {
+            k: len(v) for k, v in before.passages.items()
+        }
+
+
+def test_the_command_writes_a_directory(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "measured"
+    call = ["record", str(data / "crossing"), "--periods", "2", "--no-speeds", "--out", str(out)]
+    assert main(call) == 0
+    assert "over 6 detectors in 2 period(s)" in capsys.readouterr().out
+    assert {"periods.csv", "detectors.csv", "signals.parquet", "detections.parquet"} == {
+        path.name for path in out.iterdir()
+    }

@@ -27,6 +27,8 @@ import polars as pl
 
 from ugat_marl import signals
 from ugat_marl.effects import Domain, Effect, apply_effects, in_domain, parse_domain
+from ugat_marl.effects.detectors import observed, owners
+from ugat_marl.effects.documents import sort_departures
 from ugat_marl.errors import OptionError, SimulatorError
 from ugat_marl.evaluation import PolicyFactory
 from ugat_marl.files import parse_xml, xml_bytes
@@ -46,9 +48,12 @@ from ugat_marl.progress import Advance, Reporter, Silent
 from ugat_marl.redraw import explicit, redrawn, sumo_program
 from ugat_marl.rollout import roll_out, until
 from ugat_marl.scenario import Document, Scenario
-from ugat_marl.seeding import derive_seed
+from ugat_marl.seeding import derive_seed, numpy_generator
 from ugat_marl.simulator import launch_of
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
+
+PARKED = b"parking."
+"""How the ids of vehicles begin that the effect `parking` adds."""
 
 HALTING_MPS = 0.1
 """Below this speed SUMO calls a vehicle halting."""
@@ -205,7 +210,10 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
     scenario = street.base
     if not street.same_demand:
         scenario = redrawn(scenario, derive_seed(street.seed, "record", index, "demand"))
+        scenario = _renamed(scenario, derive_seed(street.seed, "record", index, "names"))
     scenario = apply_effects(scenario, street.effects)
+    if not street.same_demand:
+        scenario = _parked_later(scenario, derive_seed(street.seed, "record", index, "parking"))
     begin = scenario.settings.begin_s
     end = begin + scenario.decisions * scenario.control.decision_interval_s
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
@@ -227,10 +235,48 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
         {**street.programmes, **shown, **commanded},
         passages if street.speeds else {k: _without_speed(v) for k, v in passages.items()},
     )
+    owner = owners(street.base, street.detectors)
+    period = observed(period, street.effects, street.detectors, owner)
     lanes = None
     if vehicles is not None and street.lanes:
         lanes = _per_lane(vehicles, street.detectors, period)
     return _Day(period, lanes, vehicles if street.trajectories else None)
+
+
+def _renamed(scenario: Scenario, seed: int) -> Scenario:
+    """Other names for the vehicles of a day that was drawn again.
+
+    Effects choose vehicles by their names; on a street the trucks of two days are not the same
+    ones, and no model knows which they are.
+    """
+
+    def renamed(document: Document) -> Document:
+        content = document.read()
+        for quote in (b'"', b"'"):
+            start = b"<vehicle id=" + quote
+            content = content.replace(start, start + b"%08x." % seed)
+        return document.edited(content)
+
+    return replace(scenario, routes=tuple(map(renamed, scenario.routes)))
+
+
+def _parked_later(scenario: Scenario, seed: int) -> Scenario:
+    """Vehicles that park do so at other times every day: their times are turned about the day."""
+    begin, duration = scenario.settings.begin_s, scenario.settings.duration_s
+    shift = numpy_generator(seed).uniform(0, duration)
+
+    def later(document: Document) -> Document:
+        if PARKED not in document.read():
+            return document
+        root = document.parse()
+        parked = [x for x in root.iter("vehicle") if x.get("id", "").startswith(PARKED.decode())]
+        for item in parked:
+            time = (float(item.get("depart", "0")) - begin + shift) % duration
+            item.set("depart", f"{begin + time:.2f}")
+        sort_departures(root)
+        return document.edited(xml_bytes(root))
+
+    return replace(scenario, routes=tuple(map(later, scenario.routes)))
 
 
 def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scenario:
