@@ -84,6 +84,10 @@ class MeasurementError(UgatMarlError):
     """A measured process of a bench failed, or did other work than what it is compared with."""
 
 
+class BlindTestError(UgatMarlError):
+    """A blind test's plan, labels or grades are missing or damaged, or cannot be drawn."""
+
+
 class CheckpointError(UgatMarlError):
     """A checkpoint cannot be read, holds impossible numbers, or belongs to something else."""
 
