@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -13,14 +14,18 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.signals import (
     GREEN,
+    LateGreen,
     Segment,
     SignalState,
     SignalTiming,
     advance,
     check_phases,
+    delayed_log,
     free_to_change,
     initial_state,
     red_between,
+    with_late_green,
+    with_late_greens,
     yellow_between,
 )
 
@@ -280,3 +285,85 @@ def test_phases_that_cannot_be_shown_are_refused(phases: tuple[str, ...], messag
 def test_good_phases_pass() -> None:
     check_phases(PHASES, 4, "here")
     check_phases(("Gs", "gr"), 2, "here")
+
+
+# --- late green
+
+
+def test_late_green_by_hand() -> None:
+    before = LateGreen.after("GGrr")
+    commanded = [(3.0, "yyrr"), (2.0, "rrrr"), (5.0, "rrGG")]
+    after, shown = with_late_green(commanded, 2, 1, before)
+    assert shown == [(3, "yyrr"), (4, "rrrr"), (3, "rrGG")]
+    assert after.commanded == after.shown == "rrGG"
+    # The link green in both phases loses nothing; the other one its two seconds.
+    _, shown = with_late_green([(3, "rryG"), (2, "rrrG"), (5, "GrrG")], 2, 1, after)
+    assert shown == [(3, "rryG"), (4, "rrrG"), (3, "GrrG")]
+
+
+def test_a_green_shorter_than_its_delay_is_not_shown_nor_its_yellow() -> None:
+    for green in (2.0, 3.0):
+        state, shown = with_late_green(
+            [(green, "Gr"), (3, "yr"), (5, "rG")], 3, 1, LateGreen.after("rr")
+        )
+        assert shown == [(green + 6, "rr"), (2, "rG")]
+        assert with_late_green([(9, "Gr")], 3, 1, state)[1] == [(3, "rr"), (6, "Gr")]
+
+
+def test_half_a_second_is_given_to_every_other_green() -> None:
+    state, lost = LateGreen.after("G"), []
+    for _ in range(6):
+        state, shown = with_late_green([(10, "r"), (10, "G")], 1.5, 1, state)
+        lost.append(shown[0][0] - 10)
+    assert lost == [1, 2, 1, 2, 1, 2]
+
+
+@given(st.data(), phase_lists, timings, halves.filter(lambda s: s < 8))
+def test_late_green_takes_greens_away_and_nothing_else(
+    data: st.DataObject, phases: tuple[str, ...], timing: SignalTiming, late: float
+) -> None:
+    """Seconds are conserved, an interval may be split, and only the start of a green is missing."""
+    state, held, whole = initial_state(timing), LateGreen.after(phases[0]), []
+    commanded: list[str] = []
+    shown: list[str] = []
+    for _ in range(data.draw(st.integers(1, 6))):
+        requested = data.draw(st.integers(0, len(phases) - 1))
+        interval = data.draw(st.integers(1, 40).map(lambda n: n / 2))
+        state, plan = advance(phases, state, requested, interval, timing)
+        held, part = with_late_green(plan, late, 0.5, held)
+        whole += plan
+        commanded += by_half_second(plan)
+        shown += by_half_second(part)
+    assert len(shown) == len(commanded)
+    assert by_half_second(with_late_green(whole, late, 0.5, LateGreen.after(phases[0]))[1]) == shown
+    for link in range(LINKS):
+        ago = math.inf
+        for second, (asked, seen) in enumerate(zip(commanded, shown, strict=True)):
+            before = commanded[second - 1][link] if second else phases[0][link]
+            if asked[link] in GREEN and before not in GREEN:
+                ago = 0
+            if asked[link] in GREEN:
+                assert seen[link] == (asked[link] if ago >= 2 * late else seen[link])
+                assert (seen[link] in GREEN) == (ago >= 2 * late)
+                ago += 1
+            elif asked[link] != "y":
+                assert seen[link] == asked[link]
+
+
+def test_no_late_green_changes_nothing() -> None:
+    plans = {"A": [(3.0, "yr"), (7.0, "rG")], "B": [(10.0, "Gr")]}
+    assert with_late_greens(plans, {}, 1, {}) == plans
+    held = {"A": LateGreen.after("Gr"), "B": LateGreen.after("rG")}
+    shown = with_late_greens(plans, {"A": 2.0}, 1, held)
+    assert shown == {"A": [(3, "yr"), (2, "rr"), (5, "rG")], "B": plans["B"]}
+    assert held["A"].shown == "rG"
+
+
+def test_a_log_of_a_street_can_be_late() -> None:
+    log = ((0.0, "Gr"), (30.0, "yr"), (33.0, "rG"), (34.0, "ry"), (37.0, "Gr"))
+    assert delayed_log(log, 2, 1) == (
+        (0.0, "Gr"), (30.0, "yr"), (33.0, "rr"), (39.0, "Gr"),
+    )  # fmt: skip
+    assert delayed_log(log, 0, 1) == log
+    assert delayed_log(log[:1], 2, 1) == log[:1]
+    assert delayed_log((), 2, 1) == ()

@@ -18,6 +18,7 @@ from ugat_marl.effects.detectors import (
     owners,
 )
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
+from ugat_marl.effects.roads import LaneClosure, LocalSpeed, Parking
 from ugat_marl.effects.settings import (
     ALIASES,
     SETTINGS,
@@ -71,10 +72,13 @@ __all__ = [
     "Headway",
     "HeavyShare",
     "Imperfection",
+    "LaneClosure",
     "LaneDiscipline",
     "LateGreen",
+    "LocalSpeed",
     "MinGap",
     "Parameter",
+    "Parking",
     "ReactionStep",
     "RedRunning",
     "SignalClock",

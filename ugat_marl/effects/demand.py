@@ -16,9 +16,9 @@ from typing import ClassVar
 
 from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text, draw
 from ugat_marl.effects.documents import (
-    DEPARTING,
     depart_s,
     edit_scenario,
+    is_demand,
     mentions,
     seconds_text,
     sort_departures,
@@ -200,7 +200,7 @@ def replace_departing(
         children: list[ET.Element] = []
         found = False
         for item in root:
-            if item.tag in DEPARTING and (edge == EVERYWHERE or routes.origin(item) == edge):
+            if is_demand(item) and (edge == EVERYWHERE or routes.origin(item) == edge):
                 found = True
                 children += becomes(item)
             else:

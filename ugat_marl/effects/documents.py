@@ -20,6 +20,9 @@ DEFAULT_TYPES = (
 """Types SUMO defines itself. Only the first is used without being named."""
 
 DEPARTING = frozenset({"vehicle", "trip", "flow"})
+BLOCKERS = ("closure.", "parking.")
+"""How the ids of vehicles begin that stand on the street and are no part of the demand."""
+
 _SORTED = DEPARTING | {"person", "personFlow", "container", "containerFlow"}
 
 Root = ET.Element
@@ -94,6 +97,11 @@ def with_default_types(scenario: Scenario) -> Scenario:
                 ET.SubElement(root, "vType", attributes)
     document = Document(DEFAULTS_FILE, None, xml_bytes(root))
     return replace(scenario, additional=(document, *scenario.additional))
+
+
+def is_demand(item: Root) -> bool:
+    """Whether an element is a vehicle, trip or flow that wants to get somewhere."""
+    return item.tag in DEPARTING and not item.get("id", "").startswith(BLOCKERS)
 
 
 def depart_s(item: Root) -> float:

@@ -14,9 +14,9 @@ from ugat_marl.effects.base import Effect, Parameter, draw
 from ugat_marl.effects.demand import TAGS, scaled_flow
 from ugat_marl.effects.documents import (
     DEFAULT_TYPES,
-    DEPARTING,
     edit,
     edit_scenario,
+    is_demand,
     mentions,
     with_default_types,
 )
@@ -144,7 +144,7 @@ class HeavyShare(Effect):
 
         def heavy(item: ET.Element) -> list[ET.Element]:
             kind = item.get("type", DEFAULT_TYPES[0])
-            if item.tag not in DEPARTING or kind not in cars:
+            if not is_demand(item) or kind not in cars:
                 return [item]
             name = item.get("id", "")
             truck = f"{_HEAVY}{cars[kind].get('id')}"
@@ -163,7 +163,7 @@ class HeavyShare(Effect):
         def change(root: ET.Element) -> bool:
             parts = [heavy(item) for item in root]
             root[:] = [item for part in parts for item in part]
-            return any(len(part) != 1 or part[0].tag in DEPARTING for part in parts)
+            return any(len(part) != 1 or is_demand(part[0]) for part in parts)
 
         scenario = edit_scenario(scenario, change, *TAGS, applied=str(self))
 
@@ -227,7 +227,7 @@ def _with_speeds(
         types = driven_types(root)
         for item in types:
             typed(known[item.get("id", "")]).write(item)
-        own = [x for x in root if x.tag in DEPARTING and "speedFactor" in x.attrib]
+        own = [x for x in root if is_demand(x) and "speedFactor" in x.attrib]
         for item in own:
             kind = known.get(item.get("type", DEFAULT_TYPES[0]), usual)
             value = single(item.get("id", ""), float(item.get("speedFactor", "1")), kind)

@@ -18,6 +18,7 @@ from ugat_marl.effects.detectors import (
     Undercount,
 )
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
+from ugat_marl.effects.roads import LaneClosure, LocalSpeed, Parking
 from ugat_marl.effects.signals import AllRedTime, LateGreen, YellowTime
 from ugat_marl.effects.turning import Turning
 from ugat_marl.effects.vehicles import (
@@ -76,6 +77,7 @@ _EFFECTS: dict[str, type[Effect]] = {
         GapAcceptance, LaneDiscipline, HeavyShare, DriverModel,
         LateGreen, YellowTime, AllRedTime,
         DemandLevel, DemandSurge, DemandTiming, Turning,
+        LaneClosure, Parking, LocalSpeed,
         Undercount, SignalClock, ClockDrift, Stuck, Dropout, Swapped,
     )
 }  # fmt: skip

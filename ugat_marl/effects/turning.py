@@ -13,7 +13,7 @@ from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, Parameter, Text, draw
 from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
-from ugat_marl.effects.documents import DEPARTING, edit_scenario, mentions, sort_departures
+from ugat_marl.effects.documents import edit_scenario, is_demand, mentions, sort_departures
 from ugat_marl.effects.places import Places, places_of
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenario import Scenario
@@ -84,7 +84,7 @@ class Turning(Effect):
             if not mentions(document, *TAGS):
                 continue
             for item in document.parse():
-                edges = way(item) if item.tag in DEPARTING else ()
+                edges = way(item) if is_demand(item) else ()
                 for index, pair in enumerate(pairwise(edges)):
                     if pair == (self.from_edge, self.to_edge):
                         found[edges[index + 1 :]] += 1
@@ -99,7 +99,7 @@ class Turning(Effect):
         over_s: float,
     ) -> list[ET.Element]:
         """What stands for one element of a route file afterwards."""
-        if item.tag not in DEPARTING:
+        if not is_demand(item):
             return [item]
         edges = way(item)
         place = next((n for n, edge in enumerate(edges[:-1]) if edge == self.from_edge), None)

@@ -1,0 +1,177 @@
+"""Effects on roads: lanes closed or blocked for a while, and other speeds along an edge.
+
+A closed lane is a vehicle that stands on it. It has a short type and a file of its own, so that
+departures stay in order; effects on the demand pass it over.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, count
+from typing import ClassVar
+
+from ugat_marl.effects.base import Effect, Parameter, Text, draw
+from ugat_marl.effects.documents import seconds_text
+from ugat_marl.effects.places import places_of
+from ugat_marl.errors import OptionError
+from ugat_marl.files import xml_bytes
+from ugat_marl.scenario import Document, Scenario
+
+_LENGTH_M = 5.0
+_TIME = Parameter("s", 0.0, 1e7)
+
+
+@dataclass(frozen=True)
+class LaneClosure(Effect):
+    """Nobody passes the middle of a lane during a while, as after an accident."""
+
+    name: ClassVar[str] = "lane_closure"
+    ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
+    texts: ClassVar[dict[str, Text]] = {"lane": Text("lane")}
+    lane: str
+    begin_s: float
+    end_s: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Adds a vehicle that stands in the middle of the lane.
+
+        Raises:
+            UnknownNameError: No such lane.
+            OptionError: The lane is too short to stand on.
+        """
+        begin = max(self.begin_s, scenario.settings.begin_s)
+        if begin >= self.end_s:
+            return replace(scenario, applied=(*scenario.applied, str(self)))
+        stand = {"until": seconds_text(self.end_s)}
+        return _with_blockers(scenario, self, self.lane, [begin], stand)
+
+
+@dataclass(frozen=True)
+class Parking(Effect):
+    """Vehicles stop in the middle of a lane, so many in an hour, for `dwell_s` each."""
+
+    name: ClassVar[str] = "parking"
+    ranges: ClassVar[dict[str, Parameter]] = {
+        "per_hour": Parameter("1/h", 0.0, 240.0),
+        "dwell_s": Parameter("s", 1.0, 3600.0),
+    }
+    texts: ClassVar[dict[str, Text]] = {"lane": Text("lane")}
+    lane: str
+    per_hour: float
+    dwell_s: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Adds one vehicle in each interval of an hour over `per_hour`, at a time set by a hash.
+
+        Raises:
+            UnknownNameError: No such lane.
+            OptionError: The lane is too short to stand on.
+        """
+        settings = scenario.settings
+        number = round(self.per_hour * settings.duration_s / 3600.0)
+        parts = [(n + draw(self.name, self.lane, str(n))) / number for n in range(number)]
+        departs = [settings.begin_s + part * settings.duration_s for part in parts]
+        stand = {"duration": seconds_text(self.dwell_s)}
+        return _with_blockers(scenario, self, self.lane, departs, stand)
+
+
+@dataclass(frozen=True)
+class LocalSpeed(Effect):
+    """Traffic on an edge is so many times as fast: its limit, by a sign that all obey."""
+
+    name: ClassVar[str] = "local_speed"
+    ranges: ClassVar[dict[str, Parameter]] = {"factor": Parameter("", 0.1, 3.0)}
+    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge")}
+    edge: str
+    factor: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Adds a sign with a variable speed to the edge's lanes, or changes the one there is.
+
+        Raises:
+            UnknownNameError: No such edge.
+        """
+        places = places_of(scenario)
+        places.check(self.name, "edge", self.edge, places.edges)
+        file = re.sub(r"[^\w.#-]", "_", f"local-speed.{self.edge}.add.xml")
+        before = [item for item in scenario.additional if item.name == file]
+        if before:
+            root = before[0].parse()
+            for step in root.iter("step"):
+                step.set("speed", f"{float(step.get('speed', '0')) * self.factor:.6g}")
+        else:
+            root = ET.Element("additional")
+            for lane in places.edges[self.edge]:
+                sign = ET.SubElement(
+                    root, "variableSpeedSign", {"id": f"local_speed.{lane}", "lanes": lane}
+                )
+                speed = places.lanes[lane].speed_mps * self.factor
+                begin = seconds_text(scenario.settings.begin_s)
+                ET.SubElement(sign, "step", {"time": begin, "speed": f"{speed:.6g}"})
+        document = Document(file, None, xml_bytes(root))
+        others = tuple(item for item in scenario.additional if item.name != file)
+        return replace(
+            scenario, additional=(*others, document), applied=(*scenario.applied, str(self))
+        )
+
+
+def _with_blockers(
+    scenario: Scenario, effect: Effect, lane: str, departs: Sequence[float], stand: dict[str, str]
+) -> Scenario:
+    """Adds vehicles that appear in the middle of a lane, stand there and are gone.
+
+    Where a queue stands at that moment, the vehicle appears as soon as there is room for it.
+
+    Args:
+        scenario: It does not change itself.
+        effect: What is noted as applied.
+        lane: Where they stop.
+        departs: When they appear, in s, in order.
+        stand: How long each of them stands, in the words of ``<stop>``.
+    """
+    places = places_of(scenario)
+    places.check(effect.name, "lane", lane, places.lanes)
+    place = places.lanes[lane]
+    if place.length_m < 2 * _LENGTH_M + 2:
+        raise OptionError(
+            f"effect {effect.name!r}: lane {lane!r} is {place.length_m:g} m long, too short for a "
+            f"vehicle to stand on; it takes {2 * _LENGTH_M + 2:g} m"
+        )
+    scenario = replace(scenario, applied=(*scenario.applied, str(effect)))
+    if not departs:
+        return scenario
+    taken = {document.name for document in scenario.documents}
+    stem = f"{effect.name.removeprefix('lane_')}.{lane}"
+    names = chain((stem,), (f"{stem}~{number}" for number in count(2)))
+    kind = next(name for name in names if _file(name) not in taken)
+    root = ET.Element("routes")
+    ET.SubElement(
+        root,
+        "vType",
+        {
+            "id": kind,
+            "vClass": "passenger" if place.cars else "ignoring",
+            "length": f"{_LENGTH_M:g}",
+            "color": "255,128,0",
+        },
+    )
+    middle = place.length_m / 2
+    for number, depart in enumerate(departs):
+        vehicle = {
+            "id": f"{kind}.{number}", "type": kind, "depart": seconds_text(depart),
+            "departLane": str(place.index), "departPos": f"{middle:.2f}", "departSpeed": "0",
+            "arrivalLane": str(place.index), "arrivalPos": f"{middle + 0.5:.2f}",
+        }  # fmt: skip
+        item = ET.SubElement(root, "vehicle", vehicle)
+        ET.SubElement(item, "route", {"edges": place.edge})
+        ET.SubElement(item, "stop", {"lane": lane, "endPos": f"{middle:.2f}", **stand})
+    document = Document(_file(kind), None, xml_bytes(root))
+    return replace(scenario, routes=(*scenario.routes, document))
+
+
+def _file(stem: str) -> str:
+    """A name for the file of a blocked lane, whose id may hold what files cannot."""
+    return re.sub(r"[^\w.~#-]", "_", stem) + ".rou.xml"
