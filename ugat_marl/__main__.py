@@ -22,6 +22,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "evaluate": ("commands.evaluate:Evaluate", "policies and rules in any domains: measures, gaps"),
     "rollout": ("commands.rollout:Rollout", "record transitions as a Parquet log"),
     "record": ("commands.record:Record", "measure a domain as a street is measured"),
+    "import-atspm": (
+        "commands.import_atspm:ImportAtspm",
+        "measured data from a signal controllers' log",
+    ),
     "check": ("commands.check:Check", "is a scenario sound, its environment conformant?"),
     "scenarios": ("commands.scenarios:Scenarios", "the networks and domains that can be named"),
     "bench env": ("bench.speed:EnvBench", "speed against SUMO alone and sumo-rl"),

@@ -7,7 +7,7 @@ import io
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -139,7 +139,7 @@ def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
         MeasuredDataError: Unreadable, cut short, columns missing, text where numbers belong, or
             empty cells in required columns.
     """
-    raw = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, found)
+    raw = read_raw(path, found)
     wanted = {**table.columns, **table.optional}
     _check_columns(path, table, raw.columns, found)
     start = 1 if path.suffix == ".parquet" else 2  # line 1 of a CSV file is its header
@@ -150,7 +150,7 @@ def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
             columns.append(pl.Series(name, [None] * raw.height, dtype))
             continue
         cells = raw[name]
-        values = _numbers(path, cells) if kind == "number" else _texts(path, cells)
+        values = to_numbers(path, cells) if kind == "number" else to_texts(path, cells)
         if name in table.columns and values.null_count():
             where = place(path, int(values.is_null().arg_true()[0]) + start)
             raise MeasuredDataError(
@@ -161,9 +161,28 @@ def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
     return pl.DataFrame(columns)
 
 
+def read_raw(path: Path, found: list[Finding]) -> pl.DataFrame:
+    """All columns of a CSV or Parquet file; those of a CSV file as text.
+
+    Raises:
+        MeasuredDataError: Unreadable, damaged or cut short.
+    """
+    return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, found)
+
+
+def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
+    """Rows with the columns of a table."""
+    kinds = {**table.columns, **table.optional}
+    schema = {
+        name: pl.Float64() if kind == "number" else pl.String() for name, kind in kinds.items()
+    }
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
 def place(path: Path, row: int) -> str:
     """How a row is called in messages."""
-    return f"{path}, {'row' if path.suffix == '.parquet' else 'line'} {row}"
+    what = {".csv": "line", ".parquet": "row"}.get(path.suffix, "entry")
+    return f"{path}, {what} {row}"
 
 
 def refuse(path: Path, bad: pl.DataFrame, column: str, complaint: str, way_out: str) -> None:
@@ -290,8 +309,12 @@ def _bytes(path: Path) -> bytes:
         ) from None
 
 
-def _numbers(path: Path, cells: pl.Series) -> pl.Series:
-    """Numbers as Float64; empty cells and NaN are null."""
+def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
+    """Numbers as Float64; empty cells and NaN are null.
+
+    Raises:
+        MeasuredDataError: Text, infinity, or a column of another type.
+    """
     name, start = cells.name, 1 if path.suffix == ".parquet" else 2
     if cells.dtype == pl.String:
         cells = cells.str.strip_chars()
@@ -314,8 +337,12 @@ def _numbers(path: Path, cells: pl.Series) -> pl.Series:
     return numbers.fill_nan(None)
 
 
-def _texts(path: Path, cells: pl.Series) -> pl.Series:
-    """Names as text; empty cells are null."""
+def to_texts(path: Path, cells: pl.Series) -> pl.Series:
+    """Names as text; empty cells are null.
+
+    Raises:
+        MeasuredDataError: A column that holds no names.
+    """
     dtype = cells.dtype
     known = isinstance(dtype, pl.String | pl.Categorical | pl.Enum | pl.Null)
     if not (known or dtype.is_integer()):

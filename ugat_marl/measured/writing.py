@@ -23,6 +23,7 @@ from ugat_marl.measured.tables import (
     TABLES,
     TRAJECTORIES,
     Table,
+    frame_of,
 )
 
 
@@ -121,11 +122,11 @@ def _write(frame: pl.DataFrame, path: Path) -> None:
 
 def _detectors(measured: Measured) -> pl.DataFrame:
     rows = [(d.id, d.lane, d.position_m, d.length_m, d.kind) for d in measured.detectors]
-    return _frame(DETECTORS, rows)
+    return frame_of(DETECTORS, rows)
 
 
 def _periods(periods: Sequence[Period]) -> pl.DataFrame:
-    return _frame(PERIODS, [(p.id, p.begin_s, p.end_s, p.split) for p in periods])
+    return frame_of(PERIODS, [(p.id, p.begin_s, p.end_s, p.split) for p in periods])
 
 
 def _signals(periods: Sequence[Period]) -> pl.DataFrame:
@@ -135,11 +136,11 @@ def _signals(periods: Sequence[Period]) -> pl.DataFrame:
         for tls, log in period.signals.items()
         for since, state in log
     ]
-    return _frame(SIGNALS, rows)
+    return frame_of(SIGNALS, rows)
 
 
 def _detections(periods: Sequence[Period]) -> pl.DataFrame:
-    parts = [_frame(DETECTIONS, [])]
+    parts = [frame_of(DETECTIONS, [])]
     for period in periods:
         streams = [
             _events(period, name, passages)
@@ -193,11 +194,3 @@ def _ordered(frame: pl.DataFrame, table: Table) -> pl.DataFrame:
         pl.col(name).cast(pl.Float64).fill_nan(None) if kinds[name] == "number" else pl.col(name)
         for name in columns
     )
-
-
-def _frame(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
-    kinds = {**table.columns, **table.optional}
-    schema = {
-        name: pl.Float64() if kind == "number" else pl.String() for name, kind in kinds.items()
-    }
-    return pl.DataFrame(rows, schema=schema, orient="row")
