@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 
-from ugat_marl.effects import effect_from
+from ugat_marl.effects import effect_from, known_effects
 from ugat_marl.scenario_settings import (
     ControlSettings,
     IntersectionSettings,
@@ -41,3 +42,23 @@ def test_the_example_is_a_scenario_file() -> None:
     assert settings.intersections["C1"].phases == ("GGrr", "rrGG")
     for record in settings.effects:
         effect_from(record)
+
+
+def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "effects.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
+    assert list(rows) == list(known_effects())
+    for name, kind in known_effects().items():
+        cell = rows[name]
+        assert re.findall(r"`(\w+)`", cell) == [item.name for item in fields(kind)], name
+        for parameter in kind.ranges.values():
+            if parameter.high < 1e6:  # a time of the scenario has no range worth a mention
+                ends = (f"±{parameter.high:g}", f"{parameter.low:g}–{parameter.high:g}")
+                assert any(text in cell for text in ends), (name, parameter)
+            assert parameter.unit.replace("^2", "²") in cell
+        for text in kind.texts.values():
+            assert ("`*`" in cell) == text.everywhere or len(kind.texts) > 1
+    example = re.search(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    assert example is not None
+    (record,) = tomllib.loads(example[1])["effects"]
+    effect_from(record)
