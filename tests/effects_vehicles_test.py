@@ -26,6 +26,7 @@ from ugat_marl.effects import (
     ReactionStep,
     RedRunning,
     SpeedSpread,
+    StartupDelay,
     YellowRunning,
     apply_effects,
     in_domain,
@@ -98,7 +99,7 @@ def parameter(key: str) -> Callable[[str], object]:
 
 
 ATTRIBUTES: list[tuple[Effect, Question]] = [
-    (Headway(1.7), libsumo.vehicle.getTau),
+    (Headway(2.2), libsumo.vehicle.getTau),
     (MinGap(3.5), libsumo.vehicle.getMinGap),
     (Imperfection(0.85), libsumo.vehicle.getImperfection),
     (ReactionStep(2.0), libsumo.vehicle.getActionStepLength),
@@ -151,6 +152,49 @@ def last_crossing(scenario: Scenario, simulator: LibsumoSimulator, own: Path) ->
         if any(name.startswith(":C") for name in map(libsumo.vehicle.getRoadID, cars())):
             latest = second
     return latest
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        [], [Headway(0.2)], [ReactionStep(2)], [ReactionStep(3), Headway(0.5)],
+        [Headway(0.5), ReactionStep(3)], [StartupDelay(3)], [Imperfection(1)],
+        *([DriverModel(model)] for model in DRIVER_MODELS),
+    ],
+    ids=lambda effects: "+".join(map(str, effects)),
+)  # fmt: skip
+def test_nobody_runs_a_red_light_or_into_another(
+    effects: list[Effect], simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
+) -> None:
+    """SUMO's drivers do, if they decide less often than their time gap allows."""
+    stream = '<flow id="f" route="east" begin="0" end="190" period="4"/>'
+    scenario = apply_effects(load(crossing(vehicles=stream)), effects)
+    own = tmp_path / "own"
+    own.mkdir()
+    simulator.start(launch_of(scenario, 1, own, ()))
+    before: set[str] = set()
+    for second in range(190):
+        green = second % 50 >= 40
+        simulator.advance(1, {"C": [(1.0, "rG" if green else "ry" if second % 50 < 3 else "rr")]})
+        assert not libsumo.simulation.getCollidingVehiclesIDList()
+        inside = {name for name in cars() if libsumo.vehicle.getRoadID(name).startswith(":C")}
+        assert green or second % 50 < 5 or not inside - before
+        before = inside
+
+
+def test_time_gaps_and_reaction_steps_in_any_order(crossing: Crossing) -> None:
+    scenario = load(crossing(vehicles=EVERY_KIND, types=MIX))
+    for gap, reaction, expected in ((0.5, 2, 2), (3, 2, 3), (0.5, 1, 1), (1.4, 1, 1.4)):
+        for order in (
+            [Headway(gap), ReactionStep(reaction)],
+            [ReactionStep(reaction), Headway(gap)],
+        ):
+            changed = apply_effects(scenario, order)
+            documents = (*changed.additional, *changed.routes)
+            types = [item for file in documents for item in file.parse().iter("vType")]
+            assert {(x.get("tau"), x.get("actionStepLength")) for x in types} == {
+                (f"{expected:g}", f"{reaction:g}")
+            }
 
 
 def cars() -> list[str]:

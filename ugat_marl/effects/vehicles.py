@@ -23,10 +23,11 @@ _NOT_DRIVEN = frozenset(
 )  # fmt: skip
 
 DRIVER_MODELS = (
-    "Krauss", "KraussOrig1", "KraussPS", "KraussX", "PWagner2009", "BKerner", "IDM", "IDMM",
-    "EIDM", "Wiedemann", "W99", "Daniel1", "ACC", "CACC",
+    "Krauss", "KraussOrig1", "KraussPS", "KraussX", "BKerner", "IDM", "IDMM", "EIDM",
+    "Wiedemann", "W99", "Daniel1", "ACC", "CACC",
 )  # fmt: skip
-"""SUMO's car-following models that need no parameters of their own and drive on a common street."""
+"""SUMO's car-following models that need no parameters of their own and keep to red lights in steps
+of 1 s, which PWagner2009 does not."""
 
 
 def driven_types(root: ET.Element) -> list[ET.Element]:
@@ -42,21 +43,35 @@ class VehicleEffect(Effect):
 
     def apply(self, scenario: Scenario) -> Scenario:
         """Sets the attribute in every vehicle type, SUMO's default type included."""
-        number = getattr(self, fields(self)[0].name)
-        value = f"{number:.12g}"
+        number: float = getattr(self, fields(self)[0].name)
 
         def change(root: ET.Element) -> bool:
             types = driven_types(root)
             for item in types:
-                item.set(self.attribute, value)
-                for model in item:  # an old way to write a type, which overrules the attributes
-                    if model.tag.startswith("carFollowing-") and self.attribute in model.attrib:
-                        model.set(self.attribute, value)
+                self._write(item, number, scenario.settings.step_length_s)
             return bool(types)
 
-        return edit_scenario(
-            with_default_types(scenario), change, "<vType", applied=str(self)
-        )  # fmt: skip
+        scenario = with_default_types(scenario)
+        return edit_scenario(scenario, change, "<vType", applied=str(self))
+
+    def _write(self, item: ET.Element, number: float, step_s: float) -> None:
+        """Puts the number into one type, of a scenario with this step length."""
+        del step_s
+        _set(item, self.attribute, number)
+
+
+def _set(item: ET.Element, attribute: str, number: float) -> None:
+    value = f"{number:.12g}"
+    item.set(attribute, value)
+    for model in item:  # an old way to write a type, which overrules the attributes
+        if model.tag.startswith("carFollowing-") and attribute in model.attrib:
+            model.set(attribute, value)
+
+
+def _get(item: ET.Element, attribute: str, default: float) -> float:
+    models = [model for model in item if model.tag.startswith("carFollowing-")]
+    texts = (element.get(attribute) for element in (*models, item))
+    return float(next((text for text in texts if text is not None), default))
 
 
 @dataclass(frozen=True)
@@ -105,12 +120,19 @@ class StartupDelay(VehicleEffect):
 
 @dataclass(frozen=True)
 class Headway(VehicleEffect):
-    """Time gap drivers keep to the vehicle in front, in s (SUMO's `tau`; default 1)."""
+    """Time gap drivers keep to the vehicle in front, in s (SUMO's `tau`; default 1).
+
+    It is not set below the time between two decisions of a driver: a simulation step or the
+    `reaction_step`. SUMO's drivers would run red lights and into each other.
+    """
 
     name: ClassVar[str] = "headway"
     attribute: ClassVar[str] = "tau"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.1, 10.0)}
     seconds: float
+
+    def _write(self, item: ET.Element, number: float, step_s: float) -> None:
+        _set(item, "tau", max(number, step_s, _get(item, "actionStepLength", 0)))
 
 
 @dataclass(frozen=True)
@@ -135,12 +157,20 @@ class Imperfection(VehicleEffect):
 
 @dataclass(frozen=True)
 class ReactionStep(VehicleEffect):
-    """Drivers decide only every so many s (`actionStepLength`), rounded to simulation steps."""
+    """Drivers decide only every so many s (`actionStepLength`), rounded to simulation steps.
+
+    Their time gap grows with it where it was shorter, see `Headway`.
+    """
 
     name: ClassVar[str] = "reaction_step"
     attribute: ClassVar[str] = "actionStepLength"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.1, 5.0)}
     seconds: float
+
+    def _write(self, item: ET.Element, number: float, step_s: float) -> None:
+        steps = max(round(number / step_s), 1)
+        _set(item, "actionStepLength", steps * step_s)
+        _set(item, "tau", max(_get(item, "tau", 1), steps * step_s))
 
 
 @dataclass(frozen=True)
@@ -215,6 +245,5 @@ class DriverModel(Effect):
                 item.set("carFollowModel", self.model)
             return bool(types)
 
-        return edit_scenario(
-            with_default_types(scenario), change, "<vType", applied=str(self)
-        )  # fmt: skip
+        scenario = with_default_types(scenario)
+        return edit_scenario(scenario, change, "<vType", applied=str(self))
