@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,9 +11,12 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ugat_marl.errors import MeasuredDataError, OutputError
 from ugat_marl.measured.data import Detector, Measured, Passages, Period, split_periods
+from ugat_marl.measured.pairing import as_logged
 from ugat_marl.measured.reading import read_measured
 from ugat_marl.measured.writing import write_measured
 from ugat_marl.network import Network, signal_widths
@@ -193,6 +197,67 @@ def test_a_detector_is_on_or_off(reread: Callable[..., Measured]) -> None:
     np.testing.assert_array_equal(read.passages["s"].on_s, [10, 11])
     np.testing.assert_array_equal(read.passages["s"].off_s, [11, 12])
     np.testing.assert_array_equal(read.passages["s"].speed_mps, [1, 2])
+
+
+def test_what_only_a_simulation_knows_is_not_logged(reread: Callable[..., Measured]) -> None:
+    """Ends that are unknown in the middle: a vehicle that changed lanes on the zone."""
+    nan = np.nan
+    passages = Passages(
+        #         first  lost   whole  filled  next  stray  end
+        np.array([nan, 20.0, 40.0, 60.0, 61.5, nan, 190.0]),
+        np.array([3.0, nan, 41.0, nan, 62.0, 70.0, nan]),
+        np.arange(7.0),
+        np.full(7, nan),
+    )
+    expected = Passages(
+        np.array([nan, 40.0, 60.0, 61.5, 190.0]),
+        np.array([3.0, 41.0, 61.5, 62.0, nan]),
+        np.array([0.0, 2.0, 3.0, 4.0, 6.0]),
+        np.full(5, nan),
+    )
+    logged = as_logged(passages.at(np.array([6, 5, 4, 3, 2, 1, 0])), 0.0, 200.0)
+    base = recording(1)
+    read = reread(
+        given=replace(base, periods=(replace(base.periods[0], passages={"s": passages}),))
+    )
+    assert not [f.text for f in read.findings if "without" in f.text or "follows" in f.text]
+    for found in (logged, read.periods[0].passages["s"]):
+        np.testing.assert_array_equal(found.on_s, expected.on_s)
+        np.testing.assert_array_equal(found.off_s, expected.off_s)
+        np.testing.assert_array_equal(found.speed_mps, expected.speed_mps)
+
+
+def test_a_detector_that_is_on_all_the_time(reread: Callable[..., Measured]) -> None:
+    stuck = Passages(np.array([-5.0]), np.array([300.0]), np.full(1, np.nan), np.full(1, np.nan))
+    base = recording(1)
+    read = reread(given=replace(base, periods=(replace(base.periods[0], passages={"s": stuck}),)))
+    np.testing.assert_array_equal(read.periods[0].passages["s"].on_s, [0.0])
+    np.testing.assert_array_equal(read.periods[0].passages["s"].off_s, [np.nan])
+
+
+times = st.one_of(st.just(float("nan")), st.floats(-20, 220))
+
+
+@settings(max_examples=150)
+@given(rows=st.lists(st.tuples(times, times), max_size=12))
+def test_what_is_logged_is_what_is_read(rows: list[tuple[float, float]]) -> None:
+    """Whatever a simulation says, writing and reading it is `as_logged`, and nothing is lost."""
+    table = np.array(rows, np.float64).reshape(-1, 2)
+    nothing = np.full(len(table), np.nan)
+    logged = as_logged(Passages(table[:, 0], table[:, 1], nothing, nothing), 0.0, 200.0)
+    again = as_logged(logged, 0.0, 200.0)
+    np.testing.assert_array_equal(logged.on_s, again.on_s)
+    np.testing.assert_array_equal(logged.off_s, again.off_s)
+    base = recording(1)
+    before = replace(base, periods=(replace(base.periods[0], passages={"s": logged}),))
+    with tempfile.TemporaryDirectory() as directory:
+        scenario = load_scenario(Path(__file__).parent / "data" / "crossing")
+        street = write_measured(before, Path(directory) / "street")
+        if not len(logged):
+            return
+        read = read_measured(street, scenario, Network.read(scenario))
+    assert read.hash == before.hash
+    assert not [f.text for f in read.findings if "without" in f.text or "follows" in f.text]
 
 
 def test_writing_replaces_measured_data_and_nothing_else(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ from ugat_marl.measured.checks import detectors_of, periods_of
 from ugat_marl.measured.coverage import coverage
 from ugat_marl.measured.data import Finding, Measured, Period, SignalLog, letter
 from ugat_marl.measured.detections import passages_of
-from ugat_marl.measured.rows import in_order, with_period
+from ugat_marl.measured.rows import in_order, refuse_set_back, with_period
 from ugat_marl.measured.signal_logs import signals_of
 from ugat_marl.measured.tables import DETECTORS, PERIODS, ROW, frame_of
 from ugat_marl.network import Network, signal_widths
@@ -322,14 +322,9 @@ def _events(
     )
     if own.is_empty():
         return []
-    order = in_order(
-        path,
-        np.zeros(own.height, np.int64),
-        own["time_s"].to_numpy(),
-        own[ROW].to_numpy(),
-        {0: f"device {device.id!r}"},
-        found,
-    )
+    key, time = np.zeros(own.height, np.int64), own["time_s"].to_numpy()
+    refuse_set_back(path, key, time, own[ROW].to_numpy(), lambda _: f"device {device.id!r}")
+    order = in_order(path, key, time, found)
     own = own[order]
     events = [
         _Event(time, (_KIND[code], number), code)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.effects import known_effects
-from ugat_marl.measured.data import Detector, DetectorKind, Finding, Measured, Period
+from ugat_marl.measured.data import Detector, DetectorKind, Finding, Measured, Period, letter
 from ugat_marl.network import Network
 from ugat_marl.scenario import Scenario
 from ugat_marl.signals import GREEN, YELLOW
@@ -21,6 +21,8 @@ ALL_SILENT_S = 600.0
 """So is the whole recording where no detector says anything for this long."""
 BUSY = 20
 """Passages of its neighbours in that time that make a silent detector stand out."""
+MOST_ON_RED = 0.6
+"""Share of vehicles that leave the stop line on red only where something is mixed up."""
 NAMED = 6
 """Names listed in one finding; the rest is counted."""
 
@@ -77,6 +79,7 @@ def coverage(measured: Measured, scenario: Scenario, network: Network) -> list[F
         *_of_kinds(measured, network),
         *_of_places(measured.detectors, network),
         *_of_silence(measured),
+        *_of_agreement(measured, network),
     ]
 
 
@@ -215,6 +218,35 @@ def _of_places(detectors: Sequence[Detector], network: Network) -> Iterator[Find
             f"detectors.csv: no detector on {_list('incoming lane', bare)}, of {len(into)}; "
             "what differs there stays unknown"
         )
+
+
+def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
+    """Traffic lights whose vehicles leave the stop line on red: a wrong table, or a wrong clock."""
+    stops: dict[str, list[str]] = {}
+    for item in measured.detectors:
+        if item.kind == "stop":
+            stops.setdefault(item.lane, []).append(item.id)
+    for item in network.intersections:
+        total = red = 0
+        for lane in item.incoming_lanes:
+            links = sorted({link.index for link in item.links if link.from_lane == lane})
+            for period in measured.periods:
+                log = period.signals.get(item.id)
+                if not log:
+                    continue
+                since = np.array([since for since, _ in log])
+                is_red = np.array([letter([s[i] for i in links]) == "r" for _, s in log])
+                for name in stops.get(lane, ()):
+                    if name in period.passages:
+                        off = period.passages[name].off_s
+                        shown = np.searchsorted(since, off[np.isfinite(off)], side="right") - 1
+                        total += len(shown)
+                        red += int(is_red[shown].sum())
+        if total >= BUSY and red > MOST_ON_RED * total:
+            yield Finding(
+                f"{red} of {total} vehicles leave the stop detectors of traffic light {item.id!r} "
+                "while their lane has red; are lanes and links the right ones, and the clocks?"
+            )
 
 
 def _of_silence(measured: Measured) -> Iterator[Finding]:

@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.measured.data import Detector, Finding, Passages, Period
-from ugat_marl.measured.rows import PERIOD, in_order
+from ugat_marl.measured.pairing import IMPUTED_S
+from ugat_marl.measured.rows import PERIOD, in_order, refuse_set_back
 from ugat_marl.measured.tables import ROW, refuse
 
-IMPUTED_S = 2.0
-"""Two ons in a row at most this far apart are two vehicles: the first one's off is set to the
-second one's on. ODOT's `atspm` (queries of split failures) does the same."""
 MOST_UNPAIRED = 0.5
 """A detector with a larger share of events that have no partner is not used."""
 FEW = 0.01
@@ -157,15 +155,19 @@ def _sorted(
 ) -> _Stream:
     key = frame["key"].to_numpy()
     time = frame["time_s"].to_numpy()
-    streams = {
-        int(k): f"detector {names[k % len(names)]!r} in period {periods[k // len(names)].id!r}"
-        for k in np.unique(key)
-    }
-    order = in_order(path, key, time, frame[ROW].to_numpy(), streams, found)
+    is_on = (frame["event"] == "on").to_numpy()
+
+    def name(stream: int) -> str:
+        period, detector = divmod(stream // 2, len(names))
+        return f"detector {names[detector]!r} in period {periods[period].id!r}"
+
+    # Ons and offs may have been exported one after the other.
+    refuse_set_back(path, key * 2 + is_on, time, frame[ROW].to_numpy(), name)
+    order = in_order(path, key, time, found)
     return _Stream(
         key[order],
         time[order],
-        (frame["event"] == "on").to_numpy()[order],
+        is_on[order],
         frame["speed_mps"].to_numpy()[order],
         frame["length_m"].to_numpy()[order],
     )

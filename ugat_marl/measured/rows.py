@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,8 @@ from ugat_marl.measured.tables import place
 
 CLOCK_JUMP_S = 60.0
 """A step back by more is a clock set back; by less, late delivery."""
+FEW_ROWS = 10
+"""In a stream of fewer rows nobody can tell a clock set back from rows out of order."""
 MOST_OUTSIDE = 0.5
 """Share of the rows that may lie outside of their periods."""
 EPOCH = 1e8
@@ -109,8 +111,6 @@ def in_order(
     path: Path,
     key: NDArray[np.int64],
     time: NDArray[np.float64],
-    row: NDArray[np.int64],
-    name: Mapping[int, str],
     found: list[Finding],
 ) -> NDArray[np.int64]:
     """The order by stream and time; rows of one stream at the same time stay as they are.
@@ -119,9 +119,34 @@ def in_order(
         path: Where the rows come from.
         key: Stream of each row ``(n,)``.
         time: ``(n,)`` s.
+        found: Findings; a sort that was needed is added.
+    """
+    as_found = np.argsort(key, kind="stable")
+    back = len(_steps_back(key[as_found], time[as_found]))
+    if not back:
+        return as_found
+    found.append(Finding(f"{path.name}: {back} rows come before an earlier one; they were sorted"))
+    return np.lexsort((time, key))
+
+
+def refuse_set_back(
+    path: Path,
+    key: NDArray[np.int64],
+    time: NDArray[np.float64],
+    row: NDArray[np.int64],
+    name: Callable[[int], str],
+) -> None:
+    """Refuses streams whose clock was set back.
+
+    A file that is merely out of order steps back all the time; one whose pieces were put together
+    the wrong way has no time twice.
+
+    Args:
+        path: Where the rows come from.
+        key: Stream of each row ``(n,)``; what is exported on its own is a stream of its own.
+        time: ``(n,)`` s.
         row: Number of the row in its file ``(n,)``.
         name: What to call a stream in messages.
-        found: Findings; a sort that was needed is added.
 
     Raises:
         MeasuredDataError: The clock of a stream was set back, so that some of its time is there
@@ -129,26 +154,25 @@ def in_order(
     """
     as_found = np.argsort(key, kind="stable")
     stream, clock = key[as_found], time[as_found]
-    same = stream[1:] == stream[:-1]
-    back = np.flatnonzero(same & (np.diff(clock) < 0)) + 1
+    back = _steps_back(stream, clock)
     if not len(back):
-        return as_found
-    starts = np.flatnonzero(np.concatenate(([True], ~same)))
-    ends = np.append(starts[1:], len(stream))
-    for begin, end in zip(starts, ends, strict=True):
+        return
+    starts = np.flatnonzero(np.diff(stream, prepend=-1))
+    for begin, end in zip(starts, np.append(starts[1:], len(stream)), strict=True):
         steps = back[(back > begin) & (back < end)]
-        if not 1 <= len(steps) <= 2 or end - begin < 20:
-            continue  # a file out of order steps back at every second row
+        if not 1 <= len(steps) <= 2 or end - begin < FEW_ROWS:
+            continue
         step = int(steps[0])
         jump = clock[step - 1] - clock[step]
         if jump > CLOCK_JUMP_S and clock[end - 1] > clock[begin]:
             raise MeasuredDataError(
-                f"{place(path, int(row[as_found[step]]))}: the clock of "
-                f"{name[int(stream[begin])]} steps back by {jump:g} s, so some time is there "
-                "twice (daylight saving, or a clock that was set?); end the period before the "
-                "step, or correct the times behind it"
+                f"{place(path, int(row[as_found[step]]))}: the clock of {name(int(stream[begin]))} "
+                f"steps back by {jump:g} s, so some time is there twice (daylight saving, or a "
+                "clock that was set?); end the period before the step, or correct the times "
+                "behind it"
             )
-    found.append(
-        Finding(f"{path.name}: {len(back)} rows come before an earlier one; they were sorted")
-    )
-    return np.lexsort((time, key))
+
+
+def _steps_back(stream: NDArray[np.int64], clock: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Rows that are earlier than the one before them in their stream."""
+    return np.flatnonzero((stream[1:] == stream[:-1]) & (np.diff(clock) < 0)) + 1

@@ -11,7 +11,7 @@ import polars as pl
 
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.measured.data import Finding, Period, SignalLog
-from ugat_marl.measured.rows import PERIOD, in_order
+from ugat_marl.measured.rows import PERIOD, in_order, refuse_set_back
 from ugat_marl.measured.tables import ROW, refuse
 from ugat_marl.signals import STATES
 
@@ -46,12 +46,16 @@ def signals_of(
     index = {tls: i for i, tls in enumerate(names)}
     code = frame["tls_id"].replace_strict(index, return_dtype=pl.Int64).to_numpy()
     key = frame[PERIOD].to_numpy().astype(np.int64) * len(names) + code
-    streams = {
-        int(k): f"traffic light {names[k % len(names)]!r} in period {periods[k // len(names)].id!r}"
-        for k in np.unique(key)
-    }
+
+    def name(stream: int) -> str:
+        return (
+            f"traffic light {names[stream % len(names)]!r} in period "
+            f"{periods[stream // len(names)].id!r}"
+        )
+
     time = frame["time_s"].to_numpy()
-    order = in_order(path, key, time, frame[ROW].to_numpy(), streams, found)
+    refuse_set_back(path, key, time, frame[ROW].to_numpy(), name)
+    order = in_order(path, key, time, found)
     key, time = key[order], time[order]
     states = frame["state"].gather(order).to_list()
     starts = np.flatnonzero(np.diff(key, prepend=-1))
@@ -62,7 +66,7 @@ def signals_of(
         log = _log(
             list(zip(time[begin:end].tolist(), states[begin:end], strict=True)),
             period,
-            f"{path.name}: {streams[stream]}",
+            f"{path.name}: {name(stream)}",
             found,
         )
         logs[stream // len(names)][names[stream % len(names)]] = log

@@ -13,6 +13,7 @@ import polars as pl
 
 from ugat_marl.errors import OutputError
 from ugat_marl.measured.data import Measured, Passages, Period
+from ugat_marl.measured.pairing import as_logged
 from ugat_marl.measured.tables import (
     COUNTS,
     DETECTIONS,
@@ -30,9 +31,8 @@ from ugat_marl.measured.tables import (
 def write_measured(measured: Measured, directory: Path, *, csv: bool = False) -> Path:
     """Writes measured data; the directory is there whole or not at all.
 
-    Times are rounded to the millisecond. Passages are written as ``on`` and ``off`` within their
-    period: what lies outside is left out, and where two vehicles are over a detector at once the
-    first one's ``off`` is moved to the second one's ``on``, for a detector is on or off.
+    Passages are written as `as_logged` has them: to the millisecond, within their period, and one
+    vehicle at a time.
 
     Args:
         measured: What to write; its findings are not written.
@@ -154,13 +154,11 @@ def _detections(periods: Sequence[Period]) -> pl.DataFrame:
 
 
 def _events(period: Period, detector: str, passages: Passages) -> pl.DataFrame:
-    on, off = np.round(passages.on_s, 3), np.round(passages.off_s, 3)
-    following = np.append(on[1:], np.inf)
-    off = np.where(np.isnan(following), off, np.minimum(off, following))
-    time = np.stack([on, off], 1).reshape(-1)
-    is_on = np.tile([True, False], len(on))
-    inside = (time >= period.begin_s) & (time <= period.end_s)
-    nothing = np.full(len(on), np.nan)
+    passages = as_logged(passages, period.begin_s, period.end_s)
+    time = np.stack([passages.on_s, passages.off_s], 1).reshape(-1)
+    is_on = np.tile([True, False], len(passages))
+    inside = np.isfinite(time)
+    nothing = np.full(len(passages), np.nan)
     # Speed and length are known when the rear has left, or else with the front.
     with_off = inside[1::2]
     values = [
