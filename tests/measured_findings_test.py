@@ -147,6 +147,15 @@ def test_detectors_one_after_the_other_are_in_order(read: Read) -> None:
     assert findings == {}
 
 
+def test_ons_and_offs_may_be_exported_one_after_the_other(read: Read) -> None:
+    ons = pl.col("event") == "on"
+    found, findings = read(
+        changes={"detections": lambda f: pl.concat([f.filter(ons), f.filter(~ons)])}
+    )
+    assert found.hash == recording().hash
+    only(findings, "sorted")
+
+
 def test_rows_that_are_there_twice_count_once(read: Read) -> None:
     found, findings = read(changes={"detections": lambda f: pl.concat([f, f.head(100)])})
     assert found.hash == recording().hash
@@ -400,6 +409,26 @@ def test_detectors_in_places_where_they_tell_nothing(read: Read) -> None:
     fewer = replace(base, detectors=tuple(d for d in base.detectors if d.id != "w"))
     _, findings = read(fewer)
     assert any("no detector on 1 incoming lane ('W_C_0'), of 2" in text for text in findings)
+
+
+def test_lanes_that_are_mixed_up_show_in_who_leaves_on_red(read: Read) -> None:
+    # Link 0 is green in the first 20 s of every 40 s, link 1 in the second.
+    def at(begin: float, seed: int) -> Passages:
+        on = np.arange(begin, END - 40, 40) + np.random.default_rng(seed).uniform(0, 9, 179)
+        on = np.round(on, 3)
+        return Passages(on, np.round(on + 1, 3), np.full(179, 8.0), np.full(179, 5.0))
+
+    base = recording()
+    days = [
+        replace(p, passages={**p.passages, "s": at(5.0, i), "w": at(25.0, 10 + i)})
+        for i, p in enumerate(base.periods)
+    ]
+    right = replace(base, periods=tuple(days))
+    assert read(right)[1] == {}
+    lanes = {"s": "W_C_0", "w": "S_C_0"}
+    mixed = tuple(replace(d, lane=lanes.get(d.id, d.lane)) for d in right.detectors)
+    text = next(text for text in read(replace(right, detectors=mixed))[1] if "red" in text)
+    assert "1074 of 1074 vehicles leave the stop detectors of traffic light 'C'" in text
 
 
 def counts() -> pl.DataFrame:
