@@ -1,0 +1,240 @@
+"""Blind cases: sealed, drawn by the seed alone, and gone on with where they were left."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ugat_marl.__main__ import main
+from ugat_marl.blind.busy import Busy, busy_places
+from ugat_marl.blind.cases import Case, read_label, read_plan
+from ugat_marl.blind.drawing import OUTSIDE, Drawn, Task, deck, draw_hidden
+from ugat_marl.blind.generate import Blueprint, generate
+from ugat_marl.blind.outside import BusStops, Driveway
+from ugat_marl.blind.run import run_cases
+from ugat_marl.effects import load
+from ugat_marl.errors import BlindTestError, OptionError, UnknownNameError
+from ugat_marl.evaluation import policy_factory
+from ugat_marl.measured.reading import read_measured
+from ugat_marl.network import Network
+from ugat_marl.recording import record
+from ugat_marl.scenario import Scenario
+
+
+@pytest.fixture(scope="module")
+def test_folder(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Blueprint]:
+    directory = tmp_path_factory.mktemp("blind") / "test"
+    blueprint = Blueprint(
+        (str(data / "crossing"),), ("none", "headway", "undercount"), cases=4, periods=2, seed=3
+    )
+    assert generate(directory, blueprint) == 4
+    return directory, blueprint
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(directory)): path.read_bytes()
+        for path in sorted(directory.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_cases_are_sealed(test_folder: tuple[Path, Blueprint]) -> None:
+    directory, _ = test_folder
+    cases = read_plan(directory)
+    assert [case.case for case in cases] == ["case001", "case002", "case003", "case004"]
+    labels = [read_label(directory, case.case) for case in cases]
+    assert Counter(item.group for item in labels)["none"] >= 1
+    for item in labels:
+        folder = directory / item.case
+        names = {path.name for path in folder.rglob("*")}
+        assert names == {
+            "measured", "periods.csv", "detectors.csv", "signals.parquet", "detections.parquet",
+        }  # fmt: skip
+    plan = (directory / "plan.json").read_text()
+    given = json.loads(plan)["cases"][0]
+    assert set(given) == {"case", "scenario", "leave_out"}
+    assert "seed" not in plan
+    assert "policy" not in plan
+
+
+def test_the_data_hold_what_the_label_says(test_folder: tuple[Path, Blueprint]) -> None:
+    directory, blueprint = test_folder
+    scenario = load(blueprint.scenarios[0])
+    for case in read_plan(directory):
+        label = read_label(directory, case.case)
+        found = read_measured(directory / case.case / "measured", scenario, Network.read(scenario))
+        assert len(found.periods) == 2
+        effects = tuple(f"{x.name}={','.join(_values(x))}" for x in label.effects)
+        again = record(
+            scenario, "+".join(effects) or "sim", policy_factory(label.policy), periods=2,
+            seed=label.seed,
+        )  # fmt: skip
+        assert again.hash == label.measured
+
+
+def _values(item: object) -> list[str]:
+    place, parameters = getattr(item, "place", None), getattr(item, "parameters", {})
+    return [x for x in (place,) if x] + [f"{value:.12g}" for value in parameters.values()]
+
+
+def test_the_same_seed_draws_the_same_test(
+    test_folder: tuple[Path, Blueprint], tmp_path: Path
+) -> None:
+    directory, blueprint = test_folder
+    generate(tmp_path / "again", blueprint)
+    first, second = contents(directory), contents(tmp_path / "again")
+    assert first == second
+    generate(tmp_path / "other", replace(blueprint, seed=4))
+    assert contents(tmp_path / "other") != first
+
+
+def test_a_test_is_gone_on_with_and_no_other_is_mixed_in(
+    test_folder: tuple[Path, Blueprint], tmp_path: Path
+) -> None:
+    directory, blueprint = test_folder
+    assert generate(directory, blueprint) == 0
+    with pytest.raises(BlindTestError, match="another blind test"):
+        generate(directory, replace(blueprint, seed=4))
+    (tmp_path / "mine.txt").write_text("something else")
+    with pytest.raises(BlindTestError, match="not empty"):
+        generate(tmp_path, blueprint)
+
+
+def test_shares_are_kept_and_nothing_hidden_is_rounded_up() -> None:
+    tasks = deck(("none", "single", "pair", "setting", "outside"), ("medium",), 50, rng())
+    counts = Counter(task.group for task in tasks)
+    assert counts["none"] >= 0.25 * 50
+    assert counts.total() == 50
+    names = Counter(task.member for task in tasks if task.group == "single")
+    assert max(names.values()) <= min(names.values()) + 1
+    tasks = deck(("headway", "none"), ("small", "large"), 7, rng())
+    assert {task.strength for task in tasks if task.member == "headway"} <= {"small", "large"}
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def single() -> tuple[Scenario, Busy]:
+    scenario = load("single-v1").with_duration(900)
+    return scenario, busy_places(scenario, 0)
+
+
+def test_places_are_busy(single: tuple[Scenario, Busy]) -> None:
+    _, busy = single
+    assert busy.lights == ("A1",)
+    assert set(busy.origins) == {"east1_A1", "northA_A1", "southA_A1", "west1_A1"}
+    assert ("northA_A1", "A1_west1") in busy.turns
+    assert set(busy.closable) <= set(busy.lanes)
+    assert busy.several_lanes
+
+
+@pytest.mark.parametrize("member", OUTSIDE)
+def test_what_is_outside_the_library_stays_outside(
+    member: str, single: tuple[Scenario, Busy]
+) -> None:
+    drawn = draw_hidden(Task("outside", member), *single, rng())
+    if member == "without gap_acceptance":  # nobody yields on this network's greens
+        assert drawn is None
+        return
+    assert isinstance(drawn, Drawn)
+    unknown = {effect.name for effect in drawn.effects} & {"bus_stops", "driveway"}
+    assert unknown or {effect.name for effect in drawn.effects} & set(drawn.leave_out)
+
+
+def test_pairs_are_of_two_families_and_leaving_out_says_nothing(
+    single: tuple[Scenario, Busy],
+) -> None:
+    left_out = 0
+    for number in range(30):
+        generator = np.random.default_rng(number)
+        drawn = draw_hidden(Task("pair"), *single, generator)
+        assert isinstance(drawn, Drawn)
+        names = {effect.name for effect in drawn.effects}
+        assert len(names) == 2
+        assert not names & set(drawn.leave_out)
+        left_out += bool(drawn.leave_out)
+    assert 0 < left_out < 30
+
+
+def test_buses_stop_and_cars_turn_off(single: tuple[Scenario, Busy]) -> None:
+    scenario, _ = single
+    policy = policy_factory("fixed-time:30")
+    plain, buses, cut = (
+        record(scenario, effects, policy, periods=1, seed=1).periods[0]
+        for effects in ((), (BusStops("northA_A1", 20.0, 25.0),), (Driveway("northA_A1", 0.5),))
+    )
+
+    def length(period: object) -> float:
+        passages = getattr(period, "passages", {})
+        return max(float(np.nanmax(item.length_m)) for item in passages.values())
+
+    assert length(plain) == 5.0
+    assert length(buses) == 12.0
+    lanes = [f"northA_A1_{lane}" for lane in range(3)]
+    before, after = (
+        [sum(len(x.passages.get(f"{kind}:{lane}", ())) for lane in lanes) for x in (plain, cut)]
+        for kind in ("advance", "stop")
+    )
+    assert before[1] >= 0.9 * before[0]
+    assert after[1] <= 0.7 * after[0]
+
+
+def test_cases_are_diagnosed_once_and_a_failure_is_noted(
+    test_folder: tuple[Path, Blueprint],
+) -> None:
+    directory, _ = test_folder
+    seen: list[str] = []
+
+    def diagnose(case: Case, measured: Path, folder: Path) -> None:
+        assert (measured / "periods.csv").is_file()
+        seen.append(case.case)
+        if case.case == "case002":
+            raise ZeroDivisionError("a bug")
+        (folder / "diagnosis.json").write_text('{"verdict": "no_discrepancy"}')
+
+    assert run_cases(directory, diagnose, only=("case001", "case002")) == (1, 1)
+    assert run_cases(directory, diagnose) == (2, 1)
+    assert seen == ["case001", "case002", "case002", "case003", "case004"]
+    note = json.loads((directory / "case002" / "run.json").read_text())
+    assert note["error"] == "ZeroDivisionError: a bug"
+    assert main(["blind", "grade", str(directory)]) == 0
+    assert main(["blind", "table", str(directory), "--out", str(directory / "table.md")]) == 0
+    assert "| failed | 4 | 1 of 4" in (directory / "table.md").read_text()
+    with pytest.raises(UnknownNameError, match="case009"):
+        run_cases(directory, diagnose, only=("case009",))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"cases": 0}, "at least 1"),
+        ({"scenarios": ()}, "at least one"),
+        ({"classes": ("none", "none")}, "twice"),
+        ({"pressure_share": 2.0}, "from 0 to 1"),
+    ],
+)
+def test_impossible_blueprints_are_refused(change: dict[str, object], says: str) -> None:
+    base = Blueprint(("single-v1",))
+    with pytest.raises(OptionError, match=says):
+        replace(base, **change)  # pyright: ignore[reportArgumentType]
+
+
+def test_unknown_classes_and_hopeless_places_are_named(
+    crossing: Callable[..., Path], tmp_path: Path
+) -> None:
+    with pytest.raises(UnknownNameError, match="headway"):
+        deck(("hedway",), ("medium",), 2, rng())
+    with pytest.raises(UnknownNameError, match="medium"):
+        deck(("headway",), ("medum",), 2, rng())
+    blueprint = Blueprint((str(crossing()),), ("turning",), cases=1)
+    with pytest.raises(BlindTestError, match="'turning'"):
+        generate(tmp_path / "none", blueprint)

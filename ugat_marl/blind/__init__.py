@@ -1,0 +1,1 @@
+"""The sealed blind test: hidden effects are drawn, measured, diagnosed and graded."""

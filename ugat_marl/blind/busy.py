@@ -1,0 +1,151 @@
+"""Where enough happens in a scenario that a hidden effect can be seen at all."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeVar
+
+from ugat_marl.effects.places import places_of
+from ugat_marl.evaluation import policy_factory
+from ugat_marl.files import parse_xml
+from ugat_marl.measured.data import Detector
+from ugat_marl.network import Network
+from ugat_marl.recording import record
+from ugat_marl.redraw import explicit
+from ugat_marl.scenario import Scenario
+from ugat_marl.seeding import derive_seed
+
+Key = TypeVar("Key", str, tuple[str, str])
+
+TURN_PER_HOUR = 60.0
+"""A turn to which vehicles are diverted is already taken by so many."""
+BUSY_PER_HOUR = 120.0
+"""What an origin, a detector or a lane needs to count as busy."""
+LONG_M = 50.0
+"""A lane to close or to park on is at least so long."""
+
+
+@dataclass(frozen=True)
+class Busy:
+    """Places at which effects can be hidden.
+
+    Attributes:
+        lights: Traffic lights that agents control.
+        origins: Edges where vehicles start.
+        turns: ``(from, to)`` edges of turns at traffic lights.
+        closable: Lanes before a traffic light with a lane beside them.
+        lanes: Lanes before a traffic light.
+        edges: Edges before a traffic light.
+        detectors: Detectors.
+        pairs: Detectors of one kind on neighbouring lanes that count differently.
+        permitted: Whether drivers have to yield on some green.
+        several_lanes: Whether an approach has more than one lane.
+    """
+
+    lights: tuple[str, ...]
+    origins: tuple[str, ...]
+    turns: tuple[tuple[str, str], ...]
+    closable: tuple[str, ...]
+    lanes: tuple[str, ...]
+    edges: tuple[str, ...]
+    detectors: tuple[str, ...]
+    pairs: tuple[tuple[str, str], ...]
+    permitted: bool
+    several_lanes: bool
+
+
+def busy_places(scenario: Scenario, seed: int) -> Busy:
+    """Counts the demand, and plays one day to see which lanes it takes.
+
+    Args:
+        scenario: The simulation.
+        seed: Root of the seed of that day.
+    """
+    network = Network.read(scenario)
+    rates, detectors = _detected(scenario, seed)
+    origins, turns, edges = _demanded(scenario)
+    incoming = {lane for item in network.intersections for lane in item.incoming_lanes}
+    approaches = {network.lanes[lane].edge for lane in incoming}
+    lanes = [
+        lane
+        for lane in sorted(incoming)
+        if rates.get(f"stop:{lane}", 0.0) >= BUSY_PER_HOUR
+        and network.lanes[lane].length_m >= LONG_M
+    ]
+    places = places_of(scenario)
+    cars = Counter(item.edge for item in places.lanes.values() if item.cars)
+    ways = {
+        (edge, other) for edge in sorted(approaches) for other in places.following.get(edge, ())
+    }
+    return Busy(
+        lights=tuple(item.id for item in network.intersections),
+        origins=tuple(sorted(x for x, rate in origins.items() if rate >= BUSY_PER_HOUR)),
+        turns=tuple(
+            sorted(
+                (edge, other)
+                for edge, other in ways
+                if turns[edge, other] >= TURN_PER_HOUR
+                and edges[edge] - turns[edge, other] >= BUSY_PER_HOUR
+            )
+        ),
+        closable=tuple(x for x in lanes if cars[network.lanes[x].edge] > 1),
+        lanes=tuple(lanes),
+        edges=tuple(sorted({network.lanes[x].edge for x in lanes})),
+        detectors=tuple(item.id for item in detectors if rates.get(item.id, 0.0) >= BUSY_PER_HOUR),
+        pairs=_pairs(detectors, rates, network),
+        permitted=any("g" in phase for item in network.intersections for phase in item.phases),
+        several_lanes=any(cars[edge] > 1 for edge in approaches),
+    )
+
+
+def _detected(scenario: Scenario, seed: int) -> tuple[dict[str, float], tuple[Detector, ...]]:
+    """Vehicles per hour at every detector on one ordinary day."""
+    day = record(
+        scenario,
+        "sim",
+        policy_factory("fixed-time:30"),
+        periods=1,
+        seed=derive_seed(seed, "blind", "survey"),
+    )
+    hours = (day.periods[0].end_s - day.periods[0].begin_s) / 3600.0
+    return {x: len(seen) / hours for x, seen in day.periods[0].passages.items()}, day.detectors
+
+
+def _demanded(
+    scenario: Scenario,
+) -> tuple[Mapping[str, float], Mapping[tuple[str, str], float], Mapping[str, float]]:
+    """Vehicles per hour that start on an edge, that make a turn, and that pass an edge."""
+    origins: Counter[str] = Counter()
+    turns: Counter[tuple[str, str]] = Counter()
+    edges: Counter[str] = Counter()
+    for document in explicit(scenario).routes:
+        for vehicle in parse_xml(document.read(), document.source).iter("vehicle"):
+            route = vehicle.find("route")
+            way = () if route is None else tuple(route.get("edges", "").split())
+            if way:
+                origins[way[0]] += 1
+                edges.update(set(way))
+                turns.update(set(pairwise(way)))
+    hours = scenario.settings.duration_s / 3600.0
+    return _per_hour(origins, hours), _per_hour(turns, hours), _per_hour(edges, hours)
+
+
+def _per_hour(counts: Counter[Key], hours: float) -> defaultdict[Key, float]:
+    return defaultdict(float, {key: count / hours for key, count in counts.items()})
+
+
+def _pairs(
+    detectors: tuple[Detector, ...], rates: Mapping[str, float], network: Network
+) -> tuple[tuple[str, str], ...]:
+    found: list[tuple[str, str]] = []
+    for one in detectors:
+        for two in detectors:
+            same = network.lanes[one.lane].edge == network.lanes[two.lane].edge
+            if one.id < two.id and one.kind == two.kind and same:
+                low, high = sorted((rates.get(one.id, 0.0), rates.get(two.id, 0.0)))
+                if high >= BUSY_PER_HOUR and low <= 0.7 * high:
+                    found.append((one.id, two.id))
+    return tuple(found)
