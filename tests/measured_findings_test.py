@@ -236,6 +236,29 @@ def test_two_ons_within_two_seconds_are_two_vehicles(read: Read) -> None:
     assert any("1 times on follows on within 2 s" in text for text in findings)
 
 
+def test_pulses_shorter_than_the_tick_of_the_clock(read: Read) -> None:
+    """A count detector in pulse mode: every off has the time of its on, and stands before it."""
+    times = np.arange(5.0, 7000.0, 10.0)
+    pulses = pl.DataFrame(
+        {
+            "period_id": "day0",
+            "time_s": np.repeat(times, 2),
+            "detector_id": "s",
+            "event": ["off", "on"] * len(times),
+            "speed_mps": None,
+            "length_m": None,
+        },
+        schema_overrides={"speed_mps": pl.Float64, "length_m": pl.Float64},
+    )
+    found, findings = read(
+        changes={"detections": lambda f: pl.concat([f.filter(~of("s")), pulses])}
+    )
+    seen = found.periods[0].passages["s"]
+    np.testing.assert_array_equal(seen.on_s, times)
+    np.testing.assert_array_equal(seen.off_s, times)
+    assert not any("without" in text for text in findings)
+
+
 def test_a_lost_on_and_a_lost_off_are_counted(read: Read) -> None:
     times = np.arange(10.0, 110.0, 10.0)
     rows = Passages(times, times + 1, np.full(10, 8.0), np.full(10, 5.0))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.measured.data import Detector, Finding, Passages, Period
-from ugat_marl.measured.pairing import IMPUTED_S
+from ugat_marl.measured.pairing import IMPUTED_S, untangled
 from ugat_marl.measured.rows import PERIOD, in_order, refuse_set_back
 from ugat_marl.measured.tables import ROW, refuse
 
@@ -164,6 +164,7 @@ def _sorted(
     # Ons and offs may have been exported one after the other.
     refuse_set_back(path, key * 2 + is_on, time, frame[ROW].to_numpy(), name)
     order = in_order(path, key, time, found)
+    order = order[untangled(key[order], time[order], is_on[order])]
     return _Stream(
         key[order],
         time[order],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ugat_marl.measured.data import Passages
 
@@ -46,3 +47,40 @@ def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
     kept = ~lost & ~(off <= on)
     chosen = order[kept]
     return Passages(on[kept], off[kept], passages.speed_mps[chosen], passages.length_m[chosen])
+
+
+def untangled(
+    key: NDArray[np.int64], time: NDArray[np.float64], is_on: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """The order of events in which an on and an off at the same moment make sense.
+
+    Logs of tenths of a second hold pulses shorter than that, and are often sorted by event: the off
+    of such a pulse then stands before its on. After an off comes an on, and after an on an off.
+
+    Args:
+        key: Stream of each event ``(events,)``, sorted.
+        time: ``(events,)`` s, in order within each stream.
+        is_on: ``(events,)``.
+    """
+    order = np.arange(len(key))
+    same = (key[1:] == key[:-1]) & (time[1:] == time[:-1]) & (is_on[1:] != is_on[:-1])
+    shown = is_on.copy()
+    last = -1
+    for i in np.flatnonzero(same).tolist():
+        if i <= last:
+            continue
+        if i > 0 and key[i - 1] == key[i]:
+            swap = shown[i - 1] == shown[i]
+        else:  # nothing before it: the next event with a time of its own decides
+            after = i + 2
+            while after < len(same) and same[after] and key[after] == key[i]:
+                after += 2
+            if after < len(key) and key[after] == key[i]:
+                swap = shown[i] != is_on[after]
+            else:  # pulses only, or one moment only
+                swap = after > i + 2 and not shown[i]
+        if swap:
+            order[[i, i + 1]] = order[[i + 1, i]]
+            shown[[i, i + 1]] = shown[[i + 1, i]]
+        last = i + 1
+    return order
