@@ -44,7 +44,9 @@ def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
     following = np.append(on[1:], np.inf)
     off = np.where(following - on <= IMPUTED_S, np.fmin(off, following), np.minimum(off, following))
     lost = np.isnan(off) & np.isfinite(following)
-    kept = ~lost & ~(off <= on)
+    # Two ons, or two offs, at one moment are one for a detector.
+    twice = (following == on) | (np.append(np.nan, off[:-1]) == off)
+    kept = ~lost & ~(off < on) & ~twice
     chosen = order[kept]
     return Passages(on[kept], off[kept], passages.speed_mps[chosen], passages.length_m[chosen])
 
