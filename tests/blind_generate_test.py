@@ -188,6 +188,14 @@ def test_buses_stop_and_cars_turn_off(single: tuple[Scenario, Busy]) -> None:
     assert after[1] <= 0.7 * after[0]
 
 
+def test_buses_go_where_demand_is_written_as_flows(data: Path) -> None:
+    scenario = load(data / "crossing")
+    buses = (BusStops("S_C", 60.0, 10.0),)
+    found = record(scenario, buses, policy_factory("fixed-time:20"), periods=1)
+    lengths = found.periods[0].passages["exit:C_N_0"].length_m
+    assert 12.0 in lengths
+
+
 def test_cases_are_diagnosed_once_and_a_failure_is_noted(
     test_folder: tuple[Path, Blueprint],
 ) -> None:

@@ -35,6 +35,7 @@ from ugat_marl.measured.data import (
     Split,
     split_periods,
 )
+from ugat_marl.measured.pairing import as_logged
 from ugat_marl.network import Network
 from ugat_marl.progress import Advance, Reporter, Silent
 from ugat_marl.recording.controller import own_programmes, play, switch_document, switches
@@ -124,8 +125,10 @@ def record(
             f"periods = {periods} must be at least 1, detector_length_m = {detector_length_m:g} "
             f"and seed = {seed} must not be negative"
         )
-    base, effects = _world(scenario, domain)
     if duration_s is not None:
+        scenario = scenario.with_duration(duration_s)
+    base, effects = _world(explicit(scenario), domain)
+    if duration_s is not None:  # the domain may be another scenario
         base = base.with_duration(duration_s)
     network = Network.read(base)
     fixed, watched = own_programmes(base, network, policy)
@@ -220,7 +223,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
         passages if street.speeds else {k: _without_speed(v) for k, v in passages.items()},
     )
     owner = owners(street.base, street.detectors)
-    period = observed(period, street.effects, street.detectors, owner)
+    period = _logged(observed(period, street.effects, street.detectors, owner))
     lanes = None
     if vehicles is not None and street.lanes:
         lanes = per_lane(vehicles, street.detectors, period)
@@ -277,6 +280,15 @@ def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scena
         }
         settings = settings.model_copy(update={"sumo": {**settings.sumo, **output}})
     return replace(scenario, additional=(*scenario.additional, *extra), settings=settings)
+
+
+def _logged(period: Period) -> Period:
+    """What the electronics of a street would have kept; empty detectors are left out."""
+    found = {
+        name: as_logged(passages, period.begin_s, period.end_s)
+        for name, passages in period.passages.items()
+    }
+    return replace(period, passages={name: x for name, x in found.items() if len(x)})
 
 
 def _without_speed(passages: Passages) -> Passages:
