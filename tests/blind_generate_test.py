@@ -196,6 +196,7 @@ def test_buses_go_where_demand_is_written_as_flows(data: Path) -> None:
     assert 12.0 in lengths
 
 
+@pytest.mark.usefixtures("python")
 def test_cases_are_diagnosed_once_and_a_failure_is_noted(
     test_folder: tuple[Path, Blueprint],
 ) -> None:
@@ -217,6 +218,12 @@ def test_cases_are_diagnosed_once_and_a_failure_is_noted(
     assert main(["blind", "grade", str(directory)]) == 0
     assert main(["blind", "table", str(directory), "--out", str(directory / "table.md")]) == 0
     assert "| failed | 4 | 1 of 4" in (directory / "table.md").read_text()
+    # In processes of their own; one that does not even start is a failure with a reason.
+    (directory / "case004" / "diagnosis.json").unlink()
+    command = ("blind", "run", str(directory), "--no-such-option")
+    assert run_cases(directory, diagnose, jobs=2, command=command) == (0, 2)
+    note = json.loads((directory / "case004" / "run.json").read_text())
+    assert "no-such-option" in note["error"]
     with pytest.raises(UnknownNameError, match="case009"):
         run_cases(directory, diagnose, only=("case009",))
 

@@ -13,7 +13,7 @@ import pytest
 from ugat_marl.blind.cases import Case, Hidden, Label, write_label, write_plan
 from ugat_marl.blind.grade import Grade, grade, grade_cases, read_grades
 from ugat_marl.blind.strengths import KINDS, nominal_of
-from ugat_marl.blind.table import confusion, markdown, rows_of, wilson, write_table
+from ugat_marl.blind.table import AIMS, confusion, markdown, rows_of, wilson, write_table
 from ugat_marl.effects import SETTINGS, effect_from, known_effects, load
 from ugat_marl.errors import BlindTestError
 
@@ -252,11 +252,15 @@ def test_the_table_counts() -> None:
     assert confusion(some_grades())["headway"] == {"headway": 10, "acceleration": 2}
 
 
+def test_every_aim_belongs_to_a_row() -> None:
+    assert set(AIMS) <= {row.measure for row in rows_of([])}
+
+
 def test_the_table_is_written(tmp_path: Path) -> None:
     write_table(some_grades(), tmp_path / "table.md")
     text = (tmp_path / "table.md").read_text()
     assert text == markdown(some_grades())
-    assert "| 10 | 9 of 10: 90.0 % | 59.6 % to 98.2 % | at least 90 % | yes |" in text
+    assert "| 10 | 9 of 10: 90.0 % | 59.6 % to 98.2 % | at least 90 % | yes | 98 % |" in text
     assert "| headway | 12 | 10 | headway (10), acceleration (2) |" in text
     write_table(some_grades(), tmp_path / "table.json")
     content = json.loads((tmp_path / "table.json").read_text())
