@@ -61,7 +61,7 @@ def explicit(scenario: Scenario) -> Scenario:
 def redrawn(scenario: Scenario, seed: int) -> Scenario:
     """Another day: a Poisson number of copies of every vehicle, departures jittered.
 
-    The same seed gives the same vehicles with the same speedFactor whatever effects are applied
+    The same seed gives the same vehicles, names and speedFactors, whatever effects are applied
     afterwards, so that two models can be compared on the same day.
 
     Args:
@@ -86,7 +86,7 @@ def redrawn(scenario: Scenario, seed: int) -> Scenario:
         departs = np.where((departs >= end) & (vehicles.depart_s < end), 2 * end - departs, departs)
         departs = np.maximum(departs, begin)
         factors = np.clip(mean + deviation * draws[copy], least, greatest)
-        suffix = f"~{copy}" if copy else ""
+        suffix = f"~{seed}.{copy}"  # effects that choose by name choose others every day
         for index in np.flatnonzero(copies > copy).tolist():
             name = quoteattr(vehicles.names[index] + suffix)
             factor = factors[index]

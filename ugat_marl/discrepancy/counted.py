@@ -1,0 +1,45 @@
+"""Features of periods for which there are counts and nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from ugat_marl.discrepancy.features import BIN_FEATURES, BIN_S, FEATURES, INDEX, Tally
+from ugat_marl.discrepancy.site import Site
+from ugat_marl.measured.data import Period
+
+
+def counts_tally(site: Site, period: Period, counts: pl.DataFrame) -> Tally:
+    """Puts counts where the counts of detected vehicles would be; all else stays empty.
+
+    Args:
+        site: Lanes and detectors.
+        period: Which period.
+        counts: ``period_id, begin_s, end_s, detector_id, count``.
+    """
+    places = len(site.lanes) + len(site.exits)
+    length = max(1, round((period.end_s - period.begin_s) / BIN_S))
+    sums = np.zeros((len(FEATURES), places, 2))
+    bins = np.zeros((len(BIN_FEATURES), places, length))
+    edges = np.linspace(period.begin_s, period.end_s, length + 1)
+    rows = _rows(site)
+    for row in counts.filter(pl.col("period_id") == period.id).iter_rows(named=True):
+        name, place = rows.get(row["detector_id"], ("", -1))
+        if place >= 0:
+            begin, end, count = float(row["begin_s"]), float(row["end_s"]), float(row["count"])
+            sums[INDEX[name], place] += (count, (end - begin) / 60.0)
+            inside = np.clip(np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin), 0.0, None)
+            bins[BIN_FEATURES.index(name), place] += count * inside / max(end - begin, 1e-9)
+    return Tally(sums, bins)
+
+
+def _rows(site: Site) -> dict[str, tuple[str, int]]:
+    """Detector to the feature and the place it counts for."""
+    rows: dict[str, tuple[str, int]] = {}
+    for index, lane in enumerate(site.lanes):
+        for kind, names in lane.detectors.items():
+            rows |= dict.fromkeys(names[:1], (f"count_{kind}", index))
+    for index, (_, _, names) in enumerate(site.exits):
+        rows |= {name: ("count_exit", len(site.lanes) + index) for name in names[:1]}
+    return rows

@@ -1,0 +1,208 @@
+"""Tallies of simulated days: in parallel, remembered on disk, within a budget of time."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import io
+import os
+import time
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ugat_marl.discrepancy.features import FEATURES, Tally, tally
+from ugat_marl.discrepancy.replay import Day, Replay
+from ugat_marl.discrepancy.site import Greens, Site
+from ugat_marl.effects.base import Effect
+from ugat_marl.effects.detectors import DetectorEffect
+from ugat_marl.errors import UgatMarlError
+from ugat_marl.files import write_whole
+from ugat_marl.measured.data import Period
+from ugat_marl.scenario import Scenario
+from ugat_marl.seeding import derive_seed
+
+VERSION = 1
+"""Of features and replays: a tally remembered under another version is not used."""
+
+_KEPT_DAYS = 40
+
+
+class OutOfTime(UgatMarlError):
+    """The budget is spent; what is known by then is the answer."""
+
+
+@dataclass(frozen=True, eq=False)
+class Replicate:
+    """What is kept of a simulated day.
+
+    Attributes:
+        tally: Its features.
+        travel_time_s: Mean travel time.
+    """
+
+    tally: Tally
+    travel_time_s: float
+
+
+class Engine:
+    """Simulates days of models and reduces them.
+
+    Args:
+        scenario: The scenario without effects.
+        site: Lanes and detectors.
+        replay: Runs SUMO.
+        periods: Measured periods; replicate ``r`` is played under the signals of period
+            ``r mod len(periods)``.
+        seed: Root of the days.
+        cache: Folder of remembered tallies, or None.
+        deadline: ``time.monotonic()`` at which new simulations are refused, or None.
+        workers: Simulations at a time; default: one per core.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        site: Site,
+        replay: Replay,
+        periods: Sequence[Period],
+        seed: int,
+        *,
+        cache: Path | None = None,
+        deadline: float | None = None,
+        workers: int | None = None,
+    ) -> None:
+        self.site = site
+        self.periods = tuple(periods)
+        self.simulated = 0
+        self.deadline = deadline
+        self._replay = replay
+        self._seed = seed
+        self._cache = cache
+        self._workers = workers or os.cpu_count() or 1
+        self._greens: list[tuple[Greens, ...]] = [site.greens(period) for period in periods]
+        self._days: OrderedDict[str, Day] = OrderedDict()
+        self._known: dict[str, Replicate] = {}
+        head = (VERSION, FEATURES, scenario.hash, site.detectors, _versions(), seed)
+        self._root = hashlib.sha256(repr(head).encode()).hexdigest()
+        self._signals = [_signals_hash(period) for period in periods]
+
+    def measured(self, periods: Sequence[Period]) -> list[Tally]:
+        """Tallies of measured periods."""
+        return [tally(self.site, period, self.site.greens(period)) for period in periods]
+
+    def replicates(
+        self,
+        effects: Sequence[Effect],
+        numbers: Sequence[int],
+        advance: Callable[[], None] | None = None,
+    ) -> list[Replicate]:
+        """Simulated days of a model, in the order of `numbers`.
+
+        Args:
+            effects: The model.
+            numbers: Which days.
+            advance: Called after each of them.
+
+        Raises:
+            OutOfTime: The deadline has passed and a day is not remembered.
+            SimulatorError: SUMO refused.
+        """
+
+        def one(number: int) -> Replicate:
+            found = self._one(tuple(effects), number)
+            if advance is not None:
+                advance()
+            return found
+
+        with ThreadPoolExecutor(self._workers) as pool:
+            futures = [pool.submit(one, number) for number in numbers]
+            try:
+                return [future.result() for future in futures]
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+
+    def _one(self, effects: tuple[Effect, ...], number: int) -> Replicate:
+        key = self._key(effects, number)
+        found = self._known.get(key) or self._remembered(key)
+        if found is None:
+            day = self._day(effects, number)
+            place = number % len(self.periods)
+            counted = tally(self.site, day.period, self._greens[place])
+            found = Replicate(counted, day.travel_time_s)
+            self._remember(key, found)
+        self._known[key] = found
+        return found
+
+    def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
+        """A day as the detectors saw it; faults of detectors cost no further simulation."""
+        faults = tuple(effect for effect in effects if isinstance(effect, DetectorEffect))
+        physics = tuple(effect for effect in effects if not isinstance(effect, DetectorEffect))
+        key = self._key(physics, number)
+        day = self._days.get(key)
+        if day is None:
+            if self.deadline is not None and time.monotonic() > self.deadline:
+                raise OutOfTime("the budget of time is spent")
+            period = self.periods[number % len(self.periods)]
+            seed = derive_seed(self._seed, "replicate", number)
+            day = self._replay.simulate(physics, period, seed)
+            self.simulated += 1
+            self._days[key] = day
+            while len(self._days) > _KEPT_DAYS:
+                try:
+                    self._days.popitem(last=False)
+                except KeyError:  # another thread was quicker
+                    break
+        if not faults:
+            return day
+        return Day(self._replay.observed(faults, day.period), day.travel_time_s)
+
+    def _key(self, effects: Sequence[Effect], number: int) -> str:
+        signals = self._signals[number % len(self.periods)]
+        text = repr((self._root, tuple(map(str, effects)), number, signals))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _remembered(self, key: str) -> Replicate | None:
+        if self._cache is None:
+            return None
+        try:
+            with np.load(self._cache / key[:2] / f"{key}.npz", allow_pickle=False) as stored:
+                counted = Tally(
+                    stored["sums"].astype(np.float64), stored["bins"].astype(np.float64)
+                )
+                return Replicate(counted, float(stored["travel_time_s"]))
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+            return None  # absent or damaged: simulated again
+
+    def _remember(self, key: str, found: Replicate) -> None:
+        if self._cache is None:
+            return
+        content = io.BytesIO()
+        np.savez_compressed(
+            content,
+            sums=found.tally.sums,
+            bins=found.tally.bins.astype(np.float32),
+            travel_time_s=np.float64(found.travel_time_s),
+        )
+        write_whole(self._cache / key[:2] / f"{key}.npz", content.getvalue())
+
+
+def default_cache() -> Path:
+    """Where tallies are remembered between runs: the user's cache folder."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "ugat_marl" / "replicates"
+
+
+def _versions() -> tuple[str, ...]:
+    return tuple(importlib.metadata.version(name) for name in ("eclipse-sumo", "numpy"))
+
+
+def _signals_hash(period: Period) -> str:
+    content = (period.begin_s, period.end_s, sorted(period.signals.items()))
+    return hashlib.sha256(repr(content).encode()).hexdigest()

@@ -1,0 +1,118 @@
+"""Proposes faults of detectors: from counts that are missing, silence, and lamps that stay on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ugat_marl.discrepancy.features import INDEX
+from ugat_marl.discrepancy.hypotheses import Hypothesis
+from ugat_marl.discrepancy.site import Site
+from ugat_marl.discrepancy.statistics import Distance, Reference
+from ugat_marl.measured.data import Passages, Period
+
+_SILENT = 15.0
+"""Vehicles that must be missing before silence is a fault."""
+_STUCK_S = 240.0
+
+
+def fault_hypotheses(
+    site: Site, reference: Reference, distance: Distance, periods: Sequence[Period]
+) -> list[Hypothesis]:
+    """Detectors that count too few, stick, fall silent, or have each other's place."""
+    found: list[Hypothesis] = []
+    places = _detector_rows(site)
+    z = {name: float(distance.z["lane"][row]) for name, row in places.items()}
+    mean = {name: float(reference.blocks["lane"].mean[row]) for name, row in places.items()}
+    difference = {n: float(distance.difference["lane"][r]) for n, r in places.items()}
+    for name in sorted(z, key=lambda name: z[name])[:3]:
+        if z[name] < -2.5 and mean[name] > 0:
+            share = float(np.clip(-difference[name] / mean[name], 0.03, 0.9))
+            found.append(
+                Hypothesis("undercount", (("place", name),), ("share",), ((share,),), (0.0,), 0.02)
+            )
+    found += _stuck(periods) + _silent(periods, mean)
+    kinds = {item.id: item.kind for item in site.detectors}
+    found += _swapped(kinds, mean, difference, z)
+    return found
+
+
+def _detector_rows(site: Site) -> dict[str, tuple[int, int]]:
+    """Detector to its count among the statistics of lanes."""
+    rows: dict[str, tuple[int, int]] = {}
+    for index, lane in enumerate(site.lanes):
+        for kind, names in lane.detectors.items():
+            rows |= dict.fromkeys(names[:1], (index, INDEX[f"count_{kind}"]))
+    for index, (_, _, names) in enumerate(site.exits):
+        place = len(site.lanes) + index
+        rows |= dict.fromkeys(names[:1], (place, INDEX["count_exit"]))
+    return rows
+
+
+def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:
+    """Detectors that were on for minutes at the same time of every period."""
+    found: list[Hypothesis] = []
+    for name in sorted(set.intersection(*(set(p.passages) for p in periods))):
+        windows: list[tuple[float, float]] = []
+        for period in periods:
+            item = period.passages[name]
+            time = np.nan_to_num(item.off_s, nan=period.end_s) - np.nan_to_num(
+                item.on_s, nan=period.begin_s
+            )
+            longest = int(np.argmax(time))
+            if time[longest] < _STUCK_S:
+                break
+            on, off = float(item.on_s[longest]), float(item.off_s[longest])
+            on = period.begin_s if np.isnan(on) else on
+            windows.append((on, period.end_s if np.isnan(off) else off))
+        if len(windows) == len(periods):
+            begin = float(np.median([w[0] for w in windows]))
+            end = float(np.median([w[1] for w in windows]))
+            if max(w[0] for w in windows) < min(w[1] for w in windows):
+                fixed = (("detector", name), ("begin_s", begin), ("end_s", end))
+                found.append(Hypothesis("stuck", fixed, (), ((),), None))
+    return found[:3]
+
+
+def _silent(periods: Sequence[Period], rate: Mapping[str, float]) -> list[Hypothesis]:
+    """Detectors that saw nothing at the same time of every period, though vehicles came."""
+    found: list[tuple[float, Hypothesis]] = []
+    for name, expected in rate.items():
+        begin, end = -np.inf, np.inf
+        for period in periods:
+            item = period.passages.get(name, Passages.none())
+            times = np.concatenate((item.on_s, item.off_s))
+            times = np.sort(times[np.isfinite(times)])
+            times = np.concatenate(([period.begin_s], times, [period.end_s]))
+            longest = int(np.argmax(np.diff(times)))
+            begin, end = max(begin, float(times[longest])), min(end, float(times[longest + 1]))
+        missing = expected * (end - begin) / 60.0 * len(periods)
+        if end > begin and missing > _SILENT:
+            fixed = (("detector", name), ("begin_s", round(begin, 1)), ("end_s", round(end, 1)))
+            found.append((missing, Hypothesis("dropout", fixed, (), ((),), None)))
+    found.sort(key=lambda item: -item[0])
+    return [item for _, item in found[:3]]
+
+
+def _swapped(
+    kinds: Mapping[str, str],
+    mean: Mapping[str, float],
+    difference: Mapping[str, float],
+    z: Mapping[str, float],
+) -> list[Hypothesis]:
+    """Pairs of detectors of one kind whose counts fit once they are exchanged."""
+    found: list[tuple[float, Hypothesis]] = []
+    suspects = [name for name in mean if abs(z[name]) > 4.0]
+    for first in suspects:
+        for second in suspects:
+            if first < second and kinds[first] == kinds[second]:
+                error = abs(difference[first] / z[first]) + abs(difference[second] / z[second])
+                change = mean[second] - mean[first]
+                before = difference[first] ** 2 + difference[second] ** 2
+                after = (difference[first] - change) ** 2 + (difference[second] + change) ** 2
+                if after < 0.3 * before and abs(change) > 3 * error:
+                    fixed = (("detector", first), ("other", second))
+                    found.append((before - after, Hypothesis("swapped", fixed, (), ((),), None)))
+    found.sort(key=lambda item: -item[0])
+    return [item for _, item in found[:2]]

@@ -1,0 +1,259 @@
+"""Fits the free numbers of a set of effects by simulation, and says how well they are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.discrepancy.engine import Engine
+from ugat_marl.discrepancy.features import Tally
+from ugat_marl.discrepancy.hypotheses import Hypothesis, ordered
+from ugat_marl.discrepancy.statistics import (
+    Distance,
+    Pools,
+    Reference,
+    Whitener,
+    shift,
+    without_noise,
+)
+from ugat_marl.effects import Effect
+
+Array = NDArray[np.float64]
+
+Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
+"""A set of effects: hypotheses and the values of their free fields."""
+
+INTERPOLATION = 0.02
+"""Share of a measured difference that a model is forgiven while it is fitted: simulation steps
+round what the street does not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model that was simulated.
+
+    Attributes:
+        members: Its effects.
+        tallies: Its simulated days.
+        reference: Its statistics.
+        distance: From the data that were fitted.
+        cost: Distance, penalty for noise, and price of the effects: less is better.
+    """
+
+    members: Members
+    tallies: tuple[Tally, ...]
+    reference: Reference
+    distance: Distance
+    cost: float
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects in the order in which they are applied."""
+        return effects_of(self.members)
+
+    @property
+    def values(self) -> Array:
+        """All free values, one after the other."""
+        return np.array([value for _, values in self.members for value in values])
+
+
+def effects_of(members: Members) -> tuple[Effect, ...]:
+    """Effects of a set, in order."""
+    return ordered([hypothesis.effect(values) for hypothesis, values in members])
+
+
+class Fitter:
+    """Simulates and fits models against one data set.
+
+    Args:
+        engine: Simulates.
+        pools: How places pool.
+        base: Statistics of the scenario as it is.
+        base_tallies: Its simulated days.
+        data: Tallies of the periods to fit.
+        days: Simulated days behind each evaluation.
+        price: What every effect must gain.
+        speeds: Whether speeds were measured.
+        tick: Called after every simulated day.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        pools: Pools,
+        base: Reference,
+        base_tallies: Sequence[Tally],
+        data: Sequence[Tally],
+        *,
+        days: int,
+        price: float,
+        speeds: bool,
+        tick: Callable[[], None] | None = None,
+    ) -> None:
+        self.engine = engine
+        self.pools = pools
+        self.base = base
+        self.base_tallies = tuple(base_tallies)
+        self.data = tuple(data)
+        self.days = days
+        self.price = price
+        self.speeds = speeds
+        self.tick = tick
+
+    def simulate(self, members: Members, days: int | None = None) -> Fitted:
+        """Simulates a set of effects and measures its distance from the data."""
+        count = min(days or self.days, len(self.base_tallies))
+        found = self.engine.replicates(effects_of(members), range(count), self.tick)
+        tallies = tuple(item.tally for item in found)
+        reference = Reference(
+            self.pools,
+            tallies,
+            speeds=self.speeds,
+            prior=self.base,
+            paired=self.base_tallies[:count],
+        )
+        distance = reference.distance(self.data, relative_to=self.base)
+        cost = distance.total + distance.penalty + self.price * len(members)
+        return Fitted(members, tallies, reference, distance, cost)
+
+    def refine(self, start: Fitted, rounds: int = 3) -> Fitted:
+        """Gauss-Newton steps from a simulated model, with derivatives by finite differences."""
+        best = start
+        jacobian: Array | None = None
+        for number in range(rounds):
+            if not len(best.values):
+                break
+            whitener = Whitener(best.reference, self.data, INTERPOLATION, self.base)
+            if jacobian is None or number == 2:
+                jacobian = self.jacobian(best, whitener)
+            step = _solve(jacobian, whitener.measured)
+            moved = self._moved(best, step)
+            if moved == best.members:
+                break
+            found = self.simulate(moved)
+            if found.cost >= best.cost:
+                moved = self._moved(best, 0.4 * step)
+                if moved == best.members:
+                    break
+                found = self.simulate(moved)
+                if found.cost >= best.cost:
+                    if number:
+                        break
+                    jacobian = None
+                    continue
+            gain, best = best.cost - found.cost, found
+            if gain < 1.0 and number:
+                break
+        return best
+
+    def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
+        """Derivatives of the whitened statistics, ``(free values, statistics)``."""
+        rows: list[Array] = []
+        for place, (hypothesis, values) in enumerate(model.members):
+            for index in range(len(values)):
+                delta = _difference(hypothesis, values, index)
+                changed = list(values)
+                changed[index] += delta
+                moved = hypothesis.clipped(changed)
+                if moved == values:
+                    changed[index] -= 2 * delta
+                    moved = hypothesis.clipped(changed)
+                delta = moved[index] - values[index]
+                members = _replaced(model.members, place, moved)
+                found = self.engine.replicates(
+                    effects_of(members), range(len(model.tallies)), self.tick
+                )
+                change, noise = shift(self.pools, [item.tally for item in found], model.tallies)
+                rows.append(whitener(without_noise(change, noise)) / (delta or 1.0))
+        return np.stack(rows)
+
+    def _moved(self, model: Fitted, step: Array) -> Members:
+        """The model's values after a step, in range and not too far at once."""
+        moved: list[tuple[Hypothesis, tuple[float, ...]]] = []
+        place = 0
+        for hypothesis, values in model.members:
+            changed: list[float] = []
+            for index, value in enumerate(values):
+                nominal = hypothesis.nominal[index] if hypothesis.nominal else value
+                most = max(abs(value - nominal), 4 * hypothesis.least, 1e-6)
+                changed.append(value + float(np.clip(step[place], -most, most)))
+                place += 1
+            moved.append((hypothesis, hypothesis.clipped(changed)))
+        return tuple(moved)
+
+
+def _difference(hypothesis: Hypothesis, values: tuple[float, ...], index: int) -> float:
+    """How far a value is moved for a derivative."""
+    if hypothesis.step:
+        return hypothesis.step
+    nominal = hypothesis.nominal[index] if hypothesis.nominal else 0.0
+    return max(0.12 * abs(values[index] - nominal), hypothesis.least, 1e-3)
+
+
+def _replaced(members: Members, place: int, values: tuple[float, ...]) -> Members:
+    hypothesis = members[place][0]
+    return (*members[:place], (hypothesis, values), *members[place + 1 :])
+
+
+def _solve(jacobian: Array, residual: Array) -> Array:
+    """Least squares with a touch of ridge, each value on its own scale."""
+    scale = np.sqrt((jacobian**2).sum(axis=1)) + 1e-12
+    scaled = jacobian / scale[:, None]
+    normal = scaled @ scaled.T + 1e-3 * np.eye(len(scaled))
+    return np.linalg.solve(normal, scaled @ residual) / scale
+
+
+def uncertainty(
+    fitter: Fitter, model: Fitted, inflation: float = 1.0
+) -> tuple[Array, dict[str, Array]]:
+    """Standard errors of the free values, and what they make uncertain in the statistics.
+
+    The parts of the distance depend on each other, so the errors come from how much the estimate
+    would move between simulated days (a sandwich estimate), not from the curvature alone.
+
+    Returns:
+        Standard errors ``(free values,)``, and variances of the expected statistics per block.
+    """
+    if not len(model.values):
+        return np.empty(0), {
+            name: np.zeros_like(b.mean) for name, b in model.reference.blocks.items()
+        }
+    whitener = Whitener(model.reference, fitter.data, INTERPOLATION, fitter.base)
+    jacobian = fitter.jacobian(model, whitener)
+    inverse = np.linalg.pinv(jacobian @ jacobian.T)
+    influences: list[Array] = []
+    for item in model.tallies:
+        difference, _ = shift(fitter.pools, [item], model.tallies)
+        influences.append(inverse @ (jacobian @ whitener(difference)))
+    spread = np.atleast_2d(np.cov(np.stack(influences).T))
+    covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies)) * inflation
+    extra: dict[str, Array] = {}
+    changes = _changes(fitter, model)
+    for name, block in model.reference.blocks.items():
+        slopes = np.stack([change[name] for change in changes])
+        extra[name] = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes) + 0.0 * block.mean
+        extra[name] = np.nan_to_num(extra[name])
+    return np.sqrt(np.diag(covariance)), extra
+
+
+def _changes(fitter: Fitter, model: Fitted) -> list[dict[str, Array]]:
+    """Derivatives of the statistics themselves; simulated before, by `Fitter.jacobian`."""
+    found: list[dict[str, Array]] = []
+    for place, (hypothesis, values) in enumerate(model.members):
+        for index in range(len(values)):
+            delta = _difference(hypothesis, values, index)
+            changed = list(values)
+            changed[index] += delta
+            moved = hypothesis.clipped(changed)
+            if moved == values:
+                changed[index] -= 2 * delta
+                moved = hypothesis.clipped(changed)
+            delta = moved[index] - values[index]
+            members = _replaced(model.members, place, moved)
+            days = fitter.engine.replicates(effects_of(members), range(len(model.tallies)))
+            change, _ = shift(fitter.pools, [item.tally for item in days], model.tallies)
+            found.append({name: values_ / (delta or 1.0) for name, values_ in change.items()})
+    return found

@@ -1,0 +1,215 @@
+"""The library: which effects may be missing, at which strengths they are first tried."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from ugat_marl.effects import DetectorEffect, Effect, known_effects
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.scenario import Scenario
+
+WINDOW = ("begin_s", "end_s")
+NAME_ONLY = ("driver_model", "swapped")
+"""Effects without a number: they are there or not."""
+
+ORDER = (
+    "local_speed", "demand_level", "demand_surge", "demand_timing", "turning", "lane_closure",
+    "parking",
+)  # fmt: skip
+"""Effects on roads and demand come first, then drivers, trucks, signals, and detectors last."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect with what is not known of it left open.
+
+    Attributes:
+        name: Of the effect.
+        fixed: Fields that are known: places, windows, models.
+        free: Fields to be fitted.
+        levels: Values of the free fields at which it is first simulated.
+        nominal: Values of the free fields that change nothing, or None if unknown.
+        least: Distance from nominal below which it does not matter in practice.
+        step: Values are multiples of it, if not 0.
+    """
+
+    name: str
+    fixed: tuple[tuple[str, Any], ...]
+    free: tuple[str, ...]
+    levels: tuple[tuple[float, ...], ...]
+    nominal: tuple[float, ...] | None
+    least: float = 0.0
+    step: float = 0.0
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What may stand in a model only once."""
+        return (self.name, tuple(item for item in self.fixed if isinstance(item[1], str)))
+
+    @property
+    def faults_only(self) -> bool:
+        """Whether it concerns detectors and not traffic."""
+        return issubclass(known_effects()[self.name], DetectorEffect)
+
+    def effect(self, values: Sequence[float]) -> Effect:
+        """The effect with these values of the free fields, brought into range."""
+        given = dict(self.fixed)
+        given |= dict(zip(self.free, self.clipped(values), strict=True))
+        return known_effects()[self.name](**given)
+
+    def clipped(self, values: Sequence[float]) -> tuple[float, ...]:
+        """The values inside the effect's plausible ranges, and on its grid."""
+        ranges = known_effects()[self.name].ranges
+        found: list[float] = []
+        for name, value in zip(self.free, values, strict=True):
+            low, high = ranges[name].low, ranges[name].high
+            if self.step:
+                value = self.step * round(value / self.step)
+            found.append(round(min(max(float(value), low), high), 4))
+        return tuple(found)
+
+    def matters(self, values: Sequence[float]) -> bool:
+        """Whether the effect is strong enough to be named."""
+        if not self.free or self.nominal is None:
+            return True
+        return abs(values[0] - self.nominal[0]) >= self.least
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A global effect of the library: one number for the whole network."""
+
+    field: str
+    levels: tuple[float, ...]
+    nominal: float
+    least: float
+    place: str = ""
+    step: float = 0.0
+    attribute: str = ""
+
+
+_GLOBAL: dict[str, _Entry] = {
+    "acceleration": _Entry("mps2", (0.7, 1.4, 3.6), 2.6, 0.1, attribute="accel"),
+    "deceleration": _Entry("mps2", (2.0, 3.2, 6.5), 4.5, 0.2, attribute="decel"),
+    "startup_delay": _Entry(
+        "seconds", (0.25, 0.5, 0.75, 1.0, 1.5), 0.0, 0.05, attribute="startupDelay"
+    ),
+    "headway": _Entry("seconds", (1.3, 1.7), 1.0, 0.05, attribute="tau"),
+    "min_gap": _Entry("metres", (1.5, 3.5, 5.0), 2.5, 0.2, attribute="minGap"),
+    "imperfection": _Entry("sigma", (0.15, 0.85), 0.5, 0.05, attribute="sigma"),
+    "desired_speed": _Entry("factor", (0.85, 1.12), 1.0, 0.01),
+    "speed_spread": _Entry("deviation", (0.03, 0.2), 0.1, 0.01, attribute="speedDev"),
+    "reaction_step": _Entry("seconds", (2.0,), 1.0, 0.5, attribute="actionStepLength"),
+    "yellow_running": _Entry("seconds", (3.0,), 0.0, 0.3, attribute="jmDriveAfterYellowTime"),
+    "red_running": _Entry("seconds", (1.0, 3.0), 0.0, 0.3, attribute="jmDriveAfterRedTime"),
+    "gap_acceptance": _Entry("seconds", (0.4, 2.5), 1.0, 0.2, attribute="jmTimegapMinor"),
+    "lane_discipline": _Entry("strategic", (0.1, 5.0), 1.0, 0.2, attribute="lcStrategic"),
+    "heavy_share": _Entry("share", (0.06, 0.2), 0.0, 0.01),
+    "late_green": _Entry("seconds", (1.0, 3.0), 0.0, 0.3, place="place"),
+    "signal_clock": _Entry("seconds", (-2.0, 2.0), 0.0, 0.2, place="place"),
+    "clock_drift": _Entry("seconds_per_hour", (-3.0, 3.0), 0.0, 0.5, place="place"),
+    "undercount": _Entry("share", (0.1, 0.3), 0.0, 0.02, place="place"),
+    "demand_level": _Entry("factor", (0.85, 1.15), 1.0, 0.03, place="edge"),
+    "demand_timing": _Entry("seconds", (-300.0, 300.0), 0.0, 45.0, place="edge"),
+}
+
+LOCAL = frozenset(
+    {
+        "demand_surge", "turning", "lane_closure", "parking", "local_speed", "stuck", "dropout",
+        "swapped",
+    }
+)  # fmt: skip
+"""Effects that only a place, and often a window, makes complete: see `local`."""
+
+MODELS = ("IDM", "EIDM", "W99", "Wiedemann", "ACC", "Krauss")
+
+
+def library(without: Collection[str] = ()) -> frozenset[str]:
+    """Names of all effects that are examined.
+
+    Raises:
+        UnknownNameError: A name in `without` is not in the library.
+    """
+    names = frozenset(_GLOBAL) | LOCAL | {"driver_model"}
+    for name in without:
+        if name not in names:
+            raise UnknownNameError("effect of the library", name, names)
+    return names - frozenset(without)
+
+
+def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypothesis]:
+    """Hypotheses about the whole network.
+
+    Args:
+        scenario: Its vehicle types say where each number is now.
+        allowed: Names of effects to examine.
+    """
+    found: list[Hypothesis] = []
+    step = scenario.settings.step_length_s
+    for name, entry in _GLOBAL.items():
+        if name not in allowed:
+            continue
+        nominal = _nominal(scenario, entry)
+        levels = tuple((level,) for level in entry.levels if abs(level - nominal) > entry.least)
+        if name == "reaction_step":
+            nominal, levels = max(nominal, step), ((2 * max(nominal, step),),)
+        fixed = ((entry.place, "*"),) if entry.place else ()
+        grid = step if name == "reaction_step" else 0.0
+        found.append(Hypothesis(name, fixed, (entry.field,), levels, (nominal,), entry.least, grid))
+    if "driver_model" in allowed:
+        now = _attribute(scenario, "carFollowModel")
+        found += [
+            Hypothesis("driver_model", (("model", model),), (), ((),), None)
+            for model in ("IDM", "EIDM", "W99")
+            if now != {model}
+        ]
+    return found
+
+
+def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The order in which effects are applied: a truck keeps its own acceleration, say."""
+
+    def rank(effect: Effect) -> tuple[int, str]:
+        if isinstance(effect, DetectorEffect):
+            return (4, str(effect))
+        if effect.name in ORDER:
+            return (0, str(effect))
+        if effect.name == "driver_model":
+            return (1, str(effect))
+        return (3 if effect.name == "heavy_share" else 2, str(effect))
+
+    return tuple(sorted(effects, key=rank))
+
+
+def _nominal(scenario: Scenario, entry: _Entry) -> float:
+    """The number in the scenario's vehicle types if they agree, their mean, or SUMO's default."""
+    values: list[float] = []
+    for text in _attribute(scenario, entry.attribute) if entry.attribute else ():
+        try:
+            values.append(float(text))
+        except ValueError:
+            return entry.nominal
+    return float(np.mean(values)) if values else entry.nominal
+
+
+def _attribute(scenario: Scenario, name: str) -> set[str]:
+    """What the vehicle types of a scenario say."""
+    found: set[str] = set()
+    for document in (*scenario.additional, *scenario.routes):
+        if b"<vType" in document.read():
+            found |= {
+                item.get(name, "") for item in document.parse().iter("vType") if item.get(name)
+            }
+    return found
+
+
+def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:
+    """The values of the free fields in an effect."""
+    known = {item.name for item in fields(effect)}
+    if missing := [name for name in hypothesis.free if name not in known]:
+        raise OptionError(f"effect {effect.name!r} has no {missing[0]!r}")
+    return tuple(float(getattr(effect, name)) for name in hypothesis.free)

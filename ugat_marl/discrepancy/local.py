@@ -1,0 +1,374 @@
+"""Proposes effects at places and in windows: by what is left over there, before any simulation.
+
+Counts tell where demand and turning differ, since routes say which detectors a change would reach.
+Time tells windows: the stretch of minutes in which a place departs most from the model, found by a
+scan over all stretches. Detectors tell their own faults.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.discrepancy.faults import fault_hypotheses
+from ugat_marl.discrepancy.features import BIN_FEATURES, INDEX
+from ugat_marl.discrepancy.hypotheses import Hypothesis
+from ugat_marl.discrepancy.site import Site
+from ugat_marl.discrepancy.statistics import Distance, Reference
+from ugat_marl.measured.data import Passages, Period
+from ugat_marl.redraw import explicit
+from ugat_marl.scenario import Scenario
+
+Array = NDArray[np.float64]
+
+SCAN_S = 60.0
+SHORTEST_S = 240.0
+
+
+@dataclass(frozen=True, eq=False)
+class Routes:
+    """Which edges vehicles use: per pair of edges, vehicles per hour of the scenario.
+
+    Attributes:
+        origins: Vehicles per hour by first edge.
+        passing: ``passing[origin][edge]``, vehicles per hour that start there and pass here.
+        turns: ``turns[edge][next edge]``, vehicles per hour.
+    """
+
+    origins: dict[str, float]
+    passing: dict[str, dict[str, float]]
+    turns: dict[str, dict[str, float]]
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Routes:
+        """Counts the routes of all vehicles."""
+        origins: dict[str, float] = defaultdict(float)
+        passing: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        turns: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        rate = 3600.0 / scenario.settings.duration_s
+        for document in explicit(scenario).routes:
+            for item in document.parse().iter("route"):
+                edges = item.get("edges", "").split()
+                if edges:
+                    origins[edges[0]] += rate
+                    for edge in dict.fromkeys(edges):
+                        passing[edges[0]][edge] += rate
+                    for edge, following in zip(edges, edges[1:], strict=False):
+                        turns[edge][following] += rate
+        return cls(
+            dict(origins),
+            {k: dict(v) for k, v in passing.items()},
+            {k: dict(v) for k, v in turns.items()},
+        )
+
+
+class Proposer:
+    """Finds places and windows.
+
+    Args:
+        site: Lanes and detectors.
+        routes: Of the scenario.
+        allowed: Names of effects to examine.
+    """
+
+    def __init__(self, site: Site, routes: Routes, allowed: Collection[str]) -> None:
+        self._site = site
+        self._routes = routes
+        self._allowed = frozenset(allowed)
+        self._edges = [lane.edge for lane in site.lanes]
+        self._edges += [lane.rsplit("_", 1)[0] for _, lane, _ in site.exits]
+
+    def hypotheses(
+        self, reference: Reference, distance: Distance, periods: Sequence[Period]
+    ) -> list[Hypothesis]:
+        """What may be wrong at some place, strongest first within each kind.
+
+        Args:
+            reference: The model so far.
+            distance: Of the data from it.
+            periods: The data.
+        """
+        found: list[Hypothesis] = []
+        found += self._demand(distance)
+        found += self._turning(distance)
+        found += self._windows(reference, periods)
+        found += self._places(distance)
+        found += fault_hypotheses(self._site, reference, distance, periods)
+        return [item for item in found if item.name in self._allowed]
+
+    # --- volume -------------------------------------------------------------------------------
+
+    def _edge_counts(self, distance: Distance) -> tuple[list[str], Array, Array]:
+        """Per edge: measured minus expected vehicles per hour, and its standard error."""
+        hour = 60.0
+        lanes = len(self._site.lanes)
+        names: list[str] = []
+        differences: list[float] = []
+        errors: list[float] = []
+        for edge in dict.fromkeys(self._edges):
+            members = [i for i, name in enumerate(self._edges) if name == edge]
+            kinds = ("count_stop", "count_advance") if members[0] < lanes else ("count_exit",)
+            for kind in kinds:
+                row = INDEX[kind]
+                difference = distance.difference["lane"][members, row]
+                z = distance.z["lane"][members, row]
+                known = (difference != 0) & (z != 0)
+                if known.any():
+                    names.append(edge)
+                    differences.append(hour * float(difference.sum()))
+                    error = np.abs(difference[known] / z[known])
+                    errors.append(hour * float(np.sqrt((error**2).sum())))
+                    break
+        return names, np.array(differences), np.array(errors)
+
+    def _demand(self, distance: Distance) -> list[Hypothesis]:
+        """Origins whose rays of counts explain most."""
+        edges, difference, error = self._edge_counts(distance)
+        ranked: list[tuple[float, str, float]] = []
+        for origin, reached in self._routes.passing.items():
+            ray = np.array([reached.get(edge, 0.0) for edge in edges]) / np.maximum(error, 1e-9)
+            size = float(ray @ ray)
+            if size > 9.0:
+                strength = float(ray @ (difference / np.maximum(error, 1e-9))) / size
+                ranked.append((strength**2 * size, origin, 1.0 + strength))
+        ranked.sort(reverse=True)
+        return [
+            Hypothesis(
+                "demand_level",
+                (("edge", origin),),
+                ("factor",),
+                ((float(np.clip(factor, 0.3, 3.0)),),),
+                (1.0,),
+                0.03,
+            )
+            for gain, origin, factor in ranked[:2]
+            if gain > 9.0 and len(self._routes.passing) > 1
+        ]
+
+    def _turning(self, distance: Distance) -> list[Hypothesis]:
+        """Pairs of edges between which vehicles would have to move."""
+        edges, difference, error = self._edge_counts(distance)
+        place = {edge: index for index, edge in enumerate(edges)}
+        measured = difference / np.maximum(error, 1e-9)
+        ranked: list[tuple[float, str, str, float]] = []
+        approaches = {lane.edge for lane in self._site.lanes}
+        for origin in sorted(approaches & set(self._routes.turns)):
+            leaving = self._routes.turns[origin]
+            for target in leaving:
+                ray = np.zeros(len(edges))
+                for other, rate in leaving.items():
+                    change = sum(leaving.values()) - rate if other == target else -rate
+                    if other in place:
+                        ray[place[other]] += change
+                ray = ray / np.maximum(error, 1e-9)
+                size = float(ray @ ray)
+                if size > 4.0:
+                    share = float(ray @ measured) / size
+                    if share > 0.02:
+                        ranked.append((share**2 * size, origin, target, min(share, 0.9)))
+        ranked.sort(reverse=True)
+        return [
+            Hypothesis(
+                "turning",
+                (("from_edge", origin), ("to_edge", target)),
+                ("share",),
+                ((share,),),
+                (0.0,),
+                0.03,
+            )
+            for gain, origin, target, share in ranked[:3]
+            if gain > 9.0
+        ]
+
+    # --- time ---------------------------------------------------------------------------------
+
+    def _windows(self, reference: Reference, periods: Sequence[Period]) -> list[Hypothesis]:
+        """Surges and closures in the stretches that depart most."""
+        if len({(p.begin_s, p.end_s) for p in periods}) > 1:
+            return []
+        found: list[tuple[float, Hypothesis]] = []
+        for origin in self._routes.passing:
+            members = [i for i, edge in enumerate(self._edges) if edge == origin]
+            window = self._scan(reference, periods, members, "count_advance", "count_exit")
+            if window is not None:
+                z, begin, end, factor = window
+                fixed = (("edge", origin), ("begin_s", begin), ("end_s", end))
+                level = float(np.clip(factor, 0.1, 4.0))
+                surge = Hypothesis("demand_surge", fixed, ("factor",), ((level,),), (1.0,), 0.1)
+                found.append((z, surge))
+        for index, lane in enumerate(self._site.lanes):
+            window = self._scan(reference, periods, [index], "occupied", "occupied")
+            other = self._scan(reference, periods, [index], "count_stop", "count_advance")
+            for option in (window, other):
+                if option is not None:
+                    z, begin, end, _ = option
+                    fixed = (("lane", lane.id), ("begin_s", begin), ("end_s", end))
+                    found.append((z, Hypothesis("lane_closure", fixed, (), ((),), None)))
+        found.sort(key=lambda item: -item[0])
+        chosen: list[Hypothesis] = []
+        for kind, most in (("demand_surge", 2), ("lane_closure", 4)):
+            chosen += [item for _, item in found if item.name == kind][:most]
+        return chosen
+
+    def _scan(
+        self,
+        reference: Reference,
+        periods: Sequence[Period],
+        members: Sequence[int],
+        kind: str,
+        other: str,
+    ) -> tuple[float, float, float, float] | None:
+        """The stretch in which counts depart most from their ratio over the rest of the period.
+
+        Returns:
+            Standardised size, begin, end, ratio to the expected; or None if all is chance.
+        """
+        block = reference.blocks["time"]
+        places = len(self._edges)
+        rows: list[int] = []
+        for index in members:
+            name = kind if index < len(self._site.lanes) else other
+            row = BIN_FEATURES.index(name) * places + index
+            if block.used[row].any():
+                rows.append(row)
+        if not rows:
+            return None
+        begin, end = periods[0].begin_s, periods[0].end_s
+        minutes = max(int((end - begin) / SCAN_S), 1)
+        bins = block.mean.shape[1]
+        which = np.minimum((np.arange(minutes) * bins) // minutes, bins - 1)
+        per_bin = np.bincount(which, minlength=bins)
+        expected = (block.mean[rows].sum(axis=0) / np.maximum(per_bin, 1))[which]
+        variance = (block.variance[rows].sum(axis=0) / np.maximum(per_bin, 1))[which] / len(periods)
+        measured = self._minutes(periods, members, kind, other, minutes)
+        return _most_unusual(measured, expected, variance, begin)
+
+    def _minutes(
+        self, periods: Sequence[Period], members: Sequence[int], kind: str, other: str, minutes: int
+    ) -> Array:
+        """Counts, or occupied seconds, per minute: the mean over the periods."""
+        total = np.zeros(minutes)
+        for period in periods:
+            edges = np.linspace(period.begin_s, period.end_s, minutes + 1)
+            for index in members:
+                passages = self._passages(
+                    period, index, kind if index < len(self._site.lanes) else other
+                )
+                if passages is None or not len(passages):
+                    continue
+                on = np.where(np.isfinite(passages.on_s), passages.on_s, passages.off_s)
+                if kind == "occupied":
+                    off = np.where(np.isfinite(passages.off_s), passages.off_s, period.end_s)
+                    total += _occupied(on, np.maximum(off, on), edges)
+                else:
+                    total += np.histogram(on[np.isfinite(on)], edges)[0]
+        return total / len(periods)
+
+    def _passages(self, period: Period, index: int, kind: str) -> Passages | None:
+        lanes = self._site.lanes
+        if index >= len(lanes):
+            names = self._site.exits[index - len(lanes)][2]
+        else:
+            names = lanes[index].detectors.get("stop" if kind == "count_stop" else "advance", ())
+        return next((period.passages[n] for n in names if n in period.passages), None)
+
+    # --- places -------------------------------------------------------------------------------
+
+    def _places(self, distance: Distance) -> list[Hypothesis]:
+        """Lanes for parking, edges for slow roads, traffic lights for lost time and clocks."""
+        found: list[Hypothesis] = []
+        lanes = self._site.lanes
+        z = distance.z["lane"][: len(lanes)]
+        flow = [
+            INDEX[name]
+            for name in (
+                "gap_long",
+                "occupied_in_green",
+                "gap9+",
+                "free_speed",
+                "queue_over",
+                "platoon_gap",
+            )
+        ]
+        unusual = np.abs(np.clip(z[:, flow], -15, 15)).sum(axis=1)
+        for index in np.argsort(-unusual)[:2]:
+            found += [
+                Hypothesis("parking", (("lane", lanes[int(index)].id), ("dwell_s", dwell)),
+                           ("per_hour",), ((20.0,),), (0.0,), 3.0)
+                for dwell in (40.0,)
+            ]  # fmt: skip
+        speed = distance.z["lane"][: len(lanes), INDEX["free_speed"]]
+        by_edge: dict[str, float] = defaultdict(float)
+        for lane, value in zip(lanes, speed, strict=True):
+            by_edge[lane.edge] += float(value)
+        if len(by_edge) > 1:
+            typical = float(np.median(list(by_edge.values())))
+            ranked = sorted(by_edge, key=lambda edge: -abs(by_edge[edge] - typical))
+            found += [
+                Hypothesis("local_speed", (("edge", edge),), ("factor",), ((0.8,),), (1.0,), 0.02)
+                for edge in ranked[:2]
+            ]
+        if len(self._site.intersections) > 1:
+            found += self._traffic_lights(distance)
+        return found
+
+    def _traffic_lights(self, distance: Distance) -> list[Hypothesis]:
+        """The two traffic lights whose starts of green differ most from the others'."""
+        lost = distance.z["intersection"][:, INDEX["lost"]]
+        lost = lost - np.median(lost)
+        drift = distance.z["intersection"][:, INDEX["lost_trend"]]
+        drift = drift - np.median(drift)
+        names = self._site.intersections
+        found: list[Hypothesis] = []
+        for index in np.argsort(-np.abs(lost))[:2]:
+            place = (("place", names[int(index)]),)
+            found.append(Hypothesis("late_green", place, ("seconds",), ((2.0,),), (0.0,), 0.3))
+            sign = 2.0 if lost[index] > 0 else -2.0
+            found.append(Hypothesis("signal_clock", place, ("seconds",), ((sign,),), (0.0,), 0.2))
+        for index in np.argsort(-np.abs(drift))[:1]:
+            sign = 3.0 if drift[index] > 0 else -3.0
+            place = (("place", names[int(index)]),)
+            found.append(
+                Hypothesis("clock_drift", place, ("seconds_per_hour",), ((sign,),), (0.0,), 0.5)
+            )
+        return found
+
+
+def _most_unusual(
+    measured: Array, expected: Array, variance: Array, begin_s: float
+) -> tuple[float, float, float, float] | None:
+    """Scans all stretches for the largest standardised departure from a constant ratio."""
+    total = float(expected.sum())
+    if total <= 0:
+        return None
+    minutes = len(measured)
+    sums = [np.concatenate(([0.0], np.cumsum(row))) for row in (measured, expected, variance)]
+    shortest = int(SHORTEST_S / SCAN_S)
+    best: tuple[float, int, int, float] | None = None
+    for length in range(shortest, max(int(0.7 * minutes), shortest) + 1):
+        inside = [row[length:] - row[:-length] for row in sums]
+        rest = (sums[0][-1] - inside[0]) / np.maximum(sums[1][-1] - inside[1], 1e-9)
+        excess = inside[0] - rest * inside[1]
+        share = inside[1] / np.maximum(sums[1][-1] - inside[1], 1e-9)
+        noise = np.sqrt(np.maximum(inside[2] * (1 + share), 1e-6))
+        z = excess / noise
+        place = int(np.argmax(np.abs(z)))
+        if best is None or abs(z[place]) > best[0]:
+            ratio = float(inside[0][place] / max(rest[place] * inside[1][place], 1e-9))
+            best = (float(abs(z[place])), place, place + length, ratio)
+    if best is None or best[0] < 4.0:
+        return None
+    z, first, last, ratio = best
+    return z, begin_s + SCAN_S * first, begin_s + SCAN_S * last, ratio
+
+
+def _occupied(on: Array, off: Array, edges: Array) -> Array:
+    """Occupied seconds between edges of time."""
+    filled = np.zeros(len(edges))
+    for index, edge in enumerate(edges):
+        filled[index] = np.clip(np.minimum(off, edge) - on, 0.0, None).sum()
+    return np.diff(filled)

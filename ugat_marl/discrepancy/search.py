@@ -1,0 +1,137 @@
+"""Proposes models: which effects, at which strengths, would make the measured difference.
+
+Every hypothesis is simulated at a few strengths; each is a ray in the space of statistics. Subsets
+of up to three rays are fitted to the measured difference by least squares, all of them, which costs
+no simulation: so effects that hide each other are proposed together and not one after the other.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.discrepancy.hypotheses import Hypothesis
+from ugat_marl.discrepancy.statistics import Whitener, without_noise
+
+Array = NDArray[np.float64]
+
+FARTHEST = 1.6
+"""A ray is followed so far beyond the simulated strength."""
+NEAREST = 0.08
+
+
+@dataclass(frozen=True, eq=False)
+class Ray:
+    """What a hypothesis does at one strength.
+
+    Attributes:
+        hypothesis: Which.
+        level: Values of its free fields.
+        difference: Change of the statistics, per block.
+        variance: Variance of that change.
+        origin: Values at which nothing changes: the nominal ones, or those of the model so far.
+    """
+
+    hypothesis: Hypothesis
+    level: tuple[float, ...]
+    difference: dict[str, Array]
+    variance: dict[str, Array]
+    origin: tuple[float, ...] | None
+
+    def at(self, strength: float) -> tuple[float, ...]:
+        """Values of the free fields at a multiple of the simulated strength."""
+        if self.origin is None:
+            return self.level
+        values = [n + strength * (x - n) for n, x in zip(self.origin, self.level, strict=True)]
+        return self.hypothesis.clipped(values)
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A set of effects to simulate.
+
+    Attributes:
+        members: Hypotheses and values of their free fields.
+        expected: Distance that is left if all goes as on the rays.
+    """
+
+    members: tuple[tuple[Hypothesis, tuple[float, ...]], ...]
+    expected: float
+
+
+def propose(
+    rays: Sequence[Ray], whitener: Whitener, price: float, largest: int = 3
+) -> list[Proposal]:
+    """Sets of effects in order of what they would leave.
+
+    Args:
+        rays: What hypotheses do.
+        whitener: The measured difference and its noise.
+        price: What every further effect must gain.
+        largest: Size of the largest sets.
+
+    Returns:
+        Each set of hypotheses once, at its best strengths.
+    """
+    if not rays:
+        return []
+    target = whitener.measured
+    basis = np.stack([whitener(without_noise(ray.difference, ray.variance)) for ray in rays])
+    gram = basis @ basis.T
+    match = basis @ target
+    start = float(target @ target)
+    best: dict[tuple[object, ...], Proposal] = {}
+    kept = list(range(len(rays)))
+    for size in range(1, largest + 1):
+        if size == 3 and len(kept) > 40:  # the strongest alone or in pairs
+            kept = _useful(best, rays, 40)
+        for chosen in itertools.combinations(kept, size):
+            keys = tuple(sorted(str(rays[index].hypothesis.key) for index in chosen))
+            if len(set(keys)) < size:
+                continue
+            found = _least_squares(gram, match, chosen)
+            if found is None:
+                continue
+            left = start - float(
+                found @ (2 * match[list(chosen)] - gram[np.ix_(chosen, chosen)] @ found)
+            )
+            cost = left + price * size
+            if keys not in best or cost < best[keys].expected:
+                members = tuple(
+                    (rays[index].hypothesis, rays[index].at(float(strength)))
+                    for index, strength in zip(chosen, found, strict=True)
+                )
+                best[keys] = Proposal(members, cost)
+    return sorted(best.values(), key=lambda item: item.expected)
+
+
+def _least_squares(gram: Array, match: Array, chosen: tuple[int, ...]) -> Array | None:
+    """Strengths along the rays, within reach; None if one of them does not help."""
+    part = gram[np.ix_(chosen, chosen)]
+    try:
+        found = np.linalg.solve(
+            part + 1e-6 * np.trace(part) * np.eye(len(chosen)), match[list(chosen)]
+        )
+    except np.linalg.LinAlgError:
+        return None
+    if (found < NEAREST).any():
+        return None
+    return np.minimum(found, FARTHEST)
+
+
+def _useful(best: dict[tuple[object, ...], Proposal], rays: Sequence[Ray], count: int) -> list[int]:
+    """Rays of the hypotheses in the best sets so far."""
+    keys: list[str] = []
+    for item in sorted(best.values(), key=lambda item: item.expected):
+        keys += [str(hypothesis.key) for hypothesis, _ in item.members]
+    wanted = list(dict.fromkeys(keys))
+    found: list[int] = []
+    for key in wanted:
+        found += [i for i, ray in enumerate(rays) if str(ray.hypothesis.key) == key]
+        if len(found) >= count:
+            break
+    return found[:count]

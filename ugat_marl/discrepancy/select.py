@@ -1,0 +1,295 @@
+"""Selects the effects: propose, simulate, fit, and stop when what is left is chance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ugat_marl.discrepancy.engine import OutOfTime
+from ugat_marl.discrepancy.features import Tally
+from ugat_marl.discrepancy.fit import Fitted, Fitter, Members, effects_of, uncertainty
+from ugat_marl.discrepancy.hypotheses import Hypothesis
+from ugat_marl.discrepancy.local import Proposer
+from ugat_marl.discrepancy.residual import Null, Residual
+from ugat_marl.discrepancy.search import Proposal, Ray, propose
+from ugat_marl.discrepancy.statistics import Array, Whitener, shift
+from ugat_marl.measured.data import Period
+from ugat_marl.progress import Reporter
+
+ROUNDS = 4
+CANDIDATES = (4, 2, 3)
+"""Sets of one, two and three effects that are simulated in a round, at most."""
+CANDIDATES_FITTED = 3
+TOLERANCE = 0.02
+"""Share of the first difference in a statistic that a model may leave: parameters are known, and
+simulation steps resolved, no better."""
+_FORESIGHT = 0.1
+"""Rays are straight and effects are not: so much of a difference is not expected to be met."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How many days are simulated for what.
+
+    Attributes:
+        base: For the scenario as it is.
+        bank: For each strength of each hypothesis.
+        fit: For each model that is fitted.
+        test: For the test of what is left.
+    """
+
+    base: int = 80
+    bank: int = 4
+    fit: int = 8
+    test: int = 48
+
+
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """A fitted model with the test of what it leaves.
+
+    Attributes:
+        model: The model.
+        null: Its own distribution of distances.
+        residual: The test on the fitted periods.
+        errors: Standard errors of its free values.
+        extra: What they make uncertain in the statistics, and the tolerance.
+    """
+
+    model: Fitted
+    null: Null
+    residual: Residual
+    errors: Array
+    extra: dict[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What the search came to.
+
+    Attributes:
+        best: The model selected; without effects if none was worth its price.
+        rivals: Other sets of effects that were fitted, best first.
+        complete: Whether the search ended by itself, and not by the budget.
+    """
+
+    best: Tested
+    rivals: tuple[Fitted, ...]
+    complete: bool
+
+
+class Selector:
+    """Searches for the effects that make the difference.
+
+    Args:
+        fitter: Simulates and fits.
+        proposer: Finds places and windows.
+        library: Hypotheses about the whole network.
+        periods: The fitted periods.
+        effort: Numbers of days.
+        alpha: Level of the tests.
+        reporter: Shows progress.
+    """
+
+    def __init__(
+        self,
+        fitter: Fitter,
+        proposer: Proposer,
+        library: Sequence[Hypothesis],
+        periods: Sequence[Period],
+        effort: Effort,
+        alpha: float,
+        reporter: Reporter,
+    ) -> None:
+        self._fitter = fitter
+        self._proposer = proposer
+        self._library = tuple(library)
+        self._periods = tuple(periods)
+        self._effort = effort
+        self._alpha = alpha
+        self._reporter = reporter
+        self._first = fitter.base.distance(fitter.data)
+        self._seen: dict[str, Fitted] = {}
+
+    def select(self, base: Tested) -> Selection:
+        """The search, from the scenario as it is."""
+        best = base
+        complete = True
+        try:
+            for number in range(ROUNDS):
+                found = self._round(best, number)
+                if found is None:
+                    break
+                best = found
+                if best.residual.p > self._alpha:
+                    break
+            best = self._pruned(best)
+        except OutOfTime:
+            complete = False
+            cheapest = min(self._seen.values(), key=lambda item: item.cost, default=best.model)
+            if cheapest.cost < best.model.cost:
+                best = self._untested(cheapest, base)
+        rivals = sorted(self._seen.values(), key=lambda item: item.cost)
+        return Selection(best, tuple(rivals), complete)
+
+    def test(self, model: Fitted) -> Tested:
+        """Simulates more days of a model and tests what it leaves."""
+        fitter = self._fitter
+        errors, extra = uncertainty(fitter, model)
+        for name, difference in self._first.difference.items():
+            extra[name] = extra[name] + (TOLERANCE * difference) ** 2
+        null = Null(fitter.pools, self._days(model), len(fitter.data), speeds=fitter.speeds)
+        return Tested(model, null, null.test(fitter.data, extra), errors, extra)
+
+    def _days(self, model: Fitted) -> list[Tally]:
+        found = self._fitter.engine.replicates(model.effects, range(self._effort.test))
+        return [item.tally for item in found]
+
+    def _untested(self, model: Fitted, base: Tested) -> Tested:
+        """A model for whose test there was no time: its errors are unknown."""
+        residual = base.null.test(self._fitter.data)
+        return Tested(model, base.null, residual, 0.0 * model.values, {})
+
+    # --- one round ----------------------------------------------------------------------------
+
+    def _round(self, start: Tested, number: int) -> Tested | None:
+        """Adds, changes or removes effects; None if nothing is worth it."""
+        rays = self._bank(start.model, number)
+        whitener = Whitener(start.model.reference, self._fitter.data, _FORESIGHT, self._fitter.base)
+        proposals = propose(rays, whitener, self._fitter.price)
+        tried = self._tried(start.model, _promising(proposals), f"round {number + 1}: candidates")
+        best = self._refined(tried, CANDIDATES_FITTED)
+        if best is None or best.cost >= start.model.cost - self._fitter.price:
+            return None
+        return self.test(best)
+
+    def _bank(self, model: Fitted, number: int) -> list[Ray]:
+        """Simulates every hypothesis on top of a model."""
+        local = self._proposer.hypotheses(model.reference, model.distance, self._periods)
+        present = {hypothesis.key: values for hypothesis, values in model.members}
+        jobs: list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...] | None]] = []
+        for hypothesis in dict.fromkeys((*self._library, *local)):
+            values = present.get(hypothesis.key)
+            if values is not None:
+                jobs += _changes(hypothesis, values)
+            else:
+                levels = hypothesis.levels if number == 0 else _few(hypothesis)
+                jobs += [(hypothesis, level, hypothesis.nominal) for level in levels]
+        known = {item[0].key for item in jobs}
+        for hypothesis, values in model.members:
+            if hypothesis.key not in known:
+                jobs += _changes(hypothesis, values)
+        days = self._effort.bank if number == 0 else 3
+        rays: list[Ray] = []
+        before = model.tallies[:days]
+        with self._reporter.task(f"round {number + 1}: library", len(jobs)) as advance:
+            for hypothesis, level, origin in jobs:
+                members = _merged(model.members, ((hypothesis, level),))
+                found = self._fitter.engine.replicates(effects_of(members), range(len(before)))
+                difference, variance = shift(
+                    self._fitter.pools, [item.tally for item in found], before
+                )
+                rays.append(Ray(hypothesis, level, difference, variance, origin))
+                advance(note=hypothesis.name)
+        return rays
+
+    def _tried(self, model: Fitted, chosen: Sequence[Proposal], title: str) -> list[Fitted]:
+        """Simulates proposals."""
+        found: list[Fitted] = []
+        with self._reporter.task(title, len(chosen)) as advance:
+            for item in chosen:
+                members = _merged(model.members, item.members)
+                if members:
+                    found.append(self._kept(self._fitter.simulate(members)))
+                advance(note=_names(members))
+        return found
+
+    def _refined(self, models: Sequence[Fitted], count: int) -> Fitted | None:
+        """The best of several models once the most promising are fitted."""
+        ranked = sorted(models, key=lambda item: item.cost)[:count]
+        with self._reporter.task("fitting", len(ranked)) as advance:
+            found: list[Fitted] = []
+            for model in ranked:
+                found.append(self._kept(self._fitter.refine(model)))
+                advance(note=_names(model.members))
+        return min(found, key=lambda item: item.cost, default=None)
+
+    def _kept(self, model: Fitted) -> Fitted:
+        """Remembers the best of every set of effects."""
+        key = str(sorted(str(hypothesis.key) for hypothesis, _ in model.members))
+        if key not in self._seen or model.cost < self._seen[key].cost:
+            self._seen[key] = model
+        return model
+
+    def _pruned(self, best: Tested) -> Tested:
+        """Drops effects that do not matter, or that the others can do without."""
+        members = tuple(item for item in best.model.members if item[0].matters(item[1]))
+        changed = len(members) < len(best.model.members)
+        model = self._fitter.simulate(members) if changed and members else best.model
+        while len(model.members) > 1:
+            fewer = [
+                self._kept(
+                    self._fitter.refine(self._fitter.simulate(_without(model.members, i)), 2)
+                )
+                for i in range(len(model.members))
+            ]
+            least = min(fewer, key=lambda item: item.cost)
+            if least.cost > model.cost:
+                break
+            model = least
+        return best if model is best.model else self.test(model)
+
+
+def _promising(proposals: Sequence[Proposal]) -> list[Proposal]:
+    """The best alone, and whatever is expected to do nearly as well as the best of all."""
+    if not proposals:
+        return []
+    limit = 1.3 * proposals[0].expected + 100.0
+    single = [item for item in proposals if len(item.members) == 1][:1]
+    chosen: list[Proposal] = []
+    for size in (1, 2, 3):
+        near = [p for p in proposals if len(p.members) == size and p.expected <= limit]
+        chosen += near[: CANDIDATES[size - 1]]
+    return list(dict.fromkeys((*single, *chosen)))
+
+
+def _changes(
+    hypothesis: Hypothesis, values: tuple[float, ...]
+) -> list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...]]]:
+    """Both ways in which an effect of the model may change: less, to nothing, and more."""
+    if not values or hypothesis.nominal is None:
+        return []
+    away = tuple(1.4 * v - 0.4 * n for v, n in zip(values, hypothesis.nominal, strict=True))
+    less = hypothesis.clipped(hypothesis.nominal)
+    found = [(hypothesis, level, values) for level in (less, hypothesis.clipped(away))]
+    return [item for item in found if item[1] != values]
+
+
+def _few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
+    """One strength on each side of nominal: enough to see what is still missing."""
+    levels, nominal = hypothesis.levels, hypothesis.nominal
+    if nominal is None or len(levels) < 2:
+        return levels
+    low = [level for level in levels if level < nominal]
+    high = [level for level in levels if level > nominal]
+    return tuple(side[len(side) // 2] for side in (low, high) if side)
+
+
+def _merged(members: Members, new: Members) -> Members:
+    """A model with further effects, or with other values; those at nothing are left out."""
+    found = {hypothesis.key: (hypothesis, values) for hypothesis, values in members}
+    for hypothesis, values in new:
+        found[hypothesis.key] = (hypothesis, values)
+    return tuple(
+        (hypothesis, values)
+        for hypothesis, values in found.values()
+        if hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
+    )
+
+
+def _without(members: Members, place: int) -> Members:
+    return (*members[:place], *members[place + 1 :])
+
+
+def _names(members: Members) -> str:
+    return "+".join(hypothesis.name for hypothesis, _ in members)

@@ -1,0 +1,372 @@
+"""Statistics of data sets, their noise, and the distance between data and a model.
+
+A data set is D periods. Its statistics are features pooled three ways: over the network, over each
+intersection, over each lane. Each pool is a block with one correlation between features, estimated
+from simulated days over all members of the block at once and shrunk (Ledoit and Wolf 2004). The
+distance is the sum of the blocks' Mahalanobis distances: a composite of dependent parts, so that
+its distribution is never looked up but always simulated.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.discrepancy.features import FEATURES, SPEED_FEATURES, Tally
+from ugat_marl.discrepancy.site import Site
+
+Array = NDArray[np.float64]
+
+MIN_OBSERVATIONS = 3.0
+"""Observations per period below which a mean is not used."""
+_GRAIN = 0.3
+"""A mean is not known better than to this much of a unit in one observation."""
+_SOFT = {"network": np.inf, "intersection": np.inf, "lane": 5.0, "time": 4.0}
+"""Standardised differences beyond this count less: queues reach a place or they do not, and single
+lanes and minutes have heavy tails."""
+
+
+@dataclass(frozen=True)
+class Pools:
+    """How places pool: block name to a matrix ``(members, places)`` of zeros and ones."""
+
+    blocks: dict[str, Array]
+
+    @classmethod
+    def of(cls, site: Site) -> Pools:
+        """The network, every intersection if there are several, every lane."""
+        places = len(site.lanes) + len(site.exits)
+        owners = [lane.intersection for lane in site.lanes] + [item[0] for item in site.exits]
+        blocks = {"network": np.ones((1, places))}
+        if len(site.intersections) > 1:
+            blocks["intersection"] = np.array(
+                [
+                    [float(owner == index) for owner in owners]
+                    for index in range(len(site.intersections))
+                ]
+            )
+        blocks["lane"] = np.eye(places)
+        return cls(blocks)
+
+    def pool(self, item: Tally) -> dict[str, Array]:
+        """Sums and weights ``(members, features, 2)`` of every block.
+
+        The block "time" has a member for every kind of count at every place, and bins of time for
+        features.
+        """
+        pooled = {
+            name: np.einsum("mp,fpc->mfc", matrix, item.sums)
+            for name, matrix in self.blocks.items()
+        }
+        bins = item.bins.reshape(-1, item.bins.shape[-1])
+        pooled["time"] = np.stack([bins, np.full_like(bins, item.days)], axis=-1)
+        return pooled
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """What one block looks like under a model; all arrays ``(members, features)``.
+
+    Attributes:
+        mean: Expected statistics.
+        variance: Variance of one period.
+        weight: Observations per period.
+        error: Variance of `mean` itself.
+        used: Which statistics are used.
+        correlation: Between features, ``(features, features)``.
+    """
+
+    mean: Array
+    variance: Array
+    weight: Array
+    error: Array
+    used: NDArray[np.bool_]
+    correlation: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Distance:
+    """How far data are from a model.
+
+    Attributes:
+        total: Sum over the blocks.
+        parts: The distance of every block.
+        penalty: Logarithm of the variances relative to a reference, for comparing models.
+        z: Standardised differences of every block, 0 where unused, ``(members, features)``.
+        difference: Data minus model, in units of the features.
+    """
+
+    total: float
+    parts: dict[str, float]
+    penalty: float
+    z: dict[str, Array]
+    difference: dict[str, Array]
+
+
+class Reference:
+    """Statistics and noise of a model, from simulated days.
+
+    Args:
+        pools: How places pool.
+        tallies: Simulated days.
+        speeds: Whether speeds were measured.
+        prior: A model whose correlations are taken over, and towards whose variances those of few
+            days are shrunk.
+        paired: Days of `prior` with the same numbers as `tallies`: their difference is what is
+            known of the mean (common random numbers).
+    """
+
+    def __init__(
+        self,
+        pools: Pools,
+        tallies: Sequence[Tally],
+        *,
+        speeds: bool = True,
+        prior: Reference | None = None,
+        paired: Sequence[Tally] = (),
+    ) -> None:
+        self.pools = pools
+        self.days = len(tallies)
+        self._speeds = speeds
+        stacked = _stack(pools, tallies)
+        partners = _stack(pools, paired) if paired else {}
+        self.blocks: dict[str, Block] = {}
+        for name, sums in stacked.items():
+            before = prior.blocks[name] if prior else None
+            self.blocks[name] = self._block(sums, before, partners.get(name), name == "time")
+
+    def _block(self, sums: Array, prior: Block | None, partner: Array | None, timed: bool) -> Block:
+        """From sums ``(days, members, features, 2)``."""
+        mean, variance, weight, residual = _moments(sums)
+        if timed:
+            variance = _smoothed(mean, variance)
+        error = variance / len(sums)
+        if prior is not None:
+            few = 6.0
+            scale = len(sums) / (len(sums) + few)
+            variance = scale * variance + (1 - scale) * prior.variance
+            error = variance / len(sums)
+            if partner is not None:
+                mean, error = _controlled(mean, variance, residual, partner, prior)
+        if timed:
+            used = mean > 0.5
+        else:
+            used = (weight >= MIN_OBSERVATIONS) & np.isfinite(mean)
+            used &= ~_constant(self._speeds)[None, :]
+        if timed:
+            correlation = np.eye(sums.shape[2])
+        elif prior is None:
+            correlation = _correlation(np.where(used, residual / np.sqrt(variance), 0.0))
+        else:
+            correlation = prior.correlation
+            used &= prior.used
+        return Block(mean, variance, weight, error, used, correlation)
+
+    def distance(
+        self,
+        data: Sequence[Tally],
+        *,
+        relative_to: Reference | None = None,
+        extra: Mapping[str, Array] | None = None,
+    ) -> Distance:
+        """The distance of a data set.
+
+        Args:
+            data: Its periods.
+            relative_to: Whose variances the penalty is relative to; its choice of statistics is
+                used too.
+            extra: Further variance of the expected statistics.
+        """
+        sums = self.pools.pool(added(data))
+        total = penalty = 0.0
+        parts: dict[str, float] = {}
+        z: dict[str, Array] = {}
+        difference: dict[str, Array] = {}
+        for name, block in self.blocks.items():
+            other = relative_to.blocks[name] if relative_to else block
+            weight = sums[name][..., 1] / len(data)
+            used = other.used & (weight >= 1.0)
+            value = sums[name][..., 0] / np.maximum(sums[name][..., 1], 1e-9)
+            thin = np.clip(block.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
+            variance = block.variance * thin / len(data) + block.error
+            if extra is not None:
+                variance = variance + extra[name]
+            mean = np.where(np.isfinite(block.mean), block.mean, other.mean)
+            difference[name] = np.where(used, value - mean, 0.0)
+            z[name] = difference[name] / np.sqrt(variance)
+            soft = _SOFT[name]
+            counted = soft * np.arcsinh(z[name] / soft) if soft < np.inf else z[name]
+            parts[name] = _mahalanobis(counted, used, other.correlation)
+            total += parts[name]
+            if relative_to:
+                ratio = np.log(np.maximum(variance, 1e-12) / (other.variance / len(data)))
+                penalty += float(ratio[used].sum())
+        return Distance(total, parts, penalty, z, difference)
+
+
+def _stack(pools: Pools, tallies: Sequence[Tally]) -> dict[str, Array]:
+    """Pooled sums of several days, ``(days, members, features, 2)``."""
+    pooled = [pools.pool(item) for item in tallies]
+    return {name: np.stack([item[name] for item in pooled]) for name in pooled[0]}
+
+
+def added(tallies: Sequence[Tally]) -> Tally:
+    """The tally of several periods together."""
+    total = tallies[0]
+    for item in tallies[1:]:
+        total = total + item
+    return total
+
+
+def _smoothed(mean: Array, variance: Array) -> Array:
+    """Variances of counts in short bins: half their own, half in proportion to the mean."""
+    scale = variance.sum(axis=1, keepdims=True) / np.maximum(mean.sum(axis=1, keepdims=True), 1e-9)
+    return np.maximum(0.5 * variance + 0.5 * scale * mean, 0.05)
+
+
+def _moments(sums: Array) -> tuple[Array, Array, Array, Array]:
+    """Ratio estimates: mean, variance of one day, observations per day, residuals of the days."""
+    total = sums.sum(axis=0)
+    weight = total[..., 1] / len(sums)
+    mean = total[..., 0] / np.maximum(total[..., 1], 1e-9)
+    residual = (sums[..., 0] - mean * sums[..., 1]) / np.maximum(weight, 1e-9)
+    variance = (residual**2).sum(axis=0) / max(len(sums) - 1, 1)
+    grain = (_GRAIN / np.maximum(weight, 1.0)) ** 2
+    mean = np.where(weight > 0, mean, np.nan)
+    return mean, np.maximum(variance, grain), weight, residual
+
+
+def _controlled(
+    mean: Array, variance: Array, residual: Array, partner: Array, prior: Block
+) -> tuple[Array, Array]:
+    """The mean corrected by what the same days do under the prior model (a control variate)."""
+    before, _, _, other = _moments(partner)
+    spread = (other**2).sum(axis=0)
+    slope = np.clip((residual * other).sum(axis=0) / np.maximum(spread, 1e-12), 0.0, 1.5)
+    slope = np.where(np.isfinite(prior.mean) & np.isfinite(before), slope, 0.0)
+    days = len(partner)
+    left = ((residual - slope * other) ** 2).sum(axis=0) / max(days - 2, 1)
+    shift = np.where(slope > 0, slope * (before - prior.mean), 0.0)
+    error = np.maximum(left, 0.1 * variance) / days + slope**2 * prior.error
+    return mean - shift, error
+
+
+@functools.cache
+def _constant(speeds: bool) -> NDArray[np.bool_]:
+    """Features that are never used."""
+    return np.array([not speeds and name in SPEED_FEATURES for name, _, _ in FEATURES])
+
+
+def _correlation(residual: Array) -> Array:
+    """Shrunk correlation of ``(days, members, features)``, all members of the block together."""
+    rows = residual.reshape(-1, residual.shape[-1])
+    spread = np.sqrt((rows**2).mean(axis=0))
+    rows = rows / np.where(spread > 0, spread, 1.0)
+    count, width = rows.shape
+    sample = rows.T @ rows / count
+    np.fill_diagonal(sample, 1.0)
+    # Ledoit and Wolf (2004), with the identity as target.
+    distance = ((sample - np.eye(width)) ** 2).sum()
+    noise = float((((rows**2).T @ (rows**2)) / count - sample**2).sum()) / count
+    shrinkage = min(max(noise / max(distance, 1e-12), 0.02), 1.0)
+    return (1 - shrinkage) * sample + shrinkage * np.eye(width)
+
+
+def _mahalanobis(z: Array, used: NDArray[np.bool_], correlation: Array) -> float:
+    """Sum over the members of ``z' C^-1 z``, each with the features it uses."""
+    total = 0.0
+    patterns, kind = np.unique(used, axis=0, return_inverse=True)
+    for index, pattern in enumerate(patterns):
+        if pattern.any():
+            rows = z[kind.ravel() == index][:, pattern]
+            solved = np.linalg.solve(correlation[np.ix_(pattern, pattern)], rows.T)
+            total += float((rows.T * solved).sum())
+    return total
+
+
+class Whitener:
+    """Turns differences of statistics into independent numbers of unit noise, in one vector.
+
+    Args:
+        reference: Whose noise.
+        data: The data set, which decides what is used and how precise it is.
+        tolerance: Share of a measured difference that counts as noise as well: predictions by
+            interpolation are no better.
+        relative_to: Whose choice of statistics is used, so that vectors of different models fit.
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        data: Sequence[Tally],
+        tolerance: float,
+        relative_to: Reference | None = None,
+    ) -> None:
+        chosen = relative_to or reference
+        found = reference.distance(data, relative_to=chosen)
+        sums = reference.pools.pool(added(data))
+        self._parts: list[
+            tuple[str, Array, list[tuple[NDArray[np.int64], NDArray[np.bool_], Array]]]
+        ]
+        self._parts = []
+        for name, block in reference.blocks.items():
+            weight = sums[name][..., 1] / len(data)
+            thin = np.clip(block.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
+            noise = block.variance * thin / len(data) + block.error
+            difference = found.difference[name]
+            soft = 0.0 if _SOFT[name] == np.inf else 1.0 / _SOFT[name]
+            scale = np.sqrt(noise + (max(tolerance, soft) * difference) ** 2)
+            used = chosen.blocks[name].used & (weight >= 1.0)
+            patterns, kind = np.unique(used, axis=0, return_inverse=True)
+            groups: list[tuple[NDArray[np.int64], NDArray[np.bool_], Array]] = []
+            for index, pattern in enumerate(patterns):
+                if pattern.any():
+                    lower = np.linalg.cholesky(block.correlation[np.ix_(pattern, pattern)])
+                    members = np.flatnonzero(kind.ravel() == index)
+                    groups.append((members, pattern, np.asarray(np.linalg.inv(lower), np.float64)))
+            self._parts.append((name, scale, groups))
+        self.measured = self(found.difference)
+
+    def __call__(self, differences: Mapping[str, Array]) -> Array:
+        """Whitened differences, one after the other."""
+        rows: list[Array] = []
+        for name, scale, groups in self._parts:
+            z = np.nan_to_num(differences[name] / scale)
+            rows += [(z[members][:, used] @ inverse.T).ravel() for members, used, inverse in groups]
+        return np.concatenate(rows)
+
+
+def shift(
+    pools: Pools, after: Sequence[Tally], before: Sequence[Tally]
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """What a change of the model does to the statistics, from the same days before and after.
+
+    Returns:
+        The differences, and the variances of these differences.
+    """
+    new, old = _stack(pools, after), _stack(pools, before)
+    difference: dict[str, Array] = {}
+    variance: dict[str, Array] = {}
+    for name in new:
+        mean, _, _, left = _moments(new[name])
+        base, _, _, right = _moments(old[name])
+        difference[name] = np.nan_to_num(mean - base)
+        days = len(after)
+        spread = ((left - right) ** 2).sum(axis=0) / max(days - 1, 1)
+        variance[name] = np.nan_to_num(spread / days, nan=np.inf)
+    return difference, variance
+
+
+def without_noise(
+    difference: Mapping[str, Array], variance: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Differences with those of single lanes and minutes set to 0 that may be chance."""
+    found: dict[str, Array] = {}
+    for name, values in difference.items():
+        certain = values**2 > 6.0 * variance[name]
+        found[name] = np.where(certain, values, 0.0) if name in ("lane", "time") else values
+    return found

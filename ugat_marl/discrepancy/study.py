@@ -1,0 +1,199 @@
+"""One diagnosis: the scenario, the data, the simulated days, and how much time there is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ugat_marl.discrepancy.counted import counts_tally
+from ugat_marl.discrepancy.engine import Engine, default_cache
+from ugat_marl.discrepancy.features import Tally
+from ugat_marl.discrepancy.fit import Fitted, Fitter
+from ugat_marl.discrepancy.hypotheses import Hypothesis, global_hypotheses, library
+from ugat_marl.discrepancy.local import Proposer, Routes
+from ugat_marl.discrepancy.replay import Replay
+from ugat_marl.discrepancy.residual import Null
+from ugat_marl.discrepancy.select import Effort, Selector, Tested
+from ugat_marl.discrepancy.site import Site
+from ugat_marl.discrepancy.statistics import Pools, Reference
+from ugat_marl.errors import MeasuredDataError, OptionError
+from ugat_marl.measured.data import Measured, Period
+from ugat_marl.network import Network
+from ugat_marl.progress import Reporter
+from ugat_marl.scenario import Scenario
+
+PRICE = 14.0
+"""What an effect must take off the distance to be worth naming."""
+MANY = 4
+"""With more intersections every day says more, and costs more: fewer are simulated."""
+
+
+@dataclass(frozen=True)
+class DiagnosisConfig:
+    """How a diagnosis is made.
+
+    Attributes:
+        budget_s: Wall time after which no further simulation is begun, s.
+        alpha: Chance of naming an effect where there is none.
+        seed: Root of the simulated days.
+        leave_out: Effects that are not examined.
+        cache: Folder of remembered days; None for the user's cache folder.
+        workers: Simulations at a time; None for the number of cores.
+    """
+
+    budget_s: float = 600.0
+    alpha: float = 0.05
+    seed: int = 0
+    leave_out: tuple[str, ...] = ()
+    cache: Path | None = None
+    workers: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.budget_s > 0:
+            raise OptionError(f"budget_s = {self.budget_s:g} must be above 0")
+        if not 0 < self.alpha < 0.5:
+            raise OptionError(f"alpha = {self.alpha:g} must be between 0 and 0.5")
+        if self.seed < 0:
+            raise OptionError(f"seed = {self.seed} must not be negative")
+        library(self.leave_out)
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """What all steps share.
+
+    Attributes:
+        scenario: The scenario as it is.
+        network: Its network.
+        measured: The data.
+        config: How the diagnosis is made.
+        site: Measured lanes.
+        engine: Simulates days.
+        pools: How lanes pool.
+        allowed: Effects that are examined.
+        hypotheses: Those about the whole network.
+        effort: Numbers of days.
+        fit: Tallies of the periods models are fitted to.
+        heldout: Tallies of the others; of the same ones if there are no others.
+        ruled_out: Effects the data cannot show.
+    """
+
+    scenario: Scenario
+    network: Network
+    measured: Measured
+    config: DiagnosisConfig
+    site: Site
+    engine: Engine
+    pools: Pools
+    allowed: frozenset[str]
+    hypotheses: tuple[Hypothesis, ...]
+    effort: Effort
+    fit: tuple[Tally, ...]
+    heldout: tuple[Tally, ...]
+    ruled_out: frozenset[str] = field(default=frozenset())
+
+    @classmethod
+    def of(cls, scenario: Scenario, measured: Measured, config: DiagnosisConfig) -> Study:
+        """Prepares a diagnosis; nothing is simulated yet.
+
+        Raises:
+            MeasuredDataError: The data hold nothing to compare.
+        """
+        network = Network.read(scenario)
+        site = Site.of(network, measured.detectors)
+        ruled_out = frozenset(name for item in measured.findings for name in item.rules_out)
+        allowed = library(config.leave_out) - ruled_out
+        periods = measured.of("fit")
+        if not periods:
+            raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
+        replay = Replay(scenario, network, measured.detectors, site.owner)
+        engine = Engine(
+            scenario,
+            site,
+            replay,
+            [*periods, *measured.of("heldout")],
+            config.seed,
+            cache=config.cache or default_cache(),
+            deadline=time.monotonic() + config.budget_s,
+            workers=config.workers,
+        )
+        several = len(site.intersections) > MANY
+        return cls(
+            scenario,
+            network,
+            measured,
+            config,
+            site,
+            engine,
+            Pools.of(site),
+            allowed,
+            tuple(global_hypotheses(scenario, allowed)),
+            Effort(48, 3, 6, 32) if several else Effort(),
+            _tallies(site, engine, measured, periods),
+            _tallies(site, engine, measured, measured.of("heldout") or periods),
+            ruled_out,
+        )
+
+    @property
+    def speeds(self) -> bool:
+        """Whether speeds were measured."""
+        return self.measured.has_speeds
+
+    def base(self, reporter: Reporter) -> Tested:
+        """The scenario as it is, and whether the data could be its own.
+
+        Raises:
+            OutOfTime: The budget does not suffice even for this.
+            MeasuredDataError: The scenario's vehicles do not reach the measured lanes.
+        """
+        with reporter.task("the scenario as it is", self.effort.base) as advance:
+            days = self.engine.replicates([], range(self.effort.base), advance)
+        tallies = tuple(day.tally for day in days)
+        reference = Reference(self.pools, tallies, speeds=self.speeds)
+        if not any(bool(block.used.any()) for block in reference.blocks.values()):
+            raise MeasuredDataError(
+                f"scenario {self.scenario.id!r}: in the simulation hardly a vehicle reaches the "
+                "measured lanes; check lane_id in detectors.csv, and the demand of the scenario"
+            )
+        distance = reference.distance(self.fit)
+        model = Fitted((), tallies, reference, distance, distance.total)
+        null = Null(self.pools, tallies, len(self.fit), speeds=self.speeds)
+        return Tested(model, null, null.test(self.fit), np.empty(0), {})
+
+    def proposer(self) -> Proposer:
+        """Finds places and windows."""
+        return Proposer(self.site, Routes.of(self.scenario), self.allowed)
+
+    def selector(self, base: Tested, reporter: Reporter) -> Selector:
+        """Searches for effects."""
+        fitter = Fitter(
+            self.engine,
+            self.pools,
+            base.model.reference,
+            base.model.tallies,
+            self.fit,
+            days=self.effort.fit,
+            price=PRICE,
+            speeds=self.speeds,
+        )
+        return Selector(
+            fitter,
+            self.proposer(),
+            self.hypotheses,
+            self.measured.of("fit"),
+            self.effort,
+            self.config.alpha,
+            reporter,
+        )
+
+
+def _tallies(
+    site: Site, engine: Engine, measured: Measured, periods: Sequence[Period]
+) -> tuple[Tally, ...]:
+    if measured.has_events or measured.counts is None:
+        return tuple(engine.measured(periods))
+    return tuple(counts_tally(site, period, measured.counts) for period in periods)

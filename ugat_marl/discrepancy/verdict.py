@@ -1,0 +1,185 @@
+"""What can be said: one of five verdicts, in a sentence, with what would decide between rivals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ugat_marl.discrepancy.features import FEATURES
+from ugat_marl.discrepancy.fit import Fitted, Members
+from ugat_marl.discrepancy.hypotheses import WINDOW, Hypothesis
+from ugat_marl.discrepancy.select import Selection, Selector, Tested
+from ugat_marl.discrepancy.verify import Verification
+from ugat_marl.effects import known_effects
+
+Verdict = Literal[
+    "no_discrepancy", "explained", "not_identifiable", "partially_explained", "unknown"
+]
+
+INDISTINCT = 25.0
+"""Models whose distances differ by less fit equally well: a likelihood ratio above e^12 either way
+would be needed to drop one."""
+RIVALS_TESTED = 2
+FIT_LEVEL = 0.001
+"""The fitted periods must not contradict the model more than this; the held-out ones decide."""
+PART = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Conclusion:
+    """A verdict with its grounds.
+
+    Attributes:
+        verdict: Which.
+        best: The model it speaks of.
+        indistinct: Other models that fit as well.
+        sentence: The verdict for people.
+        next_measurement: What would tell the rivals apart, or show what is missing.
+    """
+
+    verdict: Verdict
+    best: Tested
+    indistinct: tuple[Fitted, ...]
+    sentence: str
+    next_measurement: str | None
+
+
+def conclude(
+    selection: Selection,
+    selector: Selector,
+    verification: Verification,
+    alpha: float,
+) -> Conclusion:
+    """Draws the conclusion of a search.
+
+    Args:
+        selection: What was found.
+        selector: Tests rivals.
+        verification: The held-out periods.
+        alpha: Level of the tests.
+    """
+    best = selection.best
+    if not best.model.members:
+        sentence = (
+            "Simulation and measurement disagree, and no effect of the library explains it; "
+            "the first places below say where to look."
+        )
+        return Conclusion("unknown", best, (), sentence, _look_at(best))
+    names = describe_members(best.model.members)
+    shrink = verification.shrink if verification.shrink is not None else 0.0
+    chance_only = verification.after.p > alpha and best.residual.p > FIT_LEVEL
+    if chance_only and selection.complete:
+        rivals = _rivals(selection, selector, alpha)
+        if rivals:
+            others = " or ".join(describe_members(rival.members) for rival in rivals)
+            sentence = f"The data fit {names} and {others} equally well."
+            return Conclusion(
+                "not_identifiable", best, rivals, sentence, _separating(best.model, rivals[0])
+            )
+        sentence = f"The street has {names}; with it, what is left is no more than chance."
+        return Conclusion("explained", best, (), sentence, None)
+    if shrink >= PART:
+        sentence = f"{names[:1].upper()}{names[1:]} explains {100 * shrink:.0f} % of the gap; " + (
+            "something else remains that the library does not have."
+            if selection.complete
+            else "the budget ended before the rest was examined."
+        )
+        return Conclusion("partially_explained", best, (), sentence, _look_at(best))
+    sentence = "Simulation and measurement disagree, and no effect of the library explains it."
+    return Conclusion("unknown", best, (), sentence, _look_at(best))
+
+
+def _rivals(selection: Selection, selector: Selector, alpha: float) -> tuple[Fitted, ...]:
+    """Other sets of effects that leave no more than chance and are hardly farther away."""
+    best = selection.best.model
+    names = _kinds(best.members)
+    found: list[Fitted] = []
+    near = [
+        rival
+        for rival in selection.rivals
+        if len(rival.members) <= len(best.members)
+        and _kinds(rival.members) != names
+        and rival.cost - best.cost < INDISTINCT
+    ]
+    for rival in near[:RIVALS_TESTED]:
+        tested = selector.test(rival)
+        if tested.residual.p > alpha:
+            found.append(rival)
+    return tuple(found)
+
+
+def _kinds(members: Members) -> set[str]:
+    return {hypothesis.name for hypothesis, _ in members}
+
+
+def _look_at(best: Tested) -> str:
+    """The regime in which most is left."""
+    z = best.model.distance.z["network"][0]
+    strongest = [FEATURES[int(i)][:2] for i in np.argsort(-np.abs(z))[:3] if z[int(i)]]
+    listed = ", ".join(f"{name} ({regime})" for name, regime in strongest)
+    return f"trajectories or video where most is left over: {listed}"
+
+
+def _separating(best: Fitted, rival: Fitted) -> str:
+    """The statistic in which two models differ most, and how many periods would decide."""
+    block, other = best.reference.blocks["network"], rival.reference.blocks["network"]
+    difference = (block.mean - other.mean)[0]
+    deviation = np.sqrt(block.variance[0])
+    z = np.where(block.used[0], difference / deviation, 0.0)
+    index = int(np.argmax(np.abs(z)))
+    name, regime, _ = FEATURES[index]
+    periods = int(np.ceil((5.0 / max(abs(float(z[index])), 0.05)) ** 2))
+    return f"{name} ({regime}) differs most between them: about {periods} periods would decide"
+
+
+def describe_members(members: Members) -> str:
+    """Effects in words: name, place, window, values."""
+    return " and ".join(describe_effect(hypothesis, values) for hypothesis, values in members)
+
+
+def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
+    """One effect in words."""
+    place, window = place_and_window(hypothesis)
+    ranges = known_effects()[hypothesis.name].ranges
+    numbers = [
+        f"{value:.3g} {ranges[name].unit}".rstrip()
+        for name, value in zip(hypothesis.free, values, strict=True)
+    ]
+    text = hypothesis.name.replace("_", " ")
+    if place and place != "*":
+        text += f" at {place}"
+    if window:
+        text += f" from {window[0]:.0f} s to {window[1]:.0f} s"
+    return text + (f" of {', '.join(numbers)}" if numbers else "")
+
+
+def place_and_window(hypothesis: Hypothesis) -> tuple[str | None, list[float] | None]:
+    """The texts of an effect joined, and its window."""
+    fixed = dict(hypothesis.fixed)
+    texts = [value for value in fixed.values() if isinstance(value, str)]
+    window = [float(fixed[key]) for key in WINDOW] if set(WINDOW) <= set(fixed) else None
+    return (">".join(texts) if texts else None), window
+
+
+def effect_record(
+    hypothesis: Hypothesis, values: tuple[float, ...], errors: tuple[float, ...]
+) -> dict[str, Any]:
+    """An effect for ``diagnosis.json``, with 95 % intervals of its numbers."""
+    place, window = place_and_window(hypothesis)
+    ranges = known_effects()[hypothesis.name].ranges
+    parameters: dict[str, Any] = {}
+    for name, value, error in zip(hypothesis.free, values, errors, strict=True):
+        allowed = ranges[name]
+        parameters[name] = {
+            "value": value,
+            "low": max(value - 1.96 * error, allowed.low),
+            "high": min(value + 1.96 * error, allowed.high),
+            "unit": allowed.unit,
+        }
+    for name, value in hypothesis.fixed:
+        if not isinstance(value, str) and name not in WINDOW:
+            unit = ranges[name].unit
+            parameters[name] = {"value": value, "low": None, "high": None, "unit": unit}
+    return {"name": hypothesis.name, "place": place, "window": window, "parameters": parameters}

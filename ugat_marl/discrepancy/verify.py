@@ -1,0 +1,191 @@
+"""Before and after, on periods that were not fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ugat_marl.discrepancy.features import FEATURES, INDEX, Tally
+from ugat_marl.discrepancy.residual import Null, Residual
+from ugat_marl.discrepancy.select import Tested
+from ugat_marl.discrepancy.statistics import Array, Reference, added
+from ugat_marl.discrepancy.study import Study
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The held-out periods under both models.
+
+    Attributes:
+        before: Test of the scenario as it is.
+        after: Test of the corrected model.
+        shrink: Share of the gap that is gone, the noise taken off on both sides.
+    """
+
+    before: Residual
+    after: Residual
+    shrink: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The fields for JSON."""
+        return {
+            "before": self.before.distance,
+            "after": self.after.distance,
+            "floor": self.after.floor,
+            "expected": self.after.expected,
+            "shrink": self.shrink,
+            "p_before": self.before.p,
+            "p_after": self.after.p,
+        }
+
+
+def verify(study: Study, base: Tested, best: Tested) -> Verification:
+    """Tests both models on the held-out periods."""
+    count = len(study.heldout)
+
+    def null(model: Tested) -> Null:
+        days = model.model.tallies
+        if model.model.members:
+            found = study.engine.replicates(model.model.effects, range(study.effort.test))
+            days = tuple(day.tally for day in found)
+        return Null(study.pools, days, count, speeds=study.speeds)
+
+    before = null(base).test(study.heldout)
+    after = null(best).test(study.heldout, best.extra or None) if best.model.members else before
+    gap = max(0.0, before.distance - before.expected)
+    left = max(0.0, after.distance - after.expected)
+    shrink = 1.0 - left / gap if gap > 0.0 and best.model.members else None
+    return Verification(before, after, shrink)
+
+
+def statistics_table(study: Study, base: Tested, best: Tested) -> list[dict[str, Any]]:
+    """Each statistic of the network on the held-out periods, before and after, with its noise."""
+    before = base.model.reference.distance(study.heldout)
+    after = best.model.reference.distance(study.heldout, relative_to=base.model.reference)
+    block = base.model.reference.blocks["network"]
+    fitted = best.model.reference.blocks["network"]
+    rows: list[dict[str, Any]] = []
+    for index, (name, regime, unit) in enumerate(FEATURES):
+        if before.z["network"][0, index] == 0.0:
+            continue
+        noise = float(np.sqrt(fitted.variance[0, index] / len(study.heldout)))
+        rows.append(
+            {
+                "statistic": name,
+                "regime": regime,
+                "unit": unit,
+                "measured": float(block.mean[0, index] + before.difference["network"][0, index]),
+                "before": float(block.mean[0, index]),
+                "after": float(fitted.mean[0, index]),
+                "noise": noise,
+                "z_before": float(before.z["network"][0, index]),
+                "z_after": float(after.z["network"][0, index]),
+            }
+        )
+    return rows
+
+
+def lanes_table(study: Study, base: Tested, best: Tested) -> list[dict[str, Any]]:
+    """Root mean square of the standardised differences of every lane, before and after."""
+    before = base.model.reference.distance(study.heldout).z["lane"]
+    after = best.model.reference.distance(study.heldout, relative_to=base.model.reference).z["lane"]
+    names = [lane.id for lane in study.site.lanes] + [name for _, name, _ in study.site.exits]
+    owners = [lane.intersection for lane in study.site.lanes] + [o for o, _, _ in study.site.exits]
+    return [
+        {
+            "lane": name,
+            "tls": study.site.intersections[owner],
+            "before": _rms(before[index]),
+            "after": _rms(after[index]),
+        }
+        for index, (name, owner) in enumerate(zip(names, owners, strict=True))
+        if np.any(before[index])
+    ]
+
+
+def _rms(z: Array) -> float:
+    used = z[z != 0]
+    return float(np.sqrt((used**2).mean())) if len(used) else 0.0
+
+
+def courtesy(study: Study, base: Tested, best: Tested) -> dict[str, Any]:
+    """What traffic engineers are used to see: GEH, bands, discharge headway.
+
+    GEH below 5 on 85 % of the counts is a common criterion (UK TAG M3.1); the bands are criteria I
+    and II of FHWA's Traffic Analysis Toolbox, volume III (2019), on counts: 95 % within two,
+    two thirds within one standard deviation of the days. None of them decides anything here.
+    """
+    data = added(study.heldout)
+    days = study.heldout
+    found: dict[str, Any] = {}
+    for name, model in (("before", base), ("after", best)):
+        counts = _hourly(data), _hourly(added(model.model.tallies))
+        geh = _geh(*counts)
+        found[name] = {
+            "geh_below_5": float((geh < 5).mean()) if len(geh) else None,
+            "geh_largest": float(geh.max()) if len(geh) else None,
+            **_bands(days, model.model.reference, study),
+            "saturation_headway_s": _headway(model.model.tallies),
+        }
+    found["measured"] = {"saturation_headway_s": _headway(days)}
+    return found
+
+
+def _hourly(item: Tally) -> Array:
+    """Vehicles per hour at every stop and exit detector."""
+    rows = [INDEX["count_stop"], INDEX["count_exit"]]
+    sums = item.sums[rows].reshape(-1, 2)
+    return 60.0 * sums[:, 0] / np.maximum(sums[:, 1], 1e-9)
+
+
+def _geh(measured: Array, simulated: Array) -> Array:
+    """``sqrt(2 (m - c)^2 / (m + c))`` of hourly counts, where there are any."""
+    some = measured + simulated > 1.0
+    m, c = simulated[some], measured[some]
+    return np.sqrt(2 * (m - c) ** 2 / (m + c))
+
+
+def _bands(days: Sequence[Tally], reference: Reference, study: Study) -> dict[str, float | None]:
+    """Shares of counts within one and two standard deviations of a simulated day."""
+    block = reference.blocks["lane"]
+    rows = [INDEX["count_stop"], INDEX["count_exit"]]
+    inside: list[Array] = []
+    for day in days:
+        z = reference.distance([day]).z["lane"][:, rows]
+        inside.append(np.abs(z[block.used[:, rows] & (z != 0)]))
+    values = np.concatenate(inside) if inside else np.empty(0)
+    if not len(values):
+        return {"within_1_sigma": None, "within_2_sigma": None}
+    return {
+        "within_1_sigma": float((values < 1).mean()),
+        "within_2_sigma": float((values < 2).mean()),
+    }
+
+
+def _headway(days: Sequence[Tally]) -> float | None:
+    """Mean gap of queued vehicles from the fourth on, s."""
+    sums = added(days).sums
+    rows = [INDEX["gap4-5"], INDEX["gap6-8"], INDEX["gap9+"]]
+    total = sums[rows].sum(axis=(0, 1))
+    return float(total[0] / total[1]) if total[1] else None
+
+
+def travel_times(study: Study, best: Tested) -> dict[str, float]:
+    """Mean simulated travel time of the measured days, before and after, s.
+
+    Detectors do not know travel times, so the measured one has no place here.
+    """
+
+    def mean(model: Tested, count: int) -> float:
+        found = study.engine.replicates(model.model.effects, range(count))
+        return float(np.nanmean([day.travel_time_s for day in found]))
+
+    count = min(study.effort.test, study.effort.base)
+    before = study.engine.replicates((), range(count))
+    return {
+        "before_s": float(np.nanmean([day.travel_time_s for day in before])),
+        "after_s": mean(best, count),
+    }

@@ -1,0 +1,275 @@
+"""The diagnosis from data to a corrected scenario: locate, hypothesise, fit, select, apply, verify.
+
+Every simulated day is remembered, so that a diagnosis that was interrupted goes on where it was,
+and one of the same scenario under the same signals needs few simulations.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.discrepancy.engine import OutOfTime
+from ugat_marl.discrepancy.fit import Fitted
+from ugat_marl.discrepancy.locate import Disagreement, locate
+from ugat_marl.discrepancy.select import Selection, Tested
+from ugat_marl.discrepancy.signal_timing import timing_effects
+from ugat_marl.discrepancy.study import DiagnosisConfig, Study
+from ugat_marl.discrepancy.verdict import Conclusion, conclude, effect_record
+from ugat_marl.discrepancy.verify import (
+    Verification,
+    courtesy,
+    lanes_table,
+    statistics_table,
+    travel_times,
+    verify,
+)
+from ugat_marl.effects import DetectorEffect, Effect, apply_effects
+from ugat_marl.files import write_whole
+from ugat_marl.measured.data import Measured
+from ugat_marl.progress import Reporter, Silent
+from ugat_marl.scenario import Scenario
+
+__all__ = ["DiagnosisConfig", "Study", "corrected", "diagnose", "where"]
+
+SCHEMA = "ugat-marl/diagnosis/1"
+FILE, CORRECTED = "diagnosis.json", "corrected"
+_ALTERNATIVES = 12
+
+
+def diagnose(
+    scenario: Scenario,
+    measured: Measured,
+    directory: Path,
+    config: DiagnosisConfig | None = None,
+    reporter: Reporter | None = None,
+) -> dict[str, Any]:
+    """Finds where scenario and data disagree, names the missing effects, and adds them.
+
+    Args:
+        scenario: The simulation.
+        measured: The data; see `ugat_marl.measured.reading.read_measured`.
+        directory: ``diagnosis.json`` and the scenario ``corrected`` go there.
+        config: How.
+        reporter: Shows progress.
+
+    Returns:
+        The content of ``diagnosis.json``; docs/diagnosis.md explains every key.
+
+    Raises:
+        MeasuredDataError: The data hold nothing to compare.
+        OutOfTime: The budget does not suffice to simulate the scenario as it is.
+    """
+    config = config or DiagnosisConfig()
+    reporter = reporter or Silent()
+    study = Study.of(scenario, measured, config)
+    for item in measured.findings:
+        reporter.say(f"note: {item.text}")
+    timing = timing_effects(scenario, study.network, measured)
+    base = study.base(reporter)
+    located = where(study, base)
+    if base.residual.p > config.alpha:
+        record = _nothing(study, base, timing)
+    else:
+        record = _search(study, base, located, timing, reporter)
+    effects = record.pop("_effects")
+    record |= _head(study, record["verdict"])
+    if effects:
+        corrected(scenario, effects, directory / CORRECTED)
+    text = json.dumps(_plain(record), indent=1, sort_keys=True, allow_nan=False)
+    write_whole(directory / FILE, text + "\n")
+    return json.loads(text)
+
+
+def where(study: Study, model: Tested) -> list[Disagreement]:
+    """Where the fitted periods disagree with a model."""
+    periods = study.measured.of("fit")
+    spans = {(period.begin_s, period.end_s) for period in periods}
+    span = spans.pop() if len(spans) == 1 else None
+    distance = model.model.reference.distance(study.fit)
+    return locate(study.site, model.model.reference, distance, study.config.alpha, span)
+
+
+def corrected(scenario: Scenario, effects: tuple[Effect, ...], directory: Path) -> Path:
+    """Writes the scenario with the effects: a domain like any other."""
+    return apply_effects(scenario, effects).write(directory)
+
+
+def _nothing(study: Study, base: Tested, timing: tuple[Effect, ...]) -> dict[str, Any]:
+    """The record where the scenario as it is could have made the data."""
+    verification = verify(study, base, base)
+    ruled = f"; {len(study.ruled_out)} effects could not be examined" if study.ruled_out else ""
+    sentence = f"Nothing in the data contradicts the scenario as it is{ruled}."
+    if timing:
+        named = " and ".join(map(str, timing))
+        sentence = f"The signal log has {named}; with that, nothing contradicts the scenario."
+    return {
+        "verdict": "explained" if timing else "no_discrepancy",
+        "sentence": sentence,
+        "effects": [_timing_record(effect) for effect in timing],
+        "where": [],
+        "alternatives": [],
+        "heldout": verification.as_dict(),
+        "evidence": {"p_fit": base.residual.p},
+        "next_measurement": None,
+        "complete": True,
+        **_tables(study, base, base),
+        "_effects": timing,
+    }
+
+
+def _search(
+    study: Study,
+    base: Tested,
+    located: list[Disagreement],
+    timing: tuple[Effect, ...],
+    reporter: Reporter,
+) -> dict[str, Any]:
+    selector = study.selector(base, reporter)
+    selection = selector.select(base)
+    try:
+        verification = verify(study, base, selection.best)
+        conclusion = conclude(selection, selector, verification, study.config.alpha)
+        tables = _tables(study, base, selection.best)
+    except OutOfTime:
+        selection = Selection(selection.best, selection.rivals, complete=False)
+        verification, conclusion = _unverified(base, selection)
+        tables = {}
+    best = conclusion.best
+    named = conclusion.verdict != "unknown"
+    records: list[dict[str, Any]] = []
+    place = 0
+    for hypothesis, values in best.model.members if named else ():
+        errors = tuple(float(e) for e in best.errors[place : place + len(values)])
+        place += len(values)
+        records.append(
+            effect_record(hypothesis, values, errors) | {"evidence": _evidence(best, selection)}
+        )
+    records += [_timing_record(effect) for effect in timing]
+    return {
+        "verdict": conclusion.verdict,
+        "sentence": conclusion.sentence,
+        "effects": records,
+        "where": [item.as_dict() for item in located],
+        "left": [item.as_dict() for item in where(study, best)] if best.model.members else [],
+        "alternatives": [_alternative(item) for item in _ranking(conclusion, selection)],
+        "heldout": verification.as_dict(),
+        "evidence": {"p_fit": base.residual.p, "p_fit_after": best.residual.p},
+        "next_measurement": conclusion.next_measurement,
+        "complete": selection.complete,
+        **tables,
+        "_effects": (*timing, *best.model.effects) if named else timing,
+    }
+
+
+def _unverified(base: Tested, selection: Selection) -> tuple[Verification, Conclusion]:
+    """What can be said when the budget ended before the model was verified."""
+    verification = Verification(base.residual, base.residual, None)
+    sentence = (
+        "Simulation and measurement disagree; the budget ended before an explanation was verified. "
+        "Run the same command again to go on."
+    )
+    return verification, Conclusion("unknown", selection.best, (), sentence, None)
+
+
+def _ranking(conclusion: Conclusion, selection: Selection) -> list[Fitted]:
+    """Models beside the one selected; those that fit as well come first."""
+    chosen = conclusion.best.model
+    others = [
+        item
+        for item in selection.rivals
+        if item.members != chosen.members and item not in conclusion.indistinct
+    ]
+    return [*conclusion.indistinct, *others][:_ALTERNATIVES]
+
+
+def _alternative(model: Fitted) -> dict[str, Any]:
+    effects = [effect_record(h, v, (0.0,) * len(v)) for h, v in model.members]
+    for effect in effects:
+        for parameter in effect["parameters"].values():
+            parameter["low"] = parameter["high"] = None
+    return {"effects": effects, "distance": model.distance.total, "cost": model.cost}
+
+
+def _evidence(best: Tested, selection: Selection) -> dict[str, Any]:
+    """How much better the model is than the best one without its effects."""
+    names = {hypothesis.name for hypothesis, _ in best.model.members}
+    others = [
+        item.cost
+        for item in selection.rivals
+        if {hypothesis.name for hypothesis, _ in item.members} != names
+    ]
+    return {
+        "distance": best.model.distance.total,
+        "runner_up_is_worse_by": min(others) - best.model.cost if others else None,
+    }
+
+
+def _timing_record(effect: Effect) -> dict[str, Any]:
+    """An effect read off the signal log, which is as certain as the log."""
+    record = effect.record()
+    name = record.pop("name")
+    return {
+        "name": name,
+        "place": None,
+        "window": None,
+        "parameters": {
+            key: {"value": value, "low": value, "high": value, "unit": effect.ranges[key].unit}
+            for key, value in record.items()
+        },
+        "evidence": {"source": "signal log"},
+    }
+
+
+def _tables(study: Study, base: Tested, best: Tested) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "statistics": statistics_table(study, base, best),
+        "lanes": lanes_table(study, base, best),
+        "courtesy": courtesy(study, base, best),
+    }
+    found["travel_time"] = travel_times(study, best)
+    return found
+
+
+def _head(study: Study, verdict: str) -> dict[str, Any]:
+    """What every diagnosis says of itself."""
+    measured = study.measured
+    return {
+        "schema": SCHEMA,
+        "scenario": study.scenario.id,
+        "seed": study.config.seed,
+        "alpha": study.config.alpha,
+        "budget_s": study.config.budget_s,
+        "left_out": sorted(study.config.leave_out),
+        "ruled_out": sorted(study.ruled_out),
+        "findings": [item.text for item in measured.findings],
+        "periods": {split: [p.id for p in measured.of(split)] for split in ("fit", "heldout")},
+        "verified_on_fitted_periods": not measured.of("heldout"),
+        "policy_gap": None,
+        "hashes": {"scenario": study.scenario.hash, "measured": measured.hash},
+        "versions": {
+            name: importlib.metadata.version(name) for name in ("ugat-marl", "eclipse-sumo")
+        },
+        "corrected": CORRECTED
+        if verdict in ("explained", "partially_explained", "not_identifiable")
+        else None,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """The value with numbers rounded to nine digits, and without what JSON cannot say."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, bool) or value is None or isinstance(value, str | int):
+        return value
+    number = float(value)
+    return float(f"{number:.9g}") if number == number and abs(number) < 1e300 else None
+
+
+def faults(effects: tuple[Effect, ...]) -> tuple[DetectorEffect, ...]:
+    """The effects on detectors among others: they change no scenario."""
+    return tuple(effect for effect in effects if isinstance(effect, DetectorEffect))
