@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -21,8 +22,8 @@ import torch
 
 import ugat_marl.transfer as transfer_module
 from ugat_marl.controllers import controller_for
-from ugat_marl.effects import load
-from ugat_marl.errors import CheckpointError, LogError, OptionError
+from ugat_marl.effects import in_domain, load
+from ugat_marl.errors import CheckpointError, LogError, OptionError, ScenarioError, UnknownNameError
 from ugat_marl.grounding.fitting import FitConfig
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
@@ -280,6 +281,94 @@ def test_the_control_starts_from_direct_transfer(tmp_path: Path) -> None:
     direct = weights(tmp_path / "run", "direct-transfer")
     assert not np.array_equal(direct, weights(tmp_path / "run", "more-plain-sim"))
     assert load("single-v1").hash == found.scenario_hash
+
+
+@pytest.fixture(scope="module")
+def repaired(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A corrected scenario as a diagnosis writes it."""
+    folder = tmp_path_factory.mktemp("diagnosis") / "corrected"
+    return in_domain(load("single-v1"), "acceleration=0.6").write(folder)
+
+
+SHORT = replace(
+    SMALL, ugat=replace(SMALL.ugat, pretrain_episodes=8, iterations=1, grounded_episodes=4)
+)
+
+
+def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
+    repaired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(SHORT, corrected=str(repaired), control=True)
+    trained: list[tuple[str, int]] = []
+    learn = transfer_module.DQN.learn
+
+    def counting(self: Any, env: Any, episodes: int, *rest: Any) -> Any:
+        trained.append((getattr(env, "domain", "grounded"), episodes))
+        return learn(self, env, episodes, *rest)
+
+    monkeypatch.setattr(transfer_module.DQN, "learn", counting)
+    found = transfer(config, tmp_path / "run")
+    assert found.policies[:4] == ["direct transfer", "UGAT", "more plain sim", "corrected sim"]
+    assert found.domains == ["sim", "V4"]
+    assert found.notes["corrected sim"] == str(repaired)
+    assert {r.seed for r in found.results if r.policy == "corrected sim"} == {
+        r.seed for r in found.results if r.policy == "UGAT"
+    }
+    there = [episodes for domain, episodes in trained if domain == str(repaired)]
+    assert sum(there) == config.episodes == 12
+    mine = weights(tmp_path / "run", "corrected-sim")
+    for other in ("ugat", "direct-transfer", "more-plain-sim"):
+        assert not np.array_equal(mine, weights(tmp_path / "run", other))
+
+
+def test_training_in_the_corrected_sim_resumes(repaired: Path, tmp_path: Path) -> None:
+    config = replace(SHORT, corrected=str(repaired))
+    transfer(config, tmp_path / "unbroken")
+
+    class KillIn(Silent):
+        @contextlib.contextmanager
+        def task(self, name: str, total: int) -> Any:
+            with super().task(name, total) as advance:
+
+                def one(*args: Any, **note: Any) -> None:
+                    done.append(name)
+                    advance(*args, **note)
+                    if name == "corrected sim" and done.count(name) == 11:
+                        raise Killed
+
+                yield one
+
+    done: list[str] = []
+    with pytest.raises(Killed):
+        transfer(config, tmp_path / "run", reporter=KillIn())
+    kept = torch.load(tmp_path / "run" / "corrected-learner.pt", weights_only=True)
+    assert kept is not None, "nothing was kept of ten episodes"
+    moved = shutil.copytree(repaired, tmp_path / "elsewhere")
+    transfer(replace(config, corrected=str(moved)), tmp_path / "run", resume=True)
+    first, again = (weights(tmp_path / name, "corrected-sim") for name in ("unbroken", "run"))
+    assert np.array_equal(first, again)
+
+
+def test_another_correction_is_another_run(repaired: Path, tmp_path: Path) -> None:
+    config = replace(SHORT, corrected=str(repaired))
+    transfer(config, tmp_path / "run")
+    for other in ("acceleration=0.7", None):
+        with pytest.raises(CheckpointError, match="its scenario_hash"):
+            transfer(replace(config, corrected=other), tmp_path / "run", resume=True)
+
+
+def test_a_correction_that_cannot_be_trained_in_is_refused_at_once(
+    repaired: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(OptionError, match="the simulation itself"):
+        replace(SMALL, corrected="sim")
+    with pytest.raises(UnknownNameError, match="no-such-directory"):
+        transfer(replace(SMALL, corrected="no-such-directory"), tmp_path / "run")
+    fewer = in_domain(load("single-v1"), "sim").with_control(phases="programme")
+    fewer.write(tmp_path / "fewer")
+    with pytest.raises(ScenarioError, match="other agents, observations or phases"):
+        transfer(replace(SMALL, corrected=str(tmp_path / "fewer")), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_models_that_are_too_poor_are_not_obeyed(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.controllers import STANDARD_RULES
 from ugat_marl.effects import describe, in_domain, load
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.evaluation import (
     TUNING_SEED,
     Evaluation,
@@ -23,6 +23,7 @@ from ugat_marl.evaluation import (
     rule_factory,
 )
 from ugat_marl.grounding.transform import GroundedActionTransform
+from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
@@ -46,6 +47,7 @@ EVALUATION_SEED = 1000
 """First seed of the reported episodes; apart from those of training and of the search for rules."""
 
 DIRECT, UGAT, CONTROL = "direct transfer", "UGAT", "more plain sim"
+CORRECTED = "corrected sim"
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,8 @@ class TransferConfig:
         evaluation_seeds: Episodes behind every number of the table.
         tuning_seeds: Episodes behind the choice of the best rule.
         control: Also train as many further episodes in plain sim, for comparison.
+        corrected: A corrected simulation, as `ugat-marl diagnose` writes it, or any other domain: a
+            further policy is trained there from scratch, for as many episodes as UGAT in all.
         ugat: Settings of the algorithm.
         dqn: Settings of the learner.
     """
@@ -82,6 +86,7 @@ class TransferConfig:
     evaluation_seeds: int = 5
     tuning_seeds: int = 2
     control: bool = True
+    corrected: str | None = None
     ugat: Annotated[UgatConfig, arg(name="")] = field(default_factory=UgatConfig)
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
@@ -92,6 +97,11 @@ class TransferConfig:
         if describe(self.real) == describe(self.sim):
             raise OptionError(
                 f"real = {self.real!r} is the simulation itself; name another domain, such as V4"
+            )
+        if self.corrected is not None and describe(self.corrected) == describe(self.sim):
+            raise OptionError(
+                f"corrected = {self.corrected!r} is the simulation itself; name the scenario that "
+                "`ugat-marl diagnose` wrote, or another domain"
             )
         if self.real == "none" and self.real_log is None:
             raise OptionError('real = "none" needs a real_log: something must be known of the real')
@@ -110,6 +120,11 @@ class TransferConfig:
     def domains(self) -> list[str]:
         """The domains the policies are judged in."""
         return [self.sim] if self.real == "none" else [self.sim, self.real]
+
+    @property
+    def episodes(self) -> int:
+        """Episodes that UGAT trains for in all, and so does every policy beside it."""
+        return self.ugat.pretrain_episodes + self.ugat.iterations * self.ugat.grounded_episodes
 
 
 def transfer(
@@ -136,11 +151,12 @@ def transfer(
         log = TransitionLog.read(config.real_log)
         recorded = RecordedWorld(log, env)  # refuses a misfit before anything is written
         _say_if_from_elsewhere(log, config, reporter)
+    corrected = _corrected_env(config, scenario, env)
     learner = DQN.of(env, config.dqn, config.seed)
     transform = GroundedActionTransform(
         env.layouts, config.seed, config.ugat.forward, config.ugat.inverse, config.ugat.gate
     )
-    run = Run(directory, _identity(config, scenario, env), resume, reporter)
+    run = Run(directory, _identity(config, scenario, env, corrected), resume, reporter)
     try:
         state = State(learner, transform)
         restore(state, run, DQNPolicy.load)
@@ -151,8 +167,12 @@ def transfer(
         policies[UGAT] = policy
         if config.control:
             policies[CONTROL] = _control(config, env, run)
+        if corrected is not None:
+            policies[CORRECTED] = _from_scratch(config, corrected, run)
     finally:
         env.close()
+        if corrected is not None:
+            corrected.close()
         run.close()
     for name, trained in policies.items():
         if isinstance(trained, DQNPolicy):
@@ -201,6 +221,7 @@ def judge(
             **{f"best rule in {domain}": rule for domain, rule in rules.items()},
             "rules searched": ", ".join(STANDARD_RULES),
             "training seed": str(config.seed),
+            **({} if config.corrected is None else {CORRECTED: describe(config.corrected)}),
         },
     )
 
@@ -241,12 +262,51 @@ def _train(
 
 def _control(config: TransferConfig, env: TrafficEnv, run: Run) -> Policy:
     """Direct transfer trained on, in plain sim, for as many episodes as the iterations had."""
+    progress = run.directory / "control-learner.pt"
+    start = progress if progress.exists() else run.directory / DIRECT_LEARNER
+    return _trained_on(config, env, run, start, progress, "control: more plain sim")
+
+
+def _corrected_env(
+    config: TransferConfig, scenario: Scenario, sim: TrafficEnv
+) -> TrafficEnv | None:
+    """The corrected simulation, if one is asked for; its policies must fit the others' worlds."""
+    if config.corrected is None:
+        return None
+    env = parallel_env(scenario, config.corrected, **config.env_options)
+    if AgentSet.of(env) != AgentSet.of(sim):
+        raise ScenarioError(
+            f"corrected = {config.corrected!r} has other agents, observations or phases than "
+            f"scenario {scenario.id!r}: {AgentSet.of(env)}, not {AgentSet.of(sim)}; take a "
+            "corrected scenario of this one"
+        )
+    return env
+
+
+def _from_scratch(config: TransferConfig, env: TrafficEnv, run: Run) -> Policy:
+    """The same learner from the same seed, with all its episodes in `env`."""
+    progress = run.directory / "corrected-learner.pt"
+    start = progress if progress.exists() else None
+    return _trained_on(config, env, run, start, progress, CORRECTED)
+
+
+def _trained_on(
+    config: TransferConfig,
+    env: TrafficEnv,
+    run: Run,
+    start: Path | None,
+    progress: Path,
+    title: str,
+) -> Policy:
+    """The learner in `start`, or a fresh one, trained until it has the episodes UGAT has.
+
+    It is saved to `progress` every few episodes, where an interrupted run goes on.
+    """
     learner = DQN.of(env, config.dqn, config.seed)
-    progress, start = run.directory / "control-learner.pt", run.directory / DIRECT_LEARNER
-    learner.load(progress if progress.exists() else start)
-    ugat = config.ugat
-    left = ugat.pretrain_episodes + ugat.iterations * ugat.grounded_episodes - learner.episodes
-    with run.reporter.task("control: more plain sim", max(left, 0)) as advance:
+    if start is not None:
+        learner.load(start)
+    left = config.episodes - learner.episodes
+    with run.reporter.task(title, max(left, 0)) as advance:
         while left > 0:
             episodes = min(CHUNK, left)
             learner.learn(env, episodes, config.seed, lambda _number, _numbers: advance())
@@ -260,12 +320,17 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> dict[str, Any]:
+def _identity(
+    config: TransferConfig, scenario: Scenario, env: TrafficEnv, corrected: TrafficEnv | None
+) -> dict[str, Any]:
     settings = asdict(config)
     for judging in ("evaluation_seeds", "tuning_seeds", "control"):
         settings.pop(judging)
+    settings.pop("corrected")  # a scenario is the same if its hash is, wherever it lies
     settings["real_log"] = _digest(config.real_log) if config.real_log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":
         hashes["real"] = in_domain(scenario, config.real).hash
+    if corrected is not None:
+        hashes["corrected"] = corrected.scenario.hash
     return {**settings, "scenario_hash": hashes, "domains": [describe(d) for d in config.domains]}
