@@ -43,6 +43,7 @@ class DiagnosisConfig:
         leave_out: Effects that are not examined.
         cache: Folder of remembered days; None for the user's cache folder.
         workers: Simulations at a time; None for the number of cores.
+        effort: Numbers of simulated days; None for what suits the size of the network.
     """
 
     budget_s: float = 600.0
@@ -51,6 +52,7 @@ class DiagnosisConfig:
     leave_out: tuple[str, ...] = ()
     cache: Path | None = None
     workers: int | None = None
+    effort: Effort | None = None
 
     def __post_init__(self) -> None:
         if not self.budget_s > 0:
@@ -132,7 +134,7 @@ class Study:
             Pools.of(site),
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
-            Effort(48, 3, 6, 32) if several else Effort(),
+            config.effort or (Effort(48, 3, 6, 32) if several else Effort()),
             _tallies(site, engine, measured, periods),
             _tallies(site, engine, measured, measured.of("heldout") or periods),
             ruled_out,
