@@ -26,6 +26,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "commands.import_atspm:ImportAtspm",
         "measured data from a signal controllers' log",
     ),
+    "policy-gap": (
+        "commands.policy_gap:PolicyGap",
+        "what a diagnosis is worth: policies before, after",
+    ),
     "check": ("commands.check:Check", "is a scenario sound, its environment conformant?"),
     "scenarios": ("commands.scenarios:Scenarios", "the networks and domains that can be named"),
     "blind generate": ("commands.blind:BlindGenerate", "hide effects, measure, seal the labels"),

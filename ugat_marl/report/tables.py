@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from rich import box
 from rich.console import Group, RenderableType
@@ -70,6 +72,50 @@ def measures_table(found: Evaluation) -> RenderableType:
         blocks += [Text(line, style="dim") for line in _backlog(found, domain)]
     blocks.append(Text(_legend(found), style="dim"))
     return Group(*blocks)
+
+
+def policy_gap_table(
+    title: str, gap: Mapping[str, Mapping[str, Any]], seeds: int
+) -> RenderableType:
+    """How far the simulation and the corrected one are off the real world, policy by policy.
+
+    Args:
+        title: What the table is of.
+        gap: As `ugat_marl.discrepancy.policy_gap.policy_gap` returns it.
+        seeds: Number of episodes behind every number.
+    """
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        title=Text(title),
+        title_justify="left",
+        caption=Text(
+            f"{seeds} seeds. before: |real - sim|, after: |real - corrected|, "
+            "both in s; shrink: share of the gap that is gone."
+        ),
+        caption_justify="left",
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("policy", max_width=24, overflow="fold")
+    for heading in ("sim", "corrected", "real", "before", "after", "shrink"):
+        table.add_column(heading, justify="right")
+    for policy, row in gap.items():
+        att = [row[world] for world in ("sim", "corrected", "real")]
+        table.add_row(
+            Text(policy),
+            *(_number(item["mean"]) for item in att),
+            _number(row["before"]),
+            _number(row["after"]),
+            "-" if row["shrink"] is None else f"{100 * row['shrink']:.0f} %",
+        )
+        if any(item["low"] is not None for item in att):
+            table.add_row(*_dim("  95 % interval", *map(_limits, att)))
+    return table
+
+
+def _limits(att: Mapping[str, float | None]) -> str:
+    low, high = att["low"], att["high"]
+    return "-" if low is None or high is None else f"{_number(low)}-{_number(high)}"
 
 
 def _backlog(found: Evaluation, domain: str) -> list[str]:

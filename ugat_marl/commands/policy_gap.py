@@ -1,0 +1,83 @@
+"""``ugat-marl policy-gap``: what a diagnosis is worth to policies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.commands.evaluate import names_of
+from ugat_marl.discrepancy.policy_gap import policy_gap, read_diagnosis, write_policy_gap
+from ugat_marl.effects import describe, load
+from ugat_marl.errors import OptionError
+from ugat_marl.evaluation import policy_factory
+from ugat_marl.progress import Bars
+from ugat_marl.report.tables import policy_gap_table
+
+
+@dataclass(frozen=True)
+class PolicyGap:
+    """Plays policies in sim, in the corrected scenario of a diagnosis and in the real domain.
+
+    The result is printed, and written to DIR/diagnosis.json under "policy_gap".
+
+    Examples:
+        ugat-marl policy-gap single-v1 diagnosis --real V4
+        ugat-marl policy-gap single-v1 diagnosis --real V4 --policies fixed-time:30 mine.pt
+
+    Attributes:
+        scenario: The scenario that was diagnosed.
+        directory: Where the diagnosis lies: diagnosis.json and corrected.
+        real: The domain the data were recorded in; only a simulated one can be played in.
+        policies: Rules and files of trained policies.
+        seeds: Number of episodes of each policy in each world.
+        first_seed: Seed of the first of them.
+        duration_s: Length of an episode in s; default: the scenario's own.
+        workers: Simulations at a time; default: one per core.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    real: str
+    policies: tuple[str, ...] = ("fixed-time:30", "max-pressure:20")
+    seeds: int = 5
+    first_seed: int = 1000
+    duration_s: float | None = None
+    workers: int | None = None
+
+    def run(self, console: Console) -> int:
+        """Plays, writes and prints."""
+        if not self.policies:
+            raise OptionError("--policies needs at least one value")
+        if len(set(self.policies)) < len(self.policies):
+            raise OptionError(f"--policies holds one twice: {' '.join(self.policies)}")
+        if self.seeds < 1 or (self.workers is not None and self.workers < 1):
+            raise OptionError("--seeds and --workers must be at least 1")
+        if self.first_seed < 0:
+            raise OptionError("--first-seed must not be negative")
+        scenario = load(self.scenario)
+        record, corrected = read_diagnosis(self.directory, scenario)
+        if corrected.hash == scenario.hash:
+            console.print("note: only detectors were at fault; the traffic was not corrected")
+        files = [Path(spec).suffix == ".pt" for spec in self.policies]
+        names = [
+            f"{name}.pt" if file else name
+            for name, file in zip(names_of(self.policies), files, strict=True)
+        ]
+        gap = policy_gap(
+            scenario,
+            corrected,
+            self.real,
+            dict(zip(names, map(policy_factory, self.policies), strict=True)),
+            range(self.first_seed, self.first_seed + self.seeds),
+            Bars(console),
+            duration_s=self.duration_s,
+            workers=self.workers,
+        )
+        write_policy_gap(self.directory, record, gap)
+        title = f"{scenario.id}: average travel time in s, real: {describe(self.real)}"
+        console.print(policy_gap_table(title, gap, self.seeds))
+        return 0
