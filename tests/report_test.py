@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import io
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console, RenderableType
 
 from ugat_marl.evaluation import Evaluation, Result
 from ugat_marl.metrics import Scores
+from ugat_marl.report import pictures
 from ugat_marl.report.pictures import transfer_picture
 from ugat_marl.report.tables import measures_table, transfer_table
 from ugat_marl.training import Metrics
@@ -50,6 +53,27 @@ def test_the_transfer_table_says_it_all_in_80_columns(found: Evaluation) -> None
     assert "best rule in V4: largest-queue:40" in text
     assert "medians in V4: direct transfer 151" in " ".join(text.split())
     assert "medians in sim" not in text
+
+
+def test_six_policies_have_room(found: Evaluation) -> None:
+    """The table says where the corrected policy was trained; names in the picture do not meet."""
+    more = ("more plain sim", "corrected sim", "rule max-pressure:20")
+    results = [*found.results]
+    for policy in more:
+        results += [replace(r, policy=policy) for r in found.results if r.policy == "UGAT"]
+    six = Evaluation(
+        found.scenario, "0", tuple(results), {"corrected sim": "runs/v4-diagnosis/corrected"}
+    )
+    text = printed(transfer_table(six))
+    assert max(map(len, text.splitlines())) <= 80
+    assert "corrected sim: trained in runs/v4-diagnosis/corrected" in " ".join(text.split())
+    figure = Figure(figsize=(10, 4.2), dpi=120, layout="constrained")
+    axes = figure.subplots(1, 2, width_ratios=(1.5, 1))[0]
+    pictures._bars(axes, six)  # pyright: ignore[reportPrivateUsage]
+    figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
+    assert len(boxes) == 6
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))
 
 
 def test_the_measures_table_tells_who_was_kept_out(found: Evaluation) -> None:

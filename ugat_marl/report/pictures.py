@@ -52,13 +52,19 @@ def _bars(axes: Any, found: Evaluation) -> None:
                 f"{mean:.0f}", (spot, mean + above), ha="center", va="bottom", fontsize=8,
                 xytext=(0, 2), textcoords="offset points",
             )  # fmt: skip
-    axes.set_xticks(
-        places, [name.replace(" ", "\n").replace(":", ":\n") for name in found.policies]
-    )
+    breaks = " :-" if len(places) > 5 else " :"  # six names side by side need narrow lines
+    axes.set_xticks(places, [_broken(name, breaks) for name in found.policies])
     axes.set_ylabel("ATT [s]")
     seeds = len({result.seed for result in found.results})
     axes.set_title(f"final policies, {seeds} seeds, 95 % intervals", fontsize=9)
     axes.legend(frameon=False, title="domain")
+
+
+def _broken(name: str, breaks: str) -> str:
+    """A name in lines; of the characters it is broken at, only blanks vanish."""
+    for character in breaks:
+        name = name.replace(character, f"{character.strip()}\n")
+    return name
 
 
 def _curves(axes: Any, found: Evaluation, metrics: Metrics) -> None:

@@ -128,6 +128,8 @@ def _backlog(found: Evaluation, domain: str) -> list[str]:
 def _caption(found: Evaluation) -> str:
     keys = [f"best rule in {domain}" for domain in found.domains]
     lines = [f"{key}: {found.notes[key]}" for key in keys if key in found.notes]
+    if corrected := found.notes.get("corrected sim"):
+        lines.append(f"corrected sim: trained in {corrected}")
     lines += _medians(found)
     if len(found.domains) == 1:
         return "\n".join([*lines, f"{_seeds(found)} seeds"])
