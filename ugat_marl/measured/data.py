@@ -192,4 +192,4 @@ def split_periods(count: int) -> tuple[Split, ...]:
 
 def letter(states: Sequence[str]) -> str:
     """The letter that decides what vehicles on several links do: green before yellow before red."""
-    return next((x for x in "Ggyur" if x in states), "r")
+    return next((x for x in "GgYyur" if x in states), "r")
