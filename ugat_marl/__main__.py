@@ -30,6 +30,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "commands.policy_gap:PolicyGap",
         "what a diagnosis is worth: policies before, after",
     ),
+    "diagnose": (
+        "commands.diagnose:Diagnose",
+        "where a simulation and measured data disagree, and why",
+    ),
     "check": ("commands.check:Check", "is a scenario sound, its environment conformant?"),
     "scenarios": ("commands.scenarios:Scenarios", "the networks and domains that can be named"),
     "blind generate": ("commands.blind:BlindGenerate", "hide effects, measure, seal the labels"),
@@ -60,8 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UgatMarlError as error:
         print(f"ugat-marl: error: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR
-    except KeyboardInterrupt:
-        print("ugat-marl: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print("; ".join(["ugat-marl: interrupted", *map(str, stop.args)]), file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

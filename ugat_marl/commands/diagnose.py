@@ -1,0 +1,155 @@
+"""``ugat-marl diagnose``: where simulation and measurement disagree, and what is missing."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.discrepancy.engine import OutOfTime
+from ugat_marl.discrepancy.workflow import CORRECTED, FILE, DiagnosisConfig, diagnose
+from ugat_marl.effects import DetectorEffect, known_effects, load
+from ugat_marl.errors import OptionError
+from ugat_marl.files import require_writable
+from ugat_marl.measured.data import Measured
+from ugat_marl.measured.reading import read_measured
+from ugat_marl.network import Network
+from ugat_marl.progress import Bars
+from ugat_marl.report.diagnosis_page import write_diagnosis_page
+from ugat_marl.report.diagnosis_tables import diagnosis_summary
+
+REPORT = "report.html"
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """Compares measured data with a scenario, names the missing effects, and adds them.
+
+    Examples:
+        ugat-marl diagnose single-v1 measured --out found
+        ugat-marl diagnose my.sumocfg street --out found --budget-s 3600 --leave-out parking
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        measured: Directory of measured data (docs/measured-data.md); it is never written to.
+        out: Directory for diagnosis.json, report.html and the corrected scenario.
+        budget_s: Wall time after which no further simulation is begun, s.
+        alpha: Chance of naming an effect where there is none.
+        seed: Root of the simulated days; the same data and seed give the same diagnosis.
+        leave_out: Effects that are not examined.
+        cache: Folder of remembered simulations; default: in the user's cache folder.
+        workers: Simulations at a time; default: one per core.
+        report: Write the page report.html.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    measured: Annotated[Positional[Path], arg(metavar="MEASURED")]
+    out: Path
+    budget_s: float = 600.0
+    alpha: float = 0.05
+    seed: int = 0
+    leave_out: tuple[str, ...] = ()
+    cache: Path | None = None
+    workers: int | None = None
+    report: bool = True
+
+    def run(self, console: Console) -> int:
+        """Diagnoses; the exit code is 0 whatever is found."""
+        config = self._config()
+        self._check_out()
+        scenario = load(self.scenario)
+        network = Network.read(scenario)
+        measured = read_measured(self.measured, scenario, network)
+        require_writable(self.out / FILE)
+        _say_what_cannot_be_seen(measured, console)
+        try:
+            record = diagnose(scenario, measured, self.out, config, Bars(console))
+        except OutOfTime:
+            raise OutOfTime(
+                f"--budget-s {self.budget_s:g} does not suffice to simulate the scenario as it is, "
+                "so nothing is known yet; the same command goes on where it stopped"
+            ) from None
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("the same command goes on where it stopped") from None
+        console.print(diagnosis_summary(record))
+        if self.report:
+            write_diagnosis_page(record, network, self.out / REPORT, self._commands(record))
+        self._say_where(record, console)
+        return 0
+
+    def _config(self) -> DiagnosisConfig:
+        if self.workers is not None and self.workers < 1:
+            raise OptionError(f"workers = {self.workers} must be at least 1")
+        return DiagnosisConfig(
+            budget_s=self.budget_s,
+            alpha=self.alpha,
+            seed=self.seed,
+            leave_out=self.leave_out,
+            cache=self.cache,
+            workers=self.workers,
+        )
+
+    def _check_out(self) -> None:
+        """Measured data stay as they are, so nothing is written among them."""
+        out, measured = self.out.resolve(), self.measured.resolve()
+        if out == measured or measured in out.parents:
+            raise OptionError(
+                f"--out {str(self.out)!r} lies in the measured data, which are never written to; "
+                "give another directory"
+            )
+
+    def _commands(self, record: Mapping[str, Any]) -> list[str]:
+        """The command itself, and what comes next."""
+        given = ["ugat-marl", "diagnose", self.scenario, str(self.measured), "--out", str(self.out)]
+        given += ["--budget-s", f"{self.budget_s:g}", "--alpha", f"{self.alpha:g}"]
+        given += ["--seed", str(self.seed)]
+        if self.leave_out:
+            given += ["--leave-out", *self.leave_out]
+        return [shlex.join(given), *self._next(record)]
+
+    def _next(self, record: Mapping[str, Any]) -> list[str]:
+        """The command that uses the corrected scenario, if anything in it is corrected."""
+        if record["corrected"] is None or not any(map(_in_the_model, record["effects"])):
+            return []
+        corrected = str(self.out / CORRECTED)
+        return [
+            shlex.join(["ugat-marl", "train", self.scenario, "--sim", corrected]) + " --real REAL"
+        ]
+
+    def _say_where(self, record: Mapping[str, Any], console: Console) -> None:
+        lines = [f"diagnosis: {self.out / FILE}"]
+        if self.report:
+            lines.append(f"page:      {self.out / REPORT}")
+        if record["corrected"] is not None:
+            lines.append(f"corrected: {self.out / CORRECTED}")
+        elif (self.out / CORRECTED).exists():
+            lines.append(f"{self.out / CORRECTED} is from an earlier diagnosis, not from this one")
+        if following := self._next(record):
+            lines.append(f"use it:    {following[0]}")
+        elif record["effects"]:
+            lines.append("The effects are faults of detectors; the simulation stays as it is.")
+        console.print("\n" + "\n".join(lines), soft_wrap=True, markup=False)
+
+
+def _say_what_cannot_be_seen(measured: Measured, console: Console) -> None:
+    """Which effects are ruled out before anything runs; what was found in the files follows."""
+    ruled_out = {name for finding in measured.findings for name in finding.rules_out}
+    if not ruled_out:
+        return
+    listed = ", ".join(sorted(ruled_out))
+    if not measured.has_events:
+        rest = ", ".join(sorted(set(known_effects()) - ruled_out))
+        text = f"Counts only: no more than {rest} can be examined. Ruled out: {listed}."
+    else:
+        text = f"Ruled out by what the data lack: {listed}."
+    console.print(text, markup=False)
+
+
+def _in_the_model(effect: Mapping[str, Any]) -> bool:
+    """Whether an effect changes the simulation, and not only what detectors see."""
+    return not issubclass(known_effects()[effect["name"]], DetectorEffect)

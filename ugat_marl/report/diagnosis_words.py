@@ -1,0 +1,220 @@
+"""The words and numbers of a diagnosis, for its page and for the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+Record = Mapping[str, Any]
+"""The content of ``diagnosis.json``, or a part of it."""
+
+VERDICTS = {
+    "no_discrepancy": "no discrepancy",
+    "explained": "explained",
+    "not_identifiable": "not identifiable",
+    "partially_explained": "partially explained",
+    "unknown": "unknown",
+}
+
+MEANINGS = {
+    "no_discrepancy": "The scenario as it is could have made these data. That does not say that it "
+    "is right in what the data do not show.",
+    "explained": "With these effects the simulation could have made the held-out data, and no "
+    "other explanation of the library comes close.",
+    "not_identifiable": "Several explanations fit equally well. The corrected scenario holds the "
+    "one listed here; which one is true takes another measurement.",
+    "partially_explained": "These effects take off most of the gap, but what is left is more than "
+    "chance: something is missing that the library does not have.",
+    "unknown": "Simulation and measurement disagree, and nothing in the library accounts for it. "
+    "No effect is named, since any name would be a guess.",
+}
+
+STATISTICS = {
+    "lost": "green begins until 1st queued vehicle is across",
+    "lost_trend": "the same, change over the period",
+    "gap2": "gap, 1st to 2nd queued vehicle",
+    "gap3": "gap, 2nd to 3rd",
+    "gap4-5": "gaps before 4th and 5th",
+    "gap6-8": "gaps before 6th to 8th",
+    "gap9+": "gaps before 9th and later",
+    "gap_spread": "distance of queue gaps from 2 s",
+    "gap_short": "share of queue gaps below 1.7 s",
+    "gap_long": "share of queue gaps above 2.6 s",
+    "gap_permitted": "queue gaps where green yields",
+    "speed1": "speed of 1st queued vehicle",
+    "speed2": "speed of 2nd queued vehicle",
+    "speed3": "speed of 3rd queued vehicle",
+    "speed4-5": "speed of 4th and 5th",
+    "speed6-8": "speed of 6th to 8th",
+    "over1": "time over detector, 1st, from green",
+    "over2-3": "time over detector, 2nd and 3rd",
+    "over4+": "time over detector, 4th and later",
+    "queued": "share of greens that begin with a queue",
+    "discharged": "queued vehicles per green",
+    "platoon_gap": "gap in moving platoons",
+    "platoon_short": "share of platoon gaps below 1.6 s",
+    "platoon_middle": "share of platoon gaps below 2.2 s",
+    "platoon_time": "time over detector in platoons",
+    "free_speed": "free speed",
+    "free_speed_spread": "distance of free speeds from the limit",
+    "free_fast": "share of free vehicles 5 % above the limit",
+    "free_time": "time over detector, free vehicles",
+    "red_speed": "speed of those who approach red",
+    "red_slow": "share of slow ones who approach red",
+    "red_time": "time over detector, approaching red",
+    "yellow_crossings": "vehicles per yellow",
+    "late_crossings": "vehicles per change, first 2 s of red",
+    "red_crossings": "vehicles per change, later in red",
+    "last_crossing": "crossings after green: how late",
+    "vehicle_length": "length of vehicles",
+    "long_vehicles": "share of vehicles above 8 m",
+    "occupied_in_red": "advance detector occupied in red",
+    "occupied_in_green": "advance detector occupied in green",
+    "queue_over": "share of greens with queue on advance detector",
+    "count_advance": "flow at advance detectors",
+    "count_stop": "flow at stop detectors",
+    "count_exit": "flow at exit detectors",
+    "kept_to_stop": "vehicles at stop per vehicle at advance",
+    "kept_to_exit": "vehicles at exit per vehicle at stop",
+    "occupied": "occupied time of advance detector",
+}
+"""What the statistics are, in words; those in time have " in time" behind their names."""
+
+
+def statistic(name: str) -> str:
+    """A statistic in words; its own name where none are known."""
+    base = name.removesuffix(" in time")
+    return STATISTICS.get(base, base) + (" in some stretch of time" if base != name else "")
+
+
+def effect_name(item: Record) -> str:
+    """The name of an effect with spaces."""
+    return str(item["name"]).replace("_", " ")
+
+
+def place(item: Record) -> str:
+    """Where an effect is."""
+    where = item.get("place")
+    return "everywhere" if where in (None, "*", "") else str(where).replace(">", " → ")
+
+
+def window(span: Sequence[float] | None) -> str:
+    """A stretch of time on the scenario's clock, as h:mm:ss."""
+    return "" if span is None else f"{clock(span[0])} – {clock(span[1])}"
+
+
+def clock(seconds: float) -> str:
+    """A time of the scenario's clock as h:mm:ss."""
+    whole = round(seconds)
+    sign, whole = ("-" if whole < 0 else ""), abs(whole)
+    return f"{sign}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
+def values(item: Record, *, intervals: bool = True) -> str:
+    """The parameters of an effect, with their intervals if wanted."""
+    found = [_parameter(name, given, intervals) for name, given in item["parameters"].items()]
+    return "; ".join(found) or "as such"
+
+
+def _parameter(name: str, given: Record, intervals: bool) -> str:
+    value, low, high = given.get("value"), given.get("low"), given.get("high")
+    unit = str(given.get("unit") or "").replace("^2", "²")
+    text = f"{name.removesuffix('_s').replace('_', ' ')} "
+    text = "" if unit and name in ("seconds", "metres", "mps2", "seconds_per_hour") else text
+    if not intervals or value is None or low is None or high is None or low == high:
+        return f"{text}{number(value)} {unit}".rstrip()
+    middle, low, high = (_rounded(x, high - low) for x in (value, low, high))
+    return f"{text}{middle} {unit}".rstrip() + f" ({low} to {high})"
+
+
+def _rounded(value: float, width: float) -> str:
+    """A number with as many decimals as an interval of this width deserves."""
+    decimals = min(max(1 - math.floor(math.log10(max(width, 1e-9))), 0), 4)
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """A number with three digits, in groups of thousands; a dash where there is none."""
+    if value is None or isinstance(value, bool) or not isinstance(value, int | float):
+        return "–" if value is None else str(value)
+    if not math.isfinite(value):
+        return "–"
+    if abs(value) >= 10**digits:
+        return f"{value:,.0f}".replace(",", " ").replace("-", "−")
+    return f"{value:.{digits}g}".replace("-", "−")
+
+
+def signed(value: Any) -> str:
+    """A number with its sign."""
+    text = number(value)
+    return text if text[:1] in ("−", "–") or text == "0" else f"+{text}"
+
+
+def share(value: Any) -> str:
+    """A share in per cent; never 100 % where something is missing."""
+    if value is None:
+        return "–"
+    percent = 100 * float(value)
+    if percent < 0:
+        return f"−{share(-value)}"
+    for digits in (0, 1, 2):
+        text = f"{percent:.{digits}f}"
+        if text.partition(".")[0] != "100" or value >= 1:
+            return f"{text} %"
+    return "99.99 %"
+
+
+def chance(value: Any) -> str:
+    """A probability."""
+    if value is None:
+        return "–"
+    return "< 0.001" if value < 0.001 else f"{value:.2g}"
+
+
+def disagreement_place(item: Record) -> str:
+    """Where data and model disagree: the narrowest place that is known."""
+    for key in ("lane", "approach", "tls"):
+        if item.get(key) is not None:
+            return str(item[key])
+    return "all of the network"
+
+
+def strongest(record: Record, count: int) -> list[Record]:
+    """The first disagreements by size, one per statistic and the broadest place first."""
+    found: list[Record] = []
+    seen: set[str] = set()
+    for item in record.get("where") or ():
+        if item["statistic"] not in seen:
+            seen.add(item["statistic"])
+            found.append(item)
+    found.sort(key=lambda item: -abs(item["z"]))
+    return found[:count]
+
+
+def partial(record: Record) -> str | None:
+    """What to say of a diagnosis that is not complete; None if it is."""
+    if record.get("complete", True):
+        return None
+    return (
+        f"Partial result: the budget of {number(record.get('budget_s'))} s ended before the search "
+        "did. The same command goes on where this one stopped."
+    )
+
+
+def geh_line(record: Record) -> str | None:
+    """What the usual criterion on counts says of the gap; None without counts."""
+    tables = record.get("courtesy") or {}
+    before = (tables.get("before") or {}).get("geh_below_5")
+    after = (tables.get("after") or {}).get("geh_below_5")
+    if before is None:
+        return None
+    text = f"GEH < 5 (usual: on 85 % of counts): {share(before)} before, {share(after)} after"
+    if record["verdict"] != "no_discrepancy" and before >= 0.85:
+        return f"{text}. It passes without any correction: it does not see this gap."
+    return f"{text}."
+
+
+def joined(names: Iterable[str]) -> str:
+    """Names as a list in a sentence."""
+    return ", ".join(str(name).replace("_", " ") for name in names)
