@@ -27,7 +27,8 @@ from ugat_marl.report.diagnosis_sections import (
 from ugat_marl.report.diagnosis_style import ABOVE, LEVELS, STYLE
 from ugat_marl.report.diagnosis_words import Record
 
-_LOUD = 16
+_LOUD, _QUIET = 16, 6
+"""Strips that are shown at once, of statistics outside of their noise and, if none is, inside."""
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 
 
@@ -73,14 +74,15 @@ def diagnosis_page(record: Record, network: Network, commands: Sequence[str] = (
 def _head(record: Record) -> str:
     verdict = str(record["verdict"])
     parts = [
-        f'<header><p class="soft">Diagnosis of <strong>{escape(record["scenario"])}</strong></p>',
-        f'<span class="badge {escape(verdict, quote=True)}">'
-        f"{escape(words.VERDICTS.get(verdict, verdict))}</span>",
-        f"<h1>{escape(record['sentence'])}</h1>",
+        f'<header><p class="soft">Diagnosis of <strong>{escape(record["scenario"])}</strong></p>'
     ]
     if (text := words.partial(record)) is not None:
         parts.append(f'<p class="partial">{escape(text)}</p>')
-    parts.append(f'<p class="soft">{escape(words.MEANINGS.get(verdict, ""))}</p>')
+    name = escape(words.VERDICTS.get(verdict, verdict))
+    parts.append(f'<span class="badge {escape(verdict, quote=True)}">{name}</span>')
+    parts.append(f"<h1>{escape(record['sentence'])}</h1>")
+    if record.get("complete", True) or record["effects"]:
+        parts.append(f'<p class="soft">{escape(words.MEANINGS.get(verdict, ""))}</p>')
     if record.get("next_measurement"):
         text = f"What would tell: {record['next_measurement']}."
         parts.append(f'<p class="note">{escape(text)}</p>')
@@ -130,12 +132,13 @@ def _statistics(record: Record) -> str:
     loud, quiet = speaking(rows)
     most = max(max(abs(row["z_before"]), abs(row["z_after"])) for row in rows)
     shown, rest = loud[:_LOUD], [*loud[_LOUD:], *quiet]
-    if not shown:
-        shown, rest = quiet[:_LOUD], quiet[_LOUD:]
+    heading = "The statistics that speak" if loud else "No statistic speaks"
+    if not loud:
+        shown, rest = quiet[:_QUIET], quiet[_QUIET:]
     key = _dot("before", "the scenario as it is")
     key += _dot("after", f"with {_model(record)}") if after else ""
     parts = [
-        "<section><h2>The statistics that speak</h2>"
+        f"<section><h2>{heading}</h2>"
         '<p class="soft">The shaded band is noise: two standard deviations of data sets of this '
         f'size. Beyond it the scale is logarithmic.</p><div class="key">{key}</div>',
         strips(shown, most, after=after),

@@ -98,6 +98,8 @@ dl { display: grid; grid-template-columns: max-content minmax(0, 1fr); gap: .15r
 dt { color: var(--soft); } dd { margin: 0; }
 @media screen and (max-width: 40rem) {
   h1 { font-size: 1.25rem; }
+  dl { grid-template-columns: minmax(0, 1fr); }
+  dd { margin-bottom: .3rem; }
   .strip { grid-template-columns: minmax(0, 1fr); }
   .stack thead { position: absolute; clip-path: inset(50%); height: 1px; overflow: hidden; }
   .stack, .stack tbody, .stack tr, .stack td { display: block; }

@@ -32,7 +32,7 @@ MEANINGS = {
 
 STATISTICS = {
     "lost": "green begins until 1st queued vehicle is across",
-    "lost_trend": "the same, change over the period",
+    "lost_trend": "time to cross of 1st: change over the period",
     "gap2": "gap, 1st to 2nd queued vehicle",
     "gap3": "gap, 2nd to 3rd",
     "gap4-5": "gaps before 4th and 5th",
@@ -141,7 +141,7 @@ def number(value: Any, digits: int = 3) -> str:
     if not math.isfinite(value):
         return "–"
     if abs(value) >= 10**digits:
-        return f"{value:,.0f}".replace(",", " ").replace("-", "−")
+        return f"{value:,.0f}".replace(",", "\u00a0").replace("-", "−")
     return f"{value:.{digits}g}".replace("-", "−")
 
 
