@@ -8,10 +8,11 @@ import io
 import os
 import time
 import zipfile
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +136,8 @@ class Engine:
             day = self._day(effects, number)
             place = number % len(self.periods)
             counted = tally(self.site, day.period, self._greens[place])
+            # As precise as what is remembered, so that the answer does not depend on the cache.
+            counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
             found = Replicate(counted, day.travel_time_s)
             self._remember(key, found)
         self._known[key] = found
@@ -177,7 +180,7 @@ class Engine:
                     stored["sums"].astype(np.float64), stored["bins"].astype(np.float64)
                 )
                 return Replicate(counted, float(stored["travel_time_s"]))
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
             return None  # absent or damaged: simulated again
 
     def _remember(self, key: str, found: Replicate) -> None:
