@@ -67,8 +67,8 @@ def test_a_lane_is_green_while_one_of_its_links_is() -> None:
 def test_only_a_green_with_right_of_way_is_protected() -> None:
     log = ((0.0, "r"), (10.0, "g"), (20.0, "y"), (23.0, "r"), (30.0, "G"), (40.0, "y"), (43.0, "r"))
     assert greens(log).protected.tolist() == [False, True]
-    mixed = tuple((time, state + "r".replace("r", "G" if state == "g" else "r"))
-                  for time, state in log)  # fmt: skip
+    # A second link that has right of way gives it to the lane.
+    mixed = tuple((time, state + ("G" if state == "g" else "r")) for time, state in log)
     assert greens(mixed, (0, 1)).protected.tolist() == [True, True]
 
 
