@@ -19,13 +19,16 @@ from ugat_marl.discrepancy.statistics import (
     shift,
     without_noise,
 )
-from ugat_marl.effects import Effect
+from ugat_marl.effects import EVERYWHERE, Effect
 
 Array = NDArray[np.float64]
 
 Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
 """A set of effects: hypotheses and the values of their free fields."""
 
+WIDE = ("network", "intersection")
+"""Blocks that effects on the whole network are fitted to: single lanes add more noise than they
+tell of them."""
 INTERPOLATION = 0.02
 """Share of a measured difference that a model is forgiven while it is fitted: simulation steps
 round what the street does not."""
@@ -126,7 +129,7 @@ class Fitter:
         for number in range(rounds):
             if not len(best.values):
                 break
-            whitener = Whitener(best.reference, self.data, INTERPOLATION, self.base)
+            whitener = self.whitener(best)
             if jacobian is None or number == 2:
                 jacobian = self.jacobian(best, whitener)
             step = _solve(jacobian, whitener.measured)
@@ -148,6 +151,17 @@ class Fitter:
             if gain < 1.0 and number:
                 break
         return best
+
+    def whitener(self, model: Fitted) -> Whitener:
+        """Residuals of a model: on all lanes and minutes only if an effect has a place."""
+        places = [
+            value
+            for hypothesis, _ in model.members
+            for _, value in hypothesis.fixed
+            if value != EVERYWHERE
+        ]
+        blocks = None if places else WIDE
+        return Whitener(model.reference, self.data, INTERPOLATION, self.base, blocks)
 
     def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
         """Derivatives of the whitened statistics, ``(free values, statistics)``."""
@@ -221,7 +235,7 @@ def uncertainty(
         return np.empty(0), {
             name: np.zeros_like(b.mean) for name, b in model.reference.blocks.items()
         }
-    whitener = Whitener(model.reference, fitter.data, INTERPOLATION, fitter.base)
+    whitener = fitter.whitener(model)
     jacobian = fitter.jacobian(model, whitener)
     inverse = np.linalg.pinv(jacobian @ jacobian.T)
     influences: list[Array] = []

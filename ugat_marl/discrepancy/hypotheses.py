@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.effects import DetectorEffect, Effect, known_effects
+from ugat_marl.effects import SETTINGS, DetectorEffect, Effect, known_effects
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenario import Scenario
 
@@ -167,6 +167,26 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
             for model in ("IDM", "EIDM", "W99")
             if now != {model}
         ]
+    return found
+
+
+def settings_as_members(
+    hypotheses: Sequence[Hypothesis],
+) -> list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]]:
+    """The settings of the paper (loads, rain, snow) as starting points of a fit.
+
+    Where drivers are sluggish in several ways at once, no single effect leads there.
+    """
+    known = {item.name: item for item in hypotheses}
+    found: list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]] = []
+    for effects in SETTINGS.values():
+        members = [
+            (known[effect.name], free_values(effect, known[effect.name]))
+            for effect in effects
+            if effect.name in known
+        ]
+        if len(members) > 1:
+            found.append(tuple(members))
     return found
 
 

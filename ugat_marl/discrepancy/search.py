@@ -63,6 +63,38 @@ class Proposal:
     expected: float
 
 
+def between(rays: Sequence[Ray]) -> list[Ray]:
+    """The rays, and further ones half-way between strengths of the same hypothesis.
+
+    What an effect does is not in proportion to its strength; between two strengths that were
+    simulated it nearly is.
+    """
+    found = list(rays)
+    for first, second in itertools.pairwise(rays):
+        near = first.hypothesis == second.hypothesis and first.origin is not None
+        if not near or not first.level or _side(first) != _side(second):
+            continue
+        for share in (0.33, 0.67):
+            level = tuple(
+                (1 - share) * a + share * b for a, b in zip(first.level, second.level, strict=True)
+            )
+            mixed = {
+                name: (1 - share) * first.difference[name] + share * second.difference[name]
+                for name in first.difference
+            }
+            noise = {
+                name: (1 - share) ** 2 * first.variance[name] + share**2 * second.variance[name]
+                for name in first.variance
+            }
+            found.append(Ray(first.hypothesis, level, mixed, noise, first.origin))
+    return found
+
+
+def _side(ray: Ray) -> bool:
+    assert ray.origin is not None
+    return ray.level > ray.origin
+
+
 def propose(
     rays: Sequence[Ray], whitener: Whitener, price: float, largest: int = 3
 ) -> list[Proposal]:
@@ -105,8 +137,14 @@ def propose(
                     (rays[index].hypothesis, rays[index].at(float(strength)))
                     for index, strength in zip(chosen, found, strict=True)
                 )
-                best[keys] = Proposal(members, cost)
+                if all(_is_something(hypothesis, values) for hypothesis, values in members):
+                    best[keys] = Proposal(members, cost)
     return sorted(best.values(), key=lambda item: item.expected)
+
+
+def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
+    """Whether the values differ from nominal once they are on the hypothesis's grid."""
+    return hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
 
 
 def _least_squares(gram: Array, match: Array, chosen: tuple[int, ...]) -> Array | None:

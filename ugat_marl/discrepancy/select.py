@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ugat_marl.discrepancy.engine import OutOfTime
 from ugat_marl.discrepancy.features import Tally
-from ugat_marl.discrepancy.fit import Fitted, Fitter, Members, effects_of, uncertainty
-from ugat_marl.discrepancy.hypotheses import Hypothesis
+from ugat_marl.discrepancy.fit import WIDE, Fitted, Fitter, Members, effects_of, uncertainty
+from ugat_marl.discrepancy.hypotheses import Hypothesis, settings_as_members
 from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.residual import Null, Residual
-from ugat_marl.discrepancy.search import Proposal, Ray, propose
+from ugat_marl.discrepancy.search import Proposal, Ray, between, propose
 from ugat_marl.discrepancy.statistics import Array, Whitener, shift
 from ugat_marl.measured.data import Period
 from ugat_marl.progress import Reporter
@@ -23,7 +24,9 @@ CANDIDATES_FITTED = 3
 TOLERANCE = 0.02
 """Share of the first difference in a statistic that a model may leave: parameters are known, and
 simulation steps resolved, no better."""
-_FORESIGHT = 0.1
+_MOST = 0.25
+"""Places and windows are looked at if effects on the whole network would leave more than this."""
+_FORESIGHT = 0.05
 """Rays are straight and effects are not: so much of a difference is not expected to be met."""
 
 
@@ -154,35 +157,53 @@ class Selector:
 
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Adds, changes or removes effects; None if nothing is worth it."""
-        rays = self._bank(start.model, number)
-        whitener = Whitener(start.model.reference, self._fitter.data, _FORESIGHT, self._fitter.base)
+        rays = between(self._bank(start.model, self._library, number))
+        whitener = self._whitener(start.model, WIDE)
+        gap = float(whitener.measured @ whitener.measured)
+        chance = float(len(whitener.measured))
+        enough = chance + _MOST * max(gap - chance, 0.0)
         proposals = propose(rays, whitener, self._fitter.price)
-        tried = self._tried(start.model, _promising(proposals), f"round {number + 1}: candidates")
+        chosen = [item.members for item in _promising(proposals)]
+        if not proposals or proposals[0].expected > enough:
+            chosen += self._elsewhere(start.model, rays, number)
+            if number == 0:
+                chosen += settings_as_members(self._library)
+        tried = self._tried(start.model, chosen, f"round {number + 1}: candidates")
         best = self._refined(tried, CANDIDATES_FITTED)
         if best is None or best.cost >= start.model.cost - self._fitter.price:
             return None
         return self.test(best)
 
-    def _bank(self, model: Fitted, number: int) -> list[Ray]:
-        """Simulates every hypothesis on top of a model."""
-        local = self._proposer.hypotheses(model.reference, model.distance, self._periods)
+    def _elsewhere(self, model: Fitted, rays: Sequence[Ray], number: int) -> list[Members]:
+        """Proposals with effects at places and in windows, judged by lanes and minutes too."""
+        present = {item.key for item in self._library}
+        found = self._proposer.hypotheses(model.reference, model.distance, self._periods)
+        local = [item for item in found if item.key not in present]
+        added = self._bank(model, local, number, "places")
+        proposals = propose([*rays, *added], self._whitener(model, None), self._fitter.price)
+        return [item.members for item in _promising(proposals)]
+
+    def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
+        data, base = self._fitter.data, self._fitter.base
+        return Whitener(model.reference, data, _FORESIGHT, base, blocks)
+
+    def _bank(
+        self, model: Fitted, hypotheses: Sequence[Hypothesis], number: int, what: str = "library"
+    ) -> list[Ray]:
+        """Simulates hypotheses on top of a model."""
         present = {hypothesis.key: values for hypothesis, values in model.members}
         jobs: list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...] | None]] = []
-        for hypothesis in dict.fromkeys((*self._library, *local)):
-            values = present.get(hypothesis.key)
-            if values is not None:
-                jobs += _changes(hypothesis, values)
-            else:
+        for hypothesis in dict.fromkeys(hypotheses):
+            if hypothesis.key not in present:
                 levels = hypothesis.levels if number == 0 else _few(hypothesis)
                 jobs += [(hypothesis, level, hypothesis.nominal) for level in levels]
-        known = {item[0].key for item in jobs}
-        for hypothesis, values in model.members:
-            if hypothesis.key not in known:
+        if what == "library":
+            for hypothesis, values in model.members:
                 jobs += _changes(hypothesis, values)
         days = self._effort.bank if number == 0 else 3
         rays: list[Ray] = []
         before = model.tallies[:days]
-        with self._reporter.task(f"round {number + 1}: library", len(jobs)) as advance:
+        with self._reporter.task(f"round {number + 1}: {what}", len(jobs)) as advance:
             for hypothesis, level, origin in jobs:
                 members = _merged(model.members, ((hypothesis, level),))
                 found = self._fitter.engine.replicates(effects_of(members), range(len(before)))
@@ -193,12 +214,12 @@ class Selector:
                 advance(note=hypothesis.name)
         return rays
 
-    def _tried(self, model: Fitted, chosen: Sequence[Proposal], title: str) -> list[Fitted]:
-        """Simulates proposals."""
+    def _tried(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
+        """Simulates sets of effects on top of a model."""
         found: list[Fitted] = []
         with self._reporter.task(title, len(chosen)) as advance:
-            for item in chosen:
-                members = _merged(model.members, item.members)
+            for new in chosen:
+                members = _merged(model.members, new)
                 if members:
                     found.append(self._kept(self._fitter.simulate(members)))
                 advance(note=_names(members))
@@ -241,16 +262,18 @@ class Selector:
 
 
 def _promising(proposals: Sequence[Proposal]) -> list[Proposal]:
-    """The best alone, and whatever is expected to do nearly as well as the best of all."""
+    """The best sets of each size, if a larger one promises more than a smaller one."""
     if not proposals:
         return []
-    limit = 1.3 * proposals[0].expected + 100.0
-    single = [item for item in proposals if len(item.members) == 1][:1]
-    chosen: list[Proposal] = []
+    chosen = [item for item in proposals if len(item.members) == 1][:1]
+    least = math.inf
     for size in (1, 2, 3):
-        near = [p for p in proposals if len(p.members) == size and p.expected <= limit]
-        chosen += near[: CANDIDATES[size - 1]]
-    return list(dict.fromkeys((*single, *chosen)))
+        own = [item for item in proposals if len(item.members) == size]
+        if own and own[0].expected < 0.95 * least - 20.0:  # more effects must be worth it
+            near = [item for item in own if item.expected <= 1.3 * own[0].expected + 50.0]
+            chosen += near[: CANDIDATES[size - 1]]
+            least = own[0].expected
+    return list(dict.fromkeys(chosen))
 
 
 def _changes(

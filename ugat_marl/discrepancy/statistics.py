@@ -10,7 +10,7 @@ its distribution is never looked up but always simulated.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -297,6 +297,7 @@ class Whitener:
         tolerance: Share of a measured difference that counts as noise as well: predictions by
             interpolation are no better.
         relative_to: Whose choice of statistics is used, so that vectors of different models fit.
+        blocks: Blocks to use; None for all.
     """
 
     def __init__(
@@ -305,6 +306,7 @@ class Whitener:
         data: Sequence[Tally],
         tolerance: float,
         relative_to: Reference | None = None,
+        blocks: Collection[str] | None = None,
     ) -> None:
         chosen = relative_to or reference
         found = reference.distance(data, relative_to=chosen)
@@ -314,6 +316,8 @@ class Whitener:
         ]
         self._parts = []
         for name, block in reference.blocks.items():
+            if blocks is not None and name not in blocks:
+                continue
             weight = sums[name][..., 1] / len(data)
             thin = np.clip(block.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
             noise = block.variance * thin / len(data) + block.error

@@ -26,7 +26,7 @@ from ugat_marl.discrepancy.verify import (
     travel_times,
     verify,
 )
-from ugat_marl.effects import DetectorEffect, Effect, apply_effects
+from ugat_marl.effects import Effect, apply_effects
 from ugat_marl.files import write_whole
 from ugat_marl.measured.data import Measured
 from ugat_marl.progress import Reporter, Silent
@@ -60,7 +60,6 @@ def diagnose(
 
     Raises:
         MeasuredDataError: The data hold nothing to compare.
-        OutOfTime: The budget does not suffice to simulate the scenario as it is.
     """
     config = config or DiagnosisConfig()
     reporter = reporter or Silent()
@@ -68,12 +67,15 @@ def diagnose(
     for item in measured.findings:
         reporter.say(f"note: {item.text}")
     timing = timing_effects(scenario, study.network, measured)
-    base = study.base(reporter)
-    located = where(study, base)
-    if base.residual.p > config.alpha:
-        record = _nothing(study, base, timing)
+    try:
+        base = study.base(reporter)
+    except OutOfTime:
+        record = _nothing_simulated(study, timing)
     else:
-        record = _search(study, base, located, timing, reporter)
+        if base.residual.p > config.alpha:
+            record = _nothing(study, base, timing)
+        else:
+            record = _search(study, base, where(study, base), timing, reporter)
     effects = record.pop("_effects")
     record |= _head(study, record["verdict"])
     if effects:
@@ -110,12 +112,35 @@ def _nothing(study: Study, base: Tested, timing: tuple[Effect, ...]) -> dict[str
         "sentence": sentence,
         "effects": [_timing_record(effect) for effect in timing],
         "where": [],
+        "left": [],
         "alternatives": [],
         "heldout": verification.as_dict(),
         "evidence": {"p_fit": base.residual.p},
         "next_measurement": None,
         "complete": True,
         **_tables(study, base, base),
+        "_effects": timing,
+    }
+
+
+def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> dict[str, Any]:
+    """The record of a budget that does not suffice for the scenario as it is."""
+    done = study.engine.simulated
+    return {
+        "verdict": "unknown",
+        "sentence": (
+            f"The budget of {study.config.budget_s:g} s ended after {done} of {study.effort.base} "
+            "simulated days of the scenario as it is, before anything could be compared. Run the "
+            "same command again to go on, or give a larger budget."
+        ),
+        "effects": [_timing_record(effect) for effect in timing],
+        "where": [],
+        "left": [],
+        "alternatives": [],
+        "heldout": None,
+        "evidence": {},
+        "next_measurement": None,
+        "complete": False,
         "_effects": timing,
     }
 
@@ -127,6 +152,7 @@ def _search(
     timing: tuple[Effect, ...],
     reporter: Reporter,
 ) -> dict[str, Any]:
+    """The record where the scenario as it is could not have made the data."""
     selector = study.selector(base, reporter)
     selection = selector.select(base)
     try:
@@ -268,8 +294,3 @@ def _plain(value: Any) -> Any:
         return value
     number = float(value)
     return float(f"{number:.9g}") if number == number and abs(number) < 1e300 else None
-
-
-def faults(effects: tuple[Effect, ...]) -> tuple[DetectorEffect, ...]:
-    """The effects on detectors among others: they change no scenario."""
-    return tuple(effect for effect in effects if isinstance(effect, DetectorEffect))
