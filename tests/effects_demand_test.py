@@ -130,6 +130,16 @@ def test_a_surge_stays_in_its_window() -> None:
     }
 
 
+def test_demand_may_grow_more_than_once(crossing: Crossing) -> None:
+    scenario = load("single-v1")
+    effects = [DemandLevel(EDGE, 1.7), DemandSurge(EDGE, 600, 1200, 2.5), DemandLevel("*", 1.7)]
+    grown = sound(apply_effects(scenario, effects))  # no id is there twice
+    assert len(departing(grown)) > 1.5 * len(departing(scenario))
+    flows = load(crossing(vehicles=FLOWS))
+    surges = [DemandSurge("W_C", 50, 100, 3), DemandSurge("W_C", 20, 70, 2)]
+    assert len(departing(apply_effects(flows, surges))) > len(departing(flows)) + 8
+
+
 def test_departures_are_shifted() -> None:
     scenario = load("single-v1")
     before = {n: float(x.get("depart", "")) for n, x in of_edge(scenario).items()}

@@ -36,6 +36,7 @@ TWIN_S = 15.0
 _FACTOR = Parameter("", 0.0, 20.0)
 _TIME = Parameter("s", 0.0, 1e7)
 _EXPONENTIAL = re.compile(r"\s*exp\((.*)\)\s*")
+_TWIN = rb"(?:\d+|surge|after)[\"']"
 
 
 @dataclass
@@ -279,10 +280,11 @@ def _scaled(
     over = settings.begin_s + settings.duration_s
     salt = f"{effect.name} {edge}"
     least = max(settings.begin_s, begin)
+    mark = _mark(scenario)
 
     def scaled(item: ET.Element) -> list[ET.Element]:
         if item.tag == "flow":
-            return _scaled_window(item, window, factor, over)
+            return _scaled_window(item, window, factor, over, mark)
         depart = depart_s(item)
         if not (math.isnan(depart) or begin <= depart < end):
             return [item]
@@ -291,7 +293,7 @@ def _scaled(
         found = [item] if count else []
         for number in range(1, count):
             twin = copy.deepcopy(item)
-            twin.set("id", f"{name}+{number}")
+            twin.set("id", f"{name}{mark}{number}")
             if not math.isnan(depart):
                 shift = TWIN_S * (2 * draw(salt, "when", name, str(number)) - 1)
                 time = depart + shift
@@ -304,8 +306,17 @@ def _scaled(
     return replace_departing(scenario, effect, edge, scaled)
 
 
+def _mark(scenario: Scenario) -> str:
+    """What stands in the ids of twins, and in none so far: demand may grow more than once."""
+    mark = "+"
+    contents = [document.read() for document in (*scenario.additional, *scenario.routes)]
+    while any(re.search(re.escape(mark).encode() + _TWIN, content) for content in contents):
+        mark += "+"
+    return mark
+
+
 def _scaled_window(
-    item: ET.Element, window: tuple[float, float], factor: float, over_s: float
+    item: ET.Element, window: tuple[float, float], factor: float, over_s: float, mark: str
 ) -> list[ET.Element]:
     """A flow in up to three parts: before, within and after the window."""
     begin = depart_s(item)
@@ -323,7 +334,11 @@ def _scaled_window(
     if first == begin and last == end:
         whole = scaled_flow(item, factor, over_s)
         return [] if whole is None else [whole]
-    parts = ((begin, first, 1.0, ""), (first, last, factor, "+surge"), (last, end, 1.0, "+after"))
+    parts = (
+        (begin, first, 1.0, ""),
+        (first, last, factor, f"{mark}surge"),
+        (last, end, 1.0, f"{mark}after"),
+    )
     found: list[ET.Element] = []
     for start, stop, rate, suffix in parts:
         part = copy.deepcopy(item)
