@@ -1,0 +1,91 @@
+"""What a diagnosis says: effects in words and in JSON, and the conclusion drawn from tests."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from ugat_marl.discrepancy.hypotheses import Hypothesis
+from ugat_marl.discrepancy.verdict import (
+    describe_effect,
+    describe_members,
+    effect_record,
+    place_and_window,
+)
+
+HEADWAY = Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05)
+SURGE = Hypothesis(
+    "demand_surge",
+    (("edge", "S_C"), ("begin_s", 300.0), ("end_s", 900.0)),
+    ("factor",),
+    ((1.5,),),
+    (1.0,),
+)
+TURNING = Hypothesis(
+    "turning", (("from_edge", "a"), ("to_edge", "b")), ("share",), ((0.2,),), (0.0,)
+)
+PARKING = Hypothesis(
+    "parking", (("lane", "S_C_0"), ("dwell_s", 40.0)), ("per_hour",), ((20.0,),), (0.0,)
+)
+MODEL = Hypothesis("driver_model", (("model", "IDM"),), (), ((),), None)
+LATE = Hypothesis("late_green", (("place", "*"),), ("seconds",), ((2.0,),), (0.0,))
+
+
+def test_an_effect_everywhere() -> None:
+    record = effect_record(HEADWAY, (1.45,), (0.02,))
+    assert record == {
+        "name": "headway",
+        "place": None,
+        "window": None,
+        "parameters": {
+            "seconds": {
+                "value": 1.45,
+                "low": pytest.approx(1.45 - 1.96 * 0.02),
+                "high": pytest.approx(1.45 + 1.96 * 0.02),
+                "unit": "s",
+            }
+        },
+    }
+
+
+def test_an_effect_with_place_and_window() -> None:
+    record = effect_record(SURGE, (1.8,), (0.1,))
+    assert record["place"] == "S_C"
+    assert record["window"] == [300.0, 900.0]
+    assert set(record["parameters"]) == {"factor"}
+
+
+def test_a_fixed_number_is_given_without_an_interval() -> None:
+    parameters = effect_record(PARKING, (25.0,), (2.0,))["parameters"]
+    assert parameters["dwell_s"] == {"value": 40.0, "low": None, "high": None, "unit": "s"}
+    assert parameters["per_hour"]["value"] == 25.0
+
+
+def test_two_places_are_joined() -> None:
+    assert place_and_window(TURNING) == ("a>b", None)
+
+
+def test_intervals_stay_in_range() -> None:
+    parameters = effect_record(TURNING, (0.05,), (1.0,))["parameters"]
+    assert parameters["share"]["low"] == 0.0
+    assert parameters["share"]["high"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("hypothesis", "values"),
+    [(HEADWAY, (1.4,)), (SURGE, (2.0,)), (TURNING, (0.2,)), (PARKING, (9.0,)), (MODEL, ()),
+     (LATE, (1.5,))],
+)  # fmt: skip
+def test_records_can_be_written(hypothesis: Hypothesis, values: tuple[float, ...]) -> None:
+    record = effect_record(hypothesis, values, (0.1,) * len(values))
+    assert json.loads(json.dumps(record, allow_nan=False)) == record
+
+
+def test_effects_in_words() -> None:
+    assert describe_effect(HEADWAY, (1.45,)) == "headway of 1.45 s"
+    assert describe_effect(SURGE, (1.8,)) == "demand surge at S_C from 300 s to 900 s of 1.8"
+    assert describe_effect(LATE, (2.0,)) == "late green of 2 s"
+    assert describe_members(((HEADWAY, (1.4,)), (LATE, (2.0,)))) == (
+        "headway of 1.4 s and late green of 2 s"
+    )
