@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, Tally
 from ugat_marl.discrepancy.hypotheses import Hypothesis
-from ugat_marl.discrepancy.search import FARTHEST, Proposal, Ray, propose
+from ugat_marl.discrepancy.search import FARTHEST, Proposal, Ray, between, propose
 from ugat_marl.discrepancy.statistics import Pools, Reference, Whitener
 
 Array = NDArray[np.float64]
@@ -205,3 +205,18 @@ def test_many_rays_are_searched_in_good_time(reference: Reference) -> None:
     )
     best = propose(among, target, PRICE)[0]
     assert {dict(h.fixed)["place"] for h, _ in best.members} == {"7", "50"}
+
+
+def test_rays_between_two_strengths_of_one_effect() -> None:
+    one, other = rays(3)[0], rays(4)[0]
+    strong = Ray(one.hypothesis, (2.0,), other.difference, one.variance, one.origin)
+    weak = Ray(one.hypothesis, (0.7,), other.difference, one.variance, one.origin)
+    found = between([one, strong])
+    assert found[:2] == [one, strong]
+    assert [item.level[0] for item in found[2:]] == pytest.approx([1.665, 1.835])
+    middle = found[2].difference["network"]
+    straight = 0.67 * one.difference["network"] + 0.33 * other.difference["network"]
+    assert middle == pytest.approx(straight)
+    # Nothing lies between shorter and longer than nominal, nor between two effects.
+    assert len(between([weak, one])) == 2
+    assert len(between(rays()[:2])) == 2
