@@ -185,6 +185,13 @@ def test_a_partial_result_says_so_first(verdict: str, network: Network) -> None:
     assert "The same command goes on" in lines
 
 
+def test_a_result_without_any_simulation_has_a_page(network: Network) -> None:
+    record = record_of("unknown", complete=False, heldout=None, where=[], alternatives=[])
+    record["evidence"] = {}
+    assert "Partial result" in Page(diagnosis_page(record, network)).text
+    assert "Partial result" in printed(record)
+
+
 def test_the_page_needs_nothing_else_and_forbids_scripts(network: Network) -> None:
     text = diagnosis_page(record_of(), network)
     assert not re.findall(r"https?:|src=|url\(|@import|<script|<link", text)

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.discrepancy.engine import OutOfTime
 from ugat_marl.discrepancy.workflow import CORRECTED, FILE, DiagnosisConfig, diagnose
 from ugat_marl.effects import DetectorEffect, known_effects, load
 from ugat_marl.errors import OptionError
@@ -69,11 +68,6 @@ class Diagnose:
         _say_what_cannot_be_seen(measured, console)
         try:
             record = diagnose(scenario, measured, self.out, config, Bars(console))
-        except OutOfTime:
-            raise OutOfTime(
-                f"--budget-s {self.budget_s:g} does not suffice to simulate the scenario as it is, "
-                "so nothing is known yet; the same command goes on where it stopped"
-            ) from None
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command goes on where it stopped") from None
         console.print(diagnosis_summary(record))

@@ -38,9 +38,11 @@ def disagreement_map(lanes: Sequence[Record], network: Network, key: str, title:
     centres = {item.id: item.position for item in network.intersections if item.id in shown}
     low, high = _frame(centres.values() or [network.lanes[known[0]["lane"]].shape[-1]])
     width, height = high[0] - low[0], high[1] - low[1]
-    stroke = max(_LANE_M, max(width, height) / 130)
+    wide = width > 2 * height
+    stroke = max(_LANE_M, max(width, height) / (180 if wide else 130))
     parts = [
-        f'<svg viewBox="{low[0]:.1f} {-high[1]:.1f} {width:.1f} {height:.1f}" role="img" '
+        f'<svg class="{"wide" if wide else "square"}" '
+        f'viewBox="{low[0]:.1f} {-high[1]:.1f} {width:.1f} {height:.1f}" role="img" '
         f'aria-label="{escape(title, quote=True)}">',
         f'<path class="road" stroke-width="{stroke:.2f}" d="{_roads(network, low, high)}"/>',
     ]
@@ -52,7 +54,7 @@ def disagreement_map(lanes: Sequence[Record], network: Network, key: str, title:
             f"<title>{escape(text)}</title></polyline>"
         )
     if len(centres) <= _NAMED:
-        parts += _names(centres, max(width, height))
+        parts += _names(centres, max(width, height) / (42 if wide else 28))
     return "".join([*parts, "</svg>"])
 
 
@@ -76,8 +78,7 @@ def _roads(network: Network, low: Point, high: Point) -> str:
     return "".join(found)
 
 
-def _names(centres: dict[str, Point], extent: float) -> list[str]:
-    size = extent / 28
+def _names(centres: dict[str, Point], size: float) -> list[str]:
     return [
         f'<text class="place" x="{x:.1f}" y="{-y:.1f}" font-size="{size:.1f}" '
         f'stroke-width="{size / 4:.1f}" text-anchor="middle" dominant-baseline="central">'

@@ -46,6 +46,8 @@ def _ground(evidence: Record) -> str:
 def heldout(record: Record) -> str:
     """The held-out periods in numbers."""
     found = record["heldout"]
+    if found is None:
+        return ""
     fitted = bool(record.get("verified_on_fitted_periods"))
     which = "The fitted periods" if fitted else "The held-out periods"
     boxes = [

@@ -62,6 +62,7 @@ summary { cursor: pointer; color: var(--soft); }
 .maps { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(20rem, 100%), 1fr));
   gap: 1rem; margin: 0; }
 figure { margin: 0; }
+.maps:has(svg.wide) { grid-template-columns: minmax(0, 1fr); }
 .maps svg { width: 100%; height: auto; max-height: 34rem; background: var(--card);
   border-radius: .4rem; display: block; }
 svg text { fill: var(--ink); }

@@ -26,7 +26,8 @@ def diagnosis_summary(record: Record) -> RenderableType:
         blocks.append(_effects(record))
     if record.get("where"):
         blocks.append(_where(record))
-    blocks.append(_heldout(record))
+    if record["heldout"] is not None:
+        blocks.append(_heldout(record))
     if (text := words.geh_line(record)) is not None:
         blocks.append(Text(text))
     return Group(*blocks)
