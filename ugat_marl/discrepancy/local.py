@@ -342,10 +342,9 @@ def _most_unusual(
     measured: Array, expected: Array, variance: Array, begin_s: float
 ) -> tuple[float, float, float, float] | None:
     """Scans all stretches for the largest standardised departure from a constant ratio."""
-    total = float(expected.sum())
-    if total <= 0:
-        return None
     minutes = len(measured)
+    if expected.sum() <= 0 or minutes * SCAN_S <= SHORTEST_S:
+        return None
     sums = [np.concatenate(([0.0], np.cumsum(row))) for row in (measured, expected, variance)]
     shortest = int(SHORTEST_S / SCAN_S)
     best: tuple[float, int, int, float] | None = None

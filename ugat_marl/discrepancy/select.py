@@ -18,7 +18,7 @@ from ugat_marl.measured.data import Period
 from ugat_marl.progress import Reporter
 
 ROUNDS = 4
-CANDIDATES = (4, 2, 3)
+CANDIDATES = (3, 2, 2)
 """Sets of one, two and three effects that are simulated in a round, at most."""
 CANDIDATES_FITTED = 3
 TOLERANCE = 0.02
@@ -26,6 +26,8 @@ TOLERANCE = 0.02
 simulation steps resolved, no better."""
 _MOST = 0.25
 """Places and windows are looked at if effects on the whole network would leave more than this."""
+_HUGE = 20.0
+"""Distances per statistic beyond which several effects at once are likely from the start."""
 _FORESIGHT = 0.05
 """Rays are straight and effects are not: so much of a difference is not expected to be met."""
 
@@ -43,7 +45,7 @@ class Effort:
 
     base: int = 80
     bank: int = 4
-    fit: int = 8
+    fit: int = 6
     test: int = 48
 
 
@@ -165,9 +167,10 @@ class Selector:
         proposals = propose(rays, whitener, self._fitter.price)
         chosen = [item.members for item in _promising(proposals)]
         if not proposals or proposals[0].expected > enough:
-            chosen += self._elsewhere(start.model, rays, number)
-            if number == 0:
+            chosen = [*chosen[:2], *self._elsewhere(start.model, rays, number)]
+            if number == 0 and gap > _HUGE * chance:
                 chosen += settings_as_members(self._library)
+            chosen = list(dict.fromkeys(chosen))
         tried = self._tried(start.model, chosen, f"round {number + 1}: candidates")
         best = self._refined(tried, CANDIDATES_FITTED)
         if best is None or best.cost >= start.model.cost - self._fitter.price:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -77,9 +78,13 @@ def diagnose(
         else:
             record = _search(study, base, where(study, base), timing, reporter)
     effects = record.pop("_effects")
-    record |= _head(study, record["verdict"])
+    record |= _head(study)
+    record["corrected"] = CORRECTED if effects else None
+    place = directory / CORRECTED
+    if (place / "scenario.toml").is_file():  # of an earlier diagnosis
+        shutil.rmtree(place)
     if effects:
-        corrected(scenario, effects, directory / CORRECTED)
+        corrected(scenario, effects, place)
     text = json.dumps(_plain(record), indent=1, sort_keys=True, allow_nan=False)
     write_whole(directory / FILE, text + "\n")
     return json.loads(text)
@@ -115,7 +120,8 @@ def _nothing(study: Study, base: Tested, timing: tuple[Effect, ...]) -> dict[str
         "left": [],
         "alternatives": [],
         "heldout": verification.as_dict(),
-        "evidence": {"p_fit": base.residual.p},
+        "evidence": {"p_fit": base.residual.p, "p_fit_after": base.residual.p},
+        "best": None,
         "next_measurement": None,
         "complete": True,
         **_tables(study, base, base),
@@ -139,6 +145,7 @@ def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> dict[str, An
         "alternatives": [],
         "heldout": None,
         "evidence": {},
+        "best": None,
         "next_measurement": None,
         "complete": False,
         "_effects": timing,
@@ -183,6 +190,7 @@ def _search(
         "alternatives": [_alternative(item) for item in _ranking(conclusion, selection)],
         "heldout": verification.as_dict(),
         "evidence": {"p_fit": base.residual.p, "p_fit_after": best.residual.p},
+        "best": _alternative(best.model) if best.model.members else None,
         "next_measurement": conclusion.next_measurement,
         "complete": selection.complete,
         **tables,
@@ -259,7 +267,7 @@ def _tables(study: Study, base: Tested, best: Tested) -> dict[str, Any]:
     return found
 
 
-def _head(study: Study, verdict: str) -> dict[str, Any]:
+def _head(study: Study) -> dict[str, Any]:
     """What every diagnosis says of itself."""
     measured = study.measured
     return {
@@ -278,9 +286,6 @@ def _head(study: Study, verdict: str) -> dict[str, Any]:
         "versions": {
             name: importlib.metadata.version(name) for name in ("ugat-marl", "eclipse-sumo")
         },
-        "corrected": CORRECTED
-        if verdict in ("explained", "partially_explained", "not_identifiable")
-        else None,
     }
 
 
