@@ -35,6 +35,7 @@ class Hypothesis:
         nominal: Values of the free fields that change nothing, or None if unknown.
         least: Distance from nominal below which it does not matter in practice.
         step: Values are multiples of it, if not 0.
+        both: Whether the other side of nominal is the opposite of this one.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Hypothesis:
     nominal: tuple[float, ...] | None
     least: float = 0.0
     step: float = 0.0
+    both: bool = False
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -88,33 +90,31 @@ class _Entry:
     nominal: float
     least: float
     place: str = ""
-    step: float = 0.0
     attribute: str = ""
+    both: bool = False
 
 
 _GLOBAL: dict[str, _Entry] = {
-    "acceleration": _Entry("mps2", (0.7, 1.4, 3.6), 2.6, 0.1, attribute="accel"),
-    "deceleration": _Entry("mps2", (2.0, 3.2, 6.5), 4.5, 0.2, attribute="decel"),
-    "startup_delay": _Entry(
-        "seconds", (0.25, 0.5, 0.75, 1.0, 1.5), 0.0, 0.05, attribute="startupDelay"
-    ),
+    "acceleration": _Entry("mps2", (0.8, 1.6), 2.6, 0.1, attribute="accel", both=True),
+    "deceleration": _Entry("mps2", (2.0, 3.2), 4.5, 0.2, attribute="decel", both=True),
+    "startup_delay": _Entry("seconds", (0.3, 0.6, 0.8, 1.2), 0.0, 0.05, attribute="startupDelay"),
     "headway": _Entry("seconds", (1.3, 1.7), 1.0, 0.05, attribute="tau"),
     "min_gap": _Entry("metres", (1.5, 3.5, 5.0), 2.5, 0.2, attribute="minGap"),
     "imperfection": _Entry("sigma", (0.15, 0.85), 0.5, 0.05, attribute="sigma"),
-    "desired_speed": _Entry("factor", (0.85, 1.12), 1.0, 0.01),
+    "desired_speed": _Entry("factor", (0.87,), 1.0, 0.01, both=True),
     "speed_spread": _Entry("deviation", (0.03, 0.2), 0.1, 0.01, attribute="speedDev"),
     "reaction_step": _Entry("seconds", (2.0,), 1.0, 0.5, attribute="actionStepLength"),
     "yellow_running": _Entry("seconds", (3.0,), 0.0, 0.3, attribute="jmDriveAfterYellowTime"),
-    "red_running": _Entry("seconds", (1.0, 3.0), 0.0, 0.3, attribute="jmDriveAfterRedTime"),
+    "red_running": _Entry("seconds", (2.0,), 0.0, 0.3, attribute="jmDriveAfterRedTime"),
     "gap_acceptance": _Entry("seconds", (0.4, 2.5), 1.0, 0.2, attribute="jmTimegapMinor"),
     "lane_discipline": _Entry("strategic", (0.1, 5.0), 1.0, 0.2, attribute="lcStrategic"),
-    "heavy_share": _Entry("share", (0.06, 0.2), 0.0, 0.01),
-    "late_green": _Entry("seconds", (1.0, 3.0), 0.0, 0.3, place="place"),
-    "signal_clock": _Entry("seconds", (-2.0, 2.0), 0.0, 0.2, place="place"),
-    "clock_drift": _Entry("seconds_per_hour", (-3.0, 3.0), 0.0, 0.5, place="place"),
-    "undercount": _Entry("share", (0.1, 0.3), 0.0, 0.02, place="place"),
-    "demand_level": _Entry("factor", (0.85, 1.15), 1.0, 0.03, place="edge"),
-    "demand_timing": _Entry("seconds", (-300.0, 300.0), 0.0, 45.0, place="edge"),
+    "heavy_share": _Entry("share", (0.12,), 0.0, 0.01),
+    "late_green": _Entry("seconds", (2.0,), 0.0, 0.3, place="place"),
+    "signal_clock": _Entry("seconds", (2.0,), 0.0, 0.2, place="place", both=True),
+    "clock_drift": _Entry("seconds_per_hour", (3.0,), 0.0, 0.5, place="place", both=True),
+    "undercount": _Entry("share", (0.15,), 0.0, 0.02, place="place"),
+    "demand_level": _Entry("factor", (1.15,), 1.0, 0.03, place="edge", both=True),
+    "demand_timing": _Entry("seconds", (300.0,), 0.0, 45.0, place="edge", both=True),
 }
 
 LOCAL = frozenset(
@@ -159,7 +159,11 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
             nominal, levels = max(nominal, step), ((2 * max(nominal, step),),)
         fixed = ((entry.place, "*"),) if entry.place else ()
         grid = step if name == "reaction_step" else 0.0
-        found.append(Hypothesis(name, fixed, (entry.field,), levels, (nominal,), entry.least, grid))
+        found.append(
+            Hypothesis(
+                name, fixed, (entry.field,), levels, (nominal,), entry.least, grid, entry.both
+            )
+        )
     if "driver_model" in allowed:
         now = _attribute(scenario, "carFollowModel")
         found += [

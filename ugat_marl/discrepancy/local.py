@@ -96,7 +96,7 @@ class Proposer:
         found += self._demand(distance)
         found += self._turning(distance)
         found += self._windows(reference, periods)
-        found += self._places(distance)
+        found += self._places(reference, distance)
         found += fault_hypotheses(self._site, reference, distance, periods)
         return [item for item in found if item.name in self._allowed]
 
@@ -125,36 +125,57 @@ class Proposer:
                     break
         return names, np.array(differences), np.array(errors)
 
+    def directed(self, distance: Distance) -> dict[str, float]:
+        """What the best origin and the best turn would explain: few counts, but the right ones."""
+        counts = self._edge_counts(distance)
+        return {
+            "demand": max((item[0] for item in self._origins(*counts)), default=0.0),
+            "turning": max((item[0] for item in self._turns(*counts)), default=0.0),
+        }
+
     def _demand(self, distance: Distance) -> list[Hypothesis]:
-        """Origins whose rays of counts explain most."""
-        edges, difference, error = self._edge_counts(distance)
-        ranked: list[tuple[float, str, float]] = []
+        ranked = sorted(self._origins(*self._edge_counts(distance)), reverse=True)
+        return [
+            Hypothesis(
+                "demand_level", (("edge", origin),), ("factor",),
+                ((float(np.clip(factor, 0.3, 3.0)),),), (1.0,), 0.03, both=True,
+            )
+            for gain, origin, factor in ranked[:2]
+            if gain > 9.0 and len(self._routes.passing) > 1
+        ]  # fmt: skip
+
+    def _origins(
+        self, edges: Sequence[str], difference: Array, error: Array
+    ) -> list[tuple[float, str, float]]:
+        """Gain, origin and factor of every origin, by its ray of counts."""
+        measured = difference / np.maximum(error, 1e-9)
+        found: list[tuple[float, str, float]] = []
         for origin, reached in self._routes.passing.items():
             ray = np.array([reached.get(edge, 0.0) for edge in edges]) / np.maximum(error, 1e-9)
             size = float(ray @ ray)
             if size > 9.0:
-                strength = float(ray @ (difference / np.maximum(error, 1e-9))) / size
-                ranked.append((strength**2 * size, origin, 1.0 + strength))
-        ranked.sort(reverse=True)
-        return [
-            Hypothesis(
-                "demand_level",
-                (("edge", origin),),
-                ("factor",),
-                ((float(np.clip(factor, 0.3, 3.0)),),),
-                (1.0,),
-                0.03,
-            )
-            for gain, origin, factor in ranked[:2]
-            if gain > 9.0 and len(self._routes.passing) > 1
-        ]
+                strength = float(ray @ measured) / size
+                found.append((strength**2 * size, origin, 1.0 + strength))
+        return found
 
     def _turning(self, distance: Distance) -> list[Hypothesis]:
-        """Pairs of edges between which vehicles would have to move."""
-        edges, difference, error = self._edge_counts(distance)
+        ranked = sorted(self._turns(*self._edge_counts(distance)), reverse=True)
+        return [
+            Hypothesis(
+                "turning", (("from_edge", origin), ("to_edge", target)), ("share",),
+                ((share,),), (0.0,), 0.03,
+            )
+            for gain, origin, target, share in ranked[:2]
+            if gain > 9.0
+        ]  # fmt: skip
+
+    def _turns(
+        self, edges: Sequence[str], difference: Array, error: Array
+    ) -> list[tuple[float, str, str, float]]:
+        """Gain, edges and share of every pair of edges between which vehicles may move."""
         place = {edge: index for index, edge in enumerate(edges)}
         measured = difference / np.maximum(error, 1e-9)
-        ranked: list[tuple[float, str, str, float]] = []
+        found: list[tuple[float, str, str, float]] = []
         approaches = {lane.edge for lane in self._site.lanes}
         for origin in sorted(approaches & set(self._routes.turns)):
             leaving = self._routes.turns[origin]
@@ -166,23 +187,10 @@ class Proposer:
                         ray[place[other]] += change
                 ray = ray / np.maximum(error, 1e-9)
                 size = float(ray @ ray)
-                if size > 4.0:
-                    share = float(ray @ measured) / size
-                    if share > 0.02:
-                        ranked.append((share**2 * size, origin, target, min(share, 0.9)))
-        ranked.sort(reverse=True)
-        return [
-            Hypothesis(
-                "turning",
-                (("from_edge", origin), ("to_edge", target)),
-                ("share",),
-                ((share,),),
-                (0.0,),
-                0.03,
-            )
-            for gain, origin, target, share in ranked[:3]
-            if gain > 9.0
-        ]
+                share = float(ray @ measured) / size if size > 4.0 else 0.0
+                if share > 0.02:
+                    found.append((share**2 * size, origin, target, min(share, 0.9)))
+        return found
 
     # --- time ---------------------------------------------------------------------------------
 
@@ -210,7 +218,7 @@ class Proposer:
                     found.append((z, Hypothesis("lane_closure", fixed, (), ((),), None)))
         found.sort(key=lambda item: -item[0])
         chosen: list[Hypothesis] = []
-        for kind, most in (("demand_surge", 2), ("lane_closure", 4)):
+        for kind, most in (("demand_surge", 2), ("lane_closure", 3)):
             chosen += [item for _, item in found if item.name == kind][:most]
         return chosen
 
@@ -278,7 +286,7 @@ class Proposer:
 
     # --- places -------------------------------------------------------------------------------
 
-    def _places(self, distance: Distance) -> list[Hypothesis]:
+    def _places(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
         """Lanes for parking, edges for slow roads, traffic lights for lost time and clocks."""
         found: list[Hypothesis] = []
         lanes = self._site.lanes
@@ -309,12 +317,31 @@ class Proposer:
             typical = float(np.median(list(by_edge.values())))
             ranked = sorted(by_edge, key=lambda edge: -abs(by_edge[edge] - typical))
             found += [
-                Hypothesis("local_speed", (("edge", edge),), ("factor",), ((0.8,),), (1.0,), 0.02)
+                Hypothesis(
+                    "local_speed",
+                    (("edge", edge),),
+                    ("factor",),
+                    ((self._speed_ratio(reference, distance, edge),),),
+                    (1.0,),
+                    0.02,
+                    both=True,
+                )
                 for edge in ranked[:2]
             ]
         if len(self._site.intersections) > 1:
             found += self._traffic_lights(distance)
         return found
+
+    def _speed_ratio(self, reference: Reference, distance: Distance, edge: str) -> float:
+        """Free speed on an edge, as a multiple of the simulated one."""
+        rows = [index for index, name in enumerate(self._edges) if name == edge]
+        mean = reference.blocks["lane"].mean[rows, INDEX["free_speed"]]
+        difference = distance.difference["lane"][rows, INDEX["free_speed"]]
+        known = np.isfinite(mean) & (difference != 0) & (mean > 0)
+        if not known.any():
+            return 0.8
+        ratio = float(np.mean(1.0 + difference[known] / mean[known]))
+        return float(np.clip(ratio, 0.2, 2.0)) if abs(ratio - 1.0) > 0.03 else 0.8
 
     def _traffic_lights(self, distance: Distance) -> list[Hypothesis]:
         """The two traffic lights whose starts of green differ most from the others'."""

@@ -125,7 +125,8 @@ def propose(
             keys = tuple(sorted(str(rays[index].hypothesis.key) for index in chosen))
             if len(set(keys)) < size:
                 continue
-            found = _least_squares(gram, match, chosen)
+            signs = tuple(rays[index].hypothesis.both for index in chosen)
+            found = _least_squares(gram, match, chosen, signs)
             if found is None:
                 continue
             left = start - float(
@@ -147,7 +148,9 @@ def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
     return hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
 
 
-def _least_squares(gram: Array, match: Array, chosen: tuple[int, ...]) -> Array | None:
+def _least_squares(
+    gram: Array, match: Array, chosen: tuple[int, ...], both: tuple[bool, ...]
+) -> Array | None:
     """Strengths along the rays, within reach; None if one of them does not help."""
     part = gram[np.ix_(chosen, chosen)]
     try:
@@ -156,9 +159,10 @@ def _least_squares(gram: Array, match: Array, chosen: tuple[int, ...]) -> Array 
         )
     except np.linalg.LinAlgError:
         return None
-    if (found < NEAREST).any():
+    size = np.where(both, np.abs(found), found)
+    if (size < NEAREST).any():
         return None
-    return np.minimum(found, FARTHEST)
+    return np.clip(found, -FARTHEST, FARTHEST)
 
 
 def _useful(best: dict[tuple[object, ...], Proposal], rays: Sequence[Ray], count: int) -> list[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from ugat_marl.discrepancy.engine import OutOfTime
@@ -26,6 +26,8 @@ TOLERANCE = 0.02
 simulation steps resolved, no better."""
 _MOST = 0.25
 """Places and windows are looked at if effects on the whole network would leave more than this."""
+_HOPELESS = 4.0
+"""Candidates so many times as far away as the best one are not fitted."""
 _HUGE = 20.0
 """Distances per statistic beyond which several effects at once are likely from the start."""
 _FORESIGHT = 0.05
@@ -43,8 +45,8 @@ class Effort:
         test: For the test of what is left.
     """
 
-    base: int = 80
-    bank: int = 4
+    base: int = 60
+    bank: int = 3
     fit: int = 6
     test: int = 48
 
@@ -93,6 +95,7 @@ class Selector:
         periods: The fitted periods.
         effort: Numbers of days.
         alpha: Level of the tests.
+        null: Makes the test of a model of its days.
         reporter: Shows progress.
     """
 
@@ -104,6 +107,7 @@ class Selector:
         periods: Sequence[Period],
         effort: Effort,
         alpha: float,
+        null: Callable[[Sequence[Tally], int], Null],
         reporter: Reporter,
     ) -> None:
         self._fitter = fitter
@@ -112,6 +116,7 @@ class Selector:
         self._periods = tuple(periods)
         self._effort = effort
         self._alpha = alpha
+        self._null = null
         self._reporter = reporter
         self._first = fitter.base.distance(fitter.data)
         self._seen: dict[str, Fitted] = {}
@@ -143,7 +148,7 @@ class Selector:
         errors, extra = uncertainty(fitter, model)
         for name, difference in self._first.difference.items():
             extra[name] = extra[name] + (TOLERANCE * difference) ** 2
-        null = Null(fitter.pools, self._days(model), len(fitter.data), speeds=fitter.speeds)
+        null = self._null(self._days(model), len(fitter.data))
         return Tested(model, null, null.test(fitter.data, extra), errors, extra)
 
     def _days(self, model: Fitted) -> list[Tally]:
@@ -231,6 +236,7 @@ class Selector:
     def _refined(self, models: Sequence[Fitted], count: int) -> Fitted | None:
         """The best of several models once the most promising are fitted."""
         ranked = sorted(models, key=lambda item: item.cost)[:count]
+        ranked = [item for item in ranked if item.cost < _HOPELESS * ranked[0].cost]
         with self._reporter.task("fitting", len(ranked)) as advance:
             found: list[Fitted] = []
             for model in ranked:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -134,7 +135,7 @@ class Study:
             Pools.of(site),
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
-            config.effort or (Effort(48, 3, 6, 32) if several else Effort()),
+            config.effort or (Effort(40, 3, 5, 32) if several else Effort()),
             _tallies(site, engine, measured, periods),
             _tallies(site, engine, measured, measured.of("heldout") or periods),
             ruled_out,
@@ -164,9 +165,15 @@ class Study:
             )
         distance = reference.distance(self.fit)
         model = Fitted((), tallies, reference, distance, distance.total)
-        null = Null(self.pools, tallies, len(self.fit), speeds=self.speeds)
+        null = self.null(tallies, len(self.fit))
         return Tested(model, null, null.test(self.fit), np.empty(0), {})
 
+    def null(self, tallies: Sequence[Tally], periods: int) -> Null:
+        """What chance makes of a model's own days."""
+        directed = self.proposer.directed
+        return Null(self.pools, tallies, periods, speeds=self.speeds, directed=directed)
+
+    @functools.cached_property
     def proposer(self) -> Proposer:
         """Finds places and windows."""
         return Proposer(self.site, Routes.of(self.scenario), self.allowed)
@@ -185,11 +192,12 @@ class Study:
         )
         return Selector(
             fitter,
-            self.proposer(),
+            self.proposer,
             self.hypotheses,
             self.measured.of("fit"),
             self.effort,
             self.config.alpha,
+            self.null,
             reporter,
         )
 

@@ -51,7 +51,7 @@ def verify(study: Study, base: Tested, best: Tested) -> Verification:
         if model.model.members:
             found = study.engine.replicates(model.model.effects, range(study.effort.test))
             days = tuple(day.tally for day in found)
-        return Null(study.pools, days, count, speeds=study.speeds)
+        return study.null(days, count)
 
     before = null(base).test(study.heldout)
     after = null(best).test(study.heldout, best.extra or None) if best.model.members else before
