@@ -123,7 +123,7 @@ class TransferConfig:
 
     @property
     def episodes(self) -> int:
-        """Episodes that UGAT trains for in all, and so does every policy beside it."""
+        """Episodes that UGAT trains for in all, and so do the control and corrected sim."""
         return self.ugat.pretrain_episodes + self.ugat.iterations * self.ugat.grounded_episodes
 
 
