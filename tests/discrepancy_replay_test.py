@@ -109,8 +109,10 @@ def test_a_traffic_light_without_signals_is_named(scenario: Scenario) -> None:
 
 
 LOGS = st.lists(
-    st.tuples(st.floats(-20, 119), st.sampled_from(("Gr", "yr", "rr", "rG", "ry"))), min_size=1
-).map(lambda rows: tuple(sorted(rows)))
+    st.tuples(st.integers(-200, 1190), st.sampled_from(("Gr", "yr", "rr", "rG", "ry"))),
+    min_size=1,
+    unique_by=lambda row: row[0],
+).map(lambda rows: tuple((tenth / 10, state) for tenth, state in sorted(rows)))
 
 
 @given(LOGS, st.sampled_from((0.0, 40.0)))
