@@ -26,6 +26,8 @@ TOLERANCE = 0.02
 simulation steps resolved, no better."""
 _MOST = 0.25
 """Places and windows are looked at if effects on the whole network would leave more than this."""
+_LITTLE = 2.0
+"""Distance per statistic of the network below which nothing is to be seen in the pool."""
 _HOPELESS = 4.0
 """Candidates so many times as far away as the best one are not fitted."""
 _HUGE = 20.0
@@ -171,7 +173,8 @@ class Selector:
         enough = chance + _MOST * max(gap - chance, 0.0)
         proposals = propose(rays, whitener, self._fitter.price)
         chosen = [item.members for item in _promising(proposals)]
-        if not proposals or proposals[0].expected > enough:
+        little = gap < _LITTLE * chance  # what differs does so in single places
+        if little or not proposals or proposals[0].expected > enough:
             chosen = [*chosen[:2], *self._elsewhere(start.model, rays, number)]
             if number == 0 and gap > _HUGE * chance:
                 chosen += settings_as_members(self._library)
@@ -189,7 +192,10 @@ class Selector:
         local = [item for item in found if item.key not in present]
         added = self._bank(model, local, number, "places")
         proposals = propose([*rays, *added], self._whitener(model, None), self._fitter.price)
-        return [item.members for item in _promising(proposals)]
+        places = {item.key for item in local}
+        alone = [item for item in proposals if len(item.members) == 1]
+        here = [item for item in alone if item.members[0][0].key in places][: CANDIDATES[0]]
+        return [item.members for item in (*_promising(proposals), *here)]
 
     def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
         data, base = self._fitter.data, self._fitter.base

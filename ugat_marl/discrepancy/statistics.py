@@ -25,6 +25,11 @@ MIN_OBSERVATIONS = 3.0
 """Observations per period below which a mean is not used."""
 _GRAIN = 0.3
 """A mean is not known better than to this much of a unit in one observation."""
+SINGLE = ("lane", "time")
+"""Blocks with so many statistics of single lanes and minutes that most of an effect's differences
+there are chance: those are left as they were."""
+CERTAIN = 6.0
+"""Squared standardised difference beyond which one is not chance."""
 _SOFT = {"network": np.inf, "intersection": np.inf, "lane": 5.0, "time": 4.0}
 """Standardised differences beyond this count less: queues reach a place or they do not, and single
 lanes and minutes have heavy tails."""
@@ -137,10 +142,11 @@ class Reference:
         self.blocks: dict[str, Block] = {}
         for name, sums in stacked.items():
             before = prior.blocks[name] if prior else None
-            self.blocks[name] = self._block(sums, before, partners.get(name), name == "time")
+            self.blocks[name] = self._block(sums, before, partners.get(name), name)
 
-    def _block(self, sums: Array, prior: Block | None, partner: Array | None, timed: bool) -> Block:
+    def _block(self, sums: Array, prior: Block | None, partner: Array | None, name: str) -> Block:
         """From sums ``(days, members, features, 2)``."""
+        timed = name == "time"
         mean, variance, weight, residual = _moments(sums)
         if timed:
             variance = _smoothed(mean, variance)
@@ -151,7 +157,11 @@ class Reference:
             variance = scale * variance + (1 - scale) * prior.variance
             error = variance / len(sums)
             if partner is not None:
+                moved = _moved(mean, residual, partner) if name in SINGLE else True
                 mean, error = _controlled(mean, variance, residual, partner, prior)
+                mean = np.where(moved, mean, prior.mean)
+                variance = np.where(moved, variance, prior.variance)
+                error = np.where(moved, error, prior.error)
         if timed:
             used = mean > 0.5
         else:
@@ -238,6 +248,14 @@ def _moments(sums: Array) -> tuple[Array, Array, Array, Array]:
     grain = (_GRAIN / np.maximum(weight, 1.0)) ** 2
     mean = np.where(weight > 0, mean, np.nan)
     return mean, np.maximum(variance, grain), weight, residual
+
+
+def _moved(mean: Array, residual: Array, partner: Array) -> NDArray[np.bool_]:
+    """Which statistics differ from those of the same days under the prior model beyond chance."""
+    before, _, _, other = _moments(partner)
+    days = len(partner)
+    noise = ((residual - other) ** 2).sum(axis=0) / max(days - 1, 1) / days
+    return np.nan_to_num((mean - before) ** 2, nan=np.inf) > CERTAIN * noise
 
 
 def _controlled(
@@ -371,6 +389,6 @@ def without_noise(
     """Differences with those of single lanes and minutes set to 0 that may be chance."""
     found: dict[str, Array] = {}
     for name, values in difference.items():
-        certain = values**2 > 6.0 * variance[name]
-        found[name] = np.where(certain, values, 0.0) if name in ("lane", "time") else values
+        certain = values**2 > CERTAIN * variance[name]
+        found[name] = np.where(certain, values, 0.0) if name in SINGLE else values
     return found
