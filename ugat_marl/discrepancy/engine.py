@@ -28,7 +28,7 @@ from ugat_marl.measured.data import Period
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
 
-VERSION = 1
+VERSION = 2
 """Of features and replays: a tally remembered under another version is not used."""
 
 _KEPT_DAYS = 40

@@ -187,8 +187,10 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     """Gaps, speeds and times over the detector of vehicles that stood at the start of green."""
     order = np.argsort(stop.off_s, kind="stable")
     stop = stop.at(order[np.isfinite(stop.off_s[order])])
-    counter.add("queued", np.empty(0))
-    if not len(stop) or not len(greens.start_s):
+    cycles = float(len(greens.start_s))
+    counter.ratio("queued", 0.0, cycles)
+    counter.ratio("discharged", 0.0, cycles)
+    if not len(stop) or not cycles:
         return
     crossed = stop.off_s
     cycle = np.searchsorted(greens.start_s, crossed, "right") - 1
@@ -228,9 +230,8 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     over = stop.off_s - np.where(number == 0, start, stop.on_s)
     for name, low, high in (("over1", 0, 0), ("over2-3", 1, 2), ("over4+", 3, 9)):
         counter.add(name, over[protected & (number >= low) & (number <= high)])
-    cycles = float(len(greens.start_s))
-    counter.ratio("queued", float((alive & (number == 0)).sum()), cycles)
-    counter.ratio("discharged", float(alive.sum()), cycles)
+    counter.ratio("queued", float((alive & (number == 0)).sum()), 0.0)
+    counter.ratio("discharged", float(alive.sum()), 0.0)
 
 
 def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:

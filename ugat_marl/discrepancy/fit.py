@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.engine import Engine
 from ugat_marl.discrepancy.features import Tally
-from ugat_marl.discrepancy.hypotheses import Hypothesis, ordered
+from ugat_marl.discrepancy.hypotheses import WINDOW, Hypothesis, ordered
 from ugat_marl.discrepancy.statistics import (
     Distance,
     Pools,
@@ -29,6 +29,8 @@ Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
 WIDE = ("network", "intersection")
 """Blocks that effects on the whole network are fitted to: single lanes add more noise than they
 tell of them."""
+WINDOW_STEPS_S = (60.0, 30.0)
+SHORTEST_S = 60.0
 INTERPOLATION = 0.02
 """Share of a measured difference that a model is forgiven while it is fitted: simulation steps
 round what the street does not."""
@@ -152,6 +154,24 @@ class Fitter:
                 break
         return best
 
+    def fitted(self, start: Fitted) -> Fitted:
+        """The best values, and the best window where there is one."""
+        best = self.refine(start)
+        if any(set(WINDOW) <= dict(h.fixed).keys() for h, _ in best.members):
+            moved = self._windows(best)
+            best = self.refine(moved, 1) if moved is not best else best
+        return best
+
+    def _windows(self, best: Fitted) -> Fitted:
+        """Moves begin and end, together and alone, in ever smaller steps while that helps."""
+        for step in WINDOW_STEPS_S:
+            for move in ((-step, -step), (-step, 0.0), (0.0, -step), (0.0, step), (step, 0.0)):
+                members = tuple((_shifted(h, move), values) for h, values in best.members)
+                found = self.simulate(members)
+                if found.cost < best.cost - 1.0:
+                    best = found
+        return best
+
     def whitener(self, model: Fitted) -> Whitener:
         """Residuals of a model: on all lanes and minutes only if an effect has a place."""
         places = [
@@ -205,6 +225,18 @@ def _difference(hypothesis: Hypothesis, values: tuple[float, ...], index: int) -
         return hypothesis.step
     nominal = hypothesis.nominal[index] if hypothesis.nominal else 0.0
     return max(0.12 * abs(values[index] - nominal), hypothesis.least, 1e-3)
+
+
+def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
+    """The hypothesis with another window, if it has one and something is left of it."""
+    known = dict(hypothesis.fixed)
+    if not set(WINDOW) <= known.keys():
+        return hypothesis
+    begin, end = (known[name] + shift for name, shift in zip(WINDOW, move, strict=True))
+    if begin < 0 or end - begin < SHORTEST_S:
+        return hypothesis
+    changed = {**known, WINDOW[0]: begin, WINDOW[1]: end}
+    return replace(hypothesis, fixed=tuple((name, changed[name]) for name, _ in hypothesis.fixed))
 
 
 def _replaced(members: Members, place: int, values: tuple[float, ...]) -> Members:

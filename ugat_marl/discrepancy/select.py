@@ -14,6 +14,7 @@ from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.residual import Null, Residual
 from ugat_marl.discrepancy.search import Proposal, Ray, between, propose
 from ugat_marl.discrepancy.statistics import Array, Whitener, shift
+from ugat_marl.errors import SimulatorError
 from ugat_marl.measured.data import Period
 from ugat_marl.progress import Reporter
 
@@ -21,6 +22,8 @@ ROUNDS = 4
 CANDIDATES = (3, 2, 2)
 """Sets of one, two and three effects that are simulated in a round, at most."""
 CANDIDATES_FITTED = 3
+KINDS_OF_PLACES = 5
+"""Kinds of effects at places of which the best is simulated."""
 TOLERANCE = 0.02
 """Share of the first difference in a statistic that a model may leave: parameters are known, and
 simulation steps resolved, no better."""
@@ -194,7 +197,12 @@ class Selector:
         proposals = propose([*rays, *added], self._whitener(model, None), self._fitter.price)
         places = {item.key for item in local}
         alone = [item for item in proposals if len(item.members) == 1]
-        here = [item for item in alone if item.members[0][0].key in places][: CANDIDATES[0]]
+        best: dict[str, Proposal] = {}
+        for item in alone:
+            hypothesis = item.members[0][0]
+            if hypothesis.key in places:
+                best.setdefault(hypothesis.name, item)
+        here = list(best.values())[:KINDS_OF_PLACES]
         return [item.members for item in (*_promising(proposals), *here)]
 
     def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
@@ -235,7 +243,10 @@ class Selector:
             for new in chosen:
                 members = _merged(model.members, new)
                 if members:
-                    found.append(self._kept(self._fitter.simulate(members)))
+                    try:
+                        found.append(self._kept(self._fitter.simulate(members)))
+                    except SimulatorError as error:  # effects that do not go together
+                        self._reporter.say(f"note: {_names(members)} left out: {error}")
                 advance(note=_names(members))
         return found
 
@@ -246,7 +257,7 @@ class Selector:
         with self._reporter.task("fitting", len(ranked)) as advance:
             found: list[Fitted] = []
             for model in ranked:
-                found.append(self._kept(self._fitter.refine(model)))
+                found.append(self._kept(self._fitter.fitted(model)))
                 advance(note=_names(model.members))
         return min(found, key=lambda item: item.cost, default=None)
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections import Counter
 
 from ugat_marl.effects import Effect, effect_from
 from ugat_marl.measured.data import Measured, SignalLog
 from ugat_marl.network import Network
 from ugat_marl.scenario import Scenario
-from ugat_marl.signals import GREEN, YELLOW
+from ugat_marl.signals import GREEN
 
+_AMBER = frozenset("yY")
 _LEAST = 20
 """Clearances that must have been seen."""
 _USUAL = 0.8
@@ -49,27 +52,20 @@ def _own(log: SignalLog, programme: tuple[tuple[float, str], ...]) -> bool:
 
 
 def _clearances(log: SignalLog) -> list[tuple[str, float]]:
-    """Durations of yellow, and of the time without green or yellow behind it."""
-    kinds = [(time, _kind(state)) for time, state in log]
-    merged: list[tuple[float, str]] = []
-    for time, kind in kinds:
-        if not merged or merged[-1][1] != kind:
-            merged.append((time, kind))
+    """Durations of yellow, and of the time from its end to the next start of a green.
+
+    Other links may be green all the while; red-yellow is not yellow.
+    """
     found: list[tuple[str, float]] = []
-    for index in range(1, len(merged) - 1):
-        time, kind = merged[index]
-        duration = merged[index + 1][0] - time
-        if kind == "y":
-            found.append(("y", duration))
-            if merged[index + 1][1] != "r":
-                found.append(("r", 0.0))
-        elif kind == "r" and merged[index - 1][1] == "y":
-            found.append(("r", duration))
-    return found
-
-
-def _kind(state: str) -> str:
-    """Yellow while any link has it: links that stay green do not end the clearance of others."""
-    if any(letter in YELLOW for letter in state):
-        return "y"
-    return "G" if any(letter in GREEN for letter in state) else "r"
+    began = ended = math.nan
+    for (_, before), (time, state) in itertools.pairwise(log):
+        pairs = list(zip(before, state, strict=False))
+        if any(new in _AMBER and old not in _AMBER for old, new in pairs):
+            began = time
+        if any(old in _AMBER and new not in _AMBER for old, new in pairs):
+            found.append(("y", time - began))
+            ended = time
+        if any(new in GREEN and old not in GREEN for old, new in pairs):
+            found.append(("r", time - ended))
+            ended = math.nan
+    return [(kind, duration) for kind, duration in found if duration == duration]

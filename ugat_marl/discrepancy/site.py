@@ -146,7 +146,9 @@ def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
             red = later if after in YELLOW else end
             rows.append((start, end, red, shown == "G"))
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    following = np.append(table[1:, 0], period.end_s)[: len(table)]
+    starts = np.array([*(time for time, shown in changes if shown in GREEN), np.inf])
+    after = starts[np.searchsorted(starts, table[:, 0], "right")]  # a green cut by the end as well
+    following = np.minimum(after, period.end_s)
     return Greens(table[:, 0], table[:, 1], table[:, 2], following, table[:, 3] > 0)
 
 

@@ -20,7 +20,7 @@ from ugat_marl.discrepancy.replay import Replay
 from ugat_marl.discrepancy.residual import Null
 from ugat_marl.discrepancy.select import Effort, Selector, Tested
 from ugat_marl.discrepancy.site import Site
-from ugat_marl.discrepancy.statistics import Pools, Reference
+from ugat_marl.discrepancy.statistics import Pools, Reference, added
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.measured.data import Measured, Period
 from ugat_marl.network import Network
@@ -169,9 +169,11 @@ class Study:
         return Tested(model, null, null.test(self.fit), np.empty(0), {})
 
     def null(self, tallies: Sequence[Tally], periods: int) -> Null:
-        """What chance makes of a model's own days."""
+        """What chance makes of a model's own days, seen as far as the data see."""
+        data = added(self.fit).sums[..., 1] > 0
+        seen = [Tally(day.sums * data[..., None], day.bins, day.days) for day in tallies]
         directed = self.proposer.directed
-        return Null(self.pools, tallies, periods, speeds=self.speeds, directed=directed)
+        return Null(self.pools, seen, periods, speeds=self.speeds, directed=directed)
 
     @functools.cached_property
     def proposer(self) -> Proposer:

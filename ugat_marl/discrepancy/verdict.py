@@ -25,6 +25,8 @@ RIVALS_TESTED = 2
 FIT_LEVEL = 0.001
 """The fitted periods must not contradict the model more than this; the held-out ones decide."""
 PART = 0.5
+CONFIRMED = 10.0
+"""What the effects must take off the distance of the held-out periods."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,11 @@ def conclude(
     names = describe_members(best.model.members)
     shrink = verification.shrink if verification.shrink is not None else 0.0
     chance_only = verification.after.p > alpha and best.residual.p > FIT_LEVEL
+    if verification.before.distance - verification.after.distance < CONFIRMED:
+        sentence = (
+            f"The fitted periods hint at {names}, but the held-out periods do not confirm it."
+        )
+        return Conclusion("unknown", best, (), sentence, "more periods")
     if chance_only and selection.complete:
         rivals = _rivals(selection, selector, alpha)
         if rivals:

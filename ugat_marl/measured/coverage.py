@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ ALL_SILENT_S = 600.0
 """So is the whole recording where no detector says anything for this long."""
 BUSY = 20
 """Passages of its neighbours in that time that make a silent detector stand out."""
+EXPECTED = 10.0
+"""Vehicles that must be missing for a silence to be worth a word."""
 MOST_ON_RED = 0.6
 """Share of vehicles that leave the stop line on red only where something is mixed up."""
 NAMED = 6
@@ -253,6 +255,7 @@ def _of_silence(measured: Measured) -> Iterator[Finding]:
     roads: dict[str, list[Detector]] = {}
     for item in measured.detectors:
         roads.setdefault(item.lane.rsplit("_", 1)[0], []).append(item)
+    usual = _usual_rates(measured)
     for period in measured.periods:
         if not period.passages:
             if measured.has_events:
@@ -267,15 +270,34 @@ def _of_silence(measured: Measured) -> Iterator[Finding]:
             )
             continue
         for group in roads.values():
-            yield from _silent(group, times, period)
+            yield from _silent(group, times, period, usual)
+
+
+def _usual_rates(measured: Measured) -> dict[str, float]:
+    """Vehicles per second at each detector outside of its longest silences."""
+    counts: dict[str, float] = {}
+    seconds: dict[str, float] = {}
+    for period in measured.periods:
+        for name in period.passages:
+            times = _times(period, name)
+            _, silent = _longest_gap(times, period)
+            counts[name] = counts.get(name, 0.0) + len(times) / 2
+            heard = max(period.end_s - period.begin_s - silent, 1.0)
+            seconds[name] = seconds.get(name, 0.0) + heard
+    return {name: counts[name] / seconds[name] for name in counts}
 
 
 def _silent(
-    group: Sequence[Detector], times: dict[str, NDArray[np.float64]], period: Period
+    group: Sequence[Detector],
+    times: dict[str, NDArray[np.float64]],
+    period: Period,
+    usual: Mapping[str, float],
 ) -> Iterator[Finding]:
-    """Detectors of one road that say nothing while others of it count."""
+    """Detectors of one road that say nothing while others of it count, and they did elsewhere."""
     for item in group:
         begin, length = _longest_gap(times.get(item.id, np.empty(0)), period)
+        if usual.get(item.id, 0.0) * length < EXPECTED:
+            continue  # a lane that hardly anybody uses
         if length <= min(SILENT_S, period.end_s - period.begin_s - 1e-6):
             continue
         others = [times[other.id] for other in group if other.id in times and other is not item]
