@@ -227,7 +227,7 @@ def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
         OptionError: An effect has an impossible value.
         ScenarioError: A scenario named as a domain cannot be read or has other roads.
     """
-    if isinstance(domain, str) and "=" not in domain:
+    if isinstance(domain, str):
         path = Path(domain).expanduser()
         if path.suffix == ".sumocfg" or (path / "scenario.toml").is_file():
             other = load(path)
