@@ -14,7 +14,7 @@ from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.residual import Null, Residual
 from ugat_marl.discrepancy.search import Proposal, Ray, between, propose
 from ugat_marl.discrepancy.statistics import Array, Whitener, shift
-from ugat_marl.errors import SimulatorError
+from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
 from ugat_marl.measured.data import Period
 from ugat_marl.progress import Reporter
 
@@ -22,6 +22,8 @@ ROUNDS = 4
 CANDIDATES = (3, 2, 2)
 """Sets of one, two and three effects that are simulated in a round, at most."""
 CANDIDATES_FITTED = 3
+NEGLIGIBLE = 60.0
+"""Cost up to which a smaller set of effects is examined in the place of a larger one."""
 KINDS_OF_PLACES = 5
 """Kinds of effects at places of which the best is simulated."""
 TOLERANCE = 0.02
@@ -228,7 +230,12 @@ class Selector:
         with self._reporter.task(f"round {number + 1}: {what}", len(jobs)) as advance:
             for hypothesis, level, origin in jobs:
                 members = _merged(model.members, ((hypothesis, level),))
-                found = self._fitter.engine.replicates(effects_of(members), range(len(before)))
+                try:
+                    found = self._fitter.engine.replicates(effects_of(members), range(len(before)))
+                except (SimulatorError, OptionError, ScenarioError) as error:
+                    # it cannot be there: the lane is too short to park on, say
+                    self._reporter.say(f"note: {hypothesis.name} left out: {error}")
+                    continue
                 difference, variance = shift(
                     self._fitter.pools, [item.tally for item in found], before
                 )
@@ -245,7 +252,7 @@ class Selector:
                 if members:
                     try:
                         found.append(self._kept(self._fitter.simulate(members)))
-                    except SimulatorError as error:  # effects that do not go together
+                    except (SimulatorError, OptionError, ScenarioError) as error:
                         self._reporter.say(f"note: {_names(members)} left out: {error}")
                 advance(note=_names(members))
         return found
@@ -269,22 +276,32 @@ class Selector:
         return model
 
     def _pruned(self, best: Tested) -> Tested:
-        """Drops effects that do not matter, or that the others can do without."""
+        """Drops effects that do not matter, or that the others can do without.
+
+        Of two sets that leave no more than chance, the smaller one is the explanation.
+        """
         members = tuple(item for item in best.model.members if item[0].matters(item[1]))
-        changed = len(members) < len(best.model.members)
-        model = self._fitter.simulate(members) if changed and members else best.model
-        while len(model.members) > 1:
+        if members and len(members) < len(best.model.members):
+            best = self.test(self._fitter.refine(self._fitter.simulate(members), 2))
+        while len(best.model.members) > 1:
             fewer = [
-                self._kept(
-                    self._fitter.refine(self._fitter.simulate(_without(model.members, i)), 2)
-                )
-                for i in range(len(model.members))
+                self._kept(self._fitter.refine(self._fitter.simulate(part), 2))
+                for part in _parts(best.model.members)
             ]
             least = min(fewer, key=lambda item: item.cost)
-            if least.cost > model.cost:
+            more = least.cost - best.model.cost
+            if more > NEGLIGIBLE:
                 break
-            model = least
-        return best if model is best.model else self.test(model)
+            tested = self.test(least)
+            if more > 0.0 and tested.residual.p <= self._alpha:
+                break
+            best = tested
+        return best
+
+
+def _parts(members: Members) -> list[Members]:
+    """The set without each of its effects."""
+    return [_without(members, index) for index in range(len(members))]
 
 
 def _promising(proposals: Sequence[Proposal]) -> list[Proposal]:

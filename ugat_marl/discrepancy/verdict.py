@@ -107,7 +107,7 @@ def _rivals(selection: Selection, selector: Selector, alpha: float) -> tuple[Fit
         rival
         for rival in selection.rivals
         if len(rival.members) <= len(best.members)
-        and _kinds(rival.members) != names
+        and not _kinds(rival.members) >= names
         and rival.cost - best.cost < INDISTINCT
     ]
     for rival in near[:RIVALS_TESTED]:
