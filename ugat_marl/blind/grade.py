@@ -182,6 +182,7 @@ def grade(label: Label, diagnosis: Mapping[str, Any], wall_s: float | None = Non
     others = [
         canonical(map(found_effect, other["effects"]), label)
         for other in diagnosis.get("alternatives") or ()
+        if verdict == "not_identifiable"  # elsewhere they are what was tried, not what is named
     ]
     sets = [{item.name for item in effects} for effects in (named, *others)]
     required, allowed = required_and_allowed(label, truth)

@@ -121,8 +121,6 @@ class Diagnose:
             lines.append(f"page:      {self.out / REPORT}")
         if record["corrected"] is not None:
             lines.append(f"corrected: {self.out / CORRECTED}")
-        elif (self.out / CORRECTED).exists():
-            lines.append(f"{self.out / CORRECTED} is from an earlier diagnosis, not from this one")
         if following := self._next(record):
             lines.append(f"use it:    {following[0]}")
         elif record["effects"]:
