@@ -81,6 +81,10 @@ class Hypothesis:
         return abs(values[0] - self.nominal[0]) >= self.least
 
 
+LATE_STEP_S = 0.1
+"""Lost time is fitted in tenths: fractions of a simulation step are spread over many greens."""
+
+
 @dataclass(frozen=True)
 class _Entry:
     """A global effect of the library: one number for the whole network."""
@@ -92,6 +96,7 @@ class _Entry:
     place: str = ""
     attribute: str = ""
     both: bool = False
+    step: float = 0.0
 
 
 _GLOBAL: dict[str, _Entry] = {
@@ -109,7 +114,7 @@ _GLOBAL: dict[str, _Entry] = {
     "gap_acceptance": _Entry("seconds", (0.4, 2.5), 1.0, 0.2, attribute="jmTimegapMinor"),
     "lane_discipline": _Entry("strategic", (0.1, 5.0), 1.0, 0.2, attribute="lcStrategic"),
     "heavy_share": _Entry("share", (0.12,), 0.0, 0.01),
-    "late_green": _Entry("seconds", (2.0,), 0.0, 0.3, place="place"),
+    "late_green": _Entry("seconds", (2.0,), 0.0, 0.3, place="place", step=LATE_STEP_S),
     "signal_clock": _Entry("seconds", (2.0,), 0.0, 0.2, place="place", both=True),
     "clock_drift": _Entry("seconds_per_hour", (3.0,), 0.0, 0.5, place="place", both=True),
     "undercount": _Entry("share", (0.15,), 0.0, 0.02, place="place"),
@@ -158,7 +163,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         if name == "reaction_step":
             nominal, levels = max(nominal, step), ((2 * max(nominal, step),),)
         fixed = ((entry.place, "*"),) if entry.place else ()
-        grid = step if name == "reaction_step" else 0.0
+        grid = step if name == "reaction_step" else entry.step
         found.append(
             Hypothesis(
                 name, fixed, (entry.field,), levels, (nominal,), entry.least, grid, entry.both

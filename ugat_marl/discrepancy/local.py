@@ -16,17 +16,20 @@ from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.faults import fault_hypotheses
 from ugat_marl.discrepancy.features import BIN_FEATURES, INDEX
-from ugat_marl.discrepancy.hypotheses import Hypothesis
+from ugat_marl.discrepancy.hypotheses import LATE_STEP_S, Hypothesis
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Distance, Reference
+from ugat_marl.discrepancy.stretches import (
+    SCAN_S,
+    largest_stretch,
+    most_unusual,
+    occupied_between,
+)
 from ugat_marl.measured.data import Passages, Period
 from ugat_marl.redraw import explicit
 from ugat_marl.scenario import Scenario
 
 Array = NDArray[np.float64]
-
-SCAN_S = 60.0
-SHORTEST_S = 240.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +134,7 @@ class Proposer:
         return {
             "demand": max((item[0] for item in self._origins(*counts)), default=0.0),
             "turning": max((item[0] for item in self._turns(*counts)), default=0.0),
+            "window": largest_stretch(self._edges, distance),
         }
 
     def _demand(self, distance: Distance) -> list[Hypothesis]:
@@ -253,7 +257,7 @@ class Proposer:
         expected = (block.mean[rows].sum(axis=0) / np.maximum(per_bin, 1))[which]
         variance = (block.variance[rows].sum(axis=0) / np.maximum(per_bin, 1))[which] / len(periods)
         measured = self._minutes(periods, members, kind, other, minutes)
-        return _most_unusual(measured, expected, variance, begin)
+        return most_unusual(measured, expected, variance, begin)
 
     def _minutes(
         self, periods: Sequence[Period], members: Sequence[int], kind: str, other: str, minutes: int
@@ -271,7 +275,7 @@ class Proposer:
                 on = np.where(np.isfinite(passages.on_s), passages.on_s, passages.off_s)
                 if kind == "occupied":
                     off = np.where(np.isfinite(passages.off_s), passages.off_s, period.end_s)
-                    total += _occupied(on, np.maximum(off, on), edges)
+                    total += occupied_between(on, np.maximum(off, on), edges)
                 else:
                     total += np.histogram(on[np.isfinite(on)], edges)[0]
         return total / len(periods)
@@ -353,7 +357,9 @@ class Proposer:
         found: list[Hypothesis] = []
         for index in np.argsort(-np.abs(lost))[:2]:
             place = (("place", names[int(index)]),)
-            found.append(Hypothesis("late_green", place, ("seconds",), ((2.0,),), (0.0,), 0.3))
+            found.append(
+                Hypothesis("late_green", place, ("seconds",), ((2.0,),), (0.0,), 0.3, LATE_STEP_S)
+            )
             sign = 2.0 if lost[index] > 0 else -2.0
             found.append(Hypothesis("signal_clock", place, ("seconds",), ((sign,),), (0.0,), 0.2))
         for index in np.argsort(-np.abs(drift))[:1]:
@@ -363,38 +369,3 @@ class Proposer:
                 Hypothesis("clock_drift", place, ("seconds_per_hour",), ((sign,),), (0.0,), 0.5)
             )
         return found
-
-
-def _most_unusual(
-    measured: Array, expected: Array, variance: Array, begin_s: float
-) -> tuple[float, float, float, float] | None:
-    """Scans all stretches for the largest standardised departure from a constant ratio."""
-    minutes = len(measured)
-    if expected.sum() <= 0 or minutes * SCAN_S <= SHORTEST_S:
-        return None
-    sums = [np.concatenate(([0.0], np.cumsum(row))) for row in (measured, expected, variance)]
-    shortest = int(SHORTEST_S / SCAN_S)
-    best: tuple[float, int, int, float] | None = None
-    for length in range(shortest, max(int(0.7 * minutes), shortest) + 1):
-        inside = [row[length:] - row[:-length] for row in sums]
-        rest = (sums[0][-1] - inside[0]) / np.maximum(sums[1][-1] - inside[1], 1e-9)
-        excess = inside[0] - rest * inside[1]
-        share = inside[1] / np.maximum(sums[1][-1] - inside[1], 1e-9)
-        noise = np.sqrt(np.maximum(inside[2] * (1 + share), 1e-6))
-        z = excess / noise
-        place = int(np.argmax(np.abs(z)))
-        if best is None or abs(z[place]) > best[0]:
-            ratio = float(inside[0][place] / max(rest[place] * inside[1][place], 1e-9))
-            best = (float(abs(z[place])), place, place + length, ratio)
-    if best is None or best[0] < 4.0:
-        return None
-    z, first, last, ratio = best
-    return z, begin_s + SCAN_S * first, begin_s + SCAN_S * last, ratio
-
-
-def _occupied(on: Array, off: Array, edges: Array) -> Array:
-    """Occupied seconds between edges of time."""
-    filled = np.zeros(len(edges))
-    for index, edge in enumerate(edges):
-        filled[index] = np.clip(np.minimum(off, edge) - on, 0.0, None).sum()
-    return np.diff(filled)
