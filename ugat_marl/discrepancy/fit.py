@@ -185,24 +185,25 @@ class Fitter:
 
     def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
         """Derivatives of the whitened statistics, ``(free values, statistics)``."""
-        rows: list[Array] = []
+        rows = [
+            whitener(without_noise(change, noise)) / delta
+            for change, noise, delta in self.changes(model)
+        ]
+        return np.stack(rows)
+
+    def changes(self, model: Fitted) -> list[tuple[dict[str, Array], dict[str, Array], float]]:
+        """For every free value: what moving it does to the statistics, the noise, how far."""
+        found: list[tuple[dict[str, Array], dict[str, Array], float]] = []
         for place, (hypothesis, values) in enumerate(model.members):
             for index in range(len(values)):
-                delta = _difference(hypothesis, values, index)
-                changed = list(values)
-                changed[index] += delta
-                moved = hypothesis.clipped(changed)
-                if moved == values:
-                    changed[index] -= 2 * delta
-                    moved = hypothesis.clipped(changed)
-                delta = moved[index] - values[index]
+                moved = _moved_a_little(hypothesis, values, index)
                 members = _replaced(model.members, place, moved)
-                found = self.engine.replicates(
+                days = self.engine.replicates(
                     effects_of(members), range(len(model.tallies)), self.tick
                 )
-                change, noise = shift(self.pools, [item.tally for item in found], model.tallies)
-                rows.append(whitener(without_noise(change, noise)) / (delta or 1.0))
-        return np.stack(rows)
+                change, noise = shift(self.pools, [day.tally for day in days], model.tallies)
+                found.append((change, noise, (moved[index] - values[index]) or 1.0))
+        return found
 
     def _moved(self, model: Fitted, step: Array) -> Members:
         """The model's values after a step, in range and not too far at once."""
@@ -219,12 +220,19 @@ class Fitter:
         return tuple(moved)
 
 
-def _difference(hypothesis: Hypothesis, values: tuple[float, ...], index: int) -> float:
-    """How far a value is moved for a derivative."""
-    if hypothesis.step:
-        return hypothesis.step
+def _moved_a_little(
+    hypothesis: Hypothesis, values: tuple[float, ...], index: int
+) -> tuple[float, ...]:
+    """The values with one of them moved for a derivative, to the side that is in range."""
     nominal = hypothesis.nominal[index] if hypothesis.nominal else 0.0
-    return max(0.12 * abs(values[index] - nominal), hypothesis.least, 1e-3)
+    delta = max(0.12 * abs(values[index] - nominal), hypothesis.least, 1e-3)
+    changed = list(values)
+    changed[index] += hypothesis.step or delta
+    moved = hypothesis.clipped(changed)
+    if moved == values:
+        changed[index] -= 2 * (hypothesis.step or delta)
+        moved = hypothesis.clipped(changed)
+    return moved
 
 
 def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
@@ -277,29 +285,9 @@ def uncertainty(
     spread = np.atleast_2d(np.cov(np.stack(influences).T))
     covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies)) * inflation
     extra: dict[str, Array] = {}
-    changes = _changes(fitter, model)
+    changes = fitter.changes(model)
     for name, block in model.reference.blocks.items():
-        slopes = np.stack([change[name] for change in changes])
+        slopes = np.stack([change[name] / delta for change, _, delta in changes])
         extra[name] = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes) + 0.0 * block.mean
         extra[name] = np.nan_to_num(extra[name])
     return np.sqrt(np.diag(covariance)), extra
-
-
-def _changes(fitter: Fitter, model: Fitted) -> list[dict[str, Array]]:
-    """Derivatives of the statistics themselves; simulated before, by `Fitter.jacobian`."""
-    found: list[dict[str, Array]] = []
-    for place, (hypothesis, values) in enumerate(model.members):
-        for index in range(len(values)):
-            delta = _difference(hypothesis, values, index)
-            changed = list(values)
-            changed[index] += delta
-            moved = hypothesis.clipped(changed)
-            if moved == values:
-                changed[index] -= 2 * delta
-                moved = hypothesis.clipped(changed)
-            delta = moved[index] - values[index]
-            members = _replaced(model.members, place, moved)
-            days = fitter.engine.replicates(effects_of(members), range(len(model.tallies)))
-            change, _ = shift(fitter.pools, [item.tally for item in days], model.tallies)
-            found.append({name: values_ / (delta or 1.0) for name, values_ in change.items()})
-    return found

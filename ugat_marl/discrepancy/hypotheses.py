@@ -13,9 +13,6 @@ from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenario import Scenario
 
 WINDOW = ("begin_s", "end_s")
-NAME_ONLY = ("driver_model", "swapped")
-"""Effects without a number: they are there or not."""
-
 ORDER = (
     "local_speed", "demand_level", "demand_surge", "demand_timing", "turning", "lane_closure",
     "parking",
@@ -130,7 +127,8 @@ LOCAL = frozenset(
 )  # fmt: skip
 """Effects that only a place, and often a window, makes complete: see `local`."""
 
-MODELS = ("IDM", "EIDM", "W99", "Wiedemann", "ACC", "Krauss")
+MODELS = ("IDM", "EIDM", "W99")
+"""Driver models that are examined."""
 
 
 def library(without: Collection[str] = ()) -> frozenset[str]:
@@ -173,7 +171,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         now = _attribute(scenario, "carFollowModel")
         found += [
             Hypothesis("driver_model", (("model", model),), (), ((),), None)
-            for model in ("IDM", "EIDM", "W99")
+            for model in MODELS
             if now != {model}
         ]
     return found
