@@ -32,7 +32,10 @@ def fault_hypotheses(
             found.append(
                 Hypothesis("undercount", (("place", name),), ("share",), ((share,),), (0.0,), 0.02)
             )
-    found += _stuck(periods) + _silent(periods, mean)
+    stuck = _stuck(periods)
+    on = {dict(item.fixed)["detector"] for item in stuck}
+    silent = [x for x in _silent(periods, mean) if dict(x.fixed)["detector"] not in on]
+    found += stuck + silent
     kinds = {item.id: item.kind for item in site.detectors}
     found += _swapped(kinds, mean, difference, z)
     return found

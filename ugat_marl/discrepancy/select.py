@@ -181,9 +181,9 @@ class Selector:
         little = gap < _LITTLE * chance  # what differs does so in single places
         if little or not proposals or proposals[0].expected > enough:
             chosen = [*chosen[:2], *self._elsewhere(start.model, rays, number)]
-            if number == 0 and gap > _HUGE * chance:
-                chosen += settings_as_members(self._library)
-            chosen = list(dict.fromkeys(chosen))
+        if number == 0 and gap > _HUGE * chance:
+            chosen += settings_as_members(self._library)
+        chosen = list(dict.fromkeys(chosen))
         tried = self._tried(start.model, chosen, f"round {number + 1}: candidates")
         best = self._refined(tried, CANDIDATES_FITTED)
         if best is None or best.cost >= start.model.cost - self._fitter.price:
