@@ -424,7 +424,9 @@ def run_script(
 
     def run(text: str) -> Script:
         file = tmp_path / f"script{len(started)}.py"
-        file.write_text(text)
+        # A terminal's signals end a program, unless the tests themselves were begun with nohup.
+        ends = "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
+        file.write_text(ends + text)
         mark = uuid.uuid4().hex
         process = subprocess.Popen(
             [*python, str(file)],
