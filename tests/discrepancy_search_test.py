@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, Tally
 from ugat_marl.discrepancy.hypotheses import Hypothesis
 from ugat_marl.discrepancy.search import FARTHEST, Proposal, Ray, between, propose
-from ugat_marl.discrepancy.statistics import Pools, Reference, Whitener
+from ugat_marl.discrepancy.statistics import Pools, Reference
+from ugat_marl.discrepancy.whitening import Whitener
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, INDEX, SPEED_FEATURES, Tally
 from ugat_marl.discrepancy.residual import Null
 from ugat_marl.discrepancy.site import Site, SiteLane
-from ugat_marl.discrepancy.statistics import Pools, Reference, Whitener, added, shift
+from ugat_marl.discrepancy.statistics import Pools, Reference, added, shift
+from ugat_marl.discrepancy.whitening import Whitener
 
 Array = NDArray[np.float64]
 

@@ -23,23 +23,11 @@ def counts_tally(site: Site, period: Period, counts: pl.DataFrame) -> Tally:
     sums = np.zeros((len(FEATURES), places, 2))
     bins = np.zeros((len(BIN_FEATURES), places, length))
     edges = np.linspace(period.begin_s, period.end_s, length + 1)
-    rows = _rows(site)
     for row in counts.filter(pl.col("period_id") == period.id).iter_rows(named=True):
-        name, place = rows.get(row["detector_id"], ("", -1))
+        name, place = site.counted.get(row["detector_id"], ("", -1))
         if place >= 0:
             begin, end, count = float(row["begin_s"]), float(row["end_s"]), float(row["count"])
             sums[INDEX[name], place] += (count, (end - begin) / 60.0)
             inside = np.clip(np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin), 0.0, None)
             bins[BIN_FEATURES.index(name), place] += count * inside / max(end - begin, 1e-9)
     return Tally(sums, bins)
-
-
-def _rows(site: Site) -> dict[str, tuple[str, int]]:
-    """Detector to the feature and the place it counts for."""
-    rows: dict[str, tuple[str, int]] = {}
-    for index, lane in enumerate(site.lanes):
-        for kind, names in lane.detectors.items():
-            rows |= dict.fromkeys(names[:1], (f"count_{kind}", index))
-    for index, (_, _, names) in enumerate(site.exits):
-        rows |= {name: ("count_exit", len(site.lanes) + index) for name in names[:1]}
-    return rows

@@ -22,7 +22,7 @@ def fault_hypotheses(
 ) -> list[Hypothesis]:
     """Detectors that count too few, stick, fall silent, or have each other's place."""
     found: list[Hypothesis] = []
-    places = _detector_rows(site)
+    places = {name: (place, INDEX[kind]) for name, (kind, place) in site.counted.items()}
     z = {name: float(distance.z["lane"][row]) for name, row in places.items()}
     mean = {name: float(reference.blocks["lane"].mean[row]) for name, row in places.items()}
     difference = {n: float(distance.difference["lane"][r]) for n, r in places.items()}
@@ -39,18 +39,6 @@ def fault_hypotheses(
     kinds = {item.id: item.kind for item in site.detectors}
     found += _swapped(kinds, mean, difference, z)
     return found
-
-
-def _detector_rows(site: Site) -> dict[str, tuple[int, int]]:
-    """Detector to its count among the statistics of lanes."""
-    rows: dict[str, tuple[int, int]] = {}
-    for index, lane in enumerate(site.lanes):
-        for kind, names in lane.detectors.items():
-            rows |= dict.fromkeys(names[:1], (index, INDEX[f"count_{kind}"]))
-    for index, (_, _, names) in enumerate(site.exits):
-        place = len(site.lanes) + index
-        rows |= dict.fromkeys(names[:1], (place, INDEX["count_exit"]))
-    return rows
 
 
 def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:

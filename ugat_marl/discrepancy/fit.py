@@ -11,14 +11,8 @@ from numpy.typing import NDArray
 from ugat_marl.discrepancy.engine import Engine
 from ugat_marl.discrepancy.features import Tally
 from ugat_marl.discrepancy.hypotheses import WINDOW, Hypothesis, ordered
-from ugat_marl.discrepancy.statistics import (
-    Distance,
-    Pools,
-    Reference,
-    Whitener,
-    shift,
-    without_noise,
-)
+from ugat_marl.discrepancy.statistics import Distance, Pools, Reference, shift, without_noise
+from ugat_marl.discrepancy.whitening import Whitener
 from ugat_marl.effects import EVERYWHERE, Effect
 
 Array = NDArray[np.float64]

@@ -82,8 +82,7 @@ class Proposer:
         self._site = site
         self._routes = routes
         self._allowed = frozenset(allowed)
-        self._edges = [lane.edge for lane in site.lanes]
-        self._edges += [lane.rsplit("_", 1)[0] for _, lane, _ in site.exits]
+        self._edges = [edge for _, edge, _ in site.places]
 
     def hypotheses(
         self, reference: Reference, distance: Distance, periods: Sequence[Period]

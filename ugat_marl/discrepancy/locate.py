@@ -110,11 +110,8 @@ def _place(site: Site, pool: str, member: int) -> tuple[str | None, str | None, 
         return (site.intersections[0] if len(site.intersections) == 1 else None, None, None)
     if pool == "intersection":
         return (site.intersections[member], None, None)
-    if member < len(site.lanes):
-        lane = site.lanes[member]
-        return (site.intersections[lane.intersection], lane.edge, lane.id)
-    owner, name, _ = site.exits[member - len(site.lanes)]
-    return (site.intersections[owner], name.rsplit("_", 1)[0], name)
+    owner, edge, name = site.places[member]
+    return (site.intersections[owner], edge, name)
 
 
 def _stretches(
@@ -123,7 +120,7 @@ def _stretches(
     """The most unusual stretch of every kind of count at every place."""
     z, difference = distance.z["time"], distance.difference["time"]
     used = reference.blocks["time"].used
-    places = len(site.lanes) + len(site.exits)
+    places = len(site.places)
     bins = z.shape[1]
     width = (span[1] - span[0]) / bins
     found: list[Disagreement] = []

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.hypotheses import Hypothesis
-from ugat_marl.discrepancy.statistics import Whitener, without_noise
+from ugat_marl.discrepancy.statistics import without_noise
+from ugat_marl.discrepancy.whitening import Whitener
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,8 @@ from ugat_marl.discrepancy.hypotheses import Hypothesis, settings_as_members
 from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.residual import Null, Residual
 from ugat_marl.discrepancy.search import Proposal, Ray, between, propose
-from ugat_marl.discrepancy.statistics import Array, Whitener, shift
+from ugat_marl.discrepancy.statistics import Array, shift
+from ugat_marl.discrepancy.whitening import Whitener
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
 from ugat_marl.measured.data import Period
 from ugat_marl.progress import Reporter

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -113,6 +114,24 @@ class Site:
             )
         names = tuple(item.id for item in network.intersections)
         return cls(names, tuple(lanes), tuple(exits), tuple(detectors), owner)
+
+    @functools.cached_property
+    def places(self) -> tuple[tuple[int, str, str], ...]:
+        """Index of the traffic light, edge and lane of every place: incoming lanes, then exits."""
+        incoming = [(lane.intersection, lane.edge, lane.id) for lane in self.lanes]
+        outgoing = [(owner, name.rsplit("_", 1)[0], name) for owner, name, _ in self.exits]
+        return (*incoming, *outgoing)
+
+    @functools.cached_property
+    def counted(self) -> Mapping[str, tuple[str, int]]:
+        """Detector to the feature and the place it counts for; the first one of a kind there."""
+        rows: dict[str, tuple[str, int]] = {}
+        for index, lane in enumerate(self.lanes):
+            for kind, names in lane.detectors.items():
+                rows |= dict.fromkeys(names[:1], (f"count_{kind}", index))
+        for index, (_, _, names) in enumerate(self.exits):
+            rows |= dict.fromkeys(names[:1], ("count_exit", len(self.lanes) + index))
+        return rows
 
     def greens(self, period: Period) -> tuple[Greens, ...]:
         """The greens of every lane; only whole ones."""

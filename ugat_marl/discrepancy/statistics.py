@@ -10,7 +10,7 @@ its distribution is never looked up but always simulated.
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,7 @@ SINGLE = ("lane", "time")
 there are chance: those are left as they were."""
 CERTAIN = 6.0
 """Squared standardised difference beyond which one is not chance."""
-_SOFT = {"network": np.inf, "intersection": np.inf, "lane": 5.0, "time": 4.0}
+SOFT = {"network": np.inf, "intersection": np.inf, "lane": 5.0, "time": 4.0}
 """Standardised differences beyond this count less: queues reach a place or they do not, and single
 lanes and minutes have heavy tails."""
 
@@ -44,8 +44,8 @@ class Pools:
     @classmethod
     def of(cls, site: Site) -> Pools:
         """The network, every intersection if there are several, every lane."""
-        places = len(site.lanes) + len(site.exits)
-        owners = [lane.intersection for lane in site.lanes] + [item[0] for item in site.exits]
+        places = len(site.places)
+        owners = [owner for owner, _, _ in site.places]
         blocks = {"network": np.ones((1, places))}
         if len(site.intersections) > 1:
             blocks["intersection"] = np.array(
@@ -91,6 +91,16 @@ class Block:
     error: Array
     used: NDArray[np.bool_]
     correlation: Array
+
+    def noise(self, weight: Array, periods: int) -> Array:
+        """Variance of measured minus expected; fewer observations than usual say less.
+
+        Args:
+            weight: Observations per measured period.
+            periods: Measured periods.
+        """
+        thin = np.clip(self.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
+        return self.variance * thin / periods + self.error
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,14 +211,13 @@ class Reference:
             weight = sums[name][..., 1] / len(data)
             used = other.used & (weight >= 1.0)
             value = sums[name][..., 0] / np.maximum(sums[name][..., 1], 1e-9)
-            thin = np.clip(block.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
-            variance = block.variance * thin / len(data) + block.error
+            variance = block.noise(weight, len(data))
             if extra is not None:
                 variance = variance + extra[name]
             mean = np.where(np.isfinite(block.mean), block.mean, other.mean)
             difference[name] = np.where(used, value - mean, 0.0)
             z[name] = difference[name] / np.sqrt(variance)
-            soft = _SOFT[name]
+            soft = SOFT[name]
             counted = soft * np.arcsinh(z[name] / soft) if soft < np.inf else z[name]
             parts[name] = _mahalanobis(counted, used, other.correlation)
             total += parts[name]
@@ -304,62 +313,6 @@ def _mahalanobis(z: Array, used: NDArray[np.bool_], correlation: Array) -> float
             solved = np.linalg.solve(correlation[np.ix_(pattern, pattern)], rows.T)
             total += float((rows.T * solved).sum())
     return total
-
-
-class Whitener:
-    """Turns differences of statistics into independent numbers of unit noise, in one vector.
-
-    Args:
-        reference: Whose noise.
-        data: The data set, which decides what is used and how precise it is.
-        tolerance: Share of a measured difference that counts as noise as well: predictions by
-            interpolation are no better.
-        relative_to: Whose choice of statistics is used, so that vectors of different models fit.
-        blocks: Blocks to use; None for all.
-    """
-
-    def __init__(
-        self,
-        reference: Reference,
-        data: Sequence[Tally],
-        tolerance: float,
-        relative_to: Reference | None = None,
-        blocks: Collection[str] | None = None,
-    ) -> None:
-        chosen = relative_to or reference
-        found = reference.distance(data, relative_to=chosen)
-        sums = reference.pools.pool(added(data))
-        self._parts: list[
-            tuple[str, Array, list[tuple[NDArray[np.int64], NDArray[np.bool_], Array]]]
-        ]
-        self._parts = []
-        for name, block in reference.blocks.items():
-            if blocks is not None and name not in blocks:
-                continue
-            weight = sums[name][..., 1] / len(data)
-            thin = np.clip(block.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
-            noise = block.variance * thin / len(data) + block.error
-            difference = found.difference[name]
-            soft = 0.0 if _SOFT[name] == np.inf else 1.0 / _SOFT[name]
-            scale = np.sqrt(noise + (max(tolerance, soft) * difference) ** 2)
-            used = chosen.blocks[name].used & (weight >= 1.0)
-            patterns, kind = np.unique(used, axis=0, return_inverse=True)
-            groups: list[tuple[NDArray[np.int64], NDArray[np.bool_], Array]] = []
-            for index, pattern in enumerate(patterns):
-                if pattern.any():
-                    lower = np.linalg.cholesky(block.correlation[np.ix_(pattern, pattern)])
-                    members = np.flatnonzero(kind.ravel() == index)
-                    groups.append((members, pattern, np.asarray(np.linalg.inv(lower), np.float64)))
-            self._parts.append((name, scale, groups))
-        self.measured = self(found.difference)
-
-    def __call__(self, differences: Mapping[str, Array]) -> Array:
-        """Whitened differences, one after the other."""
-        rows: list[Array] = []
-        for name, scale, groups in self._parts:
-            z = np.nan_to_num(differences[name] / scale)
-            rows += [(z[members][:, used] @ inverse.T).ravel() for members, used, inverse in groups]
-        return np.concatenate(rows)
 
 
 def shift(

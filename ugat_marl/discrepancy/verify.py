@@ -92,8 +92,6 @@ def lanes_table(study: Study, base: Tested, best: Tested) -> list[dict[str, Any]
     """Root mean square of the standardised differences of every lane, before and after."""
     before = base.model.reference.distance(study.heldout).z["lane"]
     after = best.model.reference.distance(study.heldout, relative_to=base.model.reference).z["lane"]
-    names = [lane.id for lane in study.site.lanes] + [name for _, name, _ in study.site.exits]
-    owners = [lane.intersection for lane in study.site.lanes] + [o for o, _, _ in study.site.exits]
     return [
         {
             "lane": name,
@@ -101,7 +99,7 @@ def lanes_table(study: Study, base: Tested, best: Tested) -> list[dict[str, Any]
             "before": _rms(before[index]),
             "after": _rms(after[index]),
         }
-        for index, (name, owner) in enumerate(zip(names, owners, strict=True))
+        for index, (owner, _, name) in enumerate(study.site.places)
         if np.any(before[index])
     ]
 
