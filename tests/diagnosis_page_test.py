@@ -21,7 +21,7 @@ from ugat_marl.discrepancy.features import FEATURES
 from ugat_marl.effects import load
 from ugat_marl.network import Network
 from ugat_marl.report import diagnosis_words as words
-from ugat_marl.report.diagnosis_page import diagnosis_page, write_diagnosis_page
+from ugat_marl.report.diagnosis_page import commands_on_page, diagnosis_page, write_diagnosis_page
 from ugat_marl.report.diagnosis_tables import diagnosis_summary
 
 LANES = ("S_C_0", "W_C_0", "C_N_0", "C_E_0")
@@ -259,6 +259,15 @@ def test_the_policy_gap_is_shown_where_it_was_measured(network: Network) -> None
     page = Page(diagnosis_page(record_of(policy_gap=GAP), network))
     for cell in ("max-pressure:20", "100 (98 to 102)", "148", "51", "94 %"):
         assert cell in page.text
+
+
+def test_a_page_tells_its_commands(network: Network, tmp_path: Path) -> None:
+    commands = [f"ugat-marl diagnose '{NASTY}' --out found", "ugat-marl train ..."]
+    page = tmp_path / "report.html"
+    write_diagnosis_page(record_of(sentence=NASTY), network, page, commands)
+    assert commands_on_page(page) == commands
+    page.write_bytes(b"\xff no page")
+    assert commands_on_page(page) == []
 
 
 def test_nothing_held_out_is_said(network: Network) -> None:

@@ -15,6 +15,8 @@ from ugat_marl.discrepancy.policy_gap import policy_gap, read_diagnosis, write_p
 from ugat_marl.effects import in_domain, load
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.evaluation import rule_factory
+from ugat_marl.network import Network
+from ugat_marl.report.diagnosis_page import commands_on_page, write_diagnosis_page
 from ugat_marl.report.tables import policy_gap_table
 
 SCENARIO = load("single-v1")
@@ -107,6 +109,25 @@ def test_the_command_writes_the_gap_and_keeps_the_rest(
         assert word in text
     assert main(call) == 0
     assert (folder / "diagnosis.json").read_text() == written, "not the same file from the same"
+
+
+def test_the_page_shows_the_gap_and_keeps_its_commands(tmp_path: Path) -> None:
+    folder = diagnosed(
+        tmp_path / "found", seed=0, alpha=0.05, budget_s=600.0, sentence="It is so.", effects=[], heldout=None,
+        periods={"fit": ["day1"], "heldout": []}, versions={},
+    )  # fmt: skip
+    call = ["policy-gap", "single-v1", str(folder), "--real", "V4", "--policies", "fixed-time:30"]
+    call += ["--seeds", "1", "--duration-s", "60"]
+    assert main(call) == 0
+    page = folder / "report.html"
+    assert not page.exists(), "none was wanted"
+    record = json.loads((folder / "diagnosis.json").read_text()) | {"policy_gap": None}
+    commands = ["ugat-marl diagnose single-v1 'my data' --out found"]
+    write_diagnosis_page(record, Network.read(SCENARIO), page, commands)
+    assert "Policy gap" not in page.read_text()
+    assert main(call) == 0
+    assert "Policy gap" in page.read_text()
+    assert commands_on_page(page) == commands
 
 
 def test_what_is_no_diagnosis_of_this_scenario_is_refused(tmp_path: Path) -> None:

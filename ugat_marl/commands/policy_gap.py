@@ -9,12 +9,17 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
+from ugat_marl.commands.diagnose import REPORT
 from ugat_marl.commands.evaluate import names_of
 from ugat_marl.discrepancy.policy_gap import policy_gap, read_diagnosis, write_policy_gap
+from ugat_marl.discrepancy.workflow import FILE
 from ugat_marl.effects import describe, load
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import policy_factory
+from ugat_marl.files import require_writable
+from ugat_marl.network import Network
 from ugat_marl.progress import Bars
+from ugat_marl.report.diagnosis_page import commands_on_page, write_diagnosis_page
 from ugat_marl.report.tables import policy_gap_table
 
 
@@ -22,7 +27,8 @@ from ugat_marl.report.tables import policy_gap_table
 class PolicyGap:
     """Plays policies in sim, in the corrected scenario of a diagnosis and in the real domain.
 
-    The result is printed, and written to DIR/diagnosis.json under "policy_gap".
+    The result is printed, and written to DIR/diagnosis.json under "policy_gap" and, where there is
+    one, to the page DIR/report.html.
 
     Examples:
         ugat-marl policy-gap single-v1 diagnosis --real V4
@@ -60,6 +66,7 @@ class PolicyGap:
             raise OptionError("--first-seed must not be negative")
         scenario = load(self.scenario)
         record, corrected = read_diagnosis(self.directory, scenario)
+        require_writable(self.directory / FILE)
         if corrected.hash == scenario.hash:
             console.print("note: only detectors were at fault; the traffic was not corrected")
         files = [Path(spec).suffix == ".pt" for spec in self.policies]
@@ -77,7 +84,11 @@ class PolicyGap:
             duration_s=self.duration_s,
             workers=self.workers,
         )
-        write_policy_gap(self.directory, record, gap)
+        record = write_policy_gap(self.directory, record, gap)
+        page = self.directory / REPORT
+        if page.is_file():  # without it, none was wanted
+            commands = commands_on_page(page)
+            write_diagnosis_page(record, Network.read(scenario), page, commands)
         title = f"{scenario.id}: average travel time in s, real: {describe(self.real)}"
         console.print(policy_gap_table(title, gap, self.seeds))
         return 0

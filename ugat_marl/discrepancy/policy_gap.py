@@ -149,11 +149,16 @@ def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[dict[str, Any],
 
 def write_policy_gap(
     directory: Path, record: Mapping[str, Any], gap: Mapping[str, Mapping[str, Any]]
-) -> None:
-    """Writes a diagnosis with its policy gap, whole or not at all, numbers to nine digits."""
+) -> dict[str, Any]:
+    """Writes a diagnosis with its policy gap, whole or not at all, numbers to nine digits.
+
+    Returns:
+        What was written.
+    """
     content = {**record, "policy_gap": _rounded(gap)}
     text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
     write_whole(directory / _FILE, text + "\n")
+    return content
 
 
 def _rounded(value: Any) -> Any:

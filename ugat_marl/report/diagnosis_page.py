@@ -5,8 +5,9 @@ Names come from files of other people; every text is escaped, and the page forbi
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from html import escape
+from html import escape, unescape
 from pathlib import Path
 
 from ugat_marl.files import write_whole
@@ -29,6 +30,7 @@ from ugat_marl.report.diagnosis_words import Record
 
 _LOUD, _QUIET = 16, 6
 """Strips that are shown at once, of statistics outside of their noise and, if none is, inside."""
+_COMMANDS = re.compile(r"<h2>Run it again</h2><pre><code>(.*?)</code></pre>", re.DOTALL)
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 
 
@@ -69,6 +71,15 @@ def diagnosis_page(record: Record, network: Network, commands: Sequence[str] = (
         f"{_head(record)}\n<main>\n" + "\n".join(filter(None, sections)) + "\n</main>\n"
         "</body>\n</html>\n"
     )
+
+
+def commands_on_page(path: Path) -> list[str]:
+    """The commands a page shows, which its record does not hold; none where none can be read."""
+    try:
+        found = _COMMANDS.search(path.read_text(encoding="utf-8", errors="replace"))
+    except OSError:
+        return []
+    return unescape(found[1]).splitlines() if found else []
 
 
 def _head(record: Record) -> str:
