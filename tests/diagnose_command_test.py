@@ -242,6 +242,25 @@ def test_the_manual_lists_exactly_the_keys_there_are(found: tuple[Path, str, str
     assert set(listed) - there - SOMETIMES == set()
 
 
+@pytest.mark.usefixtures("few")
+def test_the_policy_gap_stays_as_long_as_the_same_is_found(
+    found: tuple[Path, str, str], street: Street, tmp_path: Path
+) -> None:
+    file, page = tmp_path / "diagnosis.json", tmp_path / "report.html"
+    before = json.loads((found[0] / "diagnosis.json").read_text())
+    file.write_text(json.dumps(before | {"policy_gap": GAP}))
+    assert main(street.arguments(tmp_path)) == 0
+    assert json.loads(file.read_text()) == before | {"policy_gap": GAP}
+    assert "max-pressure:20" in page.read_text()
+    (effect,) = before["effects"]
+    seconds = effect["parameters"]["seconds"] | {"value": 5.0}
+    others = {"effects": [effect | {"parameters": {"seconds": seconds}}], "hashes": {}}
+    for key, value in others.items():
+        file.write_text(json.dumps(before | {"policy_gap": GAP, key: value}))
+        assert main(street.arguments(tmp_path, "--no-report")) == 0
+        assert json.loads(file.read_text()) == before, key
+
+
 def test_every_verdict_is_explained_in_the_manual() -> None:
     page = (Path(__file__).parent.parent / "docs" / "diagnosis.md").read_text()
     table = page.partition("## Verdicts")[2].partition("##")[0]

@@ -57,7 +57,8 @@ def diagnose(
         reporter: Shows progress.
 
     Returns:
-        The content of ``diagnosis.json``; docs/diagnosis.md explains every key.
+        The content of ``diagnosis.json``; docs/diagnosis.md explains every key. The policy gap of
+        an earlier diagnosis in `directory` is kept where the same was found.
 
     Raises:
         MeasuredDataError: The data hold nothing to compare.
@@ -85,7 +86,9 @@ def diagnose(
         shutil.rmtree(place)
     if effects:
         corrected(scenario, effects, place)
-    text = json.dumps(_plain(record), indent=1, sort_keys=True, allow_nan=False)
+    record = _plain(record)
+    record["policy_gap"] = _known_gap(directory / FILE, record)
+    text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
     write_whole(directory / FILE, text + "\n")
     return json.loads(text)
 
@@ -287,6 +290,33 @@ def _head(study: Study) -> dict[str, Any]:
             name: importlib.metadata.version(name) for name in ("ugat-marl", "eclipse-sumo")
         },
     }
+
+
+def _known_gap(file: Path, record: dict[str, Any]) -> Any:
+    """The policy gap in an earlier record of the same corrected scenario, else None.
+
+    It took the simulations of `ugat-marl policy-gap` to measure, and holds as long as scenario,
+    data, versions and effects are the same.
+    """
+    try:
+        earlier: Any = json.loads(file.read_text(encoding="utf-8"))
+        same = all(earlier[key] == record[key] for key in ("schema", "hashes", "versions"))
+        if same and _values(earlier) == _values(record):
+            return _plain(earlier["policy_gap"])
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        pass  # none, or none that `diagnose` wrote
+    return None
+
+
+def _values(record: dict[str, Any]) -> list[Any]:
+    """The effects of a record without intervals and evidence, which change no simulation."""
+    return [
+        [
+            *(effect[key] for key in ("name", "place", "window")),
+            {key: parameter["value"] for key, parameter in effect["parameters"].items()},
+        ]
+        for effect in record["effects"]
+    ]
 
 
 def _plain(value: Any) -> Any:
