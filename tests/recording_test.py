@@ -227,3 +227,21 @@ def test_the_command_writes_a_directory(
     assert {"periods.csv", "detectors.csv", "signals.parquet", "detections.parquet"} == {
         path.name for path in out.iterdir()
     }
+
+
+def test_a_foreign_directory_is_refused_before_anything_is_measured(
+    data: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def measured(*_: Any, **__: Any) -> None:
+        pytest.fail("it was measured")
+
+    monkeypatch.setattr("ugat_marl.commands.record.record", measured)
+    (tmp_path / "thesis.tex").write_text("years of work")
+    call = ["record", str(data / "crossing"), "--out", str(tmp_path)]
+    assert main(call) == 2
+    assert "'thesis.tex'" in capsys.readouterr().err
+    assert main(["record", "nowhere-v1", "--out", str(tmp_path / "new")]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]

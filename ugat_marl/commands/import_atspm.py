@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.effects import load
 from ugat_marl.measured.atspm import import_atspm
-from ugat_marl.measured.writing import write_measured
+from ugat_marl.measured.writing import require_replaceable, write_measured
 from ugat_marl.network import Network
 
 
@@ -42,6 +42,7 @@ class ImportAtspm:
     def run(self, console: Console) -> int:
         """Imports, writes, and prints what was found."""
         scenario = load(self.scenario)
+        require_replaceable(self.out)
         measured = import_atspm(self.events, self.mapping, scenario, Network.read(scenario))
         write_measured(measured, self.out, csv=self.csv)
         for finding in measured.findings:

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.effects import load
 from ugat_marl.evaluation import policy_factory
 from ugat_marl.files import require_writable
-from ugat_marl.measured.writing import write_measured
+from ugat_marl.measured.writing import require_replaceable, write_measured
 from ugat_marl.progress import Bars
 from ugat_marl.recording import record
 
@@ -57,9 +57,11 @@ class Record:
 
     def run(self, console: Console) -> int:
         """Records and writes."""
+        scenario = load(self.scenario)
+        require_replaceable(self.out)
         require_writable(self.out / "periods.csv")
         measured = record(
-            load(self.scenario),
+            scenario,
             self.domain,
             policy_factory(self.policy),
             periods=self.periods,

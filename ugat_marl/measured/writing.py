@@ -45,7 +45,7 @@ def write_measured(measured: Measured, directory: Path, *, csv: bool = False) ->
     Raises:
         OutputError: The directory holds other things, or cannot be written.
     """
-    _require_replaceable(directory)
+    require_replaceable(directory)
     suffix = ".csv" if csv else ".parquet"
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
@@ -77,13 +77,23 @@ def write_measured(measured: Measured, directory: Path, *, csv: bool = False) ->
     return directory
 
 
-def _require_replaceable(directory: Path) -> None:
+def require_replaceable(directory: Path) -> None:
+    """Refuses a directory that `write_measured` would not replace; to be asked before measuring.
+
+    Raises:
+        OutputError: It holds other things, or is a file.
+    """
     if not directory.exists():
         return
     if not directory.is_dir():
         raise OutputError(f"{directory}: is a file; give the name of a directory")
     known = {name for table in TABLES for name in table.names()}
-    there = {path.name for path in directory.iterdir()}
+    try:
+        there = {path.name for path in directory.iterdir()}
+    except OSError as error:
+        raise OutputError(
+            f"{directory}: cannot be read ({error.strerror}); give another place"
+        ) from None
     if foreign := sorted(there - known):
         raise OutputError(
             f"{directory}: holds {foreign[0]!r}, which is not measured data; give another "
