@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 
 from ugat_marl.__main__ import main
 from ugat_marl.effects import load
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.evaluation import policy_factory
 from ugat_marl.measured.data import Measured
 from ugat_marl.measured.reading import read_measured
@@ -156,6 +157,37 @@ def test_effects_on_detectors_show_in_what_is_measured(data: Path) -> None:
     swapped = "swapped=advance:S_C_0,advance:W_C_0"
     seen = measure(data / "crossing", swapped, same_demand=True).periods[0].passages
     assert (seen["advance:S_C_0"].on_s == true["advance:W_C_0"].on_s).all()
+
+
+def test_effects_on_detectors_may_stand_in_the_scenario_file(
+    crossing: Crossing, tmp_path: Path
+) -> None:
+    plain = crossing()
+    listed = tmp_path / "listed-v1"
+    shutil.copytree(plain, listed)
+    with (listed / "scenario.toml").open("a") as file:
+        file.write('[[effects]]\nname = "undercount"\nplace = "*"\nshare = 0.4\n')
+        file.write('[[effects]]\nname = "acceleration"\nmps2 = 1.0\n')
+        file.write('[[effects]]\nname = "signal_clock"\nplace = "C"\nseconds = 3.0\n')
+    given = "undercount=*,0.4+acceleration=1+signal_clock=C,3"
+    seen = measure(plain, given, same_demand=True).hash
+    assert measure(listed, same_demand=True).hash == seen
+    assert measure(plain, str(listed), same_demand=True).hash == seen
+    more = "stuck=stop:S_C_0,20,50"
+    seen = measure(plain, f"{given}+{more}", same_demand=True).hash
+    assert measure(listed, more, same_demand=True).hash == seen
+
+
+def test_a_detector_that_is_not_there_is_told_before_anything_is_simulated(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def simulated(*_: Any) -> None:
+        pytest.fail("it was simulated")
+
+    monkeypatch.setattr("ugat_marl.recording.days.own_programmes", simulated)
+    monkeypatch.setattr("ugat_marl.recording.days.play", simulated)
+    with pytest.raises(UnknownNameError, match="'stop:S_C_7'"):
+        measure(data / "crossing", "undercount=stop:S_C_7,0.4")
 
 
 def test_no_vehicle_comes_on_two_days(data: Path) -> None:

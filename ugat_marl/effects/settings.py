@@ -11,6 +11,7 @@ from ugat_marl.effects.base import Effect
 from ugat_marl.effects.demand import DemandLevel, DemandSurge, DemandTiming
 from ugat_marl.effects.detectors import (
     ClockDrift,
+    DetectorEffect,
     Dropout,
     SignalClock,
     Stuck,
@@ -213,6 +214,21 @@ def load(name: str | Path | Scenario) -> Scenario:
     effects = [effect_from(record, where) for record in scenario.settings.effects]
     plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
     return apply_effects(plain, effects)
+
+
+def detector_effects(scenario: Scenario) -> tuple[DetectorEffect, ...]:
+    """The effects on detectors that were applied to a scenario.
+
+    They leave its files as they are, so that whoever measures it has to ask for them.
+    """
+    found: list[DetectorEffect] = []
+    for text in scenario.applied:
+        kind = _EFFECTS.get(text.partition("=")[0])
+        if kind is not None and issubclass(kind, DetectorEffect):
+            effect = _effect_from_text(text)  # undoes str(effect)
+            assert isinstance(effect, DetectorEffect)
+            found.append(effect)
+    return tuple(found)
 
 
 def in_domain(scenario: Scenario, domain: Domain) -> Scenario:

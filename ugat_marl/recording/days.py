@@ -19,7 +19,14 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from ugat_marl.effects import Domain, Effect, apply_effects, in_domain, parse_domain
+from ugat_marl.effects import (
+    Domain,
+    Effect,
+    apply_effects,
+    detector_effects,
+    in_domain,
+    parse_domain,
+)
 from ugat_marl.effects.detectors import observed, owners
 from ugat_marl.effects.documents import sort_departures
 from ugat_marl.errors import OptionError
@@ -117,6 +124,7 @@ def record(
 
     Raises:
         OptionError: Not a number of periods, or an impossible length.
+        UnknownNameError: No such domain, effect or detector.
         ScenarioError: The scenario cannot be simulated.
         SimulatorError: SUMO failed.
     """
@@ -131,11 +139,14 @@ def record(
     if duration_s is not None:  # the domain may be another scenario
         base = base.with_duration(duration_s)
     network = Network.read(base)
+    detectors = tuple(_zone(item, detector_length_m) for item in standard_detectors(network))
+    empty = Period("", 0.0, 1.0, "fit", {}, {})
+    observed(empty, effects, detectors, owners(base, detectors))  # a wrong detector is an error now
     fixed, watched = own_programmes(base, network, policy)
     street = _Street(
         explicit(base),
         effects,
-        tuple(_zone(item, detector_length_m) for item in standard_detectors(network)),
+        detectors,
         fixed,
         watched,
         policy,
@@ -156,11 +167,14 @@ def record(
 
 
 def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, ...]]:
-    """What days are drawn from, and what is added to each of them."""
+    """What days are drawn from, and what is added to each of them.
+
+    The effects of a scenario's own file are in its documents already, but for those on detectors.
+    """
     changed = in_domain(scenario, domain)  # a wrong name is an error now
     if isinstance(domain, str) and "=" not in domain and Path(domain).expanduser().exists():
-        return changed, ()
-    return scenario, parse_domain(domain)
+        return changed, detector_effects(changed)
+    return scenario, (*detector_effects(scenario), *parse_domain(domain))
 
 
 def _zone(detector: Detector, length_m: float) -> Detector:
