@@ -216,6 +216,12 @@ def test_another_scenario_can_be_the_world(crossing: Crossing) -> None:
     assert seen.speed_mps.max() <= 5.01
 
 
+def test_another_scenario_may_have_any_name(crossing: Crossing, tmp_path: Path) -> None:
+    own = crossing()
+    same = shutil.copytree(own, tmp_path / "headway=1.4")
+    assert measure(own, str(same)).hash == measure(own).hash
+
+
 def test_zones_end_where_the_points_are(data: Path) -> None:
     zones = measure(data / "crossing", same_demand=True, detector_length_m=6.0)
     points = measure(data / "crossing", same_demand=True)

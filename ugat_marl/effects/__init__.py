@@ -31,6 +31,7 @@ from ugat_marl.effects.settings import (
     known_effects,
     load,
     parse_domain,
+    scenario_of,
 )
 from ugat_marl.effects.signals import AllRedTime, LateGreen, YellowTime
 from ugat_marl.effects.turning import Turning
@@ -103,4 +104,5 @@ __all__ = [
     "observed",
     "owners",
     "parse_domain",
+    "scenario_of",
 ]

@@ -243,17 +243,23 @@ def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
         OptionError: An effect has an impossible value.
         ScenarioError: A scenario named as a domain cannot be read or has other roads.
     """
-    if isinstance(domain, str):
-        path = Path(domain).expanduser()
-        if path.suffix == ".sumocfg" or (path / "scenario.toml").is_file():
-            other = load(path)
-            if _signals(other) != _signals(scenario):
-                raise ScenarioError(
-                    f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "
-                    "a domain must be on the same network, or a policy means nothing in it"
-                )
-            return other
+    if (path := scenario_of(domain)) is not None:
+        other = load(path)
+        if _signals(other) != _signals(scenario):
+            raise ScenarioError(
+                f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "
+                "a domain must be on the same network, or a policy means nothing in it"
+            )
+        return other
     return apply_effects(scenario, parse_domain(domain))
+
+
+def scenario_of(domain: Domain) -> Path | None:
+    """The other scenario that a domain names, or None; a file that is merely called V4 is none."""
+    if not isinstance(domain, str):
+        return None
+    path = Path(domain).expanduser()
+    return path if path.suffix == ".sumocfg" or (path / "scenario.toml").is_file() else None
 
 
 def _signals(scenario: Scenario) -> set[tuple[str, ...]]:

@@ -26,6 +26,7 @@ from ugat_marl.effects import (
     detector_effects,
     in_domain,
     parse_domain,
+    scenario_of,
 )
 from ugat_marl.effects.detectors import observed, owners
 from ugat_marl.effects.documents import sort_departures
@@ -172,7 +173,7 @@ def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, 
     The effects of a scenario's own file are in its documents already, but for those on detectors.
     """
     changed = in_domain(scenario, domain)  # a wrong name is an error now
-    if isinstance(domain, str) and "=" not in domain and Path(domain).expanduser().exists():
+    if scenario_of(domain) is not None:
         return changed, detector_effects(changed)
     return scenario, (*detector_effects(scenario), *parse_domain(domain))
 
