@@ -78,6 +78,30 @@ def test_every_command_explains_itself(
     assert f"    ugat-marl {command}" in text, "no example"
 
 
+MEASURING = ("record", "import-atspm", "diagnose", "policy-gap")
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if c.split()[0] in (*MEASURING, "blind")])
+def test_help_fits_a_terminal_and_says_what_defaults_mean(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    usage, *lines = capsys.readouterr().out.splitlines()
+    assert command in usage
+    assert max(map(len, lines)) <= 80
+    assert not [line for line in lines if "None" in line or "(default: )" in line]
+
+
+def test_help_of_a_group_is_about_the_group(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["blind", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "usage: ugat-marl blind COMMAND [options]" in text
+    assert "ugat-marl blind COMMAND --help" in text
+    assert "train" not in text
+
+
 def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     text = capsys.readouterr().out

@@ -175,17 +175,19 @@ def _bench(command: Any, console: Console) -> int:
 
 def _print_help(console: Console, prefix: str = "") -> None:
     console.print("Traffic signals across the gap between simulation and street.\n")
-    console.print(f"usage: ugat-marl {prefix}COMMAND [options]\n")
+    console.print(f"usage: ugat-marl {prefix}COMMAND [options]\n", markup=False)
     for name, (_, text) in COMMANDS.items():
         if name.startswith(prefix):
             console.print(f"  {name.removeprefix(prefix):<15} {text}")
-    console.print(
-        "\nugat-marl COMMAND --help shows the options and examples of a command. A first try:\n\n"
-        "  ugat-marl scenarios\n"
-        "  ugat-marl evaluate single-v1 --domains sim V4 --seeds 2\n"
-        "  ugat-marl train grid2x2-v1 --real V4\n\n"
-        "Exit codes: 0 done, 1 a check or target failed, 2 a wrong call or input."
-    )
+    console.print(f"\nugat-marl {prefix}COMMAND --help shows options and examples of a command.")
+    if not prefix:
+        console.print(
+            "A first try:\n\n"
+            "  ugat-marl scenarios\n"
+            "  ugat-marl evaluate single-v1 --domains sim V4 --seeds 2\n"
+            "  ugat-marl train grid2x2-v1 --real V4"
+        )
+    console.print("\nExit codes: 0 done, 1 a check or target failed, 2 a wrong call or input.")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from ugat_marl.blind.grade import grade_cases, read_grades
 from ugat_marl.blind.run import Diagnose, run_cases
 from ugat_marl.blind.strengths import STRENGTHS
 from ugat_marl.blind.table import markdown, write_table
+from ugat_marl.commands.arguments import LengthS
 from ugat_marl.effects import load
 from ugat_marl.errors import BlindTestError, OptionError
 from ugat_marl.files import require_writable
@@ -27,23 +28,25 @@ from ugat_marl.progress import Bars, Silent
 
 @dataclass(frozen=True)
 class BlindGenerate:
-    """Draws what is hidden, measures it, and seals the labels.
+    """Hides effects in scenarios, measures them, and seals what was hidden.
+
+    Then follow blind run, blind grade and blind table (docs/blind-tests.md).
 
     Examples:
-        ugat-marl blind generate --scenario single-v1 resco:cologne1 --cases 40 --out blind
-        ugat-marl blind generate --scenario single-v1 --classes none --cases 200 --out nulls
+        ugat-marl blind generate --scenario single-v1 --cases 40 --out blind
+        ugat-marl blind generate --scenario single-v1 --classes none --out nulls
 
     Attributes:
         scenario: Scenarios the cases are spread over.
         out: Directory of the blind test; one that is there is gone on with.
-        classes: none, single, pair, setting, outside, and names of effects.
-        strengths: Strengths of single effects.
+        classes: What is hidden: none, single, pair, setting, outside, and names of effects.
+        strengths: Strengths of single effects: small, medium, large.
         cases: Number of cases.
         seed: Root of all seeds.
         periods: Days per case.
         speeds: Whether the detectors measure speeds.
         pressure_share: Share of the cases under max-pressure control, not fixed-time.
-        duration_s: Length of a day in s; default: the scenario's own.
+        duration_s: Length of a day in s.
     """
 
     scenario: tuple[str, ...]
@@ -55,7 +58,7 @@ class BlindGenerate:
     periods: int = 5
     speeds: bool = True
     pressure_share: float = 0.2
-    duration_s: float | None = None
+    duration_s: LengthS = None
 
     def run(self, console: Console) -> int:
         """Generates."""
@@ -84,12 +87,12 @@ class BlindRun:
         ugat-marl blind run blind --budget-s 600
 
     Attributes:
-        directory: A blind test.
+        directory: Directory of a blind test.
         jobs: Cases at a time.
         budget_s: Time for each diagnosis, s.
         alpha: Chance of finding something where there is nothing.
         seed: Seed of the diagnoses.
-        only: Cases; default: all.
+        only: Names of the cases to diagnose.
     """
 
     directory: Annotated[Positional[Path], arg(metavar="DIR")]
@@ -97,7 +100,9 @@ class BlindRun:
     budget_s: float = 600.0
     alpha: float = 0.05
     seed: int = 0
-    only: tuple[str, ...] = ()
+    only: Annotated[
+        tuple[str, ...], arg(metavar="CASE ...", help_behavior_hint="(default: all)")
+    ] = ()
 
     def run(self, console: Console) -> int:
         """Runs; the exit code is 1 if a diagnosis failed."""
@@ -143,7 +148,7 @@ class BlindGrade:
         ugat-marl blind grade blind
 
     Attributes:
-        directory: A blind test.
+        directory: Directory of a blind test.
     """
 
     directory: Annotated[Positional[Path], arg(metavar="DIR")]
@@ -168,12 +173,16 @@ class BlindTable:
         ugat-marl blind table blind nulls --out table.md
 
     Attributes:
-        directories: Blind tests that have been graded.
-        out: File for the table: Markdown, or JSON if its name ends so.
+        directories: Directories of blind tests that have been graded.
+        out: File for the table: Markdown, or JSON if its name ends in .json.
     """
 
-    directories: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR")]
-    out: Path | None = None
+    directories: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="DIR ...", help_behavior_hint="(required)")
+    ]
+    out: Annotated[
+        Path | None, arg(metavar="PATH", help_behavior_hint="(default: only printed)")
+    ] = None
 
     def run(self, console: Console) -> int:
         """Prints, and writes."""

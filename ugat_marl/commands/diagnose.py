@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import Positional, arg
 
+from ugat_marl.commands.arguments import Workers
 from ugat_marl.discrepancy.workflow import CORRECTED, FILE, DiagnosisConfig, diagnose
 from ugat_marl.effects import DetectorEffect, known_effects, load
 from ugat_marl.errors import OptionError
@@ -27,22 +28,25 @@ REPORT = "report.html"
 
 @dataclass(frozen=True)
 class Diagnose:
-    """Compares measured data with a scenario, names the missing effects, and adds them.
+    """Compares measured data with a scenario, names what is missing, and adds it.
 
     Examples:
         ugat-marl diagnose single-v1 measured --out found
-        ugat-marl diagnose my.sumocfg street --out found --budget-s 3600 --leave-out parking
+        ugat-marl diagnose my.sumocfg street --out found --leave-out parking
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
-        measured: Directory of measured data (docs/measured-data.md); it is never written to.
-        out: Directory for diagnosis.json, report.html and the corrected scenario.
-        budget_s: Wall time after which no further simulation is begun, s.
+        measured: Directory of measured data, as record or import-atspm writes it
+            (docs/measured-data.md); it is never written to.
+        out: Directory for diagnosis.json, report.html and the corrected scenario; an earlier
+            diagnosis in it is replaced.
+        budget_s: Time in s after which no further simulation is begun. The result is marked as
+            partial then; the same command goes on from there.
         alpha: Chance of naming an effect where there is none.
         seed: Root of the simulated days; the same data and seed give the same diagnosis.
-        leave_out: Effects that are not examined.
-        cache: Folder of remembered simulations; default: in the user's cache folder.
-        workers: Simulations at a time; default: one per core.
+        leave_out: Names of effects (docs/effects.md) that are not examined.
+        cache: Folder of remembered simulations.
+        workers: Simulations at a time.
         report: Write the page report.html.
     """
 
@@ -52,9 +56,13 @@ class Diagnose:
     budget_s: float = 600.0
     alpha: float = 0.05
     seed: int = 0
-    leave_out: tuple[str, ...] = ()
-    cache: Path | None = None
-    workers: int | None = None
+    leave_out: Annotated[
+        tuple[str, ...], arg(metavar="EFFECT ...", help_behavior_hint="(default: none)")
+    ] = ()
+    cache: Annotated[
+        Path | None, arg(metavar="PATH", help_behavior_hint="(default: the user's cache folder)")
+    ] = None
+    workers: Workers = None
     report: bool = True
 
     def run(self, console: Console) -> int:

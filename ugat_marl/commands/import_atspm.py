@@ -19,8 +19,9 @@ from ugat_marl.network import Network
 class ImportAtspm:
     """Turns a high-resolution log of signal controllers (ATSPM) into measured data.
 
-    The log has TimeStamp, DeviceId, EventId and Parameter; the mapping says which traffic light,
-    links and lanes they mean (docs/measured-data.md).
+    The log has the columns TimeStamp, DeviceId, EventId and Parameter.
+
+    The mapping says which lights and lanes they mean (docs/measured-data.md).
 
     Examples:
         ugat-marl import-atspm my-scenario events.parquet mapping.toml --out street

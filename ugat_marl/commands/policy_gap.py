@@ -9,6 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
+from ugat_marl.commands.arguments import LengthS, Workers
 from ugat_marl.commands.diagnose import REPORT
 from ugat_marl.commands.evaluate import names_of
 from ugat_marl.discrepancy.policy_gap import policy_gap, read_diagnosis, write_policy_gap
@@ -25,24 +26,27 @@ from ugat_marl.report.tables import policy_gap_table
 
 @dataclass(frozen=True)
 class PolicyGap:
-    """Plays policies in sim, in the corrected scenario of a diagnosis and in the real domain.
+    """How much nearer a diagnosis brings policies to what they do in the real domain.
 
-    The result is printed, and written to DIR/diagnosis.json under "policy_gap" and, where there is
-    one, to the page DIR/report.html.
+    They are played in sim, in the corrected scenario and in the real domain.
+
+    The travel times are printed, and added to DIR/diagnosis.json and report.html.
 
     Examples:
-        ugat-marl policy-gap single-v1 diagnosis --real V4
-        ugat-marl policy-gap single-v1 diagnosis --real V4 --policies fixed-time:30 mine.pt
+        ugat-marl policy-gap single-v1 found --real V4
+        ugat-marl policy-gap single-v1 found --real V4 --policies mine.pt
 
     Attributes:
         scenario: The scenario that was diagnosed.
-        directory: Where the diagnosis lies: diagnosis.json and corrected.
-        real: The domain the data were recorded in; only a simulated one can be played in.
-        policies: Rules and files of trained policies.
+        directory: What diagnose wrote, its --out.
+        real: The domain the data were recorded in, as given to record. A street cannot be
+            played in.
+        policies: Rules (fixed-time:30, largest-queue:20, max-pressure:10, programme, random)
+            and files of trained policies.
         seeds: Number of episodes of each policy in each world.
         first_seed: Seed of the first of them.
-        duration_s: Length of an episode in s; default: the scenario's own.
-        workers: Simulations at a time; default: one per core.
+        duration_s: Length of an episode in s.
+        workers: Simulations at a time.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -51,8 +55,8 @@ class PolicyGap:
     policies: tuple[str, ...] = ("fixed-time:30", "max-pressure:20")
     seeds: int = 5
     first_seed: int = 1000
-    duration_s: float | None = None
-    workers: int | None = None
+    duration_s: LengthS = None
+    workers: Workers = None
 
     def run(self, console: Console) -> int:
         """Plays, writes and prints."""

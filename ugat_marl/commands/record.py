@@ -9,6 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
+from ugat_marl.commands.arguments import LengthS, Workers
 from ugat_marl.effects import load
 from ugat_marl.evaluation import policy_factory
 from ugat_marl.files import require_writable
@@ -19,26 +20,29 @@ from ugat_marl.recording import record
 
 @dataclass(frozen=True)
 class Record:
-    """Measures a domain as a street is measured: detections and signals, day after day.
+    """Measures a simulated world as a street is measured: detections and signals.
 
     Examples:
-        ugat-marl record single-v1 --domain V4 --policy fixed-time:30 --out v4
-        ugat-marl record single-v1 --domain headway=1.4 --periods 3 --lanes --out slow
+        ugat-marl record single-v1 --domain V4 --out measured
+        ugat-marl record single-v1 --domain headway=1.4 --periods 3 --out slow
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
-        out: Directory to write; see docs/measured-data.md.
-        domain: World to measure.
-        policy: A rule or the file of a trained policy.
-        periods: Number of days; the last 40 % are marked as held out.
+        out: Directory to write (docs/measured-data.md); measured data in it are replaced.
+        domain: World to measure: sim, V1 to V4, effects (headway=1.4+acceleration=1), or the
+            directory of another scenario on the same network.
+        policy: Who controls the signals: a rule (fixed-time:30, largest-queue:20,
+            max-pressure:10, programme, random) or the file of a trained policy.
+        periods: Number of days. The last 40 % are marked as held out: a diagnosis is judged on
+            them.
         seed: Root of the seeds of all days.
-        duration_s: Length of a day in s; default: the scenario's own.
+        duration_s: Length of a day in s.
         same_demand: Every day has the scenario's own vehicles; without it they are drawn again.
         detector_length_m: Length of the detection zones in m; 0 for points.
         speeds: Whether the detectors measure speeds and lengths.
         lanes: Also vehicles, halting and mean speed per lane and second.
         trajectories: Also the position of every vehicle at every second.
-        workers: Simulations at a time; default: one per core.
+        workers: Simulations at a time.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -47,13 +51,13 @@ class Record:
     policy: str = "fixed-time:30"
     periods: int = 5
     seed: int = 0
-    duration_s: float | None = None
+    duration_s: LengthS = None
     same_demand: bool = False
     detector_length_m: float = 0.0
     speeds: bool = True
     lanes: bool = False
     trajectories: bool = False
-    workers: int | None = None
+    workers: Workers = None
 
     def run(self, console: Console) -> int:
         """Records and writes."""
