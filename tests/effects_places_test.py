@@ -36,7 +36,7 @@ from ugat_marl.simulator import LibsumoSimulator, launch_of
 Crossing = Callable[..., Path]
 
 EDGE, LANE = "east1_A1", "east1_A1_1"
-MIDDLE_M = 286.4 / 2
+MIDDLE_M = 286.4 - 30
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def run(scenario: Scenario, own: Path, *options: str) -> Path:
 def passing(
     simulator: LibsumoSimulator, scenario: Scenario, own: Path, until: int
 ) -> tuple[dict[str, list[int]], dict[str, tuple[int, int]]]:
-    """Seconds at which the middle of each lane of EDGE is passed, and when blockers stand."""
+    """Seconds at which MIDDLE_M is passed on each lane of EDGE, and when blockers stand."""
     own.mkdir()
     simulator.start(launch_of(scenario, 1, own, ()))
     last: dict[str, tuple[str, float]] = {}
@@ -101,9 +101,11 @@ def test_a_closed_lane_is_blocked_then_and_free_before_and_after(
     def inside(times: list[int], begin: int, end: int) -> int:
         return sum(begin <= time < end for time in times)
 
-    assert [(begin, end) for begin, end in stood.values()] == [(601, 999)]
+    ((begin, end),) = stood.values()
+    assert 601 <= begin <= 615  # as soon as the queue leaves room
+    assert end == 999
     assert inside(plain[LANE], 602, 1000) > 10
-    assert inside(passed[LANE], 602, 1000) == 0
+    assert inside(passed[LANE], begin + 1, 1000) == 0
     assert inside(passed[LANE], 0, 595) == inside(plain[LANE], 0, 595)
     assert inside(passed[LANE], 1000, 1500) > 10
     others = [lane for lane in passed if lane != LANE]
@@ -118,8 +120,8 @@ def test_parking_blocks_a_lane_again_and_again(simulator: LibsumoSimulator, tmp_
     for begin, end in stood.values():
         assert end - begin == pytest.approx(40, abs=1)
         assert not [time for time in passed[LANE] if begin < time <= end]
-    starts = sorted(int(begin) // 120 for begin, _ in stood.values())
-    assert starts == list(range(len(starts)))
+    starts = sorted(begin for begin, _ in stood.values())
+    assert all(120 * n <= begin < 120 * (n + 1) + 40 for n, begin in enumerate(starts))
     assert len(passed[LANE]) > 20
 
 

@@ -34,19 +34,19 @@ class Busy:
 
     Attributes:
         lights: Traffic lights that agents control.
-        origins: Edges where vehicles start.
+        origins: Edges where vehicles start, and how many do, per hour.
         turns: ``(from, to)`` edges of turns at traffic lights.
         closable: Lanes before a traffic light with a lane beside them.
         lanes: Lanes before a traffic light.
         edges: Edges before a traffic light.
         detectors: Detectors.
         pairs: Detectors of one kind on neighbouring lanes that count differently.
-        permitted: Whether drivers have to yield on some green.
+        permitted: Whether drivers have to yield on some green, and enough of them do.
         several_lanes: Whether an approach has more than one lane.
     """
 
     lights: tuple[str, ...]
-    origins: tuple[str, ...]
+    origins: Mapping[str, float]
     turns: tuple[tuple[str, str], ...]
     closable: tuple[str, ...]
     lanes: tuple[str, ...]
@@ -82,7 +82,7 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
     }
     return Busy(
         lights=tuple(item.id for item in network.intersections),
-        origins=tuple(sorted(x for x, rate in origins.items() if rate >= BUSY_PER_HOUR)),
+        origins={x: rate for x, rate in sorted(origins.items()) if rate >= BUSY_PER_HOUR},
         turns=tuple(
             sorted(
                 (edge, other)
@@ -96,9 +96,19 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         edges=tuple(sorted({network.lanes[x].edge for x in lanes})),
         detectors=tuple(item.id for item in detectors if rates.get(item.id, 0.0) >= BUSY_PER_HOUR),
         pairs=_pairs(detectors, rates, network),
-        permitted=any("g" in phase for item in network.intersections for phase in item.phases),
+        permitted=any(turns[way] >= BUSY_PER_HOUR for way in _yielding(network)),
         several_lanes=any(cars[edge] > 1 for edge in approaches),
     )
+
+
+def _yielding(network: Network) -> set[tuple[str, str]]:
+    """Edges of the turns that have to yield on some green."""
+    return {
+        (network.lanes[link.from_lane].edge, network.lanes[link.to_lane].edge)
+        for item in network.intersections
+        for link in item.links
+        if any(phase[link.index] == "g" for phase in item.phases)
+    }
 
 
 def _detected(scenario: Scenario, seed: int) -> tuple[dict[str, float], tuple[Detector, ...]]:

@@ -163,7 +163,8 @@ def hidden_effect(
     if kind.parameter:
         nominal = nominal_of(name, scenario)[kind.parameter]
         other_side = kind.either and bool(generator.integers(2))
-        value = nominal + kind.value(strength, other_side) - kind.nominal
+        counted = busy.origins[place[0]] if name == "demand_level" else None
+        value = nominal + kind.value(strength, other_side, counted) - kind.nominal
         record[kind.parameter] = round(value, 4)
     if kind.window_s:
         record["begin_s"], record["end_s"] = _window(kind.window(strength), scenario, generator)
@@ -182,7 +183,7 @@ def _places(where: str, busy: Busy) -> list[tuple[str, ...]]:
     if where == "pair":
         return list(busy.pairs)
     names: Mapping[str, Sequence[str]] = {
-        "origin": busy.origins,
+        "origin": tuple(busy.origins),
         "closable": busy.closable,
         "lane": busy.lanes,
         "edge": busy.edges,

@@ -1,10 +1,12 @@
 """How strong a hidden effect is: the medium strength of every effect, and what is small and large.
 
 Small is half and large twice the distance of the medium strength from the value without the effect.
+What is told by counts alone is at medium strength at least so large that it can be told from them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -12,6 +14,10 @@ from typing import Literal
 from ugat_marl.scenario import Scenario
 
 Strength = Literal["small", "medium", "large"]
+COUNTED = 5.0
+"""A medium change of counts is at least so many standard errors of what is counted."""
+COUNTED_HOURS = 3.0
+"""Hours that are counted: the fitted ones of five periods of an hour."""
 STRENGTHS: tuple[Strength, ...] = ("small", "medium", "large")
 SCALE: Mapping[str, float] = {"small": 0.5, "medium": 1.0, "large": 2.0}
 
@@ -52,9 +58,20 @@ class Kind:
     fixed: Mapping[str, float] | None = None
     strengths: tuple[Strength, ...] = STRENGTHS
 
-    def value(self, strength: str, other_side: bool = False) -> float:
-        """The value of the field at a strength."""
-        distance = (self.medium - self.nominal) * SCALE[strength]
+    def value(
+        self, strength: str, other_side: bool = False, per_hour: float | None = None
+    ) -> float:
+        """The value of the field at a strength.
+
+        Args:
+            strength: Which.
+            other_side: On the other side of the nominal value, if there is one.
+            per_hour: Vehicles an hour that tell it, if it is a share of them.
+        """
+        distance = self.medium - self.nominal
+        if per_hour is not None:
+            distance = max(distance, COUNTED / math.sqrt(COUNTED_HOURS * per_hour))
+        distance *= SCALE[strength]
         value = self.nominal + (-distance if other_side and self.either else distance)
         return round(min(max(value, self.least), self.greatest), 4)
 
@@ -87,7 +104,7 @@ KINDS: Mapping[str, Kind] = {
     "late_green": Kind("signals", "light", "seconds", 0.0, 2.0),
     "yellow_time": Kind("signals", "everywhere", "seconds", 3.0, 5.0),
     "all_red_time": Kind("signals", "everywhere", "seconds", 2.0, 4.0),
-    "demand_level": Kind("demand", "origin", "factor", 1.0, 1.15, either=True),
+    "demand_level": Kind("demand", "origin", "factor", 1.0, 1.15, least=0.4, either=True),
     "demand_surge": Kind("demand", "origin", "factor", 1.0, 1.6, window_s=1200.0),
     "demand_timing": Kind("demand", "origin", "seconds", 0.0, 300.0, either=True),
     "turning": Kind("demand", "turn", "share", 0.0, 0.2),

@@ -21,12 +21,13 @@ from ugat_marl.files import xml_bytes
 from ugat_marl.scenario import Document, Scenario
 
 _LENGTH_M = 5.0
+_LAST_M = 60.0
 _TIME = Parameter("s", 0.0, 1e7)
 
 
 @dataclass(frozen=True)
 class LaneClosure(Effect):
-    """Nobody passes the middle of a lane during a while, as after an accident."""
+    """Nobody passes a point near the end of a lane during a while, as after an accident."""
 
     name: ClassVar[str] = "lane_closure"
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
@@ -36,7 +37,7 @@ class LaneClosure(Effect):
     end_s: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Adds a vehicle that stands in the middle of the lane.
+        """Adds a vehicle that stands in the middle of the lane's last 60 m.
 
         Raises:
             UnknownNameError: No such lane.
@@ -51,7 +52,7 @@ class LaneClosure(Effect):
 
 @dataclass(frozen=True)
 class Parking(Effect):
-    """Vehicles stop in the middle of a lane, so many in an hour, for `dwell_s` each."""
+    """Vehicles stop near the end of a lane, so many in an hour, for `dwell_s` each."""
 
     name: ClassVar[str] = "parking"
     ranges: ClassVar[dict[str, Parameter]] = {
@@ -121,9 +122,10 @@ class LocalSpeed(Effect):
 def _with_blockers(
     scenario: Scenario, effect: Effect, lane: str, departs: Sequence[float], stand: dict[str, str]
 ) -> Scenario:
-    """Adds vehicles that appear in the middle of a lane, stand there and are gone.
+    """Adds vehicles that appear in the middle of a lane's last 60 m, stand there and are gone.
 
-    Where a queue stands at that moment, the vehicle appears as soon as there is room for it.
+    Farther away traffic goes round them and is in order again before the signal. Where a queue
+    stands at that moment, the vehicle appears as soon as there is room for it.
 
     Args:
         scenario: It does not change itself.
@@ -158,7 +160,7 @@ def _with_blockers(
             "color": "255,128,0",
         },
     )
-    middle = place.length_m / 2
+    middle = place.length_m - min(place.length_m, _LAST_M) / 2
     for number, depart in enumerate(departs):
         vehicle = {
             "id": f"{kind}.{number}", "type": kind, "depart": seconds_text(depart),
