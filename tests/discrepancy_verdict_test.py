@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
+from ugat_marl.discrepancy.features import FEATURES
 from ugat_marl.discrepancy.hypotheses import Hypothesis
+from ugat_marl.discrepancy.select import Selection
 from ugat_marl.discrepancy.verdict import (
+    conclude,
     describe_effect,
     describe_members,
     effect_record,
@@ -89,3 +95,23 @@ def test_effects_in_words() -> None:
     assert describe_members(((HEADWAY, (1.4,)), (LATE, (2.0,)))) == (
         "headway of 1.4 s and late green of 2 s"
     )
+
+
+@pytest.mark.parametrize("complete", [True, False])
+@pytest.mark.parametrize("tried", [(), ((HEADWAY, (1.4,)),)])
+def test_only_a_search_that_ended_says_that_the_library_lacks_it(
+    complete: bool, tried: Any
+) -> None:
+    distance = SimpleNamespace(z={"network": np.zeros((1, len(FEATURES)))})
+    residual = SimpleNamespace(p=0.0, distance=900.0)
+    best: Any = SimpleNamespace(
+        model=SimpleNamespace(members=tried, distance=distance), residual=residual
+    )
+    nothing_won: Any = SimpleNamespace(
+        before=SimpleNamespace(p=0.0, distance=1000.0), after=residual, shrink=0.1
+    )
+    selector: Any = None
+    found = conclude(Selection(best, (), complete=complete), selector, nothing_won, 0.05)
+    assert found.verdict == "unknown"
+    assert ("no effect of the library explains it" in found.sentence) == complete
+    assert ("the budget ended" in found.sentence) != complete

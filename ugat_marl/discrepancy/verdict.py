@@ -64,10 +64,7 @@ def conclude(
     """
     best = selection.best
     if not best.model.members:
-        sentence = (
-            "Simulation and measurement disagree, and no effect of the library explains it; "
-            "the first places below say where to look."
-        )
+        sentence = _unexplained(selection) + "; the first places below say where to look."
         return Conclusion("unknown", best, (), sentence, _look_at(best))
     names = describe_members(best.model.members)
     shrink = verification.shrink if verification.shrink is not None else 0.0
@@ -94,8 +91,17 @@ def conclude(
             else "the budget ended before the rest was examined."
         )
         return Conclusion("partially_explained", best, (), sentence, _look_at(best))
-    sentence = "Simulation and measurement disagree, and no effect of the library explains it."
-    return Conclusion("unknown", best, (), sentence, _look_at(best))
+    return Conclusion("unknown", best, (), _unexplained(selection) + ".", _look_at(best))
+
+
+def _unexplained(selection: Selection) -> str:
+    """That nothing was found, which only a search that came to its end says of the library."""
+    if selection.complete:
+        return "Simulation and measurement disagree, and no effect of the library explains it"
+    return (
+        "Simulation and measurement disagree; the budget ended before the library was examined, "
+        "and nothing so far explains it"
+    )
 
 
 def _rivals(selection: Selection, selector: Selector, alpha: float) -> tuple[Fitted, ...]:
