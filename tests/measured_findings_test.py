@@ -198,6 +198,17 @@ def test_a_clock_set_ahead_leaves_a_hole(read: Read) -> None:
     assert all("no detector says anything for 30 min" in text for text in findings)
 
 
+def test_a_short_hole_shows_where_it_was_busy(read: Read) -> None:
+    def without(begin: float, end: float) -> list[str]:
+        hole = (pl.col("time_s") > begin) & (pl.col("time_s") < end)
+        found = read(changes={"detections": lambda f: f.filter(~hole)})[1]
+        return [text for text in found if "no detector says anything" in text]
+
+    assert len(without(3000, 3300)) == 3
+    assert not without(3000, 3120), "a red may last that long"
+    assert not without(0, 300), "the streets may have been empty before"
+
+
 def test_a_few_rows_outside_of_their_period_are_left_out(read: Read) -> None:
     def outside(frame: pl.DataFrame) -> pl.DataFrame:
         extra = frame.head(4).with_columns(pl.col("time_s") + END)

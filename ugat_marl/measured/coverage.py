@@ -19,6 +19,8 @@ SILENT_S = 1800.0
 """A detector that says nothing for longer, while others on its road count, is probably off."""
 ALL_SILENT_S = 600.0
 """So is the whole recording where no detector says anything for this long."""
+HOLE_S = 180.0
+"""And a busy one where they say nothing for longer than a signal cycle."""
 BUSY = 20
 """Passages of its neighbours in that time that make a silent detector stand out."""
 EXPECTED = 10.0
@@ -262,8 +264,9 @@ def _of_silence(measured: Measured) -> Iterator[Finding]:
                 yield Finding(f"detections: nothing in period {period.id!r}")
             continue
         times = {name: _times(period, name) for name in period.passages}
-        begin, length = _longest_gap(np.concatenate(list(times.values())), period)
-        if length > ALL_SILENT_S:
+        together = np.concatenate(list(times.values()))
+        begin, length = _longest_gap(together, period)
+        if length > ALL_SILENT_S or _is_hole(together, begin, length):
             yield Finding(
                 f"detections: no detector says anything for {length / 60:.0f} min from {begin:g} s "
                 f"on in period {period.id!r}; was the recording interrupted, or a clock set ahead?"
@@ -271,6 +274,14 @@ def _of_silence(measured: Measured) -> Iterator[Finding]:
             continue
         for group in roads.values():
             yield from _silent(group, times, period, usual)
+
+
+def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> bool:
+    """Whether a silence is longer than a cycle and as long before and after it was busy."""
+    end_s = begin_s + length_s
+    before = int(((times > begin_s - length_s) & (times <= begin_s)).sum()) // 2
+    after = int(((times >= end_s) & (times < end_s + length_s)).sum()) // 2
+    return length_s > HOLE_S and min(before, after) >= BUSY
 
 
 def _usual_rates(measured: Measured) -> dict[str, float]:
