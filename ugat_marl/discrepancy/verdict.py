@@ -65,7 +65,7 @@ def conclude(
     best = selection.best
     if not best.model.members:
         sentence = _unexplained(selection) + "; the first places below say where to look."
-        return Conclusion("unknown", best, (), sentence, _look_at(best))
+        return Conclusion("unknown", best, (), sentence, _look_at(selection))
     names = describe_members(best.model.members)
     shrink = verification.shrink if verification.shrink is not None else 0.0
     chance_only = verification.after.p > alpha and best.residual.p > FIT_LEVEL
@@ -90,8 +90,8 @@ def conclude(
             if selection.complete
             else "the budget ended before the rest was examined."
         )
-        return Conclusion("partially_explained", best, (), sentence, _look_at(best))
-    return Conclusion("unknown", best, (), _unexplained(selection) + ".", _look_at(best))
+        return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
+    return Conclusion("unknown", best, (), _unexplained(selection) + ".", _look_at(selection))
 
 
 def _unexplained(selection: Selection) -> str:
@@ -99,8 +99,8 @@ def _unexplained(selection: Selection) -> str:
     if selection.complete:
         return "Simulation and measurement disagree, and no effect of the library explains it"
     return (
-        "Simulation and measurement disagree; the budget ended before the library was examined, "
-        "and nothing so far explains it"
+        "Simulation and measurement disagree; the budget ended before all effects were examined, "
+        "and none so far explains it"
     )
 
 
@@ -127,9 +127,11 @@ def _kinds(members: Members) -> set[str]:
     return {hypothesis.name for hypothesis, _ in members}
 
 
-def _look_at(best: Tested) -> str:
-    """The regime in which most is left."""
-    z = best.model.distance.z["network"][0]
+def _look_at(selection: Selection) -> str | None:
+    """The regime in which most is left; as long as more time may explain it, no measurement."""
+    if not selection.complete:
+        return None
+    z = selection.best.model.distance.z["network"][0]
     strongest = [FEATURES[int(i)][:2] for i in np.argsort(-np.abs(z))[:3] if z[int(i)]]
     listed = ", ".join(f"{name} ({regime})" for name, regime in strongest)
     return f"trajectories or video where most is left over: {listed}"
