@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -241,7 +242,17 @@ def test_detectors_may_measure_no_speeds(data: Path) -> None:
     assert np.isnan(np.concatenate(lengths)).all()
 
 
-@pytest.mark.parametrize("wrong", [{"periods": 0}, {"seed": -1}, {"detector_length_m": -1.0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"periods": 0},
+        {"seed": -1},
+        {"detector_length_m": -1.0},
+        {"detector_length_m": math.nan},
+        {"workers": 0},
+        {"workers": -2},
+    ],
+)
 def test_impossible_requests_are_refused(data: Path, wrong: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match="must"):
         measure(data / "crossing", **wrong)

@@ -9,6 +9,7 @@ shows only in the vehicles.
 from __future__ import annotations
 
 import concurrent.futures
+import math
 import os
 import tempfile
 import threading
@@ -124,15 +125,16 @@ def record(
         reporter: Shows progress.
 
     Raises:
-        OptionError: Not a number of periods, or an impossible length.
+        OptionError: Not a number of periods or workers, or an impossible length.
         UnknownNameError: No such domain, effect or detector.
         ScenarioError: The scenario cannot be simulated.
         SimulatorError: SUMO failed.
     """
-    if periods < 1 or detector_length_m < 0 or seed < 0:
+    if periods < 1 or (workers is not None and workers < 1):
+        raise OptionError(f"periods = {periods} and workers = {workers} must be at least 1")
+    if seed < 0 or not 0 <= detector_length_m < math.inf:
         raise OptionError(
-            f"periods = {periods} must be at least 1, detector_length_m = {detector_length_m:g} "
-            f"and seed = {seed} must not be negative"
+            f"detector_length_m = {detector_length_m:g} and seed = {seed} must be 0 or more"
         )
     if duration_s is not None:
         scenario = scenario.with_duration(duration_s)
