@@ -369,7 +369,7 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
     "period without demand": ({"periods.csv": replaced("200.0", "900")}, r"demand from 0 s to 200"),
     "unknown split": ({"periods.csv": replaced("heldout", "test")}, r"'test' is unknown"),
     "split for some": ({"periods.csv": replaced("heldout", "")}, r"no split, though others"),
-    "all held out": ({"periods.csv": replaced("fit", "heldout", 9)}, r"all 3 periods are held out"),
+    "all held out": ({"periods.csv": replaced("fit", "heldout", 9)}, r"every period is held out"),
     "no periods": ({"periods.csv": lambda text: text.split("\n")[0] + "\n"}, r"no periods"),
     "empty file": ({"periods.csv": lambda _: ""}, r"empty"),
     "unknown traffic light": ({"signals.csv": replaced(",C,", ",D,")}, r"'D' is no traffic light"),

@@ -97,8 +97,7 @@ def _splits(path: Path, frame: pl.DataFrame) -> tuple[Split, ...]:
     splits = split_periods(len(given)) if given.null_count() else tuple(given.to_list())
     if "fit" not in splits:
         raise MeasuredDataError(
-            f"{path}: all {len(splits)} periods are held out, none is left to fit; "
-            "write split = fit for some"
+            f"{path}: every period is held out, none is left to fit; write split = fit for some"
         )
     return splits
 
