@@ -113,8 +113,8 @@ def test_the_command_writes_the_gap_and_keeps_the_rest(
 
 def test_the_page_shows_the_gap_and_keeps_its_commands(tmp_path: Path) -> None:
     folder = diagnosed(
-        tmp_path / "found", seed=0, alpha=0.05, budget_s=600.0, sentence="It is so.", effects=[], heldout=None,
-        periods={"fit": ["day1"], "heldout": []}, versions={},
+        tmp_path / "found", seed=0, alpha=0.05, budget_s=600.0, sentence="It is so.", effects=[],
+        heldout=None, periods={"fit": ["day1"], "heldout": []}, versions={},
     )  # fmt: skip
     call = ["policy-gap", "single-v1", str(folder), "--real", "V4", "--policies", "fixed-time:30"]
     call += ["--seeds", "1", "--duration-s", "60"]
