@@ -11,9 +11,10 @@ import pytest
 
 from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, INDEX, Tally, tally
 from ugat_marl.discrepancy.hypotheses import Hypothesis, library
-from ugat_marl.discrepancy.local import Proposer, Routes
+from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.site import Site, SiteLane
 from ugat_marl.discrepancy.statistics import Pools, Reference
+from ugat_marl.discrepancy.volume import Routes
 from ugat_marl.effects import Domain, load, parse_domain
 from ugat_marl.effects.detectors import observed
 from ugat_marl.measured.data import Detector, DetectorKind, Passages, Period
@@ -54,6 +55,16 @@ ROUTES = Routes(
     {
         f"{arm}_in": {f"{to}_out": rate * share for to, share in LEAVING[arm].items()}
         for arm, rate in RATE_PER_HOUR.items()
+    },
+    {
+        f"{arm}_in": {f"{arm}_in": rate}
+        | {f"{to}_out": rate * share for to, share in LEAVING[arm].items()}
+        for arm, rate in RATE_PER_HOUR.items()
+    }
+    | {
+        f"{to}_out": {f"{to}_out": sum(RATE_PER_HOUR[a] * LEAVING[a].get(to, 0.0) for a in ARMS)}
+        | {f"{arm}_in": RATE_PER_HOUR[arm] * LEAVING[arm][to] for arm in ARMS if to in LEAVING[arm]}
+        for to in ARMS
     },
 )
 LOG = tuple(
@@ -275,7 +286,7 @@ def test_the_traffic_light_that_starts_late() -> None:
         return Tally(sums, np.zeros((len(BIN_FEATURES), 4, 1)))
 
     reference = Reference(Pools.of(site), [day(seed, 0.0) for seed in range(50)])
-    proposer = Proposer(site, Routes({}, {}, {}), {"late_green", "signal_clock"})
+    proposer = Proposer(site, Routes({}, {}, {}, {}), {"late_green", "signal_clock"})
     distance = reference.distance([day(100 + seed, 1.5) for seed in range(5)])
     found = proposer.hypotheses(reference, distance, [replace(street(1), passages={})])
     for name in ("late_green", "signal_clock"):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import io
+import itertools
 import os
 import time
 import zipfile
@@ -22,13 +24,13 @@ from ugat_marl.discrepancy.replay import Day, Replay
 from ugat_marl.discrepancy.site import Greens, Site
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
-from ugat_marl.errors import UgatMarlError
+from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
 from ugat_marl.files import write_whole
 from ugat_marl.measured.data import Period
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
 
-VERSION = 2
+VERSION = 3
 """Of features and replays: a tally remembered under another version is not used."""
 
 _KEPT_DAYS = 40
@@ -66,6 +68,9 @@ class Engine:
         workers: Simulations at a time; default: one per core.
     """
 
+    set_aside: frozenset[int] = frozenset()
+    """Numbers of days that `first` passes over."""
+
     def __init__(
         self,
         scenario: Scenario,
@@ -93,9 +98,19 @@ class Engine:
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._signals = [_signals_hash(period) for period in periods]
 
+    @property
+    def known(self) -> int:
+        """Number of simulated days that are known by now, those of earlier runs included."""
+        return len(self._known)
+
     def measured(self, periods: Sequence[Period]) -> list[Tally]:
         """Tallies of measured periods."""
         return [tally(self.site, period, self.site.greens(period)) for period in periods]
+
+    def first(self, count: int) -> list[int]:
+        """The numbers of the first days; those that were set aside are passed over."""
+        numbers = (number for number in itertools.count() if number not in self.set_aside)
+        return list(itertools.islice(numbers, count))
 
     def replicates(
         self,
@@ -125,6 +140,42 @@ class Engine:
             futures = [pool.submit(one, number) for number in numbers]
             try:
                 return [future.result() for future in futures]
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+
+    def prepare(
+        self,
+        models: Sequence[tuple[Sequence[Effect], Sequence[int]]],
+        advance: Callable[[], None] | None = None,
+    ) -> None:
+        """Simulates days of many models at once, so that no core waits for the end of each model.
+
+        What SUMO refuses is left for `replicates` to report.
+
+        Args:
+            models: Effects and numbers of days.
+            advance: Called after each model.
+
+        Raises:
+            OutOfTime: The deadline has passed.
+        """
+
+        def one(effects: Sequence[Effect], number: int) -> None:
+            with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
+                self._one(tuple(effects), number)
+
+        with ThreadPoolExecutor(self._workers) as pool:
+            futures = [
+                [pool.submit(one, effects, number) for number in numbers]
+                for effects, numbers in models
+            ]
+            try:
+                for days in futures:
+                    for day in days:
+                        day.result()
+                    if advance is not None:
+                        advance()
             except BaseException:
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise

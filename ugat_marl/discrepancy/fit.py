@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ugat_marl.discrepancy.engine import Engine
 from ugat_marl.discrepancy.features import Tally
 from ugat_marl.discrepancy.hypotheses import WINDOW, Hypothesis, ordered
-from ugat_marl.discrepancy.statistics import Distance, Pools, Reference, shift, without_noise
+from ugat_marl.discrepancy.statistics import Distance, Pools, Reference, shift, shrunk
 from ugat_marl.discrepancy.whitening import Whitener
 from ugat_marl.effects import EVERYWHERE, Effect
 
@@ -23,8 +23,16 @@ Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
 WIDE = ("network", "intersection")
 """Blocks that effects on the whole network are fitted to: single lanes add more noise than they
 tell of them."""
-WINDOW_STEPS_S = (60.0, 30.0)
+WINDOW_STEPS_S = (120.0, 60.0, 30.0)
+WINDOW_DAYS = 4
 SHORTEST_S = 60.0
+SETTLING_DAYS = 16
+NEARBY, FAR = 0.2, 0.9
+"""Shares of its distance from nominal by which a value is moved for a derivative."""
+PLAIN = 10.0
+"""Standard deviations that such a move is meant to make."""
+NEAR = 0.2
+"""Standard errors by which a value may be off."""
 INTERPOLATION = 0.02
 """Share of a measured difference that a model is forgiven while it is fitted: simulation steps
 round what the street does not."""
@@ -105,7 +113,7 @@ class Fitter:
     def simulate(self, members: Members, days: int | None = None) -> Fitted:
         """Simulates a set of effects and measures its distance from the data."""
         count = min(days or self.days, len(self.base_tallies))
-        found = self.engine.replicates(effects_of(members), range(count), self.tick)
+        found = self.engine.replicates(effects_of(members), self.engine.first(count), self.tick)
         tallies = tuple(item.tally for item in found)
         reference = Reference(
             self.pools,
@@ -148,6 +156,23 @@ class Fitter:
                 break
         return best
 
+    def settled(self, model: Fitted, errors: Array) -> Fitted:
+        """A last step with more days: the search stops as soon as it hardly gains any more.
+
+        Args:
+            model: The model.
+            errors: Standard errors of its free values.
+        """
+        if not len(model.values):
+            return model
+        precise = self.simulate(model.members, SETTLING_DAYS)
+        whitener = self.whitener(precise)
+        step = _solve(self.jacobian(model, whitener), whitener.measured)
+        if (np.abs(step) <= NEAR * errors).all():
+            return precise
+        moved = self.simulate(self._moved(precise, step), SETTLING_DAYS)
+        return moved if moved.cost < precise.cost else precise
+
     def fitted(self, start: Fitted) -> Fitted:
         """The best values, and the best window where there is one."""
         best = self.refine(start)
@@ -157,14 +182,27 @@ class Fitter:
         return best
 
     def _windows(self, best: Fitted) -> Fitted:
-        """Moves begin and end, together and alone, in ever smaller steps while that helps."""
+        """Moves begin and end in ever smaller steps, and on as long as that helps.
+
+        The same few days before and after a move tell whether it helps.
+        """
+        members = best.members
+        cost = self.simulate(members, WINDOW_DAYS).cost
         for step in WINDOW_STEPS_S:
-            for move in ((-step, -step), (-step, 0.0), (0.0, -step), (0.0, step), (step, 0.0)):
-                members = tuple((_shifted(h, move), values) for h, values in best.members)
-                found = self.simulate(members)
-                if found.cost < best.cost - 1.0:
-                    best = found
-        return best
+            for direction in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                while True:
+                    move = (step * direction[0], step * direction[1])
+                    moved = tuple((_shifted(h, move), values) for h, values in members)
+                    if moved == members:
+                        break
+                    found = self.simulate(moved, WINDOW_DAYS).cost
+                    if found >= cost - 1.0:
+                        break
+                    members, cost = moved, found
+        if members == best.members:
+            return best
+        found = self.simulate(members)
+        return found if found.cost < best.cost else best
 
     def whitener(self, model: Fitted) -> Whitener:
         """Residuals of a model: on all lanes and minutes only if an effect has a place."""
@@ -179,25 +217,37 @@ class Fitter:
 
     def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
         """Derivatives of the whitened statistics, ``(free values, statistics)``."""
-        rows = [
-            whitener(without_noise(change, noise)) / delta
-            for change, noise, delta in self.changes(model)
-        ]
-        return np.stack(rows)
+        return np.stack([whitener(change) / delta for change, delta in self.changes(model)])
 
-    def changes(self, model: Fitted) -> list[tuple[dict[str, Array], dict[str, Array], float]]:
-        """For every free value: what moving it does to the statistics, the noise, how far."""
-        found: list[tuple[dict[str, Array], dict[str, Array], float]] = []
+    def changes(self, model: Fitted) -> list[tuple[dict[str, Array], float]]:
+        """For every free value: what moving it does to the statistics, and how far it was moved.
+
+        It is moved so far that what this does is more than chance.
+        """
+        whitener = self.whitener(model)
+        found: list[tuple[dict[str, Array], float]] = []
         for place, (hypothesis, values) in enumerate(model.members):
             for index in range(len(values)):
-                moved = _moved_a_little(hypothesis, values, index)
-                members = _replaced(model.members, place, moved)
-                days = self.engine.replicates(
-                    effects_of(members), range(len(model.tallies)), self.tick
-                )
-                change, noise = shift(self.pools, [day.tally for day in days], model.tallies)
-                found.append((change, noise, (moved[index] - values[index]) or 1.0))
+                change, delta = self._change(model, place, index, NEARBY)
+                errors = float(np.linalg.norm(whitener(change)))
+                if errors < PLAIN and not hypothesis.step:
+                    share = min(NEARBY * PLAIN / max(errors, 1e-9), FAR)
+                    change, delta = self._change(model, place, index, share)
+                found.append((change, delta))
         return found
+
+    def _change(
+        self, model: Fitted, place: int, index: int, share: float
+    ) -> tuple[dict[str, Array], float]:
+        """What moving one value by a share of its distance from nominal does; how far it went."""
+        hypothesis, values = model.members[place]
+        before = model.tallies[: self.days]
+        moved = _moved_a_little(hypothesis, values, index, share)
+        members = _replaced(model.members, place, moved)
+        numbers = self.engine.first(len(before))
+        days = self.engine.replicates(effects_of(members), numbers, self.tick)
+        change, noise = shift(self.pools, [day.tally for day in days], before)
+        return shrunk(change, noise), (moved[index] - values[index]) or 1.0
 
     def _moved(self, model: Fitted, step: Array) -> Members:
         """The model's values after a step, in range and not too far at once."""
@@ -215,11 +265,11 @@ class Fitter:
 
 
 def _moved_a_little(
-    hypothesis: Hypothesis, values: tuple[float, ...], index: int
+    hypothesis: Hypothesis, values: tuple[float, ...], index: int, share: float
 ) -> tuple[float, ...]:
     """The values with one of them moved for a derivative, to the side that is in range."""
     nominal = hypothesis.nominal[index] if hypothesis.nominal else 0.0
-    delta = max(0.12 * abs(values[index] - nominal), hypothesis.least, 1e-3)
+    delta = max(share * abs(values[index] - nominal), hypothesis.least, 1e-3)
     changed = list(values)
     changed[index] += hypothesis.step or delta
     moved = hypothesis.clipped(changed)
@@ -255,12 +305,17 @@ def _solve(jacobian: Array, residual: Array) -> Array:
 
 
 def uncertainty(
-    fitter: Fitter, model: Fitted, inflation: float = 1.0
+    fitter: Fitter, model: Fitted, days: Sequence[Tally] = ()
 ) -> tuple[Array, dict[str, Array]]:
     """Standard errors of the free values, and what they make uncertain in the statistics.
 
     The parts of the distance depend on each other, so the errors come from how much the estimate
     would move between simulated days (a sandwich estimate), not from the curvature alone.
+
+    Args:
+        fitter: Simulates.
+        model: The model.
+        days: Simulated days of it, the more the better; none for those it was fitted with.
 
     Returns:
         Standard errors ``(free values,)``, and variances of the expected statistics per block.
@@ -273,15 +328,18 @@ def uncertainty(
     jacobian = fitter.jacobian(model, whitener)
     inverse = np.linalg.pinv(jacobian @ jacobian.T)
     influences: list[Array] = []
-    for item in model.tallies:
-        difference, _ = shift(fitter.pools, [item], model.tallies)
+    days = days or model.tallies
+    for item in days:
+        difference, _ = shift(fitter.pools, [item], days)
         influences.append(inverse @ (jacobian @ whitener(difference)))
     spread = np.atleast_2d(np.cov(np.stack(influences).T))
-    covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies)) * inflation
+    covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies))
+    grids = np.array([h.step for h, values in model.members for _ in values])
+    covariance += np.diag(grids**2 / 12.0)
     extra: dict[str, Array] = {}
     changes = fitter.changes(model)
     for name, block in model.reference.blocks.items():
-        slopes = np.stack([change[name] / delta for change, _, delta in changes])
+        slopes = np.stack([change[name] / delta for change, delta in changes])
         extra[name] = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes) + 0.0 * block.mean
         extra[name] = np.nan_to_num(extra[name])
     return np.sqrt(np.diag(covariance)), extra

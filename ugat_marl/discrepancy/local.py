@@ -1,15 +1,14 @@
 """Proposes effects at places and in windows: by what is left over there, before any simulation.
 
-Counts tell where demand and turning differ, since routes say which detectors a change would reach.
-Time tells windows: the stretch of minutes in which a place departs most from the model, found by a
-scan over all stretches. Detectors tell their own faults.
+Counts tell where demand and turning differ: see `volume`. Time tells windows: the stretch of
+minutes in which a place departs most from the model, found by a scan over all stretches. Detectors
+tell their own faults.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,52 +20,14 @@ from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Distance, Reference
 from ugat_marl.discrepancy.stretches import (
     SCAN_S,
-    largest_stretch,
+    largest_stretches,
     most_unusual,
     occupied_between,
 )
+from ugat_marl.discrepancy.volume import Routes, Volume
 from ugat_marl.measured.data import Passages, Period
-from ugat_marl.redraw import explicit
-from ugat_marl.scenario import Scenario
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Routes:
-    """Which edges vehicles use: per pair of edges, vehicles per hour of the scenario.
-
-    Attributes:
-        origins: Vehicles per hour by first edge.
-        passing: ``passing[origin][edge]``, vehicles per hour that start there and pass here.
-        turns: ``turns[edge][next edge]``, vehicles per hour.
-    """
-
-    origins: dict[str, float]
-    passing: dict[str, dict[str, float]]
-    turns: dict[str, dict[str, float]]
-
-    @classmethod
-    def of(cls, scenario: Scenario) -> Routes:
-        """Counts the routes of all vehicles."""
-        origins: dict[str, float] = defaultdict(float)
-        passing: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-        turns: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-        rate = 3600.0 / scenario.settings.duration_s
-        for document in explicit(scenario).routes:
-            for item in document.parse().iter("route"):
-                edges = item.get("edges", "").split()
-                if edges:
-                    origins[edges[0]] += rate
-                    for edge in dict.fromkeys(edges):
-                        passing[edges[0]][edge] += rate
-                    for edge, following in zip(edges, edges[1:], strict=False):
-                        turns[edge][following] += rate
-        return cls(
-            dict(origins),
-            {k: dict(v) for k, v in passing.items()},
-            {k: dict(v) for k, v in turns.items()},
-        )
 
 
 class Proposer:
@@ -83,6 +44,7 @@ class Proposer:
         self._routes = routes
         self._allowed = frozenset(allowed)
         self._edges = [edge for _, edge, _ in site.places]
+        self._volume = Volume(site, routes)
 
     def hypotheses(
         self, reference: Reference, distance: Distance, periods: Sequence[Period]
@@ -95,105 +57,15 @@ class Proposer:
             periods: The data.
         """
         found: list[Hypothesis] = []
-        found += self._demand(distance)
-        found += self._turning(distance)
+        found += self._volume.hypotheses(distance)
         found += self._windows(reference, periods)
         found += self._places(reference, distance)
         found += fault_hypotheses(self._site, reference, distance, periods)
         return [item for item in found if item.name in self._allowed]
 
-    # --- volume -------------------------------------------------------------------------------
-
-    def _edge_counts(self, distance: Distance) -> tuple[list[str], Array, Array]:
-        """Per edge: measured minus expected vehicles per hour, and its standard error."""
-        hour = 60.0
-        lanes = len(self._site.lanes)
-        names: list[str] = []
-        differences: list[float] = []
-        errors: list[float] = []
-        for edge in dict.fromkeys(self._edges):
-            members = [i for i, name in enumerate(self._edges) if name == edge]
-            kinds = ("count_stop", "count_advance") if members[0] < lanes else ("count_exit",)
-            for kind in kinds:
-                row = INDEX[kind]
-                difference = distance.difference["lane"][members, row]
-                z = distance.z["lane"][members, row]
-                known = (difference != 0) & (z != 0)
-                if known.any():
-                    names.append(edge)
-                    differences.append(hour * float(difference.sum()))
-                    error = np.abs(difference[known] / z[known])
-                    errors.append(hour * float(np.sqrt((error**2).sum())))
-                    break
-        return names, np.array(differences), np.array(errors)
-
     def directed(self, distance: Distance) -> dict[str, float]:
-        """What the best origin and the best turn would explain: few counts, but the right ones."""
-        counts = self._edge_counts(distance)
-        return {
-            "demand": max((item[0] for item in self._origins(*counts)), default=0.0),
-            "turning": max((item[0] for item in self._turns(*counts)), default=0.0),
-            "window": largest_stretch(self._edges, distance),
-        }
-
-    def _demand(self, distance: Distance) -> list[Hypothesis]:
-        ranked = sorted(self._origins(*self._edge_counts(distance)), reverse=True)
-        return [
-            Hypothesis(
-                "demand_level", (("edge", origin),), ("factor",),
-                ((float(np.clip(factor, 0.3, 3.0)),),), (1.0,), 0.03, both=True,
-            )
-            for gain, origin, factor in ranked[:2]
-            if gain > 9.0 and len(self._routes.passing) > 1
-        ]  # fmt: skip
-
-    def _origins(
-        self, edges: Sequence[str], difference: Array, error: Array
-    ) -> list[tuple[float, str, float]]:
-        """Gain, origin and factor of every origin, by its ray of counts."""
-        measured = difference / np.maximum(error, 1e-9)
-        found: list[tuple[float, str, float]] = []
-        for origin, reached in self._routes.passing.items():
-            ray = np.array([reached.get(edge, 0.0) for edge in edges]) / np.maximum(error, 1e-9)
-            size = float(ray @ ray)
-            if size > 9.0:
-                strength = float(ray @ measured) / size
-                found.append((strength**2 * size, origin, 1.0 + strength))
-        return found
-
-    def _turning(self, distance: Distance) -> list[Hypothesis]:
-        ranked = sorted(self._turns(*self._edge_counts(distance)), reverse=True)
-        return [
-            Hypothesis(
-                "turning", (("from_edge", origin), ("to_edge", target)), ("share",),
-                ((share,),), (0.0,), 0.03,
-            )
-            for gain, origin, target, share in ranked[:2]
-            if gain > 9.0
-        ]  # fmt: skip
-
-    def _turns(
-        self, edges: Sequence[str], difference: Array, error: Array
-    ) -> list[tuple[float, str, str, float]]:
-        """Gain, edges and share of every pair of edges between which vehicles may move."""
-        place = {edge: index for index, edge in enumerate(edges)}
-        measured = difference / np.maximum(error, 1e-9)
-        found: list[tuple[float, str, str, float]] = []
-        approaches = {lane.edge for lane in self._site.lanes}
-        for origin in sorted(approaches & set(self._routes.turns)):
-            leaving = self._routes.turns[origin]
-            for target in leaving:
-                ray = np.zeros(len(edges))
-                for other, rate in leaving.items():
-                    change = sum(leaving.values()) - rate if other == target else -rate
-                    if other in place:
-                        ray[place[other]] += change
-                ray = ray / np.maximum(error, 1e-9)
-                size = float(ray @ ray)
-                share = float(ray @ measured) / size if size > 4.0 else 0.0
-                if share > 0.02:
-                    found.append((share**2 * size, origin, target, min(share, 0.9)))
-        return found
+        """What the best origin, turn and stretch would explain: few counts, but the right ones."""
+        return self._volume.directed(distance) | largest_stretches(self._edges, distance)
 
     # --- time ---------------------------------------------------------------------------------
 
@@ -212,17 +84,17 @@ class Proposer:
                 surge = Hypothesis("demand_surge", fixed, ("factor",), ((level,),), (1.0,), 0.1)
                 found.append((z, surge))
         for index, lane in enumerate(self._site.lanes):
-            window = self._scan(reference, periods, [index], "occupied", "occupied")
-            other = self._scan(reference, periods, [index], "count_stop", "count_advance")
-            for option in (window, other):
+            # What comes after a closure, the queue that is let go, is more unusual than itself.
+            for kind, side in (("occupied", 1), ("count_stop", -1), ("count_advance", -1)):
+                option = self._scan(reference, periods, [index], kind, kind, side)
                 if option is not None:
                     z, begin, end, _ = option
                     fixed = (("lane", lane.id), ("begin_s", begin), ("end_s", end))
                     found.append((z, Hypothesis("lane_closure", fixed, (), ((),), None)))
         found.sort(key=lambda item: -item[0])
         chosen: list[Hypothesis] = []
-        for kind, most in (("demand_surge", 2), ("lane_closure", 3)):
-            chosen += [item for _, item in found if item.name == kind][:most]
+        for kind, most in (("demand_surge", 2), ("lane_closure", 4)):
+            chosen += list(dict.fromkeys(item for _, item in found if item.name == kind))[:most]
         return chosen
 
     def _scan(
@@ -232,6 +104,7 @@ class Proposer:
         members: Sequence[int],
         kind: str,
         other: str,
+        side: int = 0,
     ) -> tuple[float, float, float, float] | None:
         """The stretch in which counts depart most from their ratio over the rest of the period.
 
@@ -256,7 +129,7 @@ class Proposer:
         expected = (block.mean[rows].sum(axis=0) / np.maximum(per_bin, 1))[which]
         variance = (block.variance[rows].sum(axis=0) / np.maximum(per_bin, 1))[which] / len(periods)
         measured = self._minutes(periods, members, kind, other, minutes)
-        return most_unusual(measured, expected, variance, begin)
+        return most_unusual(measured, expected, variance, begin, side)
 
     def _minutes(
         self, periods: Sequence[Period], members: Sequence[int], kind: str, other: str, minutes: int

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ugat_marl.effects import detector_effects
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
 from ugat_marl.effects.signals import late_greens
@@ -54,7 +55,7 @@ class Replay:
     """Simulates a scenario with effects under measured signals.
 
     Args:
-        scenario: The scenario without any effect.
+        scenario: The scenario as it is, with the effects of its own file.
         network: Its network.
         detectors: What is measured.
         owner: Detector to its traffic light.
@@ -71,6 +72,7 @@ class Replay:
         self._network = network
         self._detectors = tuple(detectors)
         self._owner = dict(owner)
+        self._own = detector_effects(scenario)
         self._days: OrderedDict[int, Scenario] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -92,7 +94,7 @@ class Replay:
             directory = Path(name)
             day = self._run(scenario, period, seed, directory)
         seen = day.period
-        for effect in effects:
+        for effect in (*self._own, *effects):
             if isinstance(effect, DetectorEffect):
                 seen = effect.observe(seen, self._detectors, self._owner)
         return Day(_logged(seen), day.travel_time_s)

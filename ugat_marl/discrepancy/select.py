@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ugat_marl.discrepancy.engine import OutOfTime
 from ugat_marl.discrepancy.features import Tally
 from ugat_marl.discrepancy.fit import WIDE, Fitted, Fitter, Members, effects_of, uncertainty
 from ugat_marl.discrepancy.hypotheses import Hypothesis, settings_as_members
 from ugat_marl.discrepancy.local import Proposer
+from ugat_marl.discrepancy.matched import Directions
 from ugat_marl.discrepancy.residual import Null, Residual
 from ugat_marl.discrepancy.search import Proposal, Ray, between, propose
 from ugat_marl.discrepancy.statistics import Array, shift
@@ -34,8 +35,8 @@ _MOST = 0.25
 """Places and windows are looked at if effects on the whole network would leave more than this."""
 _LITTLE = 2.0
 """Distance per statistic of the network below which nothing is to be seen in the pool."""
-_HOPELESS = 4.0
-"""Candidates so many times as far away as the best one are not fitted."""
+_HOPEFUL = 0.6
+"""Candidates that take off less than this share of what the best one does are not fitted."""
 _HUGE = 20.0
 """Distances per statistic beyond which several effects at once are likely from the start."""
 _FORESIGHT = 0.05
@@ -56,7 +57,7 @@ class Effort:
     base: int = 60
     bank: int = 3
     fit: int = 6
-    test: int = 48
+    test: int = 36
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,7 @@ class Selector:
         periods: Sequence[Period],
         effort: Effort,
         alpha: float,
-        null: Callable[[Sequence[Tally], int], Null],
+        null: Callable[[Sequence[Tally], int, Directions], Null],
         reporter: Reporter,
     ) -> None:
         self._fitter = fitter
@@ -128,6 +129,18 @@ class Selector:
         self._reporter = reporter
         self._first = fitter.base.distance(fitter.data)
         self._seen: dict[str, Fitted] = {}
+        self._rays: tuple[Ray, ...] = ()
+
+    def looked_closer(self, base: Tested) -> Tested:
+        """The test of the scenario as it is once it is known where single effects would show.
+
+        Raises:
+            OutOfTime: The budget does not suffice for that.
+        """
+        self._rays = tuple(self._bank(base.model, self._library, 0))
+        data = self._fitter.data
+        null = self._null(base.model.tallies, len(data), Directions(self._rays))
+        return replace(base, null=null, residual=null.test(data))
 
     def select(self, base: Tested) -> Selection:
         """The search, from the scenario as it is."""
@@ -153,14 +166,19 @@ class Selector:
     def test(self, model: Fitted) -> Tested:
         """Simulates more days of a model and tests what it leaves."""
         fitter = self._fitter
-        errors, extra = uncertainty(fitter, model)
+        model = self._kept(fitter.settled(model, uncertainty(fitter, model)[0]))
+        days = self._days(model)
+        errors, extra = uncertainty(fitter, model, days)
         for name, difference in self._first.difference.items():
             extra[name] = extra[name] + (TOLERANCE * difference) ** 2
-        null = self._null(self._days(model), len(fitter.data))
+        fitted = tuple(change for change, _ in fitter.changes(model))
+        directions = Directions(self._rays, extra, fitted)
+        null = self._null(days, len(fitter.data), directions)
         return Tested(model, null, null.test(fitter.data, extra), errors, extra)
 
     def _days(self, model: Fitted) -> list[Tally]:
-        found = self._fitter.engine.replicates(model.effects, range(self._effort.test))
+        engine = self._fitter.engine
+        found = engine.replicates(model.effects, engine.first(self._effort.test))
         return [item.tally for item in found]
 
     def _untested(self, model: Fitted, base: Tested) -> Tested:
@@ -172,7 +190,9 @@ class Selector:
 
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Adds, changes or removes effects; None if nothing is worth it."""
-        rays = between(self._bank(start.model, self._library, number))
+        bank = self._bank(start.model, self._library, number)
+        self._rays = self._rays or tuple(bank)
+        rays = between(bank)
         whitener = self._whitener(start.model, WIDE)
         gap = float(whitener.measured @ whitener.measured)
         chance = float(len(whitener.measured))
@@ -186,7 +206,7 @@ class Selector:
             chosen += settings_as_members(self._library)
         chosen = list(dict.fromkeys(chosen))
         tried = self._tried(start.model, chosen, f"round {number + 1}: candidates")
-        best = self._refined(tried, CANDIDATES_FITTED)
+        best = self._refined(tried, CANDIDATES_FITTED, start.model.cost)
         if best is None or best.cost >= start.model.cost - self._fitter.price:
             return None
         return self.test(best)
@@ -227,21 +247,21 @@ class Selector:
                 jobs += _changes(hypothesis, values)
         days = self._effort.bank if number == 0 else 3
         rays: list[Ray] = []
+        engine = self._fitter.engine
         before = model.tallies[:days]
+        numbers = engine.first(len(before))
+        models = [effects_of(_merged(model.members, ((h, level),))) for h, level, _ in jobs]
         with self._reporter.task(f"round {number + 1}: {what}", len(jobs)) as advance:
-            for hypothesis, level, origin in jobs:
-                members = _merged(model.members, ((hypothesis, level),))
-                try:
-                    found = self._fitter.engine.replicates(effects_of(members), range(len(before)))
-                except (SimulatorError, OptionError, ScenarioError) as error:
-                    # it cannot be there: the lane is too short to park on, say
-                    self._reporter.say(f"note: {hypothesis.name} left out: {error}")
-                    continue
-                difference, variance = shift(
-                    self._fitter.pools, [item.tally for item in found], before
-                )
-                rays.append(Ray(hypothesis, level, difference, variance, origin))
-                advance(note=hypothesis.name)
+            engine.prepare([(effects, numbers) for effects in models], advance)
+        for (hypothesis, level, origin), effects in zip(jobs, models, strict=True):
+            try:
+                found = engine.replicates(effects, numbers)
+            except (SimulatorError, OptionError, ScenarioError) as error:
+                # it cannot be there: the lane is too short to park on, say
+                self._reporter.say(f"note: {hypothesis.name} left out: {error}")
+                continue
+            difference, variance = shift(self._fitter.pools, [item.tally for item in found], before)
+            rays.append(Ray(hypothesis, level, difference, variance, origin))
         return rays
 
     def _tried(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
@@ -258,16 +278,17 @@ class Selector:
                 advance(note=_names(members))
         return found
 
-    def _refined(self, models: Sequence[Fitted], count: int) -> Fitted | None:
+    def _refined(self, models: Sequence[Fitted], count: int, gap: float) -> Fitted | None:
         """The best of several models once the most promising are fitted."""
         ranked = sorted(models, key=lambda item: item.cost)[:count]
-        ranked = [item for item in ranked if item.cost < _HOPELESS * ranked[0].cost]
+        best: Fitted | None = None
         with self._reporter.task("fitting", len(ranked)) as advance:
-            found: list[Fitted] = []
             for model in ranked:
-                found.append(self._kept(self._fitter.fitted(model)))
+                if best is None or gap - model.cost > _HOPEFUL * (gap - best.cost):
+                    found = self._kept(self._fitter.fitted(model))
+                    best = found if best is None or found.cost < best.cost else best
                 advance(note=_names(model.members))
-        return min(found, key=lambda item: item.cost, default=None)
+        return best
 
     def _kept(self, model: Fitted) -> Fitted:
         """Remembers the best of every set of effects."""

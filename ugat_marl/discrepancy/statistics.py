@@ -30,6 +30,9 @@ SINGLE = ("lane", "time")
 there are chance: those are left as they were."""
 CERTAIN = 6.0
 """Squared standardised difference beyond which one is not chance."""
+LOCKED_UP = 5.0
+"""Robust standard deviations by which a day's counts are those of no ordinary day."""
+RARE = 0.05
 SOFT = {"network": np.inf, "intersection": np.inf, "lane": 5.0, "time": 4.0}
 """Standardised differences beyond this count less: queues reach a place or they do not, and single
 lanes and minutes have heavy tails."""
@@ -217,14 +220,18 @@ class Reference:
             mean = np.where(np.isfinite(block.mean), block.mean, other.mean)
             difference[name] = np.where(used, value - mean, 0.0)
             z[name] = difference[name] / np.sqrt(variance)
-            soft = SOFT[name]
-            counted = soft * np.arcsinh(z[name] / soft) if soft < np.inf else z[name]
-            parts[name] = _mahalanobis(counted, used, other.correlation)
+            parts[name] = _mahalanobis(softened(name, z[name]), used, other.correlation)
             total += parts[name]
             if relative_to:
                 ratio = np.log(np.maximum(variance, 1e-12) / (other.variance / len(data)))
                 penalty += float(ratio[used].sum())
         return Distance(total, parts, penalty, z, difference)
+
+
+def softened(block: str, z: Array) -> Array:
+    """Standardised differences as they count: those of single places less, the larger they are."""
+    soft = SOFT[block]
+    return soft * np.arcsinh(z / soft) if soft < np.inf else z
 
 
 def _stack(pools: Pools, tallies: Sequence[Tally]) -> dict[str, Array]:
@@ -239,6 +246,18 @@ def added(tallies: Sequence[Tally]) -> Tally:
     for item in tallies[1:]:
         total = total + item
     return total
+
+
+def locked_up(tallies: Sequence[Tally]) -> list[int]:
+    """Places of the few days on which traffic came to a standstill and on others did not.
+
+    One of them widens the noise of everything. Where they are common they are part of the model.
+    """
+    counts = np.array([item.bins[:3].sum() for item in tallies])
+    middle = np.median(counts)
+    spread = 1.4826 * np.median(np.abs(counts - middle)) + 1e-9
+    found = np.flatnonzero(np.abs(counts - middle) > LOCKED_UP * spread)
+    return found.tolist() if len(found) <= RARE * len(tallies) else []
 
 
 def _smoothed(mean: Array, variance: Array) -> Array:
@@ -334,6 +353,19 @@ def shift(
         spread = ((left - right) ** 2).sum(axis=0) / max(days - 1, 1)
         variance[name] = np.nan_to_num(spread / days, nan=np.inf)
     return difference, variance
+
+
+def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> dict[str, Array]:
+    """Differences drawn towards 0 by what may be chance in them.
+
+    A derivative that holds chance points everywhere a little, which makes a fit timid and its
+    errors too small.
+    """
+    found: dict[str, Array] = {}
+    for name, values in difference.items():
+        squared = np.maximum(values**2, 1e-300)
+        found[name] = values * np.maximum(1.0 - CERTAIN * variance[name] / squared, 0.0)
+    return found
 
 
 def without_noise(

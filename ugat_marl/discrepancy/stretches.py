@@ -17,8 +17,8 @@ _COUNTS = 3
 """Kinds of counts in time that are counts of vehicles; they come first."""
 
 
-def largest_stretch(edges: Sequence[str], distance: Distance) -> float:
-    """The largest squared departure of an edge's counts over any stretch of bins.
+def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, float]:
+    """The largest squared departure over any stretch of bins: of an edge's counts, of a lane's.
 
     Args:
         edges: Edge of every place.
@@ -26,25 +26,43 @@ def largest_stretch(edges: Sequence[str], distance: Distance) -> float:
     """
     z, difference = distance.z["time"], distance.difference["time"]
     variance = np.where(z != 0, (difference / np.where(z != 0, z, 1.0)) ** 2, 0.0)
-    largest = 0.0
     places = len(edges)
-    for edge in dict.fromkeys(edges):
-        members = [index for index, name in enumerate(edges) if name == edge]
-        for kind in range(_COUNTS):
-            rows = [kind * places + index for index in members]
-            sums = np.concatenate(([0.0], np.cumsum(difference[rows].sum(axis=0))))
-            noise = np.concatenate(([0.0], np.cumsum(variance[rows].sum(axis=0))))
-            for length in range(1, len(sums)):
-                part = noise[length:] - noise[:-length]
-                squared = (sums[length:] - sums[:-length]) ** 2 / np.maximum(part, 1e-9)
-                largest = max(largest, float(np.where(part > 0, squared, 0.0).max()))
+    groups = [
+        [kind * places + index for index, name in enumerate(edges) if name == edge]
+        for edge in dict.fromkeys(edges)
+        for kind in range(_COUNTS)
+    ]
+    of_edges = np.stack([difference[rows].sum(axis=0) for rows in groups])
+    noise = np.stack([variance[rows].sum(axis=0) for rows in groups])
+    return {"window": _largest(of_edges, noise), "lane window": _largest(difference, variance)}
+
+
+def _largest(difference: Array, variance: Array) -> float:
+    """Over all rows and all stretches of bins; both ``(rows, bins)``."""
+    sums, noise = (
+        np.concatenate((np.zeros((len(item), 1)), np.cumsum(item, axis=1)), axis=1)
+        for item in (difference, variance)
+    )
+    largest = 0.0
+    for length in range(1, sums.shape[1]):
+        part = noise[:, length:] - noise[:, :-length]
+        squared = (sums[:, length:] - sums[:, :-length]) ** 2 / np.maximum(part, 1e-9)
+        largest = max(largest, float(np.where(part > 0, squared, 0.0).max()))
     return largest
 
 
 def most_unusual(
-    measured: Array, expected: Array, variance: Array, begin_s: float
+    measured: Array, expected: Array, variance: Array, begin_s: float, side: int = 0
 ) -> tuple[float, float, float, float] | None:
-    """Scans all stretches for the largest standardised departure from a constant ratio."""
+    """Scans all stretches for the largest standardised departure from a constant ratio.
+
+    Args:
+        measured: Per minute.
+        expected: Per minute.
+        variance: Of what is expected, per minute.
+        begin_s: Of the first minute.
+        side: -1 or 1 for departures to that side only.
+    """
     minutes = len(measured)
     if expected.sum() <= 0 or minutes * SCAN_S <= SHORTEST_S:
         return None
@@ -58,10 +76,11 @@ def most_unusual(
         share = inside[1] / np.maximum(sums[1][-1] - inside[1], 1e-9)
         noise = np.sqrt(np.maximum(inside[2] * (1 + share), 1e-6))
         z = excess / noise
-        place = int(np.argmax(np.abs(z)))
-        if best is None or abs(z[place]) > best[0]:
+        size = side * z if side else np.abs(z)
+        place = int(np.argmax(size))
+        if best is None or size[place] > best[0]:
             ratio = float(inside[0][place] / max(rest[place] * inside[1][place], 1e-9))
-            best = (float(abs(z[place])), place, place + length, ratio)
+            best = (float(size[place]), place, place + length, ratio)
     if best is None or best[0] < 4.0:
         return None
     z, first, last, ratio = best

@@ -15,14 +15,16 @@ from ugat_marl.discrepancy.engine import Engine, default_cache
 from ugat_marl.discrepancy.features import Tally
 from ugat_marl.discrepancy.fit import Fitted, Fitter
 from ugat_marl.discrepancy.hypotheses import Hypothesis, global_hypotheses, library
-from ugat_marl.discrepancy.local import Proposer, Routes
+from ugat_marl.discrepancy.local import Proposer
+from ugat_marl.discrepancy.matched import Directions
 from ugat_marl.discrepancy.replay import Replay
 from ugat_marl.discrepancy.residual import Null
 from ugat_marl.discrepancy.select import Effort, Selector, Tested
 from ugat_marl.discrepancy.site import Site
-from ugat_marl.discrepancy.statistics import Pools, Reference, added
+from ugat_marl.discrepancy.statistics import Distance, Pools, Reference, added, locked_up
+from ugat_marl.discrepancy.volume import Routes
 from ugat_marl.errors import MeasuredDataError, OptionError
-from ugat_marl.measured.data import Measured, Period
+from ugat_marl.measured.data import Detector, Measured, Period
 from ugat_marl.network import Network
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Scenario
@@ -107,13 +109,14 @@ class Study:
             MeasuredDataError: The data hold nothing to compare.
         """
         network = Network.read(scenario)
-        site = Site.of(network, measured.detectors)
+        detectors = heard(measured)
+        site = Site.of(network, detectors)
         ruled_out = frozenset(name for item in measured.findings for name in item.rules_out)
         allowed = library(config.leave_out) - ruled_out
         periods = measured.of("fit")
         if not periods:
             raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
-        replay = Replay(scenario, network, measured.detectors, site.owner)
+        replay = Replay(scenario, network, detectors, site.owner)
         engine = Engine(
             scenario,
             site,
@@ -155,7 +158,9 @@ class Study:
         """
         with reporter.task("the scenario as it is", self.effort.base) as advance:
             days = self.engine.replicates([], range(self.effort.base), advance)
-        tallies = tuple(day.tally for day in days)
+        aside = locked_up([day.tally for day in days])
+        self.engine.set_aside = frozenset(aside)
+        tallies = tuple(day.tally for number, day in enumerate(days) if number not in aside)
         reference = Reference(self.pools, tallies, speeds=self.speeds)
         counts = sum(float(day.bins[:3].sum()) for day in tallies) / len(tallies)
         if counts < 1.0:
@@ -168,11 +173,25 @@ class Study:
         null = self.null(tallies, len(self.fit))
         return Tested(model, null, null.test(self.fit), np.empty(0), {})
 
-    def null(self, tallies: Sequence[Tally], periods: int) -> Null:
-        """What chance makes of a model's own days, seen as far as the data see."""
+    def null(
+        self, tallies: Sequence[Tally], periods: int, directions: Directions | None = None
+    ) -> Null:
+        """What chance makes of a model's own days, seen as far as the data see.
+
+        Args:
+            tallies: The model's days.
+            periods: Periods in a data set.
+            directions: Where single effects would show; None to look at the whole only.
+        """
         data = added(self.fit).sums[..., 1] > 0
         seen = [Tally(day.sums * data[..., None], day.bins, day.days) for day in tallies]
-        directed = self.proposer.directed
+        reference = Reference(self.pools, seen, speeds=self.speeds)
+        filters = {} if directions is None else directions.filters(reference, self.fit)
+
+        def directed(distance: Distance) -> dict[str, float]:
+            found = self.proposer.directed(distance)
+            return found | {name: matched(distance) for name, matched in filters.items()}
+
         return Null(self.pools, seen, periods, speeds=self.speeds, directed=directed)
 
     @functools.cached_property
@@ -202,6 +221,18 @@ class Study:
             self.null,
             reporter,
         )
+
+
+def heard(measured: Measured) -> tuple[Detector, ...]:
+    """The detectors to compare: if half of them never saw anything, only the others.
+
+    So many are missing from the recording, and silence is no count of zero.
+    """
+    if not measured.has_events:
+        return measured.detectors
+    seen = {x for period in measured.periods for x, item in period.passages.items() if len(item)}
+    found = tuple(item for item in measured.detectors if item.id in seen)
+    return found if found and 2 * len(found) <= len(measured.detectors) else measured.detectors
 
 
 def _tallies(

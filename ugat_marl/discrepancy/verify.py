@@ -13,6 +13,7 @@ from ugat_marl.discrepancy.residual import Null, Residual
 from ugat_marl.discrepancy.select import Tested
 from ugat_marl.discrepancy.statistics import Array, Reference, added
 from ugat_marl.discrepancy.study import Study
+from ugat_marl.effects import Effect
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ def verify(study: Study, base: Tested, best: Tested) -> Verification:
     def null(model: Tested) -> Null:
         days = model.model.tallies
         if model.model.members:
-            found = study.engine.replicates(model.model.effects, range(study.effort.test))
+            numbers = study.engine.first(study.effort.test)
+            found = study.engine.replicates(model.model.effects, numbers)
             days = tuple(day.tally for day in found)
         return study.null(days, count)
 
@@ -176,14 +178,10 @@ def travel_times(study: Study, best: Tested) -> dict[str, float]:
 
     Detectors do not know travel times, so the measured one has no place here.
     """
+    numbers = study.engine.first(min(study.effort.test, study.effort.base))
 
-    def mean(model: Tested, count: int) -> float:
-        found = study.engine.replicates(model.model.effects, range(count))
+    def mean(effects: tuple[Effect, ...]) -> float:
+        found = study.engine.replicates(effects, numbers)
         return float(np.nanmean([day.travel_time_s for day in found]))
 
-    count = min(study.effort.test, study.effort.base)
-    before = study.engine.replicates((), range(count))
-    return {
-        "before_s": float(np.nanmean([day.travel_time_s for day in before])),
-        "after_s": mean(best, count),
-    }
+    return {"before_s": mean(()), "after_s": mean(best.model.effects)}

@@ -15,7 +15,7 @@ from typing import Any
 from ugat_marl.discrepancy.engine import OutOfTime
 from ugat_marl.discrepancy.fit import Fitted
 from ugat_marl.discrepancy.locate import Disagreement, locate
-from ugat_marl.discrepancy.select import Selection, Tested
+from ugat_marl.discrepancy.select import Selection, Selector, Tested
 from ugat_marl.discrepancy.signal_timing import timing_effects
 from ugat_marl.discrepancy.study import DiagnosisConfig, Study
 from ugat_marl.discrepancy.verdict import Conclusion, conclude, effect_record
@@ -74,10 +74,7 @@ def diagnose(
     except OutOfTime:
         record = _nothing_simulated(study, timing)
     else:
-        if base.residual.p > config.alpha:
-            record = _nothing(study, base, timing)
-        else:
-            record = _search(study, base, where(study, base), timing, reporter)
+        record = _compared(study, base, timing, reporter)
     effects = record.pop("_effects")
     record |= _head(study)
     record["corrected"] = CORRECTED if effects else None
@@ -91,6 +88,23 @@ def diagnose(
     text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
     write_whole(directory / FILE, text + "\n")
     return json.loads(text)
+
+
+def _compared(
+    study: Study, base: Tested, timing: tuple[Effect, ...], reporter: Reporter
+) -> dict[str, Any]:
+    """The record, once the scenario as it is has been simulated."""
+    alpha = study.config.alpha
+    selector = study.selector(base, reporter)
+    complete = True
+    if base.residual.p > alpha:
+        try:
+            base = selector.looked_closer(base)
+        except OutOfTime:
+            complete = False
+    if base.residual.p > alpha:
+        return _nothing(study, base, timing, complete)
+    return _search(study, base, selector, timing, reporter)
 
 
 def where(study: Study, model: Tested) -> list[Disagreement]:
@@ -107,7 +121,9 @@ def corrected(scenario: Scenario, effects: tuple[Effect, ...], directory: Path) 
     return apply_effects(scenario, effects).write(directory)
 
 
-def _nothing(study: Study, base: Tested, timing: tuple[Effect, ...]) -> dict[str, Any]:
+def _nothing(
+    study: Study, base: Tested, timing: tuple[Effect, ...], complete: bool
+) -> dict[str, Any]:
     """The record where the scenario as it is could have made the data."""
     verification = verify(study, base, base)
     ruled = f"; {len(study.ruled_out)} effects could not be examined" if study.ruled_out else ""
@@ -115,6 +131,8 @@ def _nothing(study: Study, base: Tested, timing: tuple[Effect, ...]) -> dict[str
     if timing:
         named = " and ".join(map(str, timing))
         sentence = f"The signal log has {named}; with that, nothing contradicts the scenario."
+    if not complete:
+        sentence += " The budget ended before single effects were looked for."
     return {
         "verdict": "explained" if timing else "no_discrepancy",
         "sentence": sentence,
@@ -126,7 +144,7 @@ def _nothing(study: Study, base: Tested, timing: tuple[Effect, ...]) -> dict[str
         "evidence": {"p_fit": base.residual.p, "p_fit_after": base.residual.p},
         "best": None,
         "next_measurement": None,
-        "complete": True,
+        "complete": complete,
         **_tables(study, base, base),
         "_effects": timing,
     }
@@ -134,7 +152,7 @@ def _nothing(study: Study, base: Tested, timing: tuple[Effect, ...]) -> dict[str
 
 def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> dict[str, Any]:
     """The record of a budget that does not suffice for the scenario as it is."""
-    done = study.engine.simulated
+    done = study.engine.known
     return {
         "verdict": "unknown",
         "sentence": (
@@ -158,12 +176,12 @@ def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> dict[str, An
 def _search(
     study: Study,
     base: Tested,
-    located: list[Disagreement],
+    selector: Selector,
     timing: tuple[Effect, ...],
     reporter: Reporter,
 ) -> dict[str, Any]:
     """The record where the scenario as it is could not have made the data."""
-    selector = study.selector(base, reporter)
+    located = where(study, base)
     selection = selector.select(base)
     try:
         verification = verify(study, base, selection.best)
