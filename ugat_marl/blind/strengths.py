@@ -14,7 +14,7 @@ from typing import Literal
 from ugat_marl.scenario import Scenario
 
 Strength = Literal["small", "medium", "large"]
-COUNTED = 5.0
+COUNTED = 6.0
 """A medium change of counts is at least so many standard errors of what is counted."""
 COUNTED_HOURS = 3.0
 """Hours that are counted: the fitted ones of five periods of an hour."""

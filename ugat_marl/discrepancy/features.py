@@ -76,6 +76,13 @@ SPEED_FEATURES = frozenset(
         "free_fast", "red_speed", "red_slow", "vehicle_length", "long_vehicles",
     }
 )  # fmt: skip
+EVENT_FEATURES = frozenset(
+    {
+        "gap_short", "gap_long", "platoon_short", "platoon_middle", "free_fast", "red_slow",
+        "yellow_crossings", "late_crossings", "red_crossings", "long_vehicles", "queue_over",
+    }
+)  # fmt: skip
+"""Features that count how often something happens, which may be hardly ever."""
 BIN_FEATURES = ("count_advance", "count_stop", "count_exit", "occupied")
 BIN_S = 300.0
 

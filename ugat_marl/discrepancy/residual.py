@@ -19,6 +19,9 @@ from ugat_marl.discrepancy.statistics import Distance, Pools, Reference
 
 Array = NDArray[np.float64]
 
+Directed = Callable[[Distance], Mapping[str, float]]
+"""Statistics of a distance."""
+
 _DRAWS = 40
 ONE_DAY = 0.25
 """Chance above which data without some day are nothing unusual."""
@@ -52,7 +55,9 @@ class Null:
         tallies: Simulated days of the model.
         periods: Periods in a data set.
         speeds: Whether speeds were measured.
-        directed: Further statistics of a distance, which small local effects move most.
+        directed: Makes further statistics of a distance, which small effects move most, for the
+            model whose distance it is. It is made anew for each half: what was adapted to the days
+            it judges would find them more usual than others.
     """
 
     def __init__(
@@ -62,20 +67,21 @@ class Null:
         periods: int,
         *,
         speeds: bool,
-        directed: Callable[[Distance], Mapping[str, float]] | None = None,
+        directed: Callable[[Reference], Directed] | None = None,
     ) -> None:
         generator = np.random.default_rng(7)
-        self._directed = directed
         self.reference = Reference(pools, tallies, speeds=speeds)
+        self._directed = directed(self.reference) if directed else None
         draws: dict[str, list[float]] = {}
         for half in (0, 1):
             model = Reference(pools, tallies[half::2], speeds=speeds)
+            own = directed(model) if directed else None
             others = tallies[1 - half :: 2]
             size = min(periods, max(len(others) - 1, 1))
             for _ in range(_DRAWS):
                 chosen = generator.choice(len(others), size, replace=False)
                 found = model.distance([others[int(i)] for i in chosen])
-                for name, value in self._statistics(found).items():
+                for name, value in _statistics(found, own).items():
                     draws.setdefault(name, []).append(value)
                 draws.setdefault("total", []).append(found.total)
         self._moments = {name: _log_moments(values) for name, values in draws.items()}
@@ -103,7 +109,7 @@ class Null:
         return replace(found, p=max(without)) if max(without) > ONE_DAY else found
 
     def _judge(self, found: Distance) -> Residual:
-        values = self._statistics(found)
+        values = _statistics(found, self._directed)
         chances = {name: self._chance(name, value) for name, value in values.items()}
         smallest = min(chances.values())
         return Residual(
@@ -113,15 +119,6 @@ class Null:
             min(1.0, smallest * len(chances)),
             chances,
         )
-
-    def _statistics(self, found: Distance) -> dict[str, float]:
-        """What is tested: the distance of every block, its largest part, and what is directed."""
-        values = dict(found.parts)
-        for name in ("lane", "time"):
-            values[f"{name}, largest"] = float(np.abs(found.z[name]).max(initial=0.0)) ** 2
-        if self._directed is not None:
-            values |= self._directed(found)
-        return {name: value + 1.0 for name, value in values.items()}
 
     def quantile(self, share: float) -> float:
         """What this share of data sets of the model stay below, in total."""
@@ -133,6 +130,16 @@ class Null:
         """Upper tail of a log-normal distribution, heavier than that of a chi-square."""
         mean, deviation = self._moments[name]
         return 0.5 * math.erfc((math.log(max(value, 1e-9)) - mean) / (deviation * math.sqrt(2)))
+
+
+def _statistics(found: Distance, directed: Directed | None) -> dict[str, float]:
+    """What is tested: the distance of every block, its largest part, and what is directed."""
+    values = dict(found.parts)
+    for name in ("lane", "time"):
+        values[f"{name}, largest"] = float(np.abs(found.z[name]).max(initial=0.0)) ** 2
+    if directed is not None:
+        values |= directed(found)
+    return {name: value + 1.0 for name, value in values.items()}
 
 
 def _log_moments(values: Sequence[float]) -> tuple[float, float]:

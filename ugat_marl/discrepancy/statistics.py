@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.discrepancy.features import FEATURES, SPEED_FEATURES, Tally
+from ugat_marl.discrepancy.features import EVENT_FEATURES, FEATURES, SPEED_FEATURES, Tally
 from ugat_marl.discrepancy.site import Site
 
 Array = NDArray[np.float64]
@@ -25,6 +25,8 @@ MIN_OBSERVATIONS = 3.0
 """Observations per period below which a mean is not used."""
 _GRAIN = 0.3
 """A mean is not known better than to this much of a unit in one observation."""
+_EVENT = 1.0
+"""What hardly ever happens is not known better than to one event in a period."""
 SINGLE = ("lane", "time")
 """Blocks with so many statistics of single lanes and minutes that most of an effect's differences
 there are chance: those are left as they were."""
@@ -273,7 +275,7 @@ def _moments(sums: Array) -> tuple[Array, Array, Array, Array]:
     mean = total[..., 0] / np.maximum(total[..., 1], 1e-9)
     residual = (sums[..., 0] - mean * sums[..., 1]) / np.maximum(weight, 1e-9)
     variance = (residual**2).sum(axis=0) / max(len(sums) - 1, 1)
-    grain = (_GRAIN / np.maximum(weight, 1.0)) ** 2
+    grain = (_grain(sums.shape[2]) / np.maximum(weight, 1.0)) ** 2
     mean = np.where(weight > 0, mean, np.nan)
     return mean, np.maximum(variance, grain), weight, residual
 
@@ -299,6 +301,14 @@ def _controlled(
     shift = np.where(slope > 0, slope * (before - prior.mean), 0.0)
     error = np.maximum(left, 0.1 * variance) / days + slope**2 * prior.error
     return mean - shift, error
+
+
+@functools.cache
+def _grain(width: int) -> Array:
+    """The smallest sum that is known to be one, for every feature, or bin of time."""
+    if width != len(FEATURES):
+        return np.full(width, _GRAIN)
+    return np.array([_EVENT if name in EVENT_FEATURES else _GRAIN for name, _, _ in FEATURES])
 
 
 @functools.cache

@@ -18,7 +18,7 @@ from ugat_marl.discrepancy.hypotheses import Hypothesis, global_hypotheses, libr
 from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.matched import Directions
 from ugat_marl.discrepancy.replay import Replay
-from ugat_marl.discrepancy.residual import Null
+from ugat_marl.discrepancy.residual import Directed, Null
 from ugat_marl.discrepancy.select import Effort, Selector, Tested
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Distance, Pools, Reference, added, locked_up
@@ -185,12 +185,15 @@ class Study:
         """
         data = added(self.fit).sums[..., 1] > 0
         seen = [Tally(day.sums * data[..., None], day.bins, day.days) for day in tallies]
-        reference = Reference(self.pools, seen, speeds=self.speeds)
-        filters = {} if directions is None else directions.filters(reference, self.fit)
 
-        def directed(distance: Distance) -> dict[str, float]:
-            found = self.proposer.directed(distance)
-            return found | {name: matched(distance) for name, matched in filters.items()}
+        def directed(reference: Reference) -> Directed:
+            filters = {} if directions is None else directions.filters(reference, self.fit)
+
+            def statistics(distance: Distance) -> dict[str, float]:
+                found = self.proposer.directed(distance)
+                return found | {name: matched(distance) for name, matched in filters.items()}
+
+            return statistics
 
         return Null(self.pools, seen, periods, speeds=self.speeds, directed=directed)
 

@@ -155,7 +155,7 @@ def _of_kinds(measured: Measured, network: Network) -> Iterator[Finding]:
         many = 2 * len(silent) >= len(measured.detectors)
         yield Finding(
             f"detections: nothing of {_list('detector', silent)}, of {len(measured.detectors)}"
-            + ("; what happens there, or whether they are broken, stays unknown" if many else ""),
+            + ("; they are not used, and what happens there stays unknown" if many else ""),
             ("dropout", "swapped", "undercount") if many else (),
         )
     kinds = {item.kind for item in measured.detectors if item.id in seen}
