@@ -24,6 +24,8 @@ TURN_PER_HOUR = 60.0
 """A turn to which vehicles are diverted is already taken by so many."""
 BUSY_PER_HOUR = 120.0
 """What an origin, a detector or a lane needs to count as busy."""
+YIELDING_PER_HOUR = 200.0
+"""A turn that shows how drivers yield: fewer find their gap, or the green that protects them."""
 LONG_M = 50.0
 """A lane to close or to park on is at least so long."""
 
@@ -96,7 +98,7 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         edges=tuple(sorted({network.lanes[x].edge for x in lanes})),
         detectors=tuple(item.id for item in detectors if rates.get(item.id, 0.0) >= BUSY_PER_HOUR),
         pairs=_pairs(detectors, rates, network),
-        permitted=any(turns[way] >= BUSY_PER_HOUR for way in _yielding(network)),
+        permitted=any(turns[way] >= YIELDING_PER_HOUR for way in _yielding(network)),
         several_lanes=any(cars[edge] > 1 for edge in approaches),
     )
 

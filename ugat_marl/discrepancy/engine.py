@@ -30,7 +30,7 @@ from ugat_marl.measured.data import Period
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
 
-VERSION = 3
+VERSION = 4
 """Of features and replays: a tally remembered under another version is not used."""
 
 _KEPT_DAYS = 40

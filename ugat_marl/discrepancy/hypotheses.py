@@ -139,8 +139,8 @@ def library(without: Collection[str] = ()) -> frozenset[str]:
     """
     names = frozenset(_GLOBAL) | LOCAL | {"driver_model"}
     for name in without:
-        if name not in names:
-            raise UnknownNameError("effect of the library", name, names)
+        if name not in known_effects():
+            raise UnknownNameError("effect of the library", name, known_effects())
     return names - frozenset(without)
 
 

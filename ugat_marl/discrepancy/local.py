@@ -29,6 +29,13 @@ from ugat_marl.measured.data import Passages, Period
 
 Array = NDArray[np.float64]
 
+_DWELL_S = 40.0
+_FLOW = (
+    "gap_long", "occupied_in_green", "gap9+", "free_speed", "queue_over", "platoon_gap",
+    "count_advance", "count_stop",
+)  # fmt: skip
+_AVOIDED = ("count_advance", "count_stop")
+
 
 class Proposer:
     """Finds places and windows.
@@ -166,25 +173,11 @@ class Proposer:
         """Lanes for parking, edges for slow roads, traffic lights for lost time and clocks."""
         found: list[Hypothesis] = []
         lanes = self._site.lanes
-        z = distance.z["lane"][: len(lanes)]
-        flow = [
-            INDEX[name]
-            for name in (
-                "gap_long",
-                "occupied_in_green",
-                "gap9+",
-                "free_speed",
-                "queue_over",
-                "platoon_gap",
-            )
-        ]
-        unusual = np.abs(np.clip(z[:, flow], -15, 15)).sum(axis=1)
-        for index in np.argsort(-unusual)[:2]:
-            found += [
-                Hypothesis("parking", (("lane", lanes[int(index)].id), ("dwell_s", dwell)),
-                           ("per_hour",), ((20.0,),), (0.0,), 3.0)
-                for dwell in (40.0,)
-            ]  # fmt: skip
+        found += [
+            Hypothesis("parking", (("lane", lane), ("dwell_s", _DWELL_S)), ("per_hour",),
+                       ((20.0,),), (0.0,), 3.0)
+            for lane in self._disturbed(distance)
+        ]  # fmt: skip
         speed = distance.z["lane"][: len(lanes), INDEX["free_speed"]]
         by_edge: dict[str, float] = defaultdict(float)
         for lane, value in zip(lanes, speed, strict=True):
@@ -206,6 +199,23 @@ class Proposer:
             ]
         if len(self._site.intersections) > 1:
             found += self._traffic_lights(distance)
+        return found
+
+    def _disturbed(self, distance: Distance) -> list[str]:
+        """Lanes on which something may stand: traffic does not flow there, or avoids the lane."""
+        lanes = self._site.lanes
+        z = np.clip(distance.z["lane"][: len(lanes)], -15, 15)
+        unusual = np.abs(z[:, [INDEX[name] for name in _FLOW]]).sum(axis=1)
+        fewer = z[:, [INDEX[name] for name in _AVOIDED]].sum(axis=1)
+        by_edge: dict[str, list[int]] = defaultdict(list)
+        for index, lane in enumerate(lanes):
+            by_edge[lane.edge].append(index)
+        edges = sorted(by_edge.values(), key=lambda members: -max(unusual[members]))
+        found: list[str] = []
+        for members in edges[:2]:
+            avoided = sorted(members, key=lambda index: fewer[index])[:1]
+            stuck = sorted(members, key=lambda index: -unusual[index])[:1]
+            found += [lanes[index].id for index in dict.fromkeys((*avoided, *stuck))]
         return found
 
     def _speed_ratio(self, reference: Reference, distance: Distance, edge: str) -> float:

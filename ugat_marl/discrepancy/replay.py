@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ugat_marl.effects import detector_effects
+from ugat_marl.effects import detector_effects, parked_at_other_times
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
 from ugat_marl.effects.signals import late_greens
@@ -29,6 +29,7 @@ from ugat_marl.measured.pairing import as_logged
 from ugat_marl.network import Network
 from ugat_marl.redraw import explicit, redrawn, sumo_program
 from ugat_marl.scenario import Document, Scenario
+from ugat_marl.seeding import derive_seed
 from ugat_marl.signals import delayed_log
 from ugat_marl.simulator import launch_of, one_line, read_trips
 
@@ -90,6 +91,7 @@ class Replay:
         scenario = self._day(seed)
         for effect in effects:
             scenario = effect.apply(scenario)
+        scenario = parked_at_other_times(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)
             day = self._run(scenario, period, seed, directory)

@@ -68,7 +68,8 @@ def diagnose(
     study = Study.of(scenario, measured, config)
     for item in measured.findings:
         reporter.say(f"note: {item.text}")
-    timing = timing_effects(scenario, study.network, measured)
+    read = timing_effects(scenario, study.network, measured)
+    timing = tuple(effect for effect in read if effect.name not in config.leave_out)
     try:
         base = study.base(reporter)
     except OutOfTime:

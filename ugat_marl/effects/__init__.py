@@ -18,7 +18,7 @@ from ugat_marl.effects.detectors import (
     owners,
 )
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
-from ugat_marl.effects.roads import LaneClosure, LocalSpeed, Parking
+from ugat_marl.effects.roads import LaneClosure, LocalSpeed, Parking, parked_at_other_times
 from ugat_marl.effects.settings import (
     ALIASES,
     SETTINGS,
@@ -103,6 +103,7 @@ __all__ = [
     "load",
     "observed",
     "owners",
+    "parked_at_other_times",
     "parse_domain",
     "scenario_of",
 ]

@@ -14,14 +14,17 @@ from itertools import chain, count
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, Parameter, Text, draw
-from ugat_marl.effects.documents import seconds_text
+from ugat_marl.effects.documents import seconds_text, sort_departures
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import OptionError
 from ugat_marl.files import xml_bytes
 from ugat_marl.scenario import Document, Scenario
+from ugat_marl.seeding import numpy_generator
 
 _LENGTH_M = 5.0
 _LAST_M = 60.0
+_PARKED = b"parking."
+"""How the ids of vehicles that park begin."""
 _TIME = Parameter("s", 0.0, 1e7)
 
 
@@ -117,6 +120,28 @@ class LocalSpeed(Effect):
         return replace(
             scenario, additional=(*others, document), applied=(*scenario.applied, str(self))
         )
+
+
+def parked_at_other_times(scenario: Scenario, seed: int) -> Scenario:
+    """The day with the vehicles of `Parking` at other times, which are turned about the day.
+
+    Nobody parks at the same second every day, and a model that says so expects a pattern in time.
+    """
+    begin, duration = scenario.settings.begin_s, scenario.settings.duration_s
+    shift = numpy_generator(seed).uniform(0, duration)
+
+    def later(document: Document) -> Document:
+        if _PARKED not in document.read():
+            return document
+        root = document.parse()
+        parked = [x for x in root.iter("vehicle") if x.get("id", "").startswith(_PARKED.decode())]
+        for item in parked:
+            time = (float(item.get("depart", "0")) - begin + shift) % duration
+            item.set("depart", f"{begin + time:.2f}")
+        sort_departures(root)
+        return document.edited(xml_bytes(root))
+
+    return replace(scenario, routes=tuple(map(later, scenario.routes)))
 
 
 def _with_blockers(

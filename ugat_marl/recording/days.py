@@ -26,14 +26,13 @@ from ugat_marl.effects import (
     apply_effects,
     detector_effects,
     in_domain,
+    parked_at_other_times,
     parse_domain,
     scenario_of,
 )
 from ugat_marl.effects.detectors import observed, owners
-from ugat_marl.effects.documents import sort_departures
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import PolicyFactory
-from ugat_marl.files import xml_bytes
 from ugat_marl.loops import loops_document, read_loops, standard_detectors
 from ugat_marl.measured.data import (
     Detector,
@@ -51,10 +50,7 @@ from ugat_marl.recording.controller import own_programmes, play, switch_document
 from ugat_marl.recording.tracks import per_lane, tracks
 from ugat_marl.redraw import explicit, redrawn
 from ugat_marl.scenario import Document, Scenario
-from ugat_marl.seeding import derive_seed, numpy_generator
-
-PARKED = b"parking."
-"""How the ids of vehicles begin that the effect `parking` adds."""
+from ugat_marl.seeding import derive_seed
 
 
 @dataclass(frozen=True)
@@ -217,7 +213,9 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
         scenario = _renamed(scenario, derive_seed(street.seed, "record", index, "names"))
     scenario = apply_effects(scenario, street.effects)
     if not street.same_demand:
-        scenario = _parked_later(scenario, derive_seed(street.seed, "record", index, "parking"))
+        scenario = parked_at_other_times(
+            scenario, derive_seed(street.seed, "record", index, "parking")
+        )
     begin = scenario.settings.begin_s
     end = begin + scenario.decisions * scenario.control.decision_interval_s
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
@@ -262,25 +260,6 @@ def _renamed(scenario: Scenario, seed: int) -> Scenario:
         return document.edited(content)
 
     return replace(scenario, routes=tuple(map(renamed, scenario.routes)))
-
-
-def _parked_later(scenario: Scenario, seed: int) -> Scenario:
-    """Vehicles that park do so at other times every day: their times are turned about the day."""
-    begin, duration = scenario.settings.begin_s, scenario.settings.duration_s
-    shift = numpy_generator(seed).uniform(0, duration)
-
-    def later(document: Document) -> Document:
-        if PARKED not in document.read():
-            return document
-        root = document.parse()
-        parked = [x for x in root.iter("vehicle") if x.get("id", "").startswith(PARKED.decode())]
-        for item in parked:
-            time = (float(item.get("depart", "0")) - begin + shift) % duration
-            item.set("depart", f"{begin + time:.2f}")
-        sort_departures(root)
-        return document.edited(xml_bytes(root))
-
-    return replace(scenario, routes=tuple(map(later, scenario.routes)))
 
 
 def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scenario:
