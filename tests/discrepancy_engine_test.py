@@ -246,3 +246,72 @@ def test_the_cache_lies_where_caches_lie(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert default_cache() == tmp_path / "ugat_marl" / "replicates"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert default_cache().parts[-3:] == (".cache", "ugat_marl", "replicates")
+
+
+# --- days of many models at once -----------------------------------------------------------------
+
+
+def test_days_that_were_set_aside_are_passed_over(scenario: Scenario, site: Site) -> None:
+    made, _ = an_engine(scenario, site, None)
+    assert made.first(4) == [0, 1, 2, 3]
+    assert made.first(0) == []
+    made.set_aside = frozenset({0, 2, 3})
+    assert made.first(4) == [1, 4, 5, 6]
+    other, _ = an_engine(scenario, site, None)
+    assert other.first(2) == [0, 1], "another engine has days of its own"
+
+
+def test_prepared_days_are_those_that_are_simulated_one_by_one(
+    scenario: Scenario, site: Site
+) -> None:
+    made, streets = an_engine(scenario, site, None)
+    told: list[None] = []
+    models = [(HEADWAY, [0, 1, 2]), ((), [0, 3]), (FAULTY, [0, 3])]
+    made.prepare(models, lambda: told.append(None))
+    assert len(told) == len(models)
+    plain, _ = an_engine(scenario, site, None)
+    calls = len(streets.calls)
+    for effects, numbers in models:
+        one, two = made.replicates(effects, numbers), plain.replicates(effects, numbers)
+        assert all(same(a, b) for a, b in zip(one, two, strict=True))
+    assert len(streets.calls) == calls, "it was simulated again"
+
+
+def test_what_sumo_refuses_is_reported_when_it_is_asked_for(
+    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, streets = an_engine(scenario, site, None)
+    plays = streets.simulate
+
+    def refuses(effects: Sequence[Effect], period: Period, seed: int) -> Day:
+        if effects:
+            raise SimulatorError("SUMO failed")
+        return plays(effects, period, seed)
+
+    monkeypatch.setattr(streets, "simulate", refuses)
+    made.prepare([(HEADWAY, [0, 1]), ((), [0])])
+    assert len(streets.calls) == 1, "the other model was simulated"
+    with pytest.raises(SimulatorError, match="SUMO failed"):
+        made.replicates(HEADWAY, [0, 1])
+
+
+def test_a_mistake_while_days_are_prepared_is_not_swallowed(
+    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, streets = an_engine(scenario, site, None)
+
+    def fails(effects: Sequence[Effect], period: Period, seed: int) -> Day:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(streets, "simulate", fails)
+    with pytest.raises(ZeroDivisionError):
+        made.prepare([((), [0, 1])])
+
+
+def test_no_day_is_prepared_when_time_is_up(scenario: Scenario, site: Site, tmp_path: Path) -> None:
+    an_engine(scenario, site, tmp_path)[0].replicates((), range(2))
+    late, streets = an_engine(scenario, site, tmp_path, deadline=time.monotonic() - 1)
+    late.prepare([((), [0, 1])])
+    with pytest.raises(OutOfTime, match="budget"):
+        late.prepare([((), [0, 1]), (HEADWAY, [0])])
+    assert streets.calls == []
