@@ -35,7 +35,7 @@ _MOST = 0.25
 """Places and windows are looked at if effects on the whole network would leave more than this."""
 _LITTLE = 2.0
 """Distance per statistic of the network below which nothing is to be seen in the pool."""
-_HOPEFUL = 0.6
+_HOPEFUL = 0.9
 """Candidates that take off less than this share of what the best one does are not fitted."""
 _HUGE = 20.0
 """Distances per statistic beyond which several effects at once are likely from the start."""
