@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.engine import Engine, Replicate
 from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, Tally
-from ugat_marl.discrepancy.fit import Fitter, Members, uncertainty
+from ugat_marl.discrepancy.fit import (
+    FAR,
+    NEARBY,
+    SETTLING_DAYS,
+    SHORTEST_S,
+    Fitter,
+    Members,
+    uncertainty,
+)
 from ugat_marl.discrepancy.hypotheses import Hypothesis
 from ugat_marl.discrepancy.statistics import Pools, Reference
 from ugat_marl.effects import Effect
@@ -145,3 +153,128 @@ def test_a_fit_is_deterministic() -> None:
         return fitter.refine(fitter.simulate(start((HEADWAY, 1.2), (GAP, 4.0)))).values
 
     assert (fitted() == fitted()).all()
+
+
+# --- the last step, derivatives and windows ------------------------------------------------------
+
+
+def test_a_fit_that_stopped_early_takes_a_last_step() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=14)
+    early = fitter.simulate(start((HEADWAY, 1.9)))
+    found = fitter.settled(early, np.array([0.03]))
+    assert found.values[0] == pytest.approx(1.43, abs=0.09)  # three standard errors of five days
+    assert found.cost < early.cost
+    assert len(found.tallies) == SETTLING_DAYS > len(early.tallies)
+
+
+def test_a_fit_within_its_errors_stays_where_it_is() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=15)
+    found = fitter.settled(fitter.simulate(start((HEADWAY, 1.46))), np.array([1.0]))
+    assert found.values[0] == 1.46
+    assert len(found.tallies) == SETTLING_DAYS
+    plain = fitter.simulate(())
+    assert fitter.settled(plain, np.empty(0)) is plain
+
+
+def test_a_derivative_is_taken_over_a_move_that_does_something_plain() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=16)
+    model = fitter.simulate(start((HEADWAY, 2.5), (GAP, 3.7)))
+    (strong, far), (weak, farther) = fitter.changes(model)
+    assert far == pytest.approx(NEARBY * 1.5), "a strong effect is moved a little"
+    assert 1.5 * NEARBY * 1.2 < farther <= FAR * 1.2 + 1e-4, "a weak one more"
+    for name, change, delta in (("headway", strong, far), ("min_gap", weak, farther)):
+        assert change["network"][0, :WIDTH] / delta == pytest.approx(SLOPES[name], rel=1e-6)
+
+
+def test_what_does_nothing_is_moved_no_farther_than_nominal() -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    after = (("edge", "a"), ("begin_s", 3600.0), ("end_s", 4200.0))
+    dead = Hypothesis("demand_surge", after, ("factor",), ((1.5,),), (1.0,), 0.05)
+    model = fitter.simulate(start((dead, 1.3)))
+    ((change, delta),) = fitter.changes(model)
+    assert abs(delta) <= FAR * 0.3 + 1e-4
+    assert not change["network"][0].any()
+
+
+class Windows(World):
+    """Every statistic is three minutes of an hour, of which a surge takes some."""
+
+    TRUTH = (900.0, 2400.0)
+
+    def replicates(
+        self,
+        effects: Sequence[Effect],
+        numbers: Sequence[int],
+        advance: Callable[[], None] | None = None,
+    ) -> list[Replicate]:
+        del advance
+        self.asked.append(tuple(map(str, effects)))
+        surges = [effect.record() for effect in effects]
+        change = np.zeros(WIDTH)
+        for item in surges:
+            window = float(item["begin_s"]), float(item["end_s"])
+            change += (float(item["factor"]) - 1.0) * surge(*window)
+        return [Replicate(with_surge(number, change), 60.0) for number in numbers]
+
+
+def surge(begin_s: float, end_s: float) -> Array:
+    """Share of the window in every three minutes, times what a factor of 2 does there."""
+    edges = np.linspace(0.0, 3600.0, WIDTH + 1)
+    return 20.0 * np.clip(
+        np.minimum(edges[1:], end_s) - np.maximum(edges[:-1], begin_s), 0.0, None
+    ) / 180.0  # fmt: skip
+
+
+def with_surge(number: int, change: Array, street: int = 0) -> Tally:
+    plain = day(number, {}, street)
+    plain.sums[:WIDTH, 0, 0] += 100.0 * change
+    return plain
+
+
+def a_surge(begin_s: float, end_s: float) -> Members:
+    fixed = (("edge", "a"), ("begin_s", begin_s), ("end_s", end_s))
+    return ((Hypothesis("demand_surge", fixed, ("factor",), ((1.5,),), (1.0,), 0.1), (1.5,)),)
+
+
+def a_fitter_of_windows(truth: tuple[float, float]) -> Fitter:
+    world = Windows()
+    base_tallies = [item.tally for item in world.replicates((), range(80))]
+    data = [with_surge(number, 0.5 * surge(*truth), 18) for number in range(5)]
+    base = Reference(POOLS, base_tallies)
+    return Fitter(world, POOLS, base, base_tallies, data, days=8, price=14.0, speeds=True)
+
+
+def window_of(members: Members) -> tuple[float, float]:
+    fixed = dict(members[0][0].fixed)
+    return float(fixed["begin_s"]), float(fixed["end_s"])
+
+
+@pytest.mark.parametrize(
+    "first",
+    [(600.0, 2700.0), (1200.0, 2100.0), (600.0, 2100.0), (1200.0, 2700.0), (900.0, 2400.0)],
+)
+def test_a_window_five_minutes_off_at_both_ends_is_found(first: tuple[float, float]) -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    begun = fitter.simulate(a_surge(*first))
+    best = fitter.fitted(begun)
+    assert window_of(best.members) == pytest.approx(Windows.TRUTH, abs=45.0)
+    assert best.values[0] == pytest.approx(1.5, abs=0.05)
+    assert best.cost <= begun.cost
+
+
+def test_the_values_alone_would_not_find_the_window() -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    begun = fitter.simulate(a_surge(600.0, 2700.0))
+    assert fitter.refine(begun).cost > fitter.fitted(begun).cost + 100.0
+
+
+def test_windows_stay_on_the_clock_and_keep_a_minute() -> None:
+    fitter = a_fitter_of_windows((0.0, 180.0))
+    best = fitter.fitted(fitter.simulate(a_surge(120.0, 420.0)))
+    assert window_of(best.members) == pytest.approx((0.0, 180.0), abs=45.0)
+    world = fitter.engine
+    assert isinstance(world, Windows)
+    for text in {item for model in world.asked for item in model}:
+        began, ended = map(float, text.split(",")[1:3])
+        assert began >= 0.0
+        assert ended - began >= SHORTEST_S
