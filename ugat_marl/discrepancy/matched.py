@@ -104,6 +104,8 @@ class Directions:
 
     def filters(self, reference: Reference, data: Sequence[Tally]) -> dict[str, Matched]:
         """Matched filters on what the pools show, and on what single lanes and minutes show."""
+        if not self.rays:
+            return {}
         wide = [ray.difference for ray in self.rays]
         single = [without_noise(ray.difference, ray.variance) for ray in self.rays]
         return {
