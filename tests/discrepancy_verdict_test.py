@@ -116,3 +116,29 @@ def test_only_a_search_that_ended_says_that_the_library_lacks_it(
     assert ("no effect of the library explains it" in found.sentence) == complete
     assert ("the budget ended" in found.sentence) != complete
     assert (found.next_measurement is not None) == complete
+
+
+@pytest.mark.parametrize(
+    ("hypothesis", "value", "verdict"),
+    [
+        (HEADWAY, 10.0, "partially_explained"),
+        (HEADWAY, 9.9, "explained"),
+        (TURNING, 1.0, "explained"),  # all of them turn: an end of what there is, not of the search
+    ],
+)
+def test_the_end_of_a_range_is_no_answer(
+    hypothesis: Hypothesis, value: float, verdict: str
+) -> None:
+    distance = SimpleNamespace(z={"network": np.zeros((1, len(FEATURES)))})
+    residual = SimpleNamespace(p=0.6, distance=100.0)
+    best: Any = SimpleNamespace(
+        model=SimpleNamespace(members=((hypothesis, (value,)),), distance=distance),
+        residual=residual,
+    )
+    won: Any = SimpleNamespace(
+        before=SimpleNamespace(p=0.0, distance=1000.0), after=residual, shrink=1.0
+    )
+    selector: Any = None
+    found = conclude(Selection(best, (), complete=True), selector, won, 0.05)
+    assert found.verdict == verdict
+    assert ("as far as the effect goes" in found.sentence) == (verdict != "explained")

@@ -74,6 +74,13 @@ def conclude(
             f"The fitted periods hint at {names}, but the held-out periods do not confirm it."
         )
         return Conclusion("unknown", best, (), sentence, "more periods")
+    ends = _at_an_end(best.model.members)
+    if chance_only and selection.complete and ends:
+        sentence = (
+            f"With {names} what is left is no more than chance, but {ends} is as far as the effect "
+            "goes: something else may be behind it."
+        )
+        return Conclusion("partially_explained", best, (), sentence, _look_at(best))
     if chance_only and selection.complete:
         rivals = _rivals(selection, selector, alpha)
         if rivals:
@@ -121,6 +128,18 @@ def _rivals(selection: Selection, selector: Selector, alpha: float) -> tuple[Fit
         if tested.residual.p > alpha:
             found.append(rival)
     return tuple(found)
+
+
+def _at_an_end(members: Members) -> str:
+    """Values at an end of their range that is a bound of plausibility, not of the definition."""
+    found: list[str] = []
+    for hypothesis, values in members:
+        ranges = known_effects()[hypothesis.name].ranges
+        for name, value in zip(hypothesis.free, values, strict=True):
+            natural = {0.0, 1.0} if not ranges[name].unit else {0.0}
+            if value in {ranges[name].low, ranges[name].high} - natural:
+                found.append(f"{hypothesis.name.replace('_', ' ')} of {value:g}")
+    return " and ".join(found)
 
 
 def _kinds(members: Members) -> set[str]:
