@@ -80,7 +80,7 @@ def conclude(
             f"With {names} what is left is no more than chance, but {ends} is as far as the effect "
             "goes: something else may be behind it."
         )
-        return Conclusion("partially_explained", best, (), sentence, _look_at(best))
+        return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
     if chance_only and selection.complete:
         rivals = _rivals(selection, selector, alpha)
         if rivals:
