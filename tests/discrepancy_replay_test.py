@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ugat_marl.discrepancy.replay import Replay, replay_document
+from ugat_marl.discrepancy.replay import Day, Replay, replay_document
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.effects import apply_effects, load, parse_domain
 from ugat_marl.errors import MeasuredDataError, SimulatorError
@@ -165,6 +165,38 @@ def test_effects_change_traffic_and_what_is_seen_of_it(scenario: Scenario) -> No
     assert shifted.period.passages[name].on_s[0] == pytest.approx(
         plain.period.passages[name].on_s[0] + 3.0
     )
+
+
+class Watched(Replay):
+    """Notes when vehicles park on each day it plays."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        network = Network.read(scenario)
+        detectors = standard_detectors(network)
+        super().__init__(scenario, network, detectors, Site.of(network, detectors).owner)
+        self.parked: list[list[float]] = []
+
+    def _run(self, scenario: Scenario, period: Period, seed: int, directory: Path) -> Day:
+        vehicles = (x for item in scenario.routes for x in item.parse().iter("vehicle"))
+        self.parked.append(
+            [float(x.get("depart", "")) for x in vehicles if x.get("id", "").startswith("parking.")]
+        )
+        return super()._run(scenario, period, seed, directory)
+
+
+def test_vehicles_park_at_other_times_on_other_days(scenario: Scenario) -> None:
+    period = a_period(((0.0, "Gr"),), end=200.0)
+    watched = Watched(scenario)
+    seen = [
+        watched.simulate(parse_domain("parking=S_C_0,90,20"), period, seed) for seed in (1, 1, 2)
+    ]
+    one, same, other = watched.parked
+    assert len(one) == len(other) == 5
+    assert one == same
+    assert not set(one) & set(other)
+    assert seen[0].travel_time_s == seen[1].travel_time_s
+    watched.simulate((), period, 1)
+    assert watched.parked[-1] == []
 
 
 def test_what_sumo_says_of_an_impossible_programme_is_passed_on(scenario: Scenario) -> None:

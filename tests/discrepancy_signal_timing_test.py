@@ -11,6 +11,7 @@ from ugat_marl.discrepancy.counted import counts_tally
 from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, INDEX
 from ugat_marl.discrepancy.signal_timing import timing_effects
 from ugat_marl.discrepancy.site import Site
+from ugat_marl.discrepancy.workflow import DiagnosisConfig, diagnose
 from ugat_marl.effects import load
 from ugat_marl.loops import standard_detectors
 from ugat_marl.measured.data import Measured, Period, SignalLog
@@ -59,6 +60,31 @@ def test_longer_yellow_and_all_red_are_read_off(scenario: Scenario, network: Net
     assert found(scenario, network, cycles(30, 4.0, 2.0)) == ["yellow_time=4"]
     assert found(scenario, network, cycles(30, 3.0, 1.0)) == ["all_red_time=1"]
     assert found(scenario, network, cycles(30, 4.5, 0.5)) == ["yellow_time=4.5", "all_red_time=0.5"]
+
+
+@pytest.mark.parametrize(
+    ("left_out", "named"),
+    [
+        ((), ["yellow_time", "all_red_time"]),
+        (("yellow_time",), ["all_red_time"]),
+        (("all_red_time", "headway"), ["yellow_time"]),
+        (("yellow_time", "all_red_time"), []),
+    ],
+)
+def test_what_the_log_tells_can_be_left_out(
+    scenario: Scenario,
+    network: Network,
+    tmp_path: Path,
+    left_out: tuple[str, ...],
+    named: list[str],
+) -> None:
+    period = Period("day1", 0.0, 3600.0, "fit", {"C": cycles(30, 4.5, 0.5)}, {})
+    measured = Measured(standard_detectors(network), (period,))
+    # Nothing is simulated within such a budget; the log is read all the same.
+    config = DiagnosisConfig(budget_s=1e-9, leave_out=left_out, cache=tmp_path / "cache")
+    record = diagnose(scenario, measured, tmp_path / "found", config)
+    assert [item["name"] for item in record["effects"]] == named
+    assert (record["corrected"] is not None) == bool(named)
 
 
 def test_green_right_behind_yellow_is_no_all_red(scenario: Scenario, network: Network) -> None:

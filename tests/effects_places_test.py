@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import libsumo
+import numpy as np
 import pytest
 import sumo
 
@@ -25,6 +26,7 @@ from ugat_marl.effects import (
     apply_effects,
     known_effects,
     load,
+    parked_at_other_times,
     parse_domain,
 )
 from ugat_marl.effects.signals import late_greens, with_late_programmes
@@ -142,6 +144,57 @@ def test_blocked_lanes_can_be_blocked_twice_and_be_written(tmp_path: Path) -> No
     names = {item.get("id", "") for item in ET.parse(report).iter("tripinfo")}
     assert len([name for name in names if name.startswith("closure.")]) == 2
     assert len([name for name in names if name.startswith("parking.")]) == 10
+
+
+def departures(scenario: Scenario) -> dict[str, float]:
+    """Of every vehicle, in the order of the files."""
+    return {
+        item.get("id", ""): float(item.get("depart", "nan"))
+        for document in scenario.routes
+        for item in document.parse().iter("vehicle")
+    }
+
+
+def parked(scenario: Scenario) -> list[float]:
+    return [time for name, time in departures(scenario).items() if name.startswith("parking.")]
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 25200.0])
+def test_parking_at_other_times_is_as_frequent_and_as_long(
+    crossing: Crossing, begin_s: float
+) -> None:
+    toml = lambda text: text.replace("duration_s", f"begin_s = {begin_s:g}\nduration_s")  # noqa: E731
+    directory = crossing(vehicles="", toml=toml if begin_s else None)
+    scenario = apply_effects(load(directory), [Parking("S_C_0", 180, 5)])
+    one, again, other = (parked_at_other_times(scenario, seed) for seed in (1, 1, 2))
+    assert len(parked(scenario)) == 10  # 200 s of 180 an hour
+    for day in (one, other):
+        assert len(parked(day)) == 10
+        assert all(begin_s <= time < begin_s + 200.0 for time in parked(day))
+        assert parked(day) == sorted(parked(day)), "SUMO wants departures in order"
+        assert sorted(departures(day)) == sorted(departures(scenario))
+    assert parked(one) == parked(again)
+    assert parked(one) != parked(other)
+    assert not set(parked(one)) & set(parked(scenario))
+    # Turned about the day: what lies between two of them, round the clock, stays.
+    rows = [np.array(parked(item)) for item in (scenario, one)]
+    gaps = [np.sort(np.diff([*row, row[0] + 200.0])) for row in rows]
+    assert gaps[1] == pytest.approx(gaps[0], abs=0.03)
+
+
+def test_only_parking_is_moved_to_other_times(crossing: Crossing) -> None:
+    plain = load(crossing())
+    assert parked_at_other_times(plain, 1).hash == plain.hash
+    closed = apply_effects(plain, [LaneClosure("S_C_0", 60, 90)])
+    assert parked_at_other_times(closed, 1).hash == closed.hash
+    both = apply_effects(closed, [Parking("W_C_0", 180, 5)])
+    moved = parked_at_other_times(both, 1)
+    others = [
+        {name: time for name, time in departures(item).items() if not name.startswith("parking.")}
+        for item in (both, moved)
+    ]
+    assert others[0] == others[1]
+    assert parked(both) != parked(moved)
 
 
 def test_a_lane_too_short_to_stand_on(crossing: Crossing) -> None:
