@@ -425,6 +425,24 @@ def test_a_detector_that_is_silent_while_its_neighbour_counts(read: Read) -> Non
     only(findings, "'s' is on for", "period 'day1'")
 
 
+def test_a_detector_that_is_silent_in_several_periods_is_one_finding(read: Read) -> None:
+    base = recording()
+    days = tuple(
+        replace(
+            day,
+            passages={
+                **day.passages,
+                "s": day.passages["s"].at(
+                    (day.passages["s"].on_s < 2000) | (day.passages["s"].on_s > end)
+                ),
+            },
+        )
+        for day, end in zip(base.periods, (5000, 4500, 4500), strict=True)
+    )
+    _, findings = read(replace(base, periods=days))
+    only(findings, "'s' says nothing for 42 to 50 min in 3 periods ('day0', 'day1', 'day2')")
+
+
 def test_whole_seconds_are_said(read: Read) -> None:
     def whole(rows: Passages) -> Passages:
         return replace(rows, on_s=np.floor(rows.on_s), off_s=np.floor(rows.on_s) + 1)

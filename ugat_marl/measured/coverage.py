@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -253,11 +254,22 @@ def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
             )
 
 
+@dataclass(frozen=True)
+class _Silence:
+    """A detector does not change for a while, in which a neighbour counts vehicles."""
+
+    period: str
+    begin_s: float
+    length_s: float
+    meanwhile: int
+
+
 def _of_silence(measured: Measured) -> Iterator[Finding]:
     roads: dict[str, list[Detector]] = {}
     for item in measured.detectors:
         roads.setdefault(item.lane.rsplit("_", 1)[0], []).append(item)
     usual = _usual_rates(measured)
+    silences: dict[tuple[str, str], list[_Silence]] = {}
     for period in measured.periods:
         if not period.passages:
             if measured.has_events:
@@ -273,7 +285,18 @@ def _of_silence(measured: Measured) -> Iterator[Finding]:
             )
             continue
         for group in roads.values():
-            yield from _silent(group, times, period, usual)
+            for name, what, silence in _silent(group, times, period, usual):
+                silences.setdefault((name, what), []).append(silence)
+    for (name, what), found in silences.items():
+        minutes = sorted(round(item.length_s / 60) for item in found)
+        span = f"{minutes[0]}" if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"
+        where = f"in {_list('period', [item.period for item in found])}"
+        if len(found) == 1:
+            where = f"from {found[0].begin_s:g} s on in period {found[0].period!r}"
+        yield Finding(
+            f"detections: {name!r} {what} for {span} min {where}, while a "
+            f"neighbour counts {max(item.meanwhile for item in found)} vehicles"
+        )
 
 
 def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> bool:
@@ -285,17 +308,13 @@ def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> boo
 
 
 def _usual_rates(measured: Measured) -> dict[str, float]:
-    """Vehicles per second at each detector outside of its longest silences."""
+    """Vehicles per second at each detector over all periods."""
     counts: dict[str, float] = {}
-    seconds: dict[str, float] = {}
+    seconds = sum(period.end_s - period.begin_s for period in measured.periods)
     for period in measured.periods:
         for name in period.passages:
-            times = _times(period, name)
-            _, silent = _longest_gap(times, period)
-            counts[name] = counts.get(name, 0.0) + len(times) / 2
-            heard = max(period.end_s - period.begin_s - silent, 1.0)
-            seconds[name] = seconds.get(name, 0.0) + heard
-    return {name: counts[name] / seconds[name] for name in counts}
+            counts[name] = counts.get(name, 0.0) + len(_times(period, name)) / 2
+    return {name: count / seconds for name, count in counts.items()}
 
 
 def _silent(
@@ -303,7 +322,7 @@ def _silent(
     times: dict[str, NDArray[np.float64]],
     period: Period,
     usual: Mapping[str, float],
-) -> Iterator[Finding]:
+) -> Iterator[tuple[str, str, _Silence]]:
     """Detectors of one road that say nothing while others of it count, and they did elsewhere."""
     for item in group:
         begin, length = _longest_gap(times.get(item.id, np.empty(0)), period)
@@ -317,10 +336,7 @@ def _silent(
         )
         if busy >= BUSY:
             what = "is on" if _is_on(period, item.id, begin) else "says nothing"
-            yield Finding(
-                f"detections: {item.id!r} {what} for {length / 60:.0f} min from {begin:g} s "
-                f"on in period {period.id!r}, while a neighbour counts {busy} vehicles"
-            )
+            yield item.id, what, _Silence(period.id, begin, length, busy)
 
 
 def _times(period: Period, detector: str) -> NDArray[np.float64]:
