@@ -294,6 +294,40 @@ def test_the_traffic_light_that_starts_late() -> None:
         assert first(found, name).levels[0][0] > 0
 
 
+@pytest.mark.parametrize(
+    ("moved", "lanes"),
+    [
+        # Traffic goes round what stands on one lane, and fills the other.
+        ({("b_0", "count_stop"): -6.0, ("b_1", "count_stop"): 9.0}, {"b_0", "b_1"}),
+        # It cannot, and queues there.
+        ({("b_0", "gap_long"): 8.0, ("b_0", "count_stop"): -4.0}, {"b_0"}),
+        ({}, None),
+    ],
+)
+def test_lanes_are_examined_for_parking_that_traffic_avoids_or_queues_on(
+    moved: dict[tuple[str, str], float], lanes: set[str] | None
+) -> None:
+    names_ = ("a_0", "a_1", "b_0", "b_1", "c_0")
+    site = Site(("A",), tuple(SiteLane(x, x[0], 0, (0,), 14.0, {}) for x in names_), (), (), {})
+
+    def day(seed: int, planted: dict[tuple[str, str], float]) -> Tally:
+        values = 20.0 + 0.3 * np.random.default_rng(seed).standard_normal((len(FEATURES), 5))
+        for (lane, feature), size in planted.items():
+            values[INDEX[feature], names_.index(lane)] += 0.3 * size
+        sums = np.stack([40 * values, np.full_like(values, 40.0)], axis=-1)
+        return Tally(sums, np.zeros((len(BIN_FEATURES), 5, 1)))
+
+    reference = Reference(Pools.of(site), [day(seed, {}) for seed in range(50)])
+    distance = reference.distance([day(100 + seed, moved) for seed in range(5)])
+    proposer = Proposer(site, Routes({}, {}, {}, {}), {"parking"})
+    found = proposer.hypotheses(reference, distance, [replace(street(1), passages={})])
+    parked = [str(dict(item.fixed)["lane"]) for item in found]
+    assert len(parked) == len(set(parked)) <= 4, "two edges, two lanes of each"
+    if lanes is not None:
+        assert {lane for lane in parked if lane.startswith("b")} == lanes
+        assert parked[0].startswith("b"), "the edge that departs most comes first"
+
+
 def test_routes_are_counted_per_hour(data: Path) -> None:
     # A vehicle every 20 s on each of two roads, for 200 s.
     routes = Routes.of(load(data / "crossing"))

@@ -171,9 +171,8 @@ def test_an_effect_without_consequences_is_no_direction(reference: Reference) ->
     assert matched(reference, [0.0 * unit(0)])(5.0 * unit(0)) == 0.0
 
 
-@pytest.mark.xfail(strict=True, reason="np.stack of no directions raises ValueError")
-def test_without_directions_nothing_points_anywhere(reference: Reference) -> None:
-    assert matched(reference, [])(5.0 * unit(0)) == 0.0
+def test_without_directions_there_are_no_filters(reference: Reference) -> None:
+    assert Directions(()).filters(reference, data_at(reference, unit(0))) == {}
 
 
 def test_filters_look_at_pools_and_at_single_places() -> None:
