@@ -331,15 +331,7 @@ def test_every_effect_that_is_left_out_for_show_can_be_left_out(
         assert name not in library((name,))
 
 
-@pytest.mark.parametrize(
-    "last_s",
-    [
-        200.0,
-        pytest.param(800.0, marks=pytest.mark.xfail(
-            strict=True, reason="vehicles of after the scenario's end are counted"
-        )),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("last_s", [200.0, 800.0])
 def test_only_vehicles_of_the_day_make_an_origin_busy(
     crossing: Callable[..., Path], last_s: float
 ) -> None:

@@ -191,13 +191,11 @@ def test_only_vehicles_that_pass_both_edges_are_shared(crossing: Callable[..., P
     assert found.origins == pytest.approx({"S_C": 54.0})
 
 
-@pytest.mark.xfail(strict=True, reason="routes are counted that stand in the file and nobody takes")
 def test_a_route_that_nobody_takes_is_no_vehicle(crossing: Callable[..., Path]) -> None:
     found = Routes.of(few(crossing, (0.0, 10.0, 20.0), used=False))
     assert found.origins == pytest.approx({"S_C": 54.0})
 
 
-@pytest.mark.xfail(strict=True, reason="vehicles of after the scenario's end are counted")
 def test_vehicles_of_after_the_end_do_not_come(crossing: Callable[..., Path]) -> None:
     found = Routes.of(few(crossing, (0.0, 10.0, 20.0, 210.0, 900.0)))
     assert found.origins == pytest.approx({"S_C": 54.0})

@@ -12,7 +12,7 @@ import re
 import subprocess
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -56,6 +56,22 @@ def explicit(scenario: Scenario) -> Scenario:
     if all(_is_explicit(document.read()) for document in scenario.routes):
         return scenario
     return replace(scenario, routes=(_routed(scenario),))
+
+
+def ways(scenario: Scenario) -> Iterator[tuple[str, ...]]:
+    """The edges of every vehicle that departs in the scenario's time, one after the other.
+
+    Args:
+        scenario: Any scenario; `explicit` is applied if need be.
+    """
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    for document in explicit(scenario).routes:
+        for vehicle in parse_xml(document.read(), document.source).iter("vehicle"):
+            route = vehicle.find("route")
+            edges = () if route is None else tuple(route.get("edges", "").split())
+            if edges and begin <= seconds_of(vehicle.get("depart", "0")) < end:
+                yield edges
 
 
 def redrawn(scenario: Scenario, seed: int) -> Scenario:

@@ -10,11 +10,10 @@ from typing import TypeVar
 
 from ugat_marl.effects.places import places_of
 from ugat_marl.evaluation import policy_factory
-from ugat_marl.files import parse_xml
 from ugat_marl.measured.data import Detector
 from ugat_marl.network import Network
 from ugat_marl.recording import record
-from ugat_marl.redraw import explicit
+from ugat_marl.redraw import ways
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
 
@@ -133,14 +132,10 @@ def _demanded(
     origins: Counter[str] = Counter()
     turns: Counter[tuple[str, str]] = Counter()
     edges: Counter[str] = Counter()
-    for document in explicit(scenario).routes:
-        for vehicle in parse_xml(document.read(), document.source).iter("vehicle"):
-            route = vehicle.find("route")
-            way = () if route is None else tuple(route.get("edges", "").split())
-            if way:
-                origins[way[0]] += 1
-                edges.update(set(way))
-                turns.update(set(pairwise(way)))
+    for way in ways(scenario):
+        origins[way[0]] += 1
+        edges.update(set(way))
+        turns.update(set(pairwise(way)))
     hours = scenario.settings.duration_s / 3600.0
     return _per_hour(origins, hours), _per_hour(turns, hours), _per_hour(edges, hours)
 

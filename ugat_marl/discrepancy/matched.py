@@ -72,7 +72,7 @@ class Matched:
         size = np.sqrt((found**2).sum(axis=1))
         self._away = np.zeros((found.shape[1], 0))
         if fitted:
-            self._away, _ = np.linalg.qr(rows(fitted).T)
+            self._away = _spanned(rows(fitted))
         found = found - (found @ self._away) @ self._away.T
         left = np.sqrt((found**2).sum(axis=1))
         seen = (left > LEAST_APART * size) & (size > 0)
@@ -86,6 +86,12 @@ class Matched:
 
     def _whitened(self, z: Mapping[str, Array]) -> Array:
         return np.concatenate([independent(z[name], groups) for name, groups in self._parts])
+
+
+def _spanned(rows: Array) -> Array:
+    """Orthonormal columns that span the rows; rows of 0, or the same twice, add nothing."""
+    _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
+    return directions[sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)].T
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from ugat_marl.discrepancy.features import INDEX
 from ugat_marl.discrepancy.hypotheses import Hypothesis
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Distance
-from ugat_marl.redraw import explicit
+from ugat_marl.redraw import ways
 from ugat_marl.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -53,18 +54,15 @@ class Routes:
         turns: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         joint: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         rate = 3600.0 / scenario.settings.duration_s
-        for document in explicit(scenario).routes:
-            for item in document.parse().iter("route"):
-                edges = item.get("edges", "").split()
-                if edges:
-                    origins[edges[0]] += rate
-                    passed = dict.fromkeys(edges)
-                    for edge in passed:
-                        passing[edges[0]][edge] += rate
-                        for other in passed:
-                            joint[edge][other] += rate
-                    for edge, following in zip(edges, edges[1:], strict=False):
-                        turns[edge][following] += rate
+        for edges in ways(scenario):
+            origins[edges[0]] += rate
+            passed = dict.fromkeys(edges)
+            for edge in passed:
+                passing[edges[0]][edge] += rate
+                for other in passed:
+                    joint[edge][other] += rate
+            for edge, following in pairwise(edges):
+                turns[edge][following] += rate
         return cls(
             dict(origins),
             {k: dict(v) for k, v in passing.items()},
