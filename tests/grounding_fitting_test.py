@@ -10,7 +10,14 @@ import pytest
 import torch
 
 from ugat_marl.errors import LogError, OptionError
-from ugat_marl.grounding.calibration import auroc, ranks, rate_by_quantile, spearman
+from ugat_marl.grounding.calibration import (
+    auroc,
+    expected_calibration_error,
+    ranks,
+    rate_by_quantile,
+    risk_by_coverage,
+    spearman,
+)
 from ugat_marl.grounding.fitting import FitConfig, fit, fit_forward, fit_inverse, split
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
@@ -148,6 +155,8 @@ def test_report_is_flat_numbers(fitted) -> None:
         "inverse/held_out_loss",
         "calibration/mean_u_off_data",
         "calibration/error_by_quantile/4",
+        "calibration/risk_by_coverage/4",
+        "calibration/ece",
         "agreement",
         "mean_u_on_predictions",
         "accuracy_on_real/a_0",
@@ -163,6 +172,15 @@ def test_a_poor_fit_says_so() -> None:
     told = " | ".join(report.warnings)
     assert "u does not tell wrong answers" in told or "most frequent phase" in told
     assert report.inverse.accuracy.mean() < 0.7
+
+
+def test_without_uncertainty_the_report_says_that_all_is_taken() -> None:
+    f, h = models()
+    log = planted(0.3, episodes=2, steps=60)
+    report = fit(f, h, log, log, dataclasses.replace(QUICK, uncertainty="none"), seed=0)
+    (told,) = report.warnings
+    assert told == "without uncertainty u is 0, and the gate takes every grounded action"
+    assert report.as_dict()["calibration/mean_u"] == 0.0
 
 
 def test_fitting_twice_gives_the_same_weights_and_another_seed_others() -> None:
@@ -358,3 +376,20 @@ def test_ranks_auroc_and_spearman_by_hand() -> None:
     assert math.isnan(spearman(np.array([1, 2]), np.array([4, 4])))
     u = np.array([0.4, 0.1, 0.3, 0.2])
     assert rate_by_quantile(u, np.array([True, False, False, False]), 2) == (0.0, 0.5)
+
+
+def test_risk_by_coverage_by_hand() -> None:
+    u, wrong = np.array([0.4, 0.1, 0.3, 0.2]), np.array([True, False, True, False])
+    assert risk_by_coverage(u, wrong, 4) == (0.0, 0.0, pytest.approx(1 / 3), 0.5)
+    assert risk_by_coverage(np.zeros(4), wrong, 2) == (0.5, 0.5)  # whoever comes first
+    assert math.isnan(risk_by_coverage(u[:1], wrong[:1], 4)[0])
+
+
+def test_expected_calibration_error_by_hand() -> None:
+    confidence = np.array([0.95, 0.95, 0.95, 0.95, 0.55])
+    correct = np.array([True, True, True, False, False])
+    expected = 4 / 5 * abs(0.95 - 0.75) + 1 / 5 * 0.55
+    assert expected_calibration_error(confidence, correct, 10) == pytest.approx(expected)
+    assert expected_calibration_error(np.ones(3), np.ones(3, bool)) == 0.0
+    assert expected_calibration_error(np.array([0.0, 1.0]), np.array([True, False])) == 1.0
+    assert math.isnan(expected_calibration_error(np.array([]), np.array([], bool)))

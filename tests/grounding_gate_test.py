@@ -96,6 +96,17 @@ def test_report_counts_by_hand() -> None:
     assert gate.report().decisions.tolist() == [0, 0]
 
 
+def test_without_any_uncertainty_the_gate_stays_open_and_says_so() -> None:
+    gate = Gate(AGENTS, GateConfig())
+    run(gate, (0.0, 0.5))
+    gate.update()
+    assert gate.alpha.tolist() == [np.inf, 0.5]  # a mean of 0 would let nothing through
+    assert run(gate, (0.0, 0.4), (0.0, 0.6)) == [[True, True], [True, False]]
+    with pytest.warns(UserWarning, match=r"every grounded action was taken .*signal_0"):
+        gate.update()
+    assert np.isinf(gate.alpha[0])
+
+
 def test_all_or_nothing_is_warned_of_after_the_first_iteration_only() -> None:
     gate = Gate(AGENTS, GateConfig(mode="static", static_alpha=0.5))
     run(gate, (0.1, 0.9))

@@ -13,6 +13,7 @@ from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.scaling import FARTHEST, Standardiser
 from ugat_marl.grounding.stacked import Stack, stack_log
+from ugat_marl.grounding.uncertainty import METHODS, Method, MethodName
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 
@@ -39,16 +40,18 @@ def stacked() -> tuple[Stack, torch.Tensor, torch.Tensor, torch.Tensor]:
     return stack, here, there, torch.stack([row[2] for row in rows])
 
 
-def part_of(model: nn.Module, alone: nn.Module, agent: int) -> None:
+def part_of(model: nn.Module, alone: nn.Module, agent: int, members: int = 1) -> None:
     """Copies one agent's share of the padded parameters into a model of that agent alone."""
     whole = model.state_dict()
     state = {}
     for name, own in alone.state_dict().items():
         source = whole[name]
-        if own.dim() == 3:
-            source = source[agent : agent + 1, : own.shape[1], : own.shape[2]]
-        elif name.startswith("head."):
-            source = source[: own.shape[0]]
+        if name.startswith("net.head."):  # shared; the agent's phases of every member
+            rows = own.shape[0] // members
+            source = source.view(members, -1, *own.shape[1:])[:, :rows].reshape(own.shape)
+        elif own.dim() >= 3 and len(source) >= len(LAYOUTS):  # the rest is shared
+            each = source.view(-1, len(LAYOUTS), *source.shape[1:])[:, agent]
+            source = each[..., : own.shape[-2], : own.shape[-1]]
         state[name] = source
     alone.load_state_dict(state)
 
@@ -72,15 +75,17 @@ def test_forward_models_together_equal_each_alone(include_phase: bool) -> None:
 
 
 @pytest.mark.parametrize("include_phase", [False, True])
-def test_inverse_models_together_equal_each_alone(include_phase: bool) -> None:
+@pytest.mark.parametrize("method", METHODS)
+def test_inverse_models_together_equal_each_alone(include_phase: bool, method: MethodName) -> None:
     stack, here, there, _ = stacked()
     config = InverseConfig(hidden=(16, 16), embedding=8, include_phase=include_phase)
-    model = InverseModel(stack, config, torch_generator(0))
+    how = Method(method, members=2, passes=4)
+    model = InverseModel(stack, config, torch_generator(0), how)
     model.standardise.fit(model.inputs(here, there), torch.ones(3, BATCH))
     together = model.predict(here, there)
     for i, (agent, layout) in enumerate(LAYOUTS.items()):
-        alone = InverseModel(Stack({agent: layout}), config, torch_generator(1))
-        part_of(model, alone, i)
+        alone = InverseModel(Stack({agent: layout}), config, torch_generator(1), how)
+        part_of(model, alone, i, model.net.members)
         own, following, _ = drawn(layout, i)
         expected = alone.predict(own[None], following[None])
         assert torch.allclose(together.u[i], expected.u[0], atol=1e-6)

@@ -14,6 +14,8 @@ from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.inverse import InverseConfig
 from ugat_marl.grounding.transform import GroundedActionTransform
+from ugat_marl.grounding.uncertainty import METHODS, Method, MethodName
+from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import AgentLayout
 
 LAYOUTS = {"a_0": AgentLayout(3, 4, 1), "b_0": AgentLayout(2, 2)}
@@ -105,6 +107,38 @@ def test_save_and_load_give_the_same_actions_and_the_same_gate(tmp_path: Path) -
     assert one.gate.alpha.tolist() == two.gate.alpha.tolist()
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_checkpoint_brings_its_method_with_it(tmp_path: Path, method: MethodName) -> None:
+    one, two = transform(seed=1), transform(seed=2)
+    one.inverse.renew(Method(method, members=3, passes=4), torch_generator(7))
+    one.inverse.fitted.fill_(True)
+    one.save(tmp_path / "grounding.pt")
+    two.load(tmp_path / "grounding.pt")
+    assert two.inverse.method == Method(method, members=3, passes=4)
+    for seed in range(5):
+        own = np.array([seed % 4, seed % 2])
+        first, second = one(state(one, seed), own), two(state(two, seed), own)
+        assert first.executed.tolist() == second.executed.tolist()
+        assert first.u.tolist() == second.u.tolist()
+        assert method != "none" or (first.accepted.all() and not first.u.any())
+
+
+def test_a_checkpoint_of_version_0_1_still_loads() -> None:
+    """Written before there were methods: the same answers, which were noted when it was made."""
+    shapes = {
+        "forward": ForwardConfig(hidden=(3,)),
+        "inverse": InverseConfig(hidden=(3,), embedding=2),
+    }
+    old = transform(seed=99, **shapes)
+    old.inverse.renew(Method("dropout"), torch_generator(0))
+    old.load(Path(__file__).parent / "data" / "grounding-0.1.pt")
+    assert old.inverse.method.name == "edl"
+    seen = {a: np.arange(v.size, dtype=np.float32) / 10 for a, v in LAYOUTS.items()}
+    outcome = old(old.stack.observations(seen), np.array([3, 1]))
+    assert outcome.grounded.tolist() == [1, 0]
+    assert outcome.u.tolist() == pytest.approx([0.571165, 0.575626], abs=1e-5)
+
+
 def written(path: Path, **changes: object) -> Path:
     torch.save({"kind": "grounding", **transform().state_dict(), **changes}, path)
     return path
@@ -134,7 +168,7 @@ BIAS = "network.layers.0.bias"
     ("changes", "complaint"),
     [
         (with_part("forward", BIAS, torch.full((2, 1, 128), torch.nan)), f"{BIAS}.*NaN"),
-        (with_part("inverse", "head.bias", torch.tensor([0, 0, torch.inf, 0])), "infinity"),
+        (with_part("inverse", "net.head.bias", torch.tensor([0, 0, torch.inf, 0])), "infinity"),
         (
             with_part("forward", BIAS, torch.zeros(2, 1, 64)),
             r"\(2, 1, 64\); expected \(2, 1, 128\)",
@@ -143,6 +177,13 @@ BIAS = "network.layers.0.bias"
         ({"inverse": None}, "inverse model .* other parts"),
         ({"layouts": {"a_0": [3, 4, 1]}}, "other agents"),
         ({"layouts": {"b_0": [2, 2, 0], "a_0": [3, 4, 1]}}, "other agents"),
+        ({"method": {"name": "ensemble", "members": 2, "passes": 1}}, r"weight.*expected \(4, 11"),
+        ({"method": {"name": "dropout", "members": 2, "passes": 1}}, "other parts"),
+        ({"method": {"name": "bayes"}}, "no method: uncertainty is 'bayes'"),
+        ({"method": {"name": "ensemble", "members": 10**9}}, "no method: members is 1000000000"),
+        ({"method": {"name": "ensemble", "members": "many"}}, "no method"),
+        ({"method": {"name": "dropout", "passes": 2.5}}, "no method: passes is 2.5"),
+        ({"method": 3}, "no method"),
         ({"gate": None}, "no gate"),
         ({"gate": {"agents": ["a_0"]}}, "gate in the checkpoint belongs to other agents"),
     ],

@@ -37,3 +37,32 @@ def rate_by_quantile(score: Numbers, hit: NDArray[np.bool_], bins: int) -> tuple
     order = np.argsort(score, kind="stable")
     groups = np.array_split(hit[order], bins)
     return tuple(float(group.mean()) if len(group) else float("nan") for group in groups)
+
+
+def risk_by_coverage(u: Numbers, wrong: NDArray[np.bool_], bins: int) -> tuple[float, ...]:
+    """Error rate among the 1/bins, 2/bins, ... of the answers with the lowest u.
+
+    The risk-coverage curve of selective classification (El-Yaniv and Wiener, JMLR 2010): what a
+    gate that lets so many answers pass lets through. Equal u share their errors evenly, so that it
+    is flat for a u that says nothing. NaN for a share without an answer.
+    """
+    _, group, counts = np.unique(u, return_inverse=True, return_counts=True)
+    rate = np.bincount(group, weights=wrong) / counts
+    errors = np.concatenate([[0.0], np.cumsum(np.repeat(rate, counts))])
+    shares = [round(len(u) * (i + 1) / bins) for i in range(bins)]
+    return tuple(float(errors[n] / n) if n else float("nan") for n in shares)
+
+
+def expected_calibration_error(
+    confidence: Numbers, correct: NDArray[np.bool_], bins: int = 15
+) -> float:
+    """Mean distance of confidence from accuracy over equally wide bins of confidence.
+
+    Guo, Pleiss, Sun, Weinberger, "On Calibration of Modern Neural Networks", ICML 2017, equation 3,
+    with their 15 bins. Confidence is the probability of the answer given; NaN without an answer.
+    """
+    if not len(correct):
+        return float("nan")
+    place = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
+    surplus = np.bincount(place, weights=confidence - correct, minlength=bins)
+    return float(np.abs(surplus).sum() / len(correct))

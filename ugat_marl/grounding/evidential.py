@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ugat_marl.grounding.uncertainty import AnswerNet, InversePrediction, Lesson
+
 
 def concentration(logits: Tensor, mask: Tensor) -> Tensor:
     """Dirichlet concentration ``softplus(logits) + 1``; 0 where a row has no such class."""
@@ -68,3 +70,31 @@ def evidential_loss(alpha: Tensor, target: Tensor, mask: Tensor, kl_weight: floa
 def annealing(epoch: int, epochs: int = 10) -> float:
     """Weight of the divergence in epoch 0, 1, ...: min(1, epoch / epochs)."""
     return 1.0 if epochs <= 0 else min(1.0, epoch / epochs)
+
+
+class EvidentialNet(AnswerNet):
+    """One network whose outputs are evidence; u = K / S."""
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Concentrations ``(agents, batch, actions)`` for standardised inputs."""
+        embedding = torch.relu(self.encoders(inputs))
+        return concentration(self.head(embedding), self.valid_actions)
+
+    def row_loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+        """The evidential loss, its divergence annealed in."""
+        weight = lesson.kl_weight * lesson.share
+        return evidential_loss(self(inputs), target, self.valid_actions, weight)
+
+    def certainty(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+        """Divergence of the evidence from none."""
+        del lesson
+        return divergence_from_uniform(self(inputs), self.valid_actions)
+
+    def answer(self, inputs: Tensor) -> InversePrediction:
+        """The mean of the Dirichlet, and how little evidence there is."""
+        alpha = self(inputs)
+        return InversePrediction(
+            action=alpha.argmax(-1),
+            probability=expected_probability(alpha),
+            u=uncertainty(alpha, self.valid_actions),
+        )

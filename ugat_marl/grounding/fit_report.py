@@ -9,12 +9,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ugat_marl.grounding.calibration import auroc, rate_by_quantile, spearman
-from ugat_marl.grounding.evidential import uncertainty
+from ugat_marl.grounding.calibration import (
+    auroc,
+    expected_calibration_error,
+    rate_by_quantile,
+    risk_by_coverage,
+    spearman,
+)
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.inverse import InverseModel
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import StackedTransitions
+from ugat_marl.grounding.uncertainty import MethodName
 
 QUANTILES = 5
 DISCRIMINATES = 0.55
@@ -72,6 +78,8 @@ class Calibration:
         spearman: Rank correlation of u with being wrong.
         auroc: Probability that u is higher for a wrong answer than for a right one.
         error_by_quantile: Error rate in fifths of rising u.
+        risk_by_coverage: Error rate of the fifth with the lowest u, of two fifths, ..., of all.
+        ece: Expected calibration error of the probability of the answer.
         mean_u: Mean u on held-out data.
         mean_u_off_data: Mean u on states and changes drawn around, not from, the data.
         auroc_off_data: Probability that u is higher off the data than on it.
@@ -80,6 +88,8 @@ class Calibration:
     spearman: float
     auroc: float
     error_by_quantile: tuple[float, ...]
+    risk_by_coverage: tuple[float, ...]
+    ece: float
     mean_u: float
     mean_u_off_data: float
     auroc_off_data: float
@@ -97,6 +107,7 @@ class InverseReport:
         mean_u: Mean uncertainty.
         auroc: u against being wrong, agent by agent.
         calibration: The same and more, pooled.
+        uncertainty: Where u came from.
     """
 
     training: TrainingRecord
@@ -106,6 +117,7 @@ class InverseReport:
     mean_u: Floats
     auroc: Floats
     calibration: Calibration
+    uncertainty: MethodName
 
 
 @dataclass(frozen=True)
@@ -142,6 +154,9 @@ class FitReport:
             self._weak("f is no better than predicting no change", self.forward.ratio >= 1.0),
             self._weak("h is no better than the most frequent phase", h.accuracy <= h.majority),
         ]
+        if h.uncertainty == "none":
+            found.append("without uncertainty u is 0, and the gate takes every grounded action")
+            return tuple(sentence for sentence in found if sentence)
         if calibration.auroc < DISCRIMINATES:
             found.append(f"u does not tell wrong answers (AUROC {calibration.auroc:.2f})")
         if calibration.mean_u_off_data <= calibration.mean_u:
@@ -235,7 +250,7 @@ def inverse_report(
     drawn = OffData.around(inputs, train, model.stack).draw(
         int(held_out.sum(1).max()), generator, state_share=1.0
     )
-    off = uncertainty(model(drawn), model.valid_actions).flatten().numpy()
+    off = model.answer(drawn).u.flatten().numpy()
     counts = torch.zeros(train.shape[0], model.stack.actions)
     counts.scatter_add_(1, data.executed, train)
     usual = counts.argmax(1)[:, None]
@@ -247,6 +262,8 @@ def inverse_report(
         spearman=spearman(on_u, on_wrong),
         auroc=auroc(on_u, on_wrong),
         error_by_quantile=rate_by_quantile(on_u, on_wrong, QUANTILES),
+        risk_by_coverage=risk_by_coverage(on_u, on_wrong, QUANTILES),
+        ece=expected_calibration_error(answer.probability.amax(-1).numpy()[kept], ~on_wrong),
         mean_u=float(on_u.mean()),
         mean_u_off_data=float(off.mean()),
         auroc_off_data=auroc(both, np.arange(len(both)) >= len(on_u)),
@@ -259,6 +276,7 @@ def inverse_report(
         mean_u=np.array([u[i][kept[i]].mean() for i in rows], float),
         auroc=np.array([auroc(u[i][kept[i]], wrong[i][kept[i]]) for i in rows]),
         calibration=calibration,
+        uncertainty=model.method.name,
     )
 
 

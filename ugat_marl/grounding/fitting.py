@@ -9,7 +9,7 @@ and a warm start never meets a held-out episode it was trained on.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from ugat_marl.batched import one_thread
 from ugat_marl.errors import LogError, OptionError
-from ugat_marl.grounding.evidential import annealing, divergence_from_uniform, evidential_loss
+from ugat_marl.grounding.evidential import annealing
 from ugat_marl.grounding.fit_report import (
     FitReport,
     ForwardReport,
@@ -32,6 +32,7 @@ from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.inverse import InverseModel
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import Stack, StackedTransitions, stack_log
+from ugat_marl.grounding.uncertainty import Lesson, Method, MethodName
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import TransitionLog
 
@@ -39,7 +40,11 @@ EpochCallback = Callable[[str, int, float], None]
 """Called as ``callback("forward" or "inverse", epoch, held_out_loss)`` after every epoch."""
 
 RowLoss = Callable[[Tensor, int], Tensor]
-"""Loss of some columns of the data, ``(agents, columns)``, in an epoch (-1: the final form)."""
+"""Loss of some columns of the data in an epoch (-1: the final form, of held-out rows).
+
+Columns are ``(batch,)`` and losses ``(agents, batch)``; in an ensemble, where every member has an
+order of its own, columns are ``(members, batch)`` and losses ``(agents, members, batch)``.
+"""
 
 
 @dataclass(frozen=True)
@@ -47,20 +52,29 @@ class FitConfig:
     """How the models are trained.
 
     Attributes:
+        uncertainty: How h says that it is unsure: "edl" (evidential), "dropout" (Concrete Dropout),
+            "ensemble" (Deep Ensembles), or "none", with which every grounded action is taken.
+        members: Networks of an ensemble.
+        passes: Thinned networks that dropout averages over.
         epochs: Most passes over the training rows.
         batch_size: Rows per agent and update.
         learning_rate: Of Adam.
         patience: Epochs without a lower held-out loss after which training ends.
         held_out_every: Every n-th episode is held out; of a single episode, the last n-th part.
-        kl_epochs: Epochs over which the divergence term of the evidential loss is annealed in.
-        kl_weight: Its final weight; 1 is Sensoy et al. With eight phases that often look alike, 1
-            keeps h from learning: on grid2x2-v1 its held-out accuracy is 0.60 (u 0.90, AUROC of u
-            0.72) against 0.70 (0.48, 0.73) at 0.1.
-        off_data_weight: Weight of the certainty h shows on invented inputs (`off_data`); 0 is the
-            evidential loss alone, under which u need not rise off the data.
+        kl_epochs: Epochs over which the divergence term of the evidential loss and the certainty on
+            invented inputs are annealed in.
+        kl_weight: Final weight of that divergence, for "edl"; 1 is Sensoy et al. With eight phases
+            that often look alike, 1 keeps h from learning: on grid2x2-v1 its held-out accuracy is
+            0.60 (u 0.90, AUROC of u 0.72) against 0.70 (0.48, 0.73) at 0.1.
+        off_data_weight: Weight of the certainty h shows on invented inputs (`off_data`), for all
+            but "none"; 0 is each method as its paper has it, under which u need not rise off the
+            data.
         warm_start: Go on from the current weights instead of drawing new ones.
     """
 
+    uncertainty: MethodName = "edl"
+    members: int = 5
+    passes: int = 20
     epochs: int = 100
     batch_size: int = 64
     learning_rate: float = 1e-3
@@ -71,7 +85,13 @@ class FitConfig:
     off_data_weight: float = 0.1
     warm_start: bool = False
 
+    @property
+    def method(self) -> Method:
+        """Which uncertainty h is given."""
+        return Method(self.uncertainty, self.members, self.passes)
+
     def __post_init__(self) -> None:
+        _ = self.method  # refuses what is impossible
         for name, least in (("epochs", 1), ("batch_size", 1), ("patience", 1), ("kl_epochs", 0)):
             if getattr(self, name) < least:
                 raise OptionError(f"fit {name} is {getattr(self, name)}; allowed: >= {least}")
@@ -175,8 +195,10 @@ def fit_forward(
     data = stack_log(log, model.stack)
     parts = split(data, config.held_out_every, model.stack)
     change = model.change(data.observation, data.next_observation)
-    fresh = _prepare(model, config, torch_generator(seed, "forward", "weights"))
-    if fresh:
+    if not (bool(model.fitted) and config.warm_start):
+        generator = torch_generator(seed, "forward", "weights")
+        fresh = ForwardModel(model.stack, model.config, generator)
+        model.load_state_dict(fresh.state_dict())
         model.fit_scale(data.observation, change, parts.train)
     outputs = model.valid_outputs.sum(-1)
 
@@ -186,7 +208,7 @@ def fit_forward(
         return (error**2).sum(-1) / outputs
 
     generator = torch_generator(seed, "forward", "batches")
-    record = _train("forward", model, loss, parts, config, generator, on_epoch, shared=False)
+    record = _train("forward", model, loss, parts, config, generator, on_epoch)
     return forward_report(model, data, parts.held_out, record)
 
 
@@ -198,70 +220,50 @@ def fit_inverse(
     seed: int,
     on_epoch: EpochCallback | None = None,
 ) -> InverseReport:
-    """Fits h with the evidential loss; the shared head learns from all agents at once."""
+    """Fits h with the loss of the method asked for; the head learns from all agents at once."""
     data = stack_log(log, model.stack)
     parts = split(data, config.held_out_every, model.stack)
     inputs = model.inputs(data.observation, data.next_observation)
-    fresh = _prepare(model, config, torch_generator(seed, "inverse", "weights"))
+    fresh = not (bool(model.fitted) and config.warm_start and model.method == config.method)
     if fresh:
+        model.renew(config.method, torch_generator(seed, "inverse", "weights"))
         model.standardise.fit(inputs, parts.train)
+    generator = torch_generator(seed, "inverse", "batches")
+    off_data = OffData.around(inputs, parts.train, model.stack)
+    standardised, rows = model.standardise(inputs), parts.train.sum(1)
+
+    def invent(count: int) -> Tensor:
+        return model.standardise(off_data.draw(count, generator, state_share=0.5))
 
     def loss(columns: Tensor, epoch: int) -> Tensor:
         # Annealing lets a fresh model gather evidence before it is punished for misleading some.
         share = annealing(epoch, config.kl_epochs) if fresh and epoch >= 0 else 1.0
-        alpha = model(inputs[:, columns])
-        weight = config.kl_weight * share
-        error = evidential_loss(alpha, data.executed[:, columns], model.valid_actions, weight)
-        if not config.off_data_weight:
-            return error
-        invented = off_data.draw(len(columns) // 2 + 1, generator, state_share=0.5)
-        certain = divergence_from_uniform(model(invented), model.valid_actions)
-        return error + config.off_data_weight * share * certain.mean(1, keepdim=True)
+        weights = config.kl_weight, config.off_data_weight
+        lesson = Lesson(epoch < 0, generator, rows, share, *weights, invent)
+        return model.net.loss(standardised[:, columns], data.executed[:, columns], lesson)
 
-    generator = torch_generator(seed, "inverse", "batches")
-    off_data = OffData.around(inputs, parts.train, model.stack)
-    record = _train("inverse", model, loss, parts, config, generator, on_epoch, shared=True)
+    record = _train("inverse", model, loss, parts, config, generator, on_epoch)
     drawn = torch_generator(seed, "inverse", "off data")
     return inverse_report(model, data, parts.train, parts.held_out, record, drawn)
 
 
-def _prepare(
-    model: ForwardModel | InverseModel, config: FitConfig, generator: torch.Generator
-) -> bool:
-    """Draws new weights unless this is a warm start; true if the weights are new."""
-    if bool(model.fitted) and config.warm_start:
-        return False
-    if isinstance(model, ForwardModel):
-        fresh = ForwardModel(model.stack, model.config, generator).state_dict()
-    else:
-        fresh = InverseModel(model.stack, model.config, generator).state_dict()
-    model.load_state_dict(fresh)
-    return True
-
-
 class _Best:
-    """The weights with the lowest held-out loss; agent by agent unless parts are shared."""
+    """The weights with the lowest held-out loss, each of `units` parts of the model for itself."""
 
-    def __init__(self, model: nn.Module, agents: int, shared: bool) -> None:
+    def __init__(self, model: nn.Module, units: int) -> None:
         self._model = model
-        self._shared = shared
         self._weights = {name: p.detach().clone() for name, p in model.named_parameters()}
-        self.loss = torch.full((agents,), torch.inf)
+        self.loss = torch.full((units,), torch.inf)
 
     def offer(self, loss: Tensor) -> bool:
-        """Keeps the model's current weights where `loss`, ``(agents,)``, is lower than before."""
-        if self._shared:
-            better = (loss.mean() < self.loss.mean()).expand_as(loss)
-        else:
-            better = loss < self.loss
+        """Keeps the model's current weights where `loss`, ``(units,)``, is lower than before."""
+        better = loss < self.loss
         if not better.any():
             return False
         self.loss = torch.where(better, loss, self.loss)
+        units = len(better)
         for name, parameter in self._model.named_parameters():
-            if self._shared:
-                self._weights[name].copy_(parameter.detach())
-            else:
-                self._weights[name][better] = parameter.detach()[better]
+            self._weights[name].view(units, -1)[better] = parameter.detach().view(units, -1)[better]
         return True
 
     def restore(self) -> None:
@@ -277,18 +279,25 @@ def _train(
     config: FitConfig,
     generator: torch.Generator,
     on_epoch: EpochCallback | None,
-    shared: bool,
 ) -> TrainingRecord:
-    best = _Best(model, len(parts.train), shared)
+    # Agents of f and members of h share no weight, so each may keep its own best.
+    members = model.net.members if isinstance(model, InverseModel) else 1
+    best = _Best(model, members if isinstance(model, InverseModel) else len(parts.train))
+
+    def held_out() -> Tensor:
+        found = _mean_loss(loss, parts.held_out, members)
+        return found.mean(0).view(-1) if isinstance(model, InverseModel) else found
+
     if bool(model.fitted):  # a warm start that only makes things worse must change nothing
-        best.offer(_mean_loss(loss, parts.held_out))
+        best.offer(held_out())
     optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
     columns = parts.train.any(0).nonzero()[:, 0]
     waited = epoch = 0
     train_loss = float("nan")
     while epoch < config.epochs and waited < config.patience:
-        train_loss = _epoch(loss, parts.train, columns, epoch, optimiser, config, generator)
-        held_out_loss = _mean_loss(loss, parts.held_out)
+        batches = _shuffled(columns, members, generator).split(config.batch_size, dim=-1)
+        train_loss = _epoch(loss, parts.train, batches, epoch, optimiser)
+        held_out_loss = held_out()
         improved = best.offer(held_out_loss)
         epoch += 1
         waited = 0 if improved else waited + 1
@@ -306,22 +315,25 @@ def _train(
     )
 
 
+def _shuffled(columns: Tensor, members: int, generator: torch.Generator) -> Tensor:
+    """Columns in random order, ``(n,)``; of several members each in its own, ``(members, n)``."""
+    orders = [torch.randperm(len(columns), generator=generator) for _ in range(members)]
+    return columns[orders[0] if members == 1 else torch.stack(orders)]
+
+
 def _epoch(
     loss: RowLoss,
     weight: Tensor,
-    columns: Tensor,
+    batches: Sequence[Tensor],
     epoch: int,
     optimiser: torch.optim.Optimizer,
-    config: FitConfig,
-    generator: torch.Generator,
 ) -> float:
-    """One pass over the training columns in random order; the mean loss over agents and batches."""
-    order = columns[torch.randperm(len(columns), generator=generator)]
-    total, batches = 0.0, order.split(config.batch_size)
+    """One pass over the batches of columns; the mean loss over agents, members and batches."""
+    total = 0.0
     for batch in batches:
         own = weight[:, batch]
         # Each agent's mean, summed: an agent learns as fast among many as it would alone.
-        mean = (loss(batch, epoch) * own).sum(1) / own.sum(1).clamp(min=1.0)
+        mean = (loss(batch, epoch) * own).sum(-1) / own.sum(-1).clamp(min=1.0)
         optimiser.zero_grad(set_to_none=True)
         mean.sum().backward()
         optimiser.step()
@@ -330,9 +342,11 @@ def _epoch(
 
 
 @torch.no_grad()
-def _mean_loss(loss: RowLoss, weight: Tensor, chunk: int = 2048) -> Tensor:
-    """Mean loss per agent over the rows with weight, in its final form."""
-    total = torch.zeros(len(weight))
-    for columns in weight.any(0).nonzero()[:, 0].split(chunk):
-        total += (loss(columns, -1) * weight[:, columns]).sum(1)
-    return total / weight.sum(1)
+def _mean_loss(loss: RowLoss, weight: Tensor, members: int, chunk: int = 2048) -> Tensor:
+    """Mean loss over the rows with weight, ``(agents,)`` or, of several, ``(agents, members)``."""
+    total, rows = torch.zeros(()), torch.zeros(())
+    for batch in weight.any(0).nonzero()[:, 0].split(chunk):
+        columns = batch if members == 1 else batch.expand(members, -1)
+        own = weight[:, columns]
+        total, rows = total + (loss(columns, -1) * own).sum(-1), rows + own.sum(-1)
+    return total / rows

@@ -2,7 +2,8 @@
 
 A grounded action is taken where the inverse model's uncertainty u is below the threshold alpha. In
 UGAT alpha starts at infinity (everything is taken) and is then the mean of the u that were logged;
-a fixed alpha and an infinite one (GAT, no gate) are the paper's ablations.
+a fixed alpha and an infinite one (GAT, no gate) are the paper's ablations. Where every u was 0,
+there is no uncertainty to gate by, and alpha stays infinite.
 """
 
 from __future__ import annotations
@@ -159,7 +160,7 @@ class Gate:
             total = np.sum(self._epochs, axis=0)
             if self.config.scope == "pooled":
                 total = np.broadcast_to(total.sum(1, keepdims=True), total.shape)
-            self.alpha = np.divide(total[0], total[1], out=self.alpha.copy(), where=total[1] > 0)
+            self.alpha = np.divide(total[0], total[1], out=self.alpha.copy(), where=total[0] > 0)
         self._counts = np.zeros_like(self._counts)
         self.iteration += 1
         return report

@@ -1,7 +1,7 @@
 """Inverse models h_i: which action of the simulation leads from one state to another.
 
-Every intersection has an encoder of its own; one evidential head is shared by all of them. Phases
-an intersection does not have are masked, and its uncertainty counts its own number of phases.
+Every intersection has an encoder of its own; one head is shared by all of them. Phases an
+intersection does not have are masked, and its uncertainty counts its own number of phases.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ugat_marl.batched import BatchedMLP
 from ugat_marl.errors import OptionError
-from ugat_marl.grounding.evidential import concentration, expected_probability, uncertainty
+from ugat_marl.grounding.dropout import DropoutNet
+from ugat_marl.grounding.ensemble import EnsembleNet, PlainNet
+from ugat_marl.grounding.evidential import EvidentialNet
 from ugat_marl.grounding.scaling import Standardiser
 from ugat_marl.grounding.stacked import Stack
+from ugat_marl.grounding.uncertainty import AnswerNet, InversePrediction, Method, NetShape
 
 
 @dataclass(frozen=True)
@@ -40,54 +42,46 @@ class InverseConfig:
             raise OptionError(f"inverse embedding is {self.embedding}; allowed: >= 1")
 
 
-@dataclass(frozen=True)
-class InversePrediction:
-    """What h answers; tensors with the leading axes ``(agents, batch)``.
-
-    Attributes:
-        action: int64, the likeliest action.
-        probability: ``(agents, batch, actions)`` expected probabilities, 0 where masked.
-        u: Uncertainty K / S in (0, 1].
-    """
-
-    action: Tensor
-    probability: Tensor
-    u: Tensor
-
-
 class InverseModel(nn.Module):
-    """h of every intersection: (s, features of s') -> distribution over actions.
+    """h of every intersection: (s, features of s') -> distribution over actions, and u.
 
     Args:
         stack: The agents.
         config: Shape of the models.
         generator: Source of the initial weights.
+        method: Which uncertainty; the evidential one unless given.
     """
 
     fitted: Tensor
     columns: Tensor
     valid_inputs: Tensor
-    valid_actions: Tensor
+    method: Method
+    net: AnswerNet
 
-    def __init__(self, stack: Stack, config: InverseConfig, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        stack: Stack,
+        config: InverseConfig,
+        generator: torch.Generator,
+        method: Method | None = None,
+    ) -> None:
         super().__init__()
         self.stack = stack
         self.config = config
         heads = stack.heads(config.include_phase)
-        fan_in = [size + head for size, head in zip(stack.sizes, heads, strict=True)]
-        self.standardise = Standardiser(len(heads), max(fan_in))
-        self.encoders = BatchedMLP(fan_in, config.hidden, config.embedding, generator)
-        bound = config.embedding**-0.5
-        self.head = nn.Linear(config.embedding, stack.actions)
-        with torch.no_grad():  # nn.Linear draws from the global generator; ours must decide
-            for part in self.head.parameters():
-                part.copy_((torch.rand(part.shape, generator=generator) * 2 - 1) * bound)
+        self._fan_in = [size + head for size, head in zip(stack.sizes, heads, strict=True)]
+        self.standardise = Standardiser(len(heads), max(self._fan_in))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
         columns, valid = _columns(stack.sizes, heads)
         self.register_buffer("columns", columns, persistent=False)
         self.register_buffer("valid_inputs", valid, persistent=False)
-        valid_actions = stack.valid_actions[:, None, :]
-        self.register_buffer("valid_actions", valid_actions, persistent=False)
+        self.renew(method or Method(), generator)
+
+    def renew(self, method: Method, generator: torch.Generator) -> None:
+        """Forgets everything: a new network, of this method, with weights from `generator`."""
+        self.method = method
+        self.net = _net(self, method, self._fan_in, generator)
+        self.fitted.fill_(False)
 
     def inputs(self, observation: Tensor, next_features: Tensor) -> Tensor:
         """The state, and directly behind it the change of its features; unscaled.
@@ -103,19 +97,29 @@ class InverseModel(nn.Module):
         columns = self.columns.expand(-1, both.shape[1], -1)
         return both.gather(2, columns) * self.valid_inputs
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Dirichlet concentrations ``(agents, batch, actions)`` for unscaled `inputs`."""
-        embedding = torch.relu(self.encoders(self.standardise(inputs)))
-        return concentration(self.head(embedding), self.valid_actions)
+    def answer(self, inputs: Tensor) -> InversePrediction:
+        """Answers to unscaled `inputs`, ``(agents, batch, width)``."""
+        return self.net.answer(self.standardise(inputs))
 
     def predict(self, observation: Tensor, next_features: Tensor) -> InversePrediction:
         """The action that h holds responsible for the step from s to s'."""
-        alpha = self(self.inputs(observation, next_features))
-        return InversePrediction(
-            action=alpha.argmax(-1),
-            probability=expected_probability(alpha),
-            u=uncertainty(alpha, self.valid_actions),
-        )
+        return self.answer(self.inputs(observation, next_features))
+
+
+def _net(
+    model: InverseModel, method: Method, fan_in: list[int], generator: torch.Generator
+) -> AnswerNet:
+    valid_actions = model.stack.valid_actions[:, None, :]
+    shape = NetShape(fan_in, model.config.hidden, model.config.embedding, valid_actions)
+    match method.name:
+        case "edl":
+            return EvidentialNet(shape, generator)
+        case "dropout":
+            return DropoutNet(shape, generator, method.passes)
+        case "ensemble":
+            return EnsembleNet(shape, generator, method.members)
+        case "none":
+            return PlainNet(shape, generator)
 
 
 def _columns(sizes: list[int], heads: list[int]) -> tuple[Tensor, Tensor]:

@@ -7,14 +7,14 @@ the action with which the simulation does the same; the gate takes a' where h is
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from ugat_marl.batched import one_thread
 from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
@@ -23,6 +23,7 @@ from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.gate import Gate, GateConfig
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.stacked import Stack
+from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import AgentLayout
 
@@ -114,8 +115,9 @@ class GroundedActionTransform:
         return Grounding(np.where(accepted, grounded, actions), grounded, u, accepted)
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights, statistics and gate, as tensors and plain values."""
+        """Weights, statistics, method of uncertainty and gate, as tensors and plain values."""
         return {
+            "method": asdict(self.inverse.method),
             "layouts": {a: list(_sizes(v)) for a, v in self.stack.layouts.items()},
             "forward": self.forward.state_dict(),
             "inverse": self.inverse.state_dict(),
@@ -123,7 +125,7 @@ class GroundedActionTransform:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores `state_dict`; on an error nothing is changed.
+        """Restores `state_dict`, with the method of uncertainty h had; on an error nothing changes.
 
         Raises:
             CheckpointError: Of other agents or shapes, incomplete, or not finite.
@@ -135,14 +137,16 @@ class GroundedActionTransform:
                 "the grounding in the checkpoint belongs to other agents or another observation; "
                 f"this one has {len(own)} agents ({', '.join(self.stack.agents[:4])} ...)"
             )
-        models: dict[str, nn.Module] = {"forward": self.forward, "inverse": self.inverse}
-        for name, model in models.items():
-            _refuse_foreign(name, state.get(name), model.state_dict())
+        method, parts = _method(state), _renamed(state.get("inverse"))
+        inverse = InverseModel(self.stack, self.inverse.config, torch_generator(0), method)
+        _refuse_foreign("forward", state.get("forward"), self.forward.state_dict())
+        _refuse_foreign("inverse", parts, inverse.state_dict())
         if not isinstance(state.get("gate"), Mapping):
             raise CheckpointError("the grounding in the checkpoint has no gate")
         self.gate.load_state_dict(state["gate"])
-        for name, model in models.items():
-            model.load_state_dict(state[name])
+        self.forward.load_state_dict(state["forward"])
+        self.inverse.renew(method, torch_generator(0))
+        self.inverse.load_state_dict(parts)
 
     def save(self, path: Path) -> None:
         """Writes `state_dict` to a file, whole or not at all.
@@ -163,6 +167,25 @@ class GroundedActionTransform:
             self.load_state_dict(state)
         except CheckpointError as error:
             raise CheckpointError(f"{path}: {error}") from None
+
+
+def _method(state: Mapping[str, Any]) -> Method:
+    """The method of uncertainty; checkpoints of version 0.1 do not say theirs, it is "edl"."""
+    found = state.get("method", asdict(Method()))
+    try:
+        return Method(**found)
+    except (TypeError, OptionError) as error:
+        raise CheckpointError(
+            f"the inverse model in the checkpoint is of no method: {error}"
+        ) from None
+
+
+def _renamed(parts: Any) -> Any:
+    """The parts of h under their names of today; in version 0.1 they lacked the ``net.``."""
+    if not isinstance(parts, Mapping):
+        return parts
+    old = ("encoders.", "head.")
+    return {f"net.{k}" if str(k).startswith(old) else k: value for k, value in parts.items()}
 
 
 def _sizes(layout: AgentLayout) -> tuple[int, int, int]:
