@@ -15,7 +15,7 @@ from rich.console import Console, RenderableType
 from ugat_marl.evaluation import Evaluation, Result
 from ugat_marl.metrics import Scores
 from ugat_marl.report import pictures
-from ugat_marl.report.pictures import transfer_picture
+from ugat_marl.report.pictures import calibration_picture, transfer_picture
 from ugat_marl.report.tables import measures_table, transfer_table
 from ugat_marl.training import Metrics
 
@@ -93,3 +93,16 @@ def test_the_picture_is_a_picture(found: Evaluation, tmp_path: Path) -> None:
     pixels = matplotlib.image.imread(path)
     assert pixels.shape[:2] == (504, 1200)
     assert pixels.std() > 0.05
+
+
+def test_the_calibration_is_drawn_if_there_was_an_iteration(tmp_path: Path) -> None:
+    numbers = {f"calibration/risk_by_coverage/{i}": 0.05 * i for i in range(5)}
+    numbers |= {
+        f"calibration/{name}": 0.6 for name in ("auroc", "ece", "mean_u", "mean_u_off_data")
+    }
+    metrics, path = Metrics(), tmp_path / "calibration.png"
+    assert not calibration_picture(metrics, path) and not path.exists()
+    for iteration in (1, 2, 3):
+        metrics.add("iteration", iteration, numbers)
+        assert calibration_picture(metrics, path)
+        assert matplotlib.image.imread(path).std() > 0.05

@@ -13,7 +13,7 @@ from tyro.conf import arg
 from ugat_marl.effects import describe
 from ugat_marl.errors import OptionError
 from ugat_marl.progress import Bars
-from ugat_marl.report.pictures import transfer_picture
+from ugat_marl.report.pictures import calibration_picture, transfer_picture
 from ugat_marl.report.tables import transfer_table
 from ugat_marl.training import METRICS, Metrics
 from ugat_marl.transfer import TransferConfig, transfer
@@ -48,7 +48,9 @@ class Train:
         directory = self.out or Path("runs") / f"{name}-s{config.seed}"
         found = transfer(config, directory, resume=self.resume, reporter=Bars(console))
         picture = directory / "gap.png"
-        transfer_picture(found, Metrics.read(directory / METRICS), picture)
+        metrics = Metrics.read(directory / METRICS)
+        transfer_picture(found, metrics, picture)
+        calibration_picture(metrics, directory / "calibration.png")
         console.print(transfer_table(found))
         console.print(
             f"run: {directory}\ntable: {directory / 'table.json'}\npicture: {picture}\n"

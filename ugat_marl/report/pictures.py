@@ -34,6 +34,61 @@ def transfer_picture(found: Evaluation, metrics: Metrics, path: Path) -> None:
             figure.savefig(temporary, format="png")
 
 
+def calibration_picture(metrics: Metrics, path: Path) -> bool:
+    """What u is worth: risk against coverage, and u on and off the data, as PNG.
+
+    Args:
+        metrics: The metrics of a run.
+        path: Where to write.
+
+    Returns:
+        Whether there was an iteration to draw; if not, nothing is written.
+    """
+    found: dict[int, dict[str, float]] = {}
+    for stage, step, name, value in metrics.rows:
+        if stage == "iteration" and name.startswith("calibration/"):
+            found.setdefault(step, {})[name.removeprefix("calibration/")] = value
+    if not found:
+        return False
+    with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(10, 4.2), dpi=120, layout="constrained")
+        left, right = figure.subplots(1, 2)
+        _risks(left, found)
+        _levels(right, found)
+        figure.suptitle("uncertainty u of the inverse models", fontsize=11, x=0.01, ha="left")
+        with replacing(path) as temporary:
+            figure.savefig(temporary, format="png")
+    return True
+
+
+def _risks(axes: Any, found: dict[int, dict[str, float]]) -> None:
+    for number, step in enumerate((min(found), max(found)) if len(found) > 1 else found):
+        risks = [v for name, v in sorted(found[step].items()) if name.startswith("risk_by_cov")]
+        shares = [(i + 1) / len(risks) for i in range(len(risks))]
+        label = f"iteration {step} (AUROC {found[step]['auroc']:.2f}, ECE {found[step]['ece']:.2f})"
+        axes.plot(shares, risks, "o-", color=_COLOURS[number], label=label)
+        axes.axhline(risks[-1], color=_COLOURS[number], ls="--", lw=1)
+    axes.set_xlabel("share of answers taken, lowest u first")
+    axes.set_ylabel("wrong among them")
+    axes.set_ylim(bottom=0)
+    axes.set_title("held-out errors of h; dashed: a u that says nothing", fontsize=9)
+    axes.legend(frameon=False)
+
+
+def _levels(axes: Any, found: dict[int, dict[str, float]]) -> None:
+    steps = sorted(found)
+    for number, (name, label) in enumerate(
+        (("mean_u", "on held-out data"), ("mean_u_off_data", "off the data"))
+    ):
+        axes.plot(steps, [found[s][name] for s in steps], "o-", color=_COLOURS[number], label=label)
+    axes.set_xlabel("iteration")
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.set_ylabel("mean u")
+    axes.set_ylim(0, 1)
+    axes.set_title("does u rise where the simulation never was?", fontsize=9)
+    axes.legend(frameon=False)
+
+
 def _bars(axes: Any, found: Evaluation) -> None:
     width = 0.8 / len(found.domains)
     places = np.arange(len(found.policies))
