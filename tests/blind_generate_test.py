@@ -15,6 +15,7 @@ import pytest
 from ugat_marl.__main__ import main
 from ugat_marl.blind.busy import Busy, busy_places
 from ugat_marl.blind.cases import Case, read_label, read_plan
+from ugat_marl.blind.consequence import Consequences, differing
 from ugat_marl.blind.drawing import (
     IN_THE_LOG,
     OUTSIDE,
@@ -29,9 +30,10 @@ from ugat_marl.blind.outside import BusStops, Driveway
 from ugat_marl.blind.run import run_cases
 from ugat_marl.blind.strengths import KINDS
 from ugat_marl.discrepancy.hypotheses import library
-from ugat_marl.effects import known_effects, load
+from ugat_marl.effects import effect_from, known_effects, load
 from ugat_marl.errors import BlindTestError, OptionError, UnknownNameError
 from ugat_marl.evaluation import policy_factory
+from ugat_marl.measured.data import Passages, Period
 from ugat_marl.measured.reading import read_measured
 from ugat_marl.network import Network
 from ugat_marl.recording import record
@@ -345,3 +347,35 @@ def test_only_vehicles_of_the_day_make_an_origin_busy(
     lines = demand.read_text().splitlines()
     demand.write_text("\n".join(line for line in lines if "<route id=" not in line))
     assert busy_places(load(directory), 0).origins == pytest.approx({"S_C": 180.0})
+
+
+def test_what_changes_no_detection_is_not_hidden(crossing: Callable[..., Path]) -> None:
+    scenario = load(crossing()).with_duration(300)
+    consequences = Consequences(3)
+
+    def has(*records: dict[str, str | float]) -> bool:
+        effects = tuple(effect_from(item) for item in records)
+        return consequences.has(scenario, effects, "fixed-time:20")
+
+    nobody_weaves = {"name": "lane_discipline", "strategic": 0.0}  # every approach has one lane
+    headway = {"name": "headway", "seconds": 1.6}
+    assert not has(nobody_weaves)
+    assert has(headway)
+    assert not has(headway, nobody_weaves)
+    assert has({"name": "undercount", "place": "*", "share": 0.1})
+
+
+def test_detections_that_differ_are_counted_both_ways() -> None:
+    def period(**times: list[float]) -> Period:
+        seen = {
+            name: Passages(np.array(off) - 0.5, np.array(off), np.full(len(off), np.nan),
+                           np.full(len(off), np.nan))
+            for name, off in times.items()
+        }  # fmt: skip
+        return Period("day1", 0.0, 60.0, "fit", {}, seen)
+
+    one = period(a=[1.0, 2.0, 3.0], b=[5.0])
+    assert differing(one, one) == 0
+    assert differing(one, period(a=[1.0, 2.02, 3.0], b=[5.0])) == 0
+    assert differing(one, period(a=[1.0, 2.5, 3.0], b=[5.0])) == 2
+    assert differing(one, period(a=[1.0, 3.0])) == 2

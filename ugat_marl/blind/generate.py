@@ -19,6 +19,7 @@ from ugat_marl.blind.cases import (
     write_label,
     write_plan,
 )
+from ugat_marl.blind.consequence import Consequences
 from ugat_marl.blind.drawing import GROUPS, Drawn, Task, deck, draw_hidden
 from ugat_marl.blind.strengths import STRENGTHS, nominal_of
 from ugat_marl.effects import load
@@ -107,7 +108,7 @@ def generate(directory: Path, blueprint: Blueprint, reporter: Reporter | None = 
         for name, scenario in scenarios.items():
             busy[name] = busy_places(scenario, blueprint.seed)
             advance()
-    planned = _plan(blueprint, scenarios, busy)
+    planned = _plan(blueprint, scenarios, busy, reporter)
     _begin(directory, blueprint, tuple(item.case for item in planned))
     made = 0
     with reporter.task("hiding and measuring", len(planned)) as advance:
@@ -127,13 +128,22 @@ def _loaded(name: str, blueprint: Blueprint) -> Scenario:
 
 
 def _plan(
-    blueprint: Blueprint, scenarios: dict[str, Scenario], busy: dict[str, Busy]
+    blueprint: Blueprint,
+    scenarios: dict[str, Scenario],
+    busy: dict[str, Busy],
+    reporter: Reporter,
 ) -> list[_Planned]:
     """Draws all cases; case by case, so that a longer test begins like a shorter one."""
     generator = numpy_generator(blueprint.seed, "blind", "deck")
     tasks = deck(blueprint.classes, blueprint.strengths, blueprint.cases, generator)
     spare = _spare(tasks)
-    return [_planned(blueprint, i, task, spare, scenarios, busy) for i, task in enumerate(tasks)]
+    consequences = Consequences(blueprint.seed)
+    planned: list[_Planned] = []
+    with reporter.task("drawing what is hidden", len(tasks)) as advance:
+        for index, task in enumerate(tasks):
+            planned.append(_planned(blueprint, index, task, spare, scenarios, busy, consequences))
+            advance()
+    return planned
 
 
 def _spare(tasks: Sequence[Task]) -> dict[str, list[Task]]:
@@ -151,6 +161,7 @@ def _planned(
     spare: dict[str, list[Task]],
     scenarios: dict[str, Scenario],
     busy: dict[str, Busy],
+    consequences: Consequences,
 ) -> _Planned:
     generator = numpy_generator(blueprint.seed, "blind", "draw", index)
     names = [blueprint.scenarios[i] for i in generator.permutation(len(blueprint.scenarios))]
@@ -164,6 +175,8 @@ def _planned(
                 if generator.random() < blueprint.pressure_share and drawn.group != "setting":
                     policies = PRESSURES
                 policy = policies[int(generator.integers(len(policies)))]
+                if not consequences.has(scenarios[name], drawn.effects, policy):
+                    continue
                 case = Case(f"case{index + 1:03d}", name, drawn.leave_out)
                 seed = derive_seed(blueprint.seed, "blind", "case", index)
                 return _Planned(case, drawn, policy, seed)
