@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from ugat_marl.bench import EnvBench, LearningBench, MemoryBench, Report, Spread, Target
+from ugat_marl.bench import (
+    EnvBench,
+    FittingBench,
+    LearningBench,
+    MemoryBench,
+    Report,
+    Spread,
+    Target,
+)
 from ugat_marl.bench.episode import RecordingSimulator, random_actions
 from ugat_marl.bench.learning_episodes import Noise, Tape
 from ugat_marl.bench.measured import in_fresh_process
@@ -119,6 +127,7 @@ def test_other_work_is_not_compared() -> None:
         (lambda: EnvBench(rounds=0), "rounds = 0"),
         (lambda: EnvBench(scenarios=()), "scenarios = 0"),
         (lambda: LearningBench(updates=0), "updates = 0"),
+        (lambda: FittingBench(rounds=0), "rounds = 0"),
         (lambda: MemoryBench(resets=20), "more than settled"),
     ],
 )
@@ -205,6 +214,21 @@ def test_bench_learning() -> None:
     assert overhead.measured == pytest.approx(np.median(ratios))
     assert growth.measured > 0
     assert "20 decisions and 20 updates" in report.notes[0]
+
+
+def test_bench_fitting(tmp_path: Path) -> None:
+    out = tmp_path / "fitting.json"
+    report = FittingBench(SCENARIO, episodes=2, duration_s=200, rounds=2, epochs=2, out=out).run()
+    rows = {row["what"]: row for row in report.rows}
+    ratios, times = rows["CPU time of a fit / edl"], rows["CPU time of a fit [s]"]
+    assert ratios["edl"].values == (1.0, 1.0)
+    assert ratios["ensemble"].values == pytest.approx(
+        [a / b for a, b in zip(times["ensemble"].values, times["edl"].values, strict=True)]
+    )
+    assert rows["mean u"]["none"].median == rows["mean u off the data"]["none"].median == 0.0
+    assert 0 < rows["mean u in V4"]["dropout"].median <= 1
+    assert "1 agents, 40 transitions" in report.notes[0]
+    assert json.loads(out.read_text())["settings"]["domain"] == "V4"
 
 
 def test_bench_memory() -> None:

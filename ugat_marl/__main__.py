@@ -42,8 +42,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "blind table": ("commands.blind:BlindTable", "sum up graded blind tests"),
     "bench env": ("bench.speed:EnvBench", "speed against SUMO alone and sumo-rl"),
     "bench learning": ("bench.learning:LearningBench", "what learning adds to an episode"),
+    "bench fitting": (
+        "bench.fitting:FittingBench",
+        "what each uncertainty costs and is worth",
+    ),
     "bench memory": ("bench.memory:MemoryBench", "memory over many resets"),
-    "bench all": ("bench.everything:AllBench", "all three"),
+    "bench all": ("bench.everything:AllBench", "all four"),
 }
 
 USAGE_ERROR = 2

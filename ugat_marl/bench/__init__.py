@@ -1,4 +1,4 @@
-"""The suite's figures, measured: speed of the environment, cost of learning, memory.
+"""The suite's figures, measured: speed of the environment, cost of learning and fitting, memory.
 
 Every bench is a frozen dataclass of options with a ``run()`` that returns a `Report`: rows, targets
 and what they were measured on. Ratios are taken between runs of the same round, next to each other
@@ -6,6 +6,7 @@ in time, since a machine's speed drifts by more than what is measured.
 """
 
 from ugat_marl.bench.everything import AllBench
+from ugat_marl.bench.fitting import FittingBench
 from ugat_marl.bench.learning import LearningBench
 from ugat_marl.bench.memory import MemoryBench
 from ugat_marl.bench.report import Report, Spread, Target
@@ -14,6 +15,7 @@ from ugat_marl.bench.speed import EnvBench
 __all__ = [
     "AllBench",
     "EnvBench",
+    "FittingBench",
     "LearningBench",
     "MemoryBench",
     "Report",

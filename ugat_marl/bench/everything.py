@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from ugat_marl.bench.fitting import FittingBench
 from ugat_marl.bench.learning import LearningBench
 from ugat_marl.bench.memory import MemoryBench
 from ugat_marl.bench.report import Report
@@ -22,12 +23,14 @@ class AllBench:
     Attributes:
         env: Options of ``bench env``.
         learning: Options of ``bench learning``.
+        fitting: Options of ``bench fitting``.
         memory: Options of ``bench memory``.
         out: Folder for one JSON file per bench.
     """
 
     env: EnvBench = field(default_factory=EnvBench)
     learning: LearningBench = field(default_factory=LearningBench)
+    fitting: FittingBench = field(default_factory=FittingBench)
     memory: MemoryBench = field(default_factory=MemoryBench)
     out: Path | None = None
 
@@ -41,8 +44,8 @@ class AllBench:
             MeasurementError: A measured process failed.
         """
         reports: list[Report] = []
-        for name in ("env", "learning", "memory"):
-            bench: EnvBench | LearningBench | MemoryBench = getattr(self, name)
+        for name in ("env", "learning", "fitting", "memory"):
+            bench: EnvBench | LearningBench | FittingBench | MemoryBench = getattr(self, name)
             if self.out is not None and bench.out is None:
                 bench = replace(bench, out=self.out / f"{name}.json")
             reports.append(bench.run(reporter))

@@ -1,0 +1,108 @@
+"""Measured program: every uncertainty fitted to the same transitions, round by round."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ugat_marl.controllers import controller_for
+from ugat_marl.grounding.fit_report import on_transitions
+from ugat_marl.grounding.fitting import FitConfig, fit_inverse
+from ugat_marl.grounding.inverse import InverseConfig, InverseModel
+from ugat_marl.grounding.stacked import Stack, stack_log
+from ugat_marl.grounding.uncertainty import METHODS, MethodName
+from ugat_marl.rollout import Exploring, observer_of, roll_out
+from ugat_marl.seeding import torch_generator
+from ugat_marl.traffic_env import parallel_env
+from ugat_marl.transitions import TransitionLog
+
+RULE = "largest-queue:20"
+EPSILON = 0.3
+ANSWERS = 200
+"""Answers that are timed together."""
+
+
+def recorded(request: Mapping[str, Any], domain: str) -> TransitionLog:
+    """Roll-outs of the rule with random phases in between."""
+    options: dict[str, Any] = {"duration_s": request["duration_s"]}
+    rule = controller_for(RULE, parallel_env(request["scenario"], domain, **options))
+    env = parallel_env(request["scenario"], domain, **options, **rule.env_options)
+    logs: list[TransitionLog] = []
+    for number in range(request["episodes"]):
+        seed = request["seed"] + number
+        log = roll_out(env, Exploring(rule, EPSILON), seed, record=observer_of(env, "count")).log
+        assert log is not None, "recording was asked for"
+        logs.append(log)
+    env.close()
+    return TransitionLog.concatenate(logs)
+
+
+def measured(
+    method: MethodName, simulated: TransitionLog, real: TransitionLog, epochs: int, seed: int
+) -> dict[str, float]:
+    """One fit and what it is worth; seconds are CPU time."""
+    stack = Stack(simulated.provenance.layouts)
+    model = InverseModel(stack, InverseConfig(), torch_generator(seed))
+    config = FitConfig(uncertainty=method, epochs=epochs)
+    began = time.process_time()
+    report = fit_inverse(model, simulated, config, seed)
+    fitted = time.process_time() - began
+    there = stack_log(real, stack)
+    accuracy, mean_u = on_transitions(model, there, there.weight)
+    calibration = report.calibration
+    return {
+        "fit_s": fitted,
+        "epochs": report.training.epochs,
+        "answer_ms": answer_ms(model),
+        "accuracy": float(report.accuracy.mean()),
+        "auroc": calibration.auroc,
+        "risk": calibration.risk_by_coverage[2],
+        "ece": calibration.ece,
+        "mean_u": calibration.mean_u,
+        "mean_u_off_data": calibration.mean_u_off_data,
+        "auroc_off_data": calibration.auroc_off_data,
+        "accuracy_there": float(accuracy.mean()),
+        "mean_u_there": float(mean_u.mean()),
+    }
+
+
+@torch.no_grad()
+def answer_ms(model: InverseModel) -> float:
+    """CPU milliseconds of one answer for all agents."""
+    row = torch.ones(len(model.stack.agents), 1, model.stack.width)
+    began = time.process_time()
+    for _ in range(ANSWERS):
+        model.predict(row, row)
+    return 1e3 * (time.process_time() - began) / ANSWERS
+
+
+def measure(request: Mapping[str, Any]) -> dict[str, Any]:
+    """All methods in turn, each round with another seed."""
+    torch.set_num_threads(1)
+    simulated, real = recorded(request, "sim"), recorded(request, request["domain"])
+    for method in METHODS:  # what is loaded and compiled on first use is nobody's cost
+        measured(method, simulated, real, 1, request["seed"])
+    found: dict[str, list[dict[str, float]]] = {method: [] for method in METHODS}
+    for number in range(request["rounds"]):
+        for method in METHODS:
+            seed = request["seed"] + number
+            found[method].append(measured(method, simulated, real, request["epochs"], seed))
+    return {
+        "agents": len(simulated.agents),
+        "rows": len(simulated.transitions(simulated.agents[0])),
+        "methods": {
+            method: {name: [one[name] for one in rounds] for name in rounds[0]}
+            for method, rounds in found.items()
+        },
+    }
+
+
+if __name__ == "__main__":
+    asked, result = map(Path, sys.argv[1:3])
+    result.write_text(json.dumps(measure(json.loads(asked.read_text()))))
