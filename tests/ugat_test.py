@@ -25,6 +25,7 @@ from ugat_marl.controllers import controller_for
 from ugat_marl.effects import in_domain, load
 from ugat_marl.errors import CheckpointError, LogError, OptionError, ScenarioError, UnknownNameError
 from ugat_marl.grounding.fitting import FitConfig
+from ugat_marl.grounding.uncertainty import MethodName
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.progress import Silent
@@ -145,6 +146,36 @@ def test_resuming_gives_the_numbers_of_an_unbroken_run(
         assert pl.read_parquet(folder / name).equals(pl.read_parquet(unbroken / name))
     assert np.array_equal(weights(folder, "ugat"), weights(unbroken, "ugat"))
     assert (folder / "table.json").read_text() == (unbroken / "table.json").read_text()
+
+
+def short_of(method: MethodName) -> TransferConfig:
+    fit = FitConfig(uncertainty=method, epochs=2, members=2, passes=3)
+    ugat = replace(SMALL.ugat, pretrain_episodes=2, grounded_episodes=1, fit=fit)
+    return replace(SMALL, duration_s=100, ugat=ugat)
+
+
+@pytest.mark.parametrize("method", ["ensemble", "none"])
+def test_every_uncertainty_trains(method: MethodName, tmp_path: Path) -> None:
+    transfer(short_of(method), tmp_path)
+    metrics = Metrics.read(tmp_path / "metrics.parquet").rows
+    rows = {(step, name): value for _, step, name, value in metrics}
+    assert 0 <= rows[2, "calibration/ece"] <= 1
+    if method == "none":
+        assert rows[1, "gate/mean_u"] == rows[2, "gate/mean_u"] == 0.0
+        assert rows[1, "gate/acceptance"] == rows[2, "gate/acceptance"] == 1.0
+    else:
+        assert rows[2, "gate/alpha"] == pytest.approx(rows[1, "gate/mean_u"])
+
+
+def test_a_run_with_dropout_resumes(tmp_path: Path) -> None:
+    """Its thinned networks are part of the checkpoint, and are not those of a fresh grounding."""
+    config = short_of("dropout")
+    with pytest.raises(Killed):
+        transfer(config, tmp_path / "run", reporter=KillAt("fitting f and h, round 2"))
+    transfer(config, tmp_path / "run", resume=True)
+    transfer(config, tmp_path / "unbroken")
+    one, two = (pl.read_parquet(tmp_path / n / "metrics.parquet") for n in ("run", "unbroken"))
+    assert one.equals(two)
 
 
 def test_a_killed_process_resumes(tmp_path: Path) -> None:
