@@ -32,11 +32,7 @@ from ugat_marl.report.diagnosis_words import VERDICTS
 
 FEW = Effort(base=14, bank=2, fit=4, test=12)
 EXAMINED = ("late_green", "gap_acceptance")
-LEFT_OUT = tuple(
-    sorted(
-        set(known_effects()) - {*EXAMINED, "emergency_deceleration", "yellow_time", "all_red_time"}
-    )
-)
+LEFT_OUT = tuple(sorted(set(known_effects()) - {*EXAMINED, "yellow_time", "all_red_time"}))
 
 
 @dataclass(frozen=True)

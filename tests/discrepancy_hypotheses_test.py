@@ -102,12 +102,8 @@ def test_effects_that_are_left_out_are_not_examined(single: Scenario) -> None:
 
 
 def test_the_library_holds_every_effect_that_can_be_diagnosed() -> None:
-    # Clearance times are read off the log; emergency braking shows in no detector.
-    assert set(known_effects()) - library() == {
-        "all_red_time",
-        "emergency_deceleration",
-        "yellow_time",
-    }
+    # Clearance times are read off the log.
+    assert set(known_effects()) - library() == {"all_red_time", "yellow_time"}
     assert library() <= set(known_effects())
 
 

@@ -11,7 +11,10 @@ import pytest
 
 from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, INDEX, Tally, tally
 from ugat_marl.discrepancy.hypotheses import Hypothesis, library
-from ugat_marl.discrepancy.local import Proposer
+from ugat_marl.discrepancy.local import (
+    Proposer,
+    _later,  # pyright: ignore[reportPrivateUsage]
+)
 from ugat_marl.discrepancy.site import Site, SiteLane
 from ugat_marl.discrepancy.statistics import Pools, Reference
 from ugat_marl.discrepancy.volume import Routes
@@ -180,6 +183,22 @@ def test_a_surge_is_proposed_in_its_window(
     assert dict(item.fixed)["edge"] == "a_in"
     assert overlap(window_of(item), truth) > 0.85
     assert item.levels[0][0] == pytest.approx(1.8, abs=0.25)
+
+
+@pytest.mark.parametrize("late_s", [300.0, -300.0])
+def test_an_origin_that_comes_later_or_sooner(reference: Reference, late_s: float) -> None:
+    gone = {"b": lambda t: np.where((t < late_s) | (t >= END_S + late_s), 0.0, 1.0)}
+    item = first(proposed(reference, [street(340 + i, gone) for i in range(5)]), "demand_timing")
+    assert dict(item.fixed) == {"edge": "b_in"}
+    assert item.levels == ((late_s,),)
+
+
+def test_counts_come_later() -> None:
+    counts = np.array([[4.0, 8.0, 2.0, 6.0]])
+    assert _later(counts, 1.0).tolist() == [[0.0, 4.0, 8.0, 2.0]]
+    assert _later(counts, 0.5).tolist() == [[2.0, 6.0, 5.0, 4.0]]
+    assert _later(counts, -1.0).tolist() == [[8.0, 2.0, 6.0, 0.0]]
+    assert _later(counts, -1.5).tolist() == [[5.0, 4.0, 3.0, 0.0]]
 
 
 def test_vehicles_that_turn_elsewhere(reference: Reference) -> None:

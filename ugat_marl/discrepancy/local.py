@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.faults import fault_hypotheses
-from ugat_marl.discrepancy.features import BIN_FEATURES, INDEX
+from ugat_marl.discrepancy.features import BIN_FEATURES, BIN_S, INDEX
 from ugat_marl.discrepancy.hypotheses import LATE_STEP_S, Hypothesis
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Distance, Reference
@@ -35,6 +35,10 @@ _FLOW = (
     "count_advance", "count_stop",
 )  # fmt: skip
 _AVOIDED = ("count_advance", "count_stop")
+_SHIFTS_S = (-900.0, -600.0, -300.0, -150.0, 150.0, 300.0, 600.0, 900.0)
+_SUSPECT = 16.0
+_MOSTLY = 0.7
+"""Share of the vehicles on an edge from which its counts are those of one origin."""
 
 
 class Proposer:
@@ -65,6 +69,7 @@ class Proposer:
         """
         found: list[Hypothesis] = []
         found += self._volume.hypotheses(distance)
+        found += self._timing(reference, distance)
         found += self._windows(reference, periods)
         found += self._places(reference, distance)
         found += fault_hypotheses(self._site, reference, distance, periods)
@@ -75,6 +80,39 @@ class Proposer:
         return self._volume.directed(distance) | largest_stretches(self._edges, distance)
 
     # --- time ---------------------------------------------------------------------------------
+
+    def _timing(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
+        """Origins whose profile over time would fit if it came sooner or later."""
+        z, difference = distance.z["time"], distance.difference["time"]
+        block = reference.blocks["time"]
+        found: list[tuple[float, str, float]] = []
+        first = BIN_FEATURES.index("count_advance") * len(self._edges)
+        for origin in self._routes.passing:
+            rows = [
+                first + index
+                for index, lane in enumerate(self._site.lanes)
+                if self._routes.share(origin, lane.edge) > _MOSTLY
+            ]
+            known = z[rows] != 0
+            if not known.any():
+                continue
+            mean = np.where(np.isfinite(block.mean[rows]), block.mean[rows], 0.0)
+            noise = np.where(known, difference[rows] / np.where(known, z[rows], 1.0), np.inf)
+            for shift in _SHIFTS_S:
+                ray = (_later(mean, shift / BIN_S) - mean) / np.abs(noise)
+                size = float((ray**2).sum())
+                strength = float((ray * z[rows]).sum()) / max(size, 1e-9)
+                if 0.5 < strength < 2.0 and strength**2 * size > _SUSPECT:
+                    found.append((strength**2 * size, origin, shift))
+        chosen: dict[str, float] = {}
+        for _, origin, shift in sorted(found, reverse=True):
+            chosen.setdefault(origin, shift)
+        return [
+            Hypothesis(
+                "demand_timing", (("edge", origin),), ("seconds",), ((shift,),), (0.0,), 45.0
+            )
+            for origin, shift in list(chosen.items())[:2]
+        ]
 
     def _windows(self, reference: Reference, periods: Sequence[Period]) -> list[Hypothesis]:
         """Surges and closures in the stretches that depart most."""
@@ -251,3 +289,15 @@ class Proposer:
                 Hypothesis("clock_drift", place, ("seconds_per_hour",), ((sign,),), (0.0,), 0.5)
             )
         return found
+
+
+def _later(counts: Array, bins: float) -> Array:
+    """Counts ``(rows, bins)`` so many bins later; nobody comes from before the first bin."""
+    moved = np.zeros_like(counts)
+    whole = int(np.floor(bins))
+    for part, step in ((1.0 - (bins - whole), whole), (bins - whole, whole + 1)):
+        if step >= 0:
+            moved[:, step:] += part * counts[:, : counts.shape[1] - step]
+        else:
+            moved[:, :step] += part * counts[:, -step:]
+    return moved

@@ -46,6 +46,11 @@ class Routes:
     turns: dict[str, dict[str, float]]
     joint: dict[str, dict[str, float]]
 
+    def share(self, origin: str, edge: str) -> float:
+        """Share of the vehicles that pass an edge which start at an origin."""
+        own = self.passing[origin].get(edge, 0.0)
+        return own / self.joint[edge][edge] if own else 0.0
+
     @classmethod
     def of(cls, scenario: Scenario) -> Routes:
         """Counts the routes of all vehicles."""
