@@ -281,12 +281,13 @@ def _train(
     on_epoch: EpochCallback | None,
 ) -> TrainingRecord:
     # Agents of f and members of h share no weight, so each may keep its own best.
-    members = model.net.members if isinstance(model, InverseModel) else 1
-    best = _Best(model, members if isinstance(model, InverseModel) else len(parts.train))
+    h = model if isinstance(model, InverseModel) else None
+    members = h.net.members if h else 1
+    best = _Best(model, members if h else len(parts.train))
 
     def held_out() -> Tensor:
         found = _mean_loss(loss, parts.held_out, members)
-        return found.mean(0).view(-1) if isinstance(model, InverseModel) else found
+        return found.mean(0).view(-1) if h else found
 
     if bool(model.fitted):  # a warm start that only makes things worse must change nothing
         best.offer(held_out())
