@@ -32,6 +32,7 @@ class FittingBench:
         duration_s: Simulated seconds per episode.
         rounds: Fits of every method; medians and quartiles are over these.
         epochs: Most epochs of a fit.
+        off_data_weight: How much certainty on invented inputs costs in a fit.
         seed: Seed of simulation, exploration and weights.
         out: JSON file to write.
     """
@@ -42,6 +43,7 @@ class FittingBench:
     duration_s: float = 3600.0
     rounds: int = 3
     epochs: int = 100
+    off_data_weight: float = 0.1
     seed: int = 1
     out: Path | None = None
 

@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ugat_marl.grounding.fit_report import on_transitions
 from ugat_marl.grounding.fitting import FitConfig, fit_inverse
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.stacked import Stack, stack_log
-from ugat_marl.grounding.uncertainty import METHODS, MethodName
+from ugat_marl.grounding.uncertainty import METHODS
 from ugat_marl.rollout import Exploring, observer_of, roll_out
 from ugat_marl.seeding import torch_generator
 from ugat_marl.traffic_env import parallel_env
@@ -44,12 +45,11 @@ def recorded(request: Mapping[str, Any], domain: str) -> TransitionLog:
 
 
 def measured(
-    method: MethodName, simulated: TransitionLog, real: TransitionLog, epochs: int, seed: int
+    config: FitConfig, simulated: TransitionLog, real: TransitionLog, seed: int
 ) -> dict[str, float]:
     """One fit and what it is worth; seconds are CPU time."""
     stack = Stack(simulated.provenance.layouts)
     model = InverseModel(stack, InverseConfig(), torch_generator(seed))
-    config = FitConfig(uncertainty=method, epochs=epochs)
     began = time.process_time()
     report = fit_inverse(model, simulated, config, seed)
     fitted = time.process_time() - began
@@ -86,13 +86,14 @@ def measure(request: Mapping[str, Any]) -> dict[str, Any]:
     """All methods in turn, each round with another seed."""
     torch.set_num_threads(1)
     simulated, real = recorded(request, "sim"), recorded(request, request["domain"])
-    for method in METHODS:  # what is loaded and compiled on first use is nobody's cost
-        measured(method, simulated, real, 1, request["seed"])
+    options = {name: request[name] for name in ("epochs", "off_data_weight")}
+    configs = {method: FitConfig(uncertainty=method, **options) for method in METHODS}
+    for config in configs.values():  # what is loaded on first use is nobody's cost
+        measured(replace(config, epochs=1), simulated, real, request["seed"])
     found: dict[str, list[dict[str, float]]] = {method: [] for method in METHODS}
     for number in range(request["rounds"]):
-        for method in METHODS:
-            seed = request["seed"] + number
-            found[method].append(measured(method, simulated, real, request["epochs"], seed))
+        for method, config in configs.items():
+            found[method].append(measured(config, simulated, real, request["seed"] + number))
     return {
         "agents": len(simulated.agents),
         "rows": len(simulated.transitions(simulated.agents[0])),
