@@ -8,6 +8,8 @@ from dataclasses import fields
 from pathlib import Path
 
 from ugat_marl.effects import effect_from, known_effects
+from ugat_marl.grounding.fitting import FitConfig
+from ugat_marl.grounding.uncertainty import METHODS
 from ugat_marl.scenario_settings import (
     ControlSettings,
     IntersectionSettings,
@@ -42,6 +44,13 @@ def test_the_example_is_a_scenario_file() -> None:
     assert settings.intersections["C1"].phases == ("GGrr", "rrGG")
     for record in settings.effects:
         effect_from(record)
+
+
+def test_every_uncertainty_is_documented() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "training.md").read_text()
+    table = page.partition("| `--fit.uncertainty` |")[2].partition("\n\n")[0]
+    assert tuple(re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE)) == METHODS
+    assert f"`{FitConfig().uncertainty}` (default)" in table
 
 
 def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
