@@ -13,6 +13,7 @@ from ugat_marl.discrepancy.features import FEATURES
 from ugat_marl.discrepancy.hypotheses import Hypothesis
 from ugat_marl.discrepancy.select import Selection
 from ugat_marl.discrepancy.verdict import (
+    combined,
     conclude,
     describe_effect,
     describe_members,
@@ -111,7 +112,10 @@ def test_only_a_search_that_ended_says_that_the_library_lacks_it(
         before=SimpleNamespace(p=0.0, distance=1000.0), after=residual, shrink=0.1
     )
     selector: Any = None
-    found = conclude(Selection(best, (), complete=complete), selector, nothing_won, 0.05)
+    contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
+    found = conclude(
+        contradicted, Selection(best, (), complete=complete), selector, nothing_won, 0.05
+    )
     assert found.verdict == "unknown"
     assert ("no effect of the library explains it" in found.sentence) == complete
     assert ("the budget ended" in found.sentence) != complete
@@ -139,6 +143,37 @@ def test_the_end_of_a_range_is_no_answer(
         before=SimpleNamespace(p=0.0, distance=1000.0), after=residual, shrink=1.0
     )
     selector: Any = None
-    found = conclude(Selection(best, (), complete=True), selector, won, 0.05)
+    contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
+    found = conclude(contradicted, Selection(best, (), complete=True), selector, won, 0.05)
     assert found.verdict == verdict
     assert ("as far as the effect goes" in found.sentence) == (verdict != "explained")
+
+
+@pytest.mark.parametrize(
+    ("fitted", "heldout", "verdict"),
+    [
+        (0.03, 0.5, "no_discrepancy"),  # 0.015 by chance: 0.08
+        (0.03, 0.01, "unknown"),
+        (1e-6, 0.5, "unknown"),
+    ],
+)
+def test_a_hint_that_is_not_confirmed_is_weighed_with_the_other_periods(
+    fitted: float, heldout: float, verdict: str
+) -> None:
+    distance = SimpleNamespace(z={"network": np.zeros((1, len(FEATURES)))})
+    best: Any = SimpleNamespace(
+        model=SimpleNamespace(members=(), distance=distance),
+        residual=SimpleNamespace(p=fitted, distance=900.0),
+    )
+    before = SimpleNamespace(p=heldout, distance=950.0)
+    verification: Any = SimpleNamespace(before=before, after=before, shrink=None)
+    selector: Any = None
+    found = conclude(best, Selection(best, (), complete=True), selector, verification, 0.05)
+    assert found.verdict == verdict
+
+
+def test_two_tests_as_a_whole() -> None:
+    assert combined(0.03, 0.5) == pytest.approx(0.015 * (1 - np.log(0.015)))
+    assert combined(1.0, 1.0) == 1.0
+    product = np.random.default_rng(1).random((2, 100_000)).prod(axis=0)
+    assert np.mean([combined(p, 1.0) < 0.05 for p in product]) == pytest.approx(0.05, abs=0.003)

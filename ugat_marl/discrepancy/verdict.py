@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -49,6 +50,7 @@ class Conclusion:
 
 
 def conclude(
+    base: Tested,
     selection: Selection,
     selector: Selector,
     verification: Verification,
@@ -57,19 +59,28 @@ def conclude(
     """Draws the conclusion of a search.
 
     Args:
+        base: The test of the scenario as it is.
         selection: What was found.
         selector: Tests rivals.
         verification: The held-out periods.
         alpha: Level of the tests.
     """
     best = selection.best
+    confirmed = verification.before.distance - verification.after.distance >= CONFIRMED
+    chance = combined(base.residual.p, verification.before.p)
+    if chance > alpha and not confirmed and selection.complete:
+        sentence = (
+            f"The fitted periods hint at something (p = {base.residual.p:.2g}), but the held-out "
+            f"periods do not: together nothing unusual (p = {chance:.2g})."
+        )
+        return Conclusion("no_discrepancy", base, (), sentence, "more periods")
     if not best.model.members:
         sentence = _unexplained(selection) + "; the first places below say where to look."
         return Conclusion("unknown", best, (), sentence, _look_at(selection))
     names = describe_members(best.model.members)
     shrink = verification.shrink if verification.shrink is not None else 0.0
     chance_only = verification.after.p > alpha and best.residual.p > FIT_LEVEL
-    if verification.before.distance - verification.after.distance < CONFIRMED:
+    if not confirmed:
         sentence = (
             f"The fitted periods hint at {names}, but the held-out periods do not confirm it."
         )
@@ -109,6 +120,12 @@ def _unexplained(selection: Selection) -> str:
         "Simulation and measurement disagree; the budget ended before all effects were examined, "
         "and none so far explains it"
     )
+
+
+def combined(one: float, other: float) -> float:
+    """Chance of two independent tests as a whole (Fisher 1932)."""
+    product = max(one * other, 1e-300)
+    return product * (1.0 - math.log(product))
 
 
 def _rivals(selection: Selection, selector: Selector, alpha: float) -> tuple[Fitted, ...]:

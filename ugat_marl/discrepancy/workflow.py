@@ -186,12 +186,21 @@ def _search(
     selection = selector.select(base)
     try:
         verification = verify(study, base, selection.best)
-        conclusion = conclude(selection, selector, verification, study.config.alpha)
+        conclusion = conclude(base, selection, selector, verification, study.config.alpha)
         tables = _tables(study, base, selection.best)
     except OutOfTime:
         selection = Selection(selection.best, selection.rivals, complete=False)
         verification, conclusion = _unverified(base, selection)
         tables = {}
+    if conclusion.verdict == "no_discrepancy":
+        record = _nothing(study, base, timing, selection.complete)
+        hint = f"{record['sentence']} {conclusion.sentence}" if timing else conclusion.sentence
+        return record | {
+            "sentence": hint,
+            "where": [item.as_dict() for item in located],
+            "alternatives": [_alternative(item) for item in _ranking(conclusion, selection)],
+            "next_measurement": conclusion.next_measurement,
+        }
     best = conclusion.best
     named = conclusion.verdict != "unknown"
     records: list[dict[str, Any]] = []
