@@ -220,13 +220,15 @@ class Selector:
         proposals = propose([*rays, *added], self._whitener(model, None), self._fitter.price)
         places = {item.key for item in local}
         alone = [item for item in proposals if len(item.members) == 1]
-        best: dict[str, Proposal] = {}
+        best: dict[str, Members] = {}
         for item in alone:
             hypothesis = item.members[0][0]
             if hypothesis.key in places:
-                best.setdefault(hypothesis.name, item)
+                best.setdefault(hypothesis.name, item.members)
         here = list(best.values())[:KINDS_OF_PLACES]
-        return [item.members for item in (*_promising(proposals), *here)]
+        # What the counts say may be nearer than what a straight ray makes of it.
+        here += [((h, h.levels[0]),) for ((h, _),) in here if h.levels[0]]
+        return [*(item.members for item in _promising(proposals)), *here]
 
     def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
         data, base = self._fitter.data, self._fitter.base
