@@ -23,7 +23,7 @@ INDISTINCT = 25.0
 """Models whose distances differ by less fit equally well: a likelihood ratio above e^12 either way
 would be needed to drop one."""
 RIVALS_TESTED = 2
-FIT_LEVEL = 0.001
+FIT_LEVEL = 0.01
 """The fitted periods must not contradict the model more than this; the held-out ones decide."""
 PART = 0.5
 CONFIRMED = 10.0
