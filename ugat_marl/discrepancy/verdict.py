@@ -85,14 +85,13 @@ def conclude(
             f"The fitted periods hint at {names}, but the held-out periods do not confirm it."
         )
         return Conclusion("unknown", best, (), sentence, "more periods")
-    ends = _at_an_end(best.model.members)
-    if chance_only and selection.complete and ends:
-        sentence = (
-            f"With {names} what is left is no more than chance, but {ends} is as far as the effect "
-            "goes: something else may be behind it."
-        )
-        return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
     if chance_only and selection.complete:
+        if ends := _at_an_end(best.model.members):
+            sentence = (
+                f"With {names} what is left is no more than chance, but {ends} is as far as the "
+                "effect goes: something else may be behind it."
+            )
+            return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
         rivals = _rivals(selection, selector, alpha)
         if rivals:
             others = " or ".join(describe_members(rival.members) for rival in rivals)
