@@ -60,10 +60,14 @@ class World(Engine):
     ) -> list[Replicate]:
         del advance
         self.asked.append(tuple(map(str, effects)))
+        return [Replicate(self.played(number, effects), 60.0) for number in numbers]
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        """One day of a model."""
         values = {
             e.name: float(next(v for k, v in e.record().items() if k != "name")) for e in effects
         }
-        return [Replicate(day(number, values), 60.0) for number in numbers]
+        return day(number, values)
 
 
 def a_fitter(truth: dict[str, float], street: int, days: int = 8) -> Fitter:
@@ -201,20 +205,12 @@ class Windows(World):
 
     TRUTH = (900.0, 2400.0)
 
-    def replicates(
-        self,
-        effects: Sequence[Effect],
-        numbers: Sequence[int],
-        advance: Callable[[], None] | None = None,
-    ) -> list[Replicate]:
-        del advance
-        self.asked.append(tuple(map(str, effects)))
-        surges = [effect.record() for effect in effects]
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
         change = np.zeros(WIDTH)
-        for item in surges:
+        for item in (effect.record() for effect in effects):
             window = float(item["begin_s"]), float(item["end_s"])
             change += (float(item["factor"]) - 1.0) * surge(*window)
-        return [Replicate(with_surge(number, change), 60.0) for number in numbers]
+        return with_surge(number, change)
 
 
 def surge(begin_s: float, end_s: float) -> Array:

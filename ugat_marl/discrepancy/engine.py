@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -34,6 +35,9 @@ VERSION = 4
 """Of features and replays: a tally remembered under another version is not used."""
 
 _KEPT_DAYS = 40
+
+Job = TypeVar("Job")
+Done = TypeVar("Done")
 
 
 class OutOfTime(UgatMarlError):
@@ -136,13 +140,8 @@ class Engine:
                 advance()
             return found
 
-        with ThreadPoolExecutor(self._workers) as pool:
-            futures = [pool.submit(one, number) for number in numbers]
-            try:
-                return [future.result() for future in futures]
-            except BaseException:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
+        (days,) = self._together(one, [numbers])
+        return days
 
     def prepare(
         self,
@@ -161,24 +160,38 @@ class Engine:
             OutOfTime: The deadline has passed.
         """
 
-        def one(effects: Sequence[Effect], number: int) -> None:
+        def one(day: tuple[Sequence[Effect], int]) -> None:
             with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
-                self._one(tuple(effects), number)
+                self._one(tuple(day[0]), day[1])
 
+        days = [[(effects, number) for number in numbers] for effects, numbers in models]
+        self._together(one, days, advance)
+
+    def _together(
+        self,
+        work: Callable[[Job], Done],
+        groups: Sequence[Sequence[Job]],
+        advance: Callable[[], None] | None = None,
+    ) -> list[list[Done]]:
+        """Does groups of jobs on all workers; the first failure stops what was not begun.
+
+        Args:
+            work: Does one.
+            groups: Jobs.
+            advance: Called after each group.
+        """
         with ThreadPoolExecutor(self._workers) as pool:
-            futures = [
-                [pool.submit(one, effects, number) for number in numbers]
-                for effects, numbers in models
-            ]
+            futures = [[pool.submit(work, job) for job in group] for group in groups]
+            done: list[list[Done]] = []
             try:
-                for days in futures:
-                    for day in days:
-                        day.result()
+                for group in futures:
+                    done.append([future.result() for future in group])
                     if advance is not None:
                         advance()
             except BaseException:
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
+        return done
 
     def _one(self, effects: tuple[Effect, ...], number: int) -> Replicate:
         key = self._key(effects, number)

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
 """A set of effects: hypotheses and the values of their free fields."""
 
+Change = tuple[dict[str, Array], float]
+"""What moving a free value does to the statistics, and how far it was moved."""
+
 WIDE = ("network", "intersection")
 """Blocks that effects on the whole network are fitted to: single lanes add more noise than they
 tell of them."""
@@ -217,15 +220,15 @@ class Fitter:
 
     def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
         """Derivatives of the whitened statistics, ``(free values, statistics)``."""
-        return np.stack([whitener(change) / delta for change, delta in self.changes(model)])
+        return _derivatives(self.changes(model), whitener)
 
-    def changes(self, model: Fitted) -> list[tuple[dict[str, Array], float]]:
+    def changes(self, model: Fitted) -> list[Change]:
         """For every free value: what moving it does to the statistics, and how far it was moved.
 
         It is moved so far that what this does is more than chance.
         """
         whitener = self.whitener(model)
-        found: list[tuple[dict[str, Array], float]] = []
+        found: list[Change] = []
         for place, (hypothesis, values) in enumerate(model.members):
             for index in range(len(values)):
                 change, delta = self._change(model, place, index, NEARBY)
@@ -236,9 +239,7 @@ class Fitter:
                 found.append((change, delta))
         return found
 
-    def _change(
-        self, model: Fitted, place: int, index: int, share: float
-    ) -> tuple[dict[str, Array], float]:
+    def _change(self, model: Fitted, place: int, index: int, share: float) -> Change:
         """What moving one value by a share of its distance from nominal does; how far it went."""
         hypothesis, values = model.members[place]
         before = model.tallies[: self.days]
@@ -304,6 +305,10 @@ def _solve(jacobian: Array, residual: Array) -> Array:
     return np.linalg.solve(normal, scaled @ residual) / scale
 
 
+def _derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
+    return np.stack([whitener(change) / delta for change, delta in changes])
+
+
 def uncertainty(
     fitter: Fitter, model: Fitted, days: Sequence[Tally] = ()
 ) -> tuple[Array, dict[str, Array]]:
@@ -325,7 +330,8 @@ def uncertainty(
             name: np.zeros_like(b.mean) for name, b in model.reference.blocks.items()
         }
     whitener = fitter.whitener(model)
-    jacobian = fitter.jacobian(model, whitener)
+    changes = fitter.changes(model)
+    jacobian = _derivatives(changes, whitener)
     inverse = np.linalg.pinv(jacobian @ jacobian.T)
     influences: list[Array] = []
     days = days or model.tallies
@@ -337,7 +343,6 @@ def uncertainty(
     grids = np.array([h.step for h, values in model.members for _ in values])
     covariance += np.diag(grids**2 / 12.0)
     extra: dict[str, Array] = {}
-    changes = fitter.changes(model)
     for name, block in model.reference.blocks.items():
         slopes = np.stack([change[name] / delta for change, delta in changes])
         extra[name] = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes) + 0.0 * block.mean

@@ -137,9 +137,9 @@ class Selector:
         Raises:
             OutOfTime: The budget does not suffice for that.
         """
-        self._rays = tuple(self._bank(base.model, self._library, 0))
         data = self._fitter.data
-        null = self._null(base.model.tallies, len(data), Directions(self._rays))
+        directions = Directions(self._library_rays(base.model, 0))
+        null = self._null(base.model.tallies, len(data), directions)
         return replace(base, null=null, residual=null.test(data))
 
     def select(self, base: Tested) -> Selection:
@@ -190,9 +190,7 @@ class Selector:
 
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Adds, changes or removes effects; None if nothing is worth it."""
-        bank = self._bank(start.model, self._library, number)
-        self._rays = self._rays or tuple(bank)
-        rays = between(bank)
+        rays = between(self._library_rays(start.model, number))
         whitener = self._whitener(start.model, WIDE)
         gap = float(whitener.measured @ whitener.measured)
         chance = float(len(whitener.measured))
@@ -233,6 +231,13 @@ class Selector:
     def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
         data, base = self._fitter.data, self._fitter.base
         return Whitener(model.reference, data, _FORESIGHT, base, blocks)
+
+    def _library_rays(self, model: Fitted, number: int) -> tuple[Ray, ...]:
+        """The whole library on top of a model; upon the scenario as it is it is worked out once."""
+        if number:
+            return tuple(self._bank(model, self._library, number))
+        self._rays = self._rays or tuple(self._bank(model, self._library, 0))
+        return self._rays
 
     def _bank(
         self, model: Fitted, hypotheses: Sequence[Hypothesis], number: int, what: str = "library"

@@ -187,12 +187,13 @@ def _search(
     try:
         verification = verify(study, base, selection.best)
         conclusion = conclude(base, selection, selector, verification, study.config.alpha)
-        tables = _tables(study, base, selection.best)
+        plain = conclusion.verdict == "no_discrepancy"
+        tables = {} if plain else _tables(study, base, selection.best)
     except OutOfTime:
         selection = Selection(selection.best, selection.rivals, complete=False)
         verification, conclusion = _unverified(base, selection)
         tables = {}
-    if conclusion.verdict == "no_discrepancy":
+    if conclusion.verdict == "no_discrepancy":  # its tables are those of the scenario as it is
         record = _nothing(study, base, timing, selection.complete)
         hint = f"{record['sentence']} {conclusion.sentence}" if timing else conclusion.sentence
         return record | {
