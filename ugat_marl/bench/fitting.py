@@ -59,10 +59,8 @@ class FittingBench:
         Raises:
             MeasurementError: The measured process failed.
         """
-        asked = asdict(self)
-        asked.pop("out")
         with (reporter or Silent()).task(f"fitting on {self.scenario}", 1):
-            found = in_fresh_process(_PROGRAM, asked)
+            found = in_fresh_process(_PROGRAM, {**asdict(self), "out": None})
         measured: dict[str, dict[str, list[float]]] = found["methods"]
         rows = [_row("CPU time of a fit / edl", measured, "fit_s", relative=True)]
         rows += [

@@ -62,10 +62,8 @@ class LearningBench:
         Raises:
             MeasurementError: The measured process failed.
         """
-        asked = asdict(self)
-        asked.pop("out")
         with (reporter or Silent()).task(f"learning on {self.scenario}", 1):
-            found = in_fresh_process(_PROGRAM, asked)
+            found = in_fresh_process(_PROGRAM, {**asdict(self), "out": None})
         agents = found["agents"]
         training, plain = Spread.of(found["training_s"]), Spread.of(found["plain_s"])
         overhead = Spread.of_ratios(found["training_s"], found["plain_s"])
