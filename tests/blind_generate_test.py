@@ -353,15 +353,17 @@ def test_what_changes_no_detection_is_not_hidden(crossing: Callable[..., Path]) 
     scenario = load(crossing()).with_duration(300)
     consequences = Consequences(3)
 
-    def has(*records: dict[str, str | float]) -> bool:
+    def has(*records: dict[str, str | float], group: str = "pair") -> bool:
         effects = tuple(effect_from(item) for item in records)
-        return consequences.has(scenario, effects, "fixed-time:20")
+        return consequences.has(scenario, Drawn(group, "", "", effects), "fixed-time:20")
 
     nobody_weaves = {"name": "lane_discipline", "strategic": 0.0}  # every approach has one lane
     headway = {"name": "headway", "seconds": 1.6}
     assert not has(nobody_weaves)
     assert has(headway)
     assert not has(headway, nobody_weaves)
+    assert has(headway, nobody_weaves, group="setting")  # all of it together
+    assert not has(nobody_weaves, group="setting")
     assert has({"name": "undercount", "place": "*", "share": 0.1})
 
 

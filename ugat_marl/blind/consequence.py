@@ -10,6 +10,7 @@ from collections import Counter
 
 import numpy as np
 
+from ugat_marl.blind.drawing import Drawn
 from ugat_marl.effects import Effect
 from ugat_marl.effects.detectors import DetectorEffect
 from ugat_marl.evaluation import policy_factory
@@ -33,16 +34,19 @@ class Consequences:
         self._seed = derive_seed(seed, "blind", "consequences")
         self._plain: dict[tuple[str, str], Period] = {}
 
-    def has(self, scenario: Scenario, effects: tuple[Effect, ...], policy: str) -> bool:
-        """Whether each of the effects changes what is measured; faults of detectors always do."""
-        for effect in effects:
-            if isinstance(effect, DetectorEffect):
-                continue
+    def has(self, scenario: Scenario, drawn: Drawn, policy: str) -> bool:
+        """Whether each of the effects changes what is measured; faults of detectors always do.
+
+        A setting is judged as a whole: beside drivers who brake as usual an emergency braking is
+        never seen, and V1 to V4 have one all the same.
+        """
+        alone = [(effect,) for effect in drawn.effects if not isinstance(effect, DetectorEffect)]
+        for effects in [drawn.effects] if drawn.group == "setting" else alone:
             key = (scenario.hash, policy)
             plain = self._plain.get(key)
             if plain is None:
                 plain = self._plain[key] = self._day(scenario, policy, ())
-            if differing(plain, self._day(scenario, policy, (effect,))) < LEAST:
+            if differing(plain, self._day(scenario, policy, effects)) < LEAST:
                 return False
         return True
 

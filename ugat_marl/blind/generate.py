@@ -175,7 +175,7 @@ def _planned(
                 if generator.random() < blueprint.pressure_share and drawn.group != "setting":
                     policies = PRESSURES
                 policy = policies[int(generator.integers(len(policies)))]
-                if not consequences.has(scenarios[name], drawn.effects, policy):
+                if not consequences.has(scenarios[name], drawn, policy):
                     continue
                 case = Case(f"case{index + 1:03d}", name, drawn.leave_out)
                 seed = derive_seed(blueprint.seed, "blind", "case", index)
