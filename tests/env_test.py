@@ -155,6 +155,36 @@ def test_a_held_green_masks_every_other_phase() -> None:
 # --- the end of an episode ----------------------------------------------------------------------
 
 
+def test_a_delay_at_every_decision_is_late_green() -> None:
+    def trajectory(domain: str, delay_s: float | None) -> list[Any]:
+        env = ugat_marl.parallel_env("single-v1", domain, duration_s=300)
+        seen: list[Any] = []
+        env.reset(seed=4)
+        while env.agents:
+            if delay_s is not None:
+                env.delay_greens(dict.fromkeys(env.agents, delay_s))
+            env.step(dict.fromkeys(env.agents, len(seen) // 3 % 4))
+            seen.append(env.snapshot.vehicles.tolist())
+        env.close()
+        return seen
+
+    assert trajectory("sim", 2.0) == trajectory("late_green=*,2", None)
+    assert trajectory("sim", 0.0) == trajectory("sim", None) != trajectory("sim", 2.0)
+
+
+def test_impossible_delays_are_refused(mixed: TrafficEnv) -> None:
+    mixed.close()
+    with pytest.raises(EpisodeError, match="call reset"):
+        mixed.delay_greens({})
+    mixed.reset(seed=1)
+    agent = mixed.agents[0]
+    with pytest.raises(ActionError, match="unknown agents \\['nobody'\\]"):
+        mixed.delay_greens({"nobody": 1.0})
+    for delay in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ActionError, match="0 or more"):
+            mixed.delay_greens({agent: delay})
+
+
 def test_an_episode_has_as_many_steps_as_its_duration() -> None:
     env = ugat_marl.parallel_env("single-v1", duration_s=75)  # the last 5 s are no whole decision
     episode = whole_episode(env)

@@ -14,6 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.signals import (
     GREEN,
+    GreenDelays,
     LateGreen,
     Segment,
     SignalState,
@@ -25,7 +26,6 @@ from ugat_marl.signals import (
     initial_state,
     red_between,
     with_late_green,
-    with_late_greens,
     yellow_between,
 )
 
@@ -350,13 +350,32 @@ def test_late_green_takes_greens_away_and_nothing_else(
                 assert seen[link] == asked[link]
 
 
-def test_no_late_green_changes_nothing() -> None:
-    plans = {"A": [(3.0, "yr"), (7.0, "rG")], "B": [(10.0, "Gr")]}
-    assert with_late_greens(plans, {}, 1, {}) == plans
-    held = {"A": LateGreen.after("Gr"), "B": LateGreen.after("rG")}
-    shown = with_late_greens(plans, {"A": 2.0}, 1, held)
-    assert shown == {"A": [(3, "yr"), (2, "rr"), (5, "rG")], "B": plans["B"]}
-    assert held["A"].shown == "rG"
+def test_a_green_is_held_back_always_or_once() -> None:
+    first = {"A": [(10.0, "Gr")], "B": [(10.0, "Gr")]}
+    then = {"A": [(3.0, "yr"), (7.0, "rG")], "B": [(3.0, "yr"), (7.0, "rG")]}
+    back = {"A": [(3.0, "ry"), (7.0, "Gr")], "B": [(3.0, "ry"), (7.0, "Gr")]}
+    nothing = GreenDelays({"A": "Gr", "B": "Gr"}, {}, 1)
+    assert [nothing.hold(plans) for plans in (first, then)] == [first, then]
+
+    delays = GreenDelays({"A": "Gr", "B": "Gr"}, {"A": 2.0}, 1)
+    assert delays.hold(first) == first
+    delays.ask({"A": 1.0, "B": 9.0})
+    shown = delays.hold(then)
+    assert shown["A"] == [(3, "yr"), (3, "rr"), (4, "rG")]
+    assert shown["B"] == [(3, "yr"), (7, "rr")]
+    shown = delays.hold({"A": [(10.0, "rG")], "B": [(10.0, "rG")]})  # nine seconds reach over
+    assert shown == {"A": [(10, "rG")], "B": [(2, "rr"), (8, "rG")]}
+    shown = delays.hold(back)  # asked for once: only the late green is left
+    assert shown == {"A": [(3, "ry"), (2, "rr"), (5, "Gr")], "B": back["B"]}
+
+
+def test_fractions_of_a_step_are_paid_with_the_next_green() -> None:
+    delays = GreenDelays({"A": "Gr"}, {}, 1)
+    delays.ask({"A": 1.5})
+    assert delays.hold({"A": [(10.0, "rG")]})["A"] == [(1, "rr"), (9, "rG")]
+    delays.hold({"A": [(10.0, "Gr")]})
+    delays.ask({"A": 1.5})
+    assert delays.hold({"A": [(10.0, "rG")]})["A"] == [(2, "rr"), (8, "rG")]
 
 
 def test_a_log_of_a_street_can_be_late() -> None:

@@ -242,25 +242,42 @@ def with_late_green(
     return state, shown
 
 
-def with_late_greens(
-    plans: Mapping[str, list[Segment]],
-    late_s: Mapping[str, float],
-    step_s: float,
-    before: dict[str, LateGreen],
-) -> dict[str, list[Segment]]:
-    """`with_late_green` for many traffic lights; lights that `late_s` leaves out are in time.
+class GreenDelays:
+    """Holds greens back at many traffic lights: always, by their late green, or at one decision.
 
     Args:
-        plans: Traffic light to what is commanded.
-        late_s: Traffic light to the time lost, in s.
+        shown: Traffic light to the state it has shown for long.
+        late_s: Traffic light to the time every green loses, in s; lights left out lose nothing.
         step_s: Length of a simulation step.
-        before: Traffic light to what is remembered of it; brought up to date.
     """
-    shown = dict(plans)
-    for tls, late in late_s.items():
-        if tls in plans:
-            before[tls], shown[tls] = with_late_green(plans[tls], late, step_s, before[tls])
-    return shown
+
+    def __init__(
+        self, shown: Mapping[str, str], late_s: Mapping[str, float], step_s: float
+    ) -> None:
+        self._late_s = late_s
+        self._step_s = step_s
+        self._asked: Mapping[str, float] = {}
+        self._before = {tls: LateGreen.after(state) for tls, state in shown.items()}
+
+    def ask(self, seconds: Mapping[str, float]) -> None:
+        """Traffic light to how much longer greens that begin in the next `hold` stay red, in s."""
+        self._asked = seconds
+
+    def hold(self, plans: Mapping[str, list[Segment]]) -> dict[str, list[Segment]]:
+        """What is shown instead of `plans`, which are the same decision of every light."""
+        shown = dict(plans)
+        # A light that was ever delayed may wait across decisions, or owe a fraction of a step.
+        for tls in plans:
+            late = self._late_s.get(tls, 0.0) + self._asked.get(tls, 0.0)
+            before = self._before[tls]
+            if late or before.shown != before.commanded or any(before.owed_s):
+                self._before[tls], shown[tls] = with_late_green(
+                    plans[tls], late, self._step_s, before
+                )
+            else:
+                self._before[tls] = LateGreen.after(plans[tls][-1][1])
+        self._asked = {}
+        return shown
 
 
 def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -> LateGreen:

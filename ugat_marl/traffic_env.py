@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from ugat_marl import signals
+from ugat_marl.actions import checked_delays, checked_phases
 from ugat_marl.demand import check_demand
 from ugat_marl.effects import Domain, describe, in_domain, load
 from ugat_marl.effects.signals import late_greens, with_late_programmes
-from ugat_marl.errors import ActionError, EpisodeError, OptionError
+from ugat_marl.errors import EpisodeError, OptionError
 from ugat_marl.measurements import Snapshot
 from ugat_marl.metrics import EpisodeRecorder, Scores
 from ugat_marl.network import Network
@@ -81,7 +82,6 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._timing = signals.SignalTiming(
             control.yellow_s, control.all_red_s, control.min_green_s
         )
-        self._late_s = late_greens(self.scenario)
         self._lanes = self.network.lane_table()
         self._observer = Observer(self.network, options.observation, options.neighbours)
         self._rewarder = Rewarder(self.network, options.reward)
@@ -145,7 +145,11 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._decision = 0
         self._states = [signals.initial_state(self._timing) for _ in self.agents]
         lights = self.network.intersections
-        self._held = {item.id: signals.LateGreen.after(item.phases[0]) for item in lights}
+        self._delays = signals.GreenDelays(
+            {item.id: item.phases[0] for item in lights},
+            late_greens(self.scenario),
+            self.scenario.settings.step_length_s,
+        )
         self._recorder = EpisodeRecorder(
             self._lanes,
             [self._lanes.indices(item.incoming_lanes) for item in lights],
@@ -176,7 +180,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """
         if not actions and self._scores is not None:  # after the end; SuperSuit's black_death asks
             return {}, {}, {}, {}, {}
-        requested = self._checked(actions)
+        if not self.agents:
+            raise EpisodeError("step() needs a running episode; call reset() first")
+        requested = checked_phases(actions, self.agents, self.action_spaces)
         before = self._snapshot
         self._advance(requested)
         rewards = self._rewarder.rewards(before, self._snapshot)
@@ -195,6 +201,24 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if over:
             self._finish()
         return result
+
+    def delay_greens(self, seconds: Mapping[str, float]) -> None:
+        """Holds back the greens that begin in the next step; what ends is not touched.
+
+        Observations and infos are blind to it, as they are to a late green of the scenario.
+
+        Args:
+            seconds: Agent to how long its links stay red beyond the usual, in s. Greens begin at
+                whole simulation steps; what is left over is added to the link's next green.
+
+        Raises:
+            ActionError: Of an unknown agent, negative or not finite.
+            EpisodeError: The episode has not begun or is over.
+        """
+        if not self.agents:
+            raise EpisodeError("delay_greens() needs a running episode; call reset() first")
+        delays = checked_delays(seconds, self.agents)
+        self._delays.ask({self.intersection_of[a]: delay for a, delay in delays.items()})
 
     def state(self) -> NDArray[np.float32]:
         """All observations, one after the other; also after the last step."""
@@ -282,25 +306,6 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.agents = []
         self._snapshot = self._simulator.start(launch)
 
-    def _checked(self, actions: Mapping[str, int]) -> list[int]:
-        if not self.agents:
-            raise EpisodeError("step() needs a running episode; call reset() first")
-        if unknown := sorted(set(actions) - set(self.agents)):
-            raise ActionError(f"actions for unknown agents {unknown}; agents: {self.agents}")
-        requested: list[int] = []
-        for agent in self.agents:
-            if agent not in actions:
-                raise ActionError(f"no action for agent {agent!r}; every agent needs one")
-            action = actions[agent]
-            if not _is_phase(action, self.action_spaces[agent]):
-                last = self.action_spaces[agent].n - 1
-                raise ActionError(
-                    f"action of agent {agent!r} is {action!r}; "
-                    f"allowed: the integers 0 to {last}, its green phases"
-                )
-            requested.append(int(action))
-        return requested
-
     def _advance(self, requested: list[int]) -> None:
         assert self._simulator is not None
         plans: dict[str, list[signals.Segment]] = {}
@@ -314,8 +319,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             states.append(after)
         if self.options.signals == "programme":
             plans, states = {}, self._states
-        step_s = self.scenario.settings.step_length_s
-        plans = signals.with_late_greens(plans, self._late_s, step_s, self._held)
+        plans = self._delays.hold(plans)
         agents, self.agents = self.agents, []  # the episode is over if SUMO fails
         self._snapshot: Snapshot = self._simulator.advance(self.decision_interval_s, plans)
         self.agents, self._states = agents, states
@@ -380,11 +384,6 @@ def env(scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any)
     from pettingzoo.utils import parallel_to_aec
 
     return parallel_to_aec(parallel_env(scenario, domain, **options))
-
-
-def _is_phase(action: Any, space: Discrete) -> bool:
-    """Whether `space` contains `action`; a plain int, the usual case, is quickly told."""
-    return (type(action) is int and 0 <= action < space.n) or space.contains(action)
 
 
 def _simulator(name: str) -> Simulator:

@@ -1,0 +1,58 @@
+"""What agents ask for, checked before anything happens."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gymnasium.spaces import Discrete
+
+from ugat_marl.errors import ActionError
+
+
+def checked_phases(
+    actions: Mapping[str, Any], agents: Sequence[str], spaces: Mapping[str, Discrete]
+) -> list[int]:
+    """The green phase asked for by each agent, in their order.
+
+    Raises:
+        ActionError: An action is missing, of an unknown agent, or outside its space.
+    """
+    _refuse_unknown("actions", actions, agents)
+    requested: list[int] = []
+    for agent in agents:
+        if agent not in actions:
+            raise ActionError(f"no action for agent {agent!r}; every agent needs one")
+        action = actions[agent]
+        if not _is_phase(action, spaces[agent]):
+            last = spaces[agent].n - 1
+            raise ActionError(
+                f"action of agent {agent!r} is {action!r}; "
+                f"allowed: the integers 0 to {last}, its green phases"
+            )
+        requested.append(int(action))
+    return requested
+
+
+def checked_delays(seconds: Mapping[str, float], agents: Sequence[str]) -> dict[str, float]:
+    """Delays of the greens of some agents, in s.
+
+    Raises:
+        ActionError: Of an unknown agent, negative or not finite.
+    """
+    _refuse_unknown("delays", seconds, agents)
+    for agent, delay in seconds.items():
+        if not 0 <= delay < math.inf:
+            raise ActionError(f"delay of agent {agent!r} is {delay!r} s; allowed: 0 or more")
+    return {agent: float(delay) for agent, delay in seconds.items()}
+
+
+def _refuse_unknown(what: str, given: Mapping[str, Any], agents: Sequence[str]) -> None:
+    if unknown := sorted(set(given) - set(agents)):
+        raise ActionError(f"{what} for unknown agents {unknown}; agents: {[*agents]}")
+
+
+def _is_phase(action: Any, space: Discrete) -> bool:
+    """Whether `space` contains `action`; a plain int, the usual case, is quickly told."""
+    return (type(action) is int and 0 <= action < space.n) or space.contains(action)
