@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from ugat_marl.effects import effect_from, known_effects
-from ugat_marl.grounding.fitting import FitConfig
+from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.uncertainty import METHODS
 from ugat_marl.scenario_settings import (
     ControlSettings,

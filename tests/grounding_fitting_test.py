@@ -18,7 +18,9 @@ from ugat_marl.grounding.calibration import (
     risk_by_coverage,
     spearman,
 )
-from ugat_marl.grounding.fitting import FitConfig, fit, fit_forward, fit_inverse, split
+from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.fit_loop import split
+from ugat_marl.grounding.fitting import fit, fit_forward, fit_inverse
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.stacked import Stack, stack_log

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.dropout import DropoutNet, divergence, thinned
 from ugat_marl.grounding.ensemble import EnsembleNet, PlainNet
-from ugat_marl.grounding.fitting import FitConfig
+from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import (

@@ -16,8 +16,9 @@ import torch
 
 from ugat_marl.grounding.dropout import DropoutNet
 from ugat_marl.grounding.ensemble import EnsembleNet
+from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.fit_report import InverseReport
-from ugat_marl.grounding.fitting import FitConfig, fit_inverse
+from ugat_marl.grounding.fitting import fit_inverse
 from ugat_marl.grounding.gate import Gate, GateConfig
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.stacked import Stack

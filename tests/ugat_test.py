@@ -24,7 +24,7 @@ import ugat_marl.transfer as transfer_module
 from ugat_marl.controllers import controller_for
 from ugat_marl.effects import in_domain, load
 from ugat_marl.errors import CheckpointError, LogError, OptionError, ScenarioError, UnknownNameError
-from ugat_marl.grounding.fitting import FitConfig
+from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.uncertainty import MethodName
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy

@@ -111,8 +111,9 @@ class _Recording:
     def add(self, actions: Actions, rewards: Mapping[str, float], infos: Infos) -> None:
         then = self._look()
         executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
-        acted, served, got = map(self._renamed, (actions, executed, rewards))
-        self._recorder.record(0, self._step, self._seen, acted, served, got, then)
+        held = {agent: float(infos[agent].get("delay_s", 0.0)) for agent in self._names}
+        acted, served, got, held = map(self._renamed, (actions, executed, rewards, held))
+        self._recorder.record(0, self._step, self._seen, acted, served, got, then, held)
         self._seen = then
         self._step += 1
 

@@ -16,9 +16,12 @@ SCHEMA: Mapping[str, pl.DataType] = {
     "observation": pl.List(pl.Float32()),
     "action": pl.Int16(),
     "executed": pl.Int16(),
+    "delay_s": pl.Float32(),
     "reward": pl.Float32(),
     "next_observation": pl.List(pl.Float32()),
 }
+OPTIONAL: Mapping[str, float] = {"delay_s": 0.0}
+"""Columns that may be missing, and what they hold then."""
 VECTORS = ("observation", "next_observation")
 CHOICES = ("action", "executed")
 
@@ -69,6 +72,8 @@ def checked(
         bad = (pl.col(column) < 0) | (pl.col(column) >= limit)
         _refuse_rows(frame, bad, column, "is no phase of its agent")
     _refuse_rows(frame, ~pl.col("reward").is_finite(), "reward", "is not finite")
+    delay = pl.col("delay_s")
+    _refuse_rows(frame, ~delay.is_finite() | (delay < 0), "delay_s", "is no time to wait")
     key = ["episode", "step", "agent"]
     _refuse_rows(frame, pl.struct(key).is_duplicated(), "step", "occurs twice in its episode")
     return frame
@@ -76,6 +81,8 @@ def checked(
 
 def _converted(frame: pl.DataFrame) -> pl.DataFrame:
     columns: list[pl.Series] = []
+    absent = [name for name in OPTIONAL if name not in frame.columns]
+    frame = frame.with_columns(pl.lit(OPTIONAL[name], SCHEMA[name]).alias(name) for name in absent)
     for name, wanted in SCHEMA.items():
         if name not in frame.columns:
             raise LogError(f"column {name!r} is missing; a log has {', '.join(SCHEMA)}")

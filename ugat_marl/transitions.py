@@ -1,7 +1,8 @@
 """Transition logs: what roll-outs write and grounding reads.
 
 A log holds one row per (episode, step, agent): what the intersection observed, which phase its
-policy asked for, which phase really was served, the reward, and what it observed next. Simulated
+policy asked for, which phase really was served and how long its green was held back, the reward,
+and what it observed next. Simulated
 and measured logs are the same thing, told apart by their provenance, which travels in the metadata
 of the Parquet file.
 """
@@ -132,6 +133,7 @@ class Transitions:
         observation: ``(n, d)`` float32.
         action: ``(n,)`` int64, the phase the policy asked for.
         executed: ``(n,)`` int64, the phase that was served.
+        delay_s: ``(n,)`` float32, for how long the green was held back or interrupted on purpose.
         reward: ``(n,)`` float32.
         next_observation: ``(n, d)`` float32.
         episode: ``(n,)`` int64.
@@ -141,6 +143,7 @@ class Transitions:
     observation: NDArray[np.float32]
     action: NDArray[np.int64]
     executed: NDArray[np.int64]
+    delay_s: NDArray[np.float32]
     reward: NDArray[np.float32]
     next_observation: NDArray[np.float32]
     episode: NDArray[np.int64]
@@ -208,6 +211,7 @@ class TransitionLog:
             observation=vectors("observation"),
             action=numbers("action"),
             executed=numbers("executed"),
+            delay_s=rows["delay_s"].to_numpy().astype(np.float32),
             reward=rows["reward"].to_numpy().astype(np.float32),
             next_observation=vectors("next_observation"),
             episode=numbers("episode"),
@@ -263,13 +267,16 @@ class TransitionLog:
             raise LogError(f"{path}: {error}") from None
 
 
+_Row = tuple[NDArray[np.float32], int, int, float, float, NDArray[np.float32]]
+
+
 class TransitionRecorder:
     """Collects transitions while an episode runs; cheap per step, a table only at the end."""
 
     def __init__(self, provenance: Provenance) -> None:
         self._provenance = provenance
         self._clock: list[tuple[int, int]] = []
-        self._rows: list[list[tuple[NDArray[np.float32], int, int, float, NDArray[np.float32]]]]
+        self._rows: list[list[_Row]]
         self._rows = [[] for _ in provenance.layouts]
 
     def __len__(self) -> int:
@@ -285,8 +292,9 @@ class TransitionRecorder:
         executed: Mapping[str, Any],
         rewards: Mapping[str, float],
         next_observations: Mapping[str, NDArray[np.float32]],
+        delays_s: Mapping[str, float] | None = None,
     ) -> None:
-        """Adds one step of all agents; the arrays are copied.
+        """Adds one step of all agents; the arrays are copied. Without delays, none was held back.
 
         Raises:
             LogError: An agent of the provenance is missing in one of the mappings.
@@ -297,6 +305,7 @@ class TransitionRecorder:
                     np.array(observations[agent], np.float32),
                     int(actions[agent]),
                     int(executed[agent]),
+                    0.0 if delays_s is None else float(delays_s[agent]),
                     float(rewards[agent]),
                     np.array(next_observations[agent], np.float32),
                 )
@@ -326,7 +335,7 @@ class TransitionRecorder:
         self,
         agent: str,
         layout: AgentLayout,
-        rows: list[tuple[NDArray[np.float32], int, int, float, NDArray[np.float32]]],
+        rows: list[_Row],
     ) -> pl.DataFrame:
         if not rows:
             return pl.DataFrame(schema=SCHEMA)
@@ -339,8 +348,9 @@ class TransitionRecorder:
                 "observation": _stacked(agent, layout, [row[0] for row in rows]),
                 "action": [row[1] for row in rows],
                 "executed": [row[2] for row in rows],
-                "reward": np.array([row[3] for row in rows], np.float32),
-                "next_observation": _stacked(agent, layout, [row[4] for row in rows]),
+                "delay_s": np.array([row[3] for row in rows], np.float32),
+                "reward": np.array([row[4] for row in rows], np.float32),
+                "next_observation": _stacked(agent, layout, [row[5] for row in rows]),
             },
             schema_overrides={"observation": SCHEMA["observation"]}
             | {"next_observation": SCHEMA["next_observation"]},

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import OptionError
-from ugat_marl.grounding.fitting import FitConfig, FitReport, fit
+from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.fit_report import FitReport
+from ugat_marl.grounding.fitting import fit
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig, GateReport
 from ugat_marl.grounding.inverse import InverseConfig

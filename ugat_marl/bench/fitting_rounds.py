@@ -13,8 +13,9 @@ from typing import Any
 import torch
 
 from ugat_marl.controllers import controller_for
+from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.fit_report import on_transitions
-from ugat_marl.grounding.fitting import FitConfig, fit_inverse
+from ugat_marl.grounding.fitting import fit_inverse
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.stacked import Stack, stack_log
 from ugat_marl.grounding.uncertainty import METHODS

@@ -216,11 +216,15 @@ class FitReport:
 
 @torch.no_grad()
 def forward_report(
-    model: ForwardModel, data: StackedTransitions, held_out: Tensor, training: TrainingRecord
+    model: ForwardModel,
+    data: StackedTransitions,
+    acted: Tensor,
+    held_out: Tensor,
+    training: TrainingRecord,
 ) -> ForwardReport:
-    """Errors of f on the held-out rows; `held_out` is ``(agents, n)`` weights."""
+    """Errors of f after the actions `acted`, on held-out rows with weights ``(agents, n)``."""
     happened = model.change(data.observation, data.next_observation)
-    predicted = model(data.observation, data.asked) * model.scale
+    predicted = model(data.observation, acted, data.delay_s) * model.scale
     outputs = model.valid_outputs.sum(-1)[:, 0].double()
     share = (held_out / held_out.sum(1, keepdim=True)).double()
 

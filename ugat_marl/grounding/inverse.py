@@ -42,7 +42,64 @@ class InverseConfig:
             raise OptionError(f"inverse embedding is {self.embedding}; allowed: >= 1")
 
 
-class InverseModel(nn.Module):
+class AnswerModel(nn.Module):
+    """A network that answers inputs with one of some classes and an uncertainty.
+
+    Args:
+        stack: The agents.
+        config: Shape of the models.
+        fan_in: Number of inputs of each agent.
+        valid_answers: ``(agents, classes)`` bool, the classes each agent has.
+        generator: Source of the initial weights.
+        method: Which uncertainty; the evidential one unless given.
+    """
+
+    fitted: Tensor
+    valid_answers: Tensor
+    method: Method
+    net: AnswerNet
+
+    def __init__(
+        self,
+        stack: Stack,
+        config: InverseConfig,
+        fan_in: list[int],
+        valid_answers: Tensor,
+        generator: torch.Generator,
+        method: Method | None,
+    ) -> None:
+        super().__init__()
+        self.stack = stack
+        self.config = config
+        self._fan_in = fan_in
+        self.standardise = Standardiser(len(fan_in), max(fan_in))
+        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("valid_answers", valid_answers[:, None, :], persistent=False)
+        self.renew(method or Method(), generator)
+
+    def renew(self, method: Method, generator: torch.Generator) -> None:
+        """Forgets everything: a new network, of this method, with weights from `generator`."""
+        self.method = method
+        shape = NetShape(
+            self._fan_in, self.config.hidden, self.config.embedding, self.valid_answers
+        )
+        match method.name:
+            case "edl":
+                self.net = EvidentialNet(shape, generator)
+            case "dropout":
+                self.net = DropoutNet(shape, generator, method.passes)
+            case "ensemble":
+                self.net = EnsembleNet(shape, generator, method.members)
+            case "none":
+                self.net = PlainNet(shape, generator)
+        self.fitted.fill_(False)
+
+    def answer(self, inputs: Tensor) -> InversePrediction:
+        """Answers to unscaled inputs, ``(agents, batch, width)``."""
+        return self.net.answer(self.standardise(inputs))
+
+
+class InverseModel(AnswerModel):
     """h of every intersection: (s, features of s') -> distribution over actions, and u.
 
     Args:
@@ -52,11 +109,8 @@ class InverseModel(nn.Module):
         method: Which uncertainty; the evidential one unless given.
     """
 
-    fitted: Tensor
     columns: Tensor
     valid_inputs: Tensor
-    method: Method
-    net: AnswerNet
 
     def __init__(
         self,
@@ -65,23 +119,12 @@ class InverseModel(nn.Module):
         generator: torch.Generator,
         method: Method | None = None,
     ) -> None:
-        super().__init__()
-        self.stack = stack
-        self.config = config
         heads = stack.heads(config.include_phase)
-        self._fan_in = [size + head for size, head in zip(stack.sizes, heads, strict=True)]
-        self.standardise = Standardiser(len(heads), max(self._fan_in))
-        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
+        fan_in = [size + head for size, head in zip(stack.sizes, heads, strict=True)]
+        super().__init__(stack, config, fan_in, stack.valid_actions, generator, method)
         columns, valid = _columns(stack.sizes, heads)
         self.register_buffer("columns", columns, persistent=False)
         self.register_buffer("valid_inputs", valid, persistent=False)
-        self.renew(method or Method(), generator)
-
-    def renew(self, method: Method, generator: torch.Generator) -> None:
-        """Forgets everything: a new network, of this method, with weights from `generator`."""
-        self.method = method
-        self.net = _net(self, method, self._fan_in, generator)
-        self.fitted.fill_(False)
 
     def inputs(self, observation: Tensor, next_features: Tensor) -> Tensor:
         """The state, and directly behind it the change of its features; unscaled.
@@ -97,29 +140,9 @@ class InverseModel(nn.Module):
         columns = self.columns.expand(-1, both.shape[1], -1)
         return both.gather(2, columns) * self.valid_inputs
 
-    def answer(self, inputs: Tensor) -> InversePrediction:
-        """Answers to unscaled `inputs`, ``(agents, batch, width)``."""
-        return self.net.answer(self.standardise(inputs))
-
     def predict(self, observation: Tensor, next_features: Tensor) -> InversePrediction:
         """The action that h holds responsible for the step from s to s'."""
         return self.answer(self.inputs(observation, next_features))
-
-
-def _net(
-    model: InverseModel, method: Method, fan_in: list[int], generator: torch.Generator
-) -> AnswerNet:
-    valid_actions = model.stack.valid_actions[:, None, :]
-    shape = NetShape(fan_in, model.config.hidden, model.config.embedding, valid_actions)
-    match method.name:
-        case "edl":
-            return EvidentialNet(shape, generator)
-        case "dropout":
-            return DropoutNet(shape, generator, method.passes)
-        case "ensemble":
-            return EnsembleNet(shape, generator, method.members)
-        case "none":
-            return PlainNet(shape, generator)
 
 
 def _columns(sizes: list[int], heads: list[int]) -> tuple[Tensor, Tensor]:

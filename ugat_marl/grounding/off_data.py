@@ -39,8 +39,17 @@ class OffData:
     change: Tensor
 
     @classmethod
-    def around(cls, inputs: Tensor, weight: Tensor, stack: Stack) -> OffData:
-        """The box around the rows of `inputs` with weight, ``(agents, n)``."""
+    def around(
+        cls, inputs: Tensor, weight: Tensor, stack: Stack, fixed: Tensor | None = None
+    ) -> OffData:
+        """The box around the rows of `inputs` with weight, ``(agents, n)``.
+
+        Args:
+            inputs: ``(agents, n, width)``: the observation, and directly behind it the change.
+            weight: ``(agents, n)``.
+            stack: The agents.
+            fixed: ``(agents, 1, width)`` bool, what else is never redrawn.
+        """
         own = weight.bool()[..., None]
         low = torch.where(own, inputs, torch.inf).amin(1, keepdim=True)
         high = torch.where(own, inputs, -torch.inf).amax(1, keepdim=True)
@@ -50,6 +59,8 @@ class OffData:
         for i, layout in enumerate(stack.layouts.values()):
             kept[i, 0, layout.features : layout.features + layout.phases] = True
             change[i, 0, layout.size :] = True
+        if fixed is not None:
+            kept |= fixed
         candidates = weight.bool().all(0).nonzero()[:, 0]
         if not len(candidates):  # agents measured at different times share no column
             candidates = weight.bool().any(0).nonzero()[:, 0]

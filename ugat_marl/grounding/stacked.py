@@ -70,6 +70,7 @@ class StackedTransitions:
         next_observation: ``(agents, n, width)`` float32.
         asked: ``(agents, n)`` int64, the action the policy chose.
         executed: ``(agents, n)`` int64, the phase that was served.
+        delay_s: ``(agents, n)`` float32, for how long its green was held back.
         episode: ``(agents, n)`` int64, counted from 0 without gaps; -1 in padding.
         step: ``(agents, n)`` int64.
         weight: ``(agents, n)`` float32, 1 for a row, 0 for padding.
@@ -79,6 +80,7 @@ class StackedTransitions:
     next_observation: Tensor
     asked: Tensor
     executed: Tensor
+    delay_s: Tensor
     episode: Tensor
     step: Tensor
     weight: Tensor
@@ -107,17 +109,20 @@ def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
     following = torch.zeros(count, n, stack.width)
     asked, executed, step = (torch.zeros(count, n, dtype=torch.long) for _ in range(3))
     episode = torch.full((count, n), -1)
-    weight = torch.zeros(count, n)
+    weight, delay_s = torch.zeros(count, n), torch.zeros(count, n)
     for i, own in enumerate(rows):
         k, size = len(own), stack.sizes[i]
         observation[i, :k, :size] = torch.from_numpy(own.observation)
         following[i, :k, :size] = torch.from_numpy(own.next_observation)
         asked[i, :k] = torch.from_numpy(own.action)
         executed[i, :k] = torch.from_numpy(own.executed)
+        delay_s[i, :k] = torch.from_numpy(own.delay_s)
         episode[i, :k] = torch.from_numpy(np.searchsorted(number, own.episode))
         step[i, :k] = torch.from_numpy(own.step)
         weight[i, :k] = 1.0
-    return StackedTransitions(observation, following, asked, executed, episode, step, weight)
+    return StackedTransitions(
+        observation, following, asked, executed, delay_s, episode, step, weight
+    )
 
 
 def _names(agents: tuple[str, ...]) -> str:
