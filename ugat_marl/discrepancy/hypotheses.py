@@ -241,3 +241,25 @@ def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:
     if missing := [name for name in hypothesis.free if name not in known]:
         raise OptionError(f"effect {effect.name!r} has no {missing[0]!r}")
     return tuple(float(getattr(effect, name)) for name in hypothesis.free)
+
+
+def both_ways(
+    hypothesis: Hypothesis, values: tuple[float, ...]
+) -> list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...]]]:
+    """Both ways in which an effect of the model may change: less, to nothing, and more."""
+    if not values or hypothesis.nominal is None:
+        return []
+    away = tuple(1.4 * v - 0.4 * n for v, n in zip(values, hypothesis.nominal, strict=True))
+    less = hypothesis.clipped(hypothesis.nominal)
+    found = [(hypothesis, level, values) for level in (less, hypothesis.clipped(away))]
+    return [item for item in found if item[1] != values]
+
+
+def a_few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
+    """One strength on each side of nominal: enough to see what is still missing."""
+    levels, nominal = hypothesis.levels, hypothesis.nominal
+    if nominal is None or len(levels) < 2:
+        return levels
+    low = [level for level in levels if level < nominal]
+    high = [level for level in levels if level > nominal]
+    return tuple(side[len(side) // 2] for side in (low, high) if side)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from ugat_marl.discrepancy.engine import OutOfTime
 from ugat_marl.discrepancy.features import Tally
 from ugat_marl.discrepancy.fit import WIDE, Fitted, Fitter, Members, effects_of, uncertainty
-from ugat_marl.discrepancy.hypotheses import Hypothesis, settings_as_members
+from ugat_marl.discrepancy.hypotheses import Hypothesis, a_few, both_ways, settings_as_members
 from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.matched import Directions
 from ugat_marl.discrepancy.residual import Null, Residual
@@ -39,6 +39,8 @@ _HOPEFUL = 0.9
 """Candidates that take off less than this share of what the best one does are not fitted."""
 _HUGE = 20.0
 """Distances per statistic beyond which several effects at once are likely from the start."""
+_PLAIN = 100.0
+"""How much rarer than the level of the tests a difference must be that its size does not show."""
 _FORESIGHT = 0.05
 """Rays are straight and effects are not: so much of a difference is not expected to be met."""
 
@@ -157,11 +159,10 @@ class Selector:
             best = self._pruned(best)
         except OutOfTime:
             complete = False
-            cheapest = min(self._seen.values(), key=lambda item: item.cost, default=best.model)
+            cheapest = min(self._seen.values(), key=_cost, default=best.model)
             if cheapest.cost < best.model.cost:
                 best = self._untested(cheapest, base)
-        rivals = sorted(self._seen.values(), key=lambda item: item.cost)
-        return Selection(best, tuple(rivals), complete)
+        return Selection(best, tuple(sorted(self._seen.values(), key=_cost)), complete)
 
     def test(self, model: Fitted) -> Tested:
         """Simulates more days of a model and tests what it leaves."""
@@ -198,16 +199,31 @@ class Selector:
         proposals = propose(rays, whitener, self._fitter.price)
         chosen = [item.members for item in _promising(proposals)]
         little = gap < _LITTLE * chance  # what differs does so in single places
-        if little or not proposals or proposals[0].expected > enough:
+        near = little or not proposals or proposals[0].expected > enough
+        if near:
             chosen = [*chosen[:2], *self._elsewhere(start.model, rays, number)]
         if number == 0 and gap > _HUGE * chance:
             chosen += settings_as_members(self._library)
-        chosen = list(dict.fromkeys(chosen))
-        tried = self._tried(start.model, chosen, f"round {number + 1}: candidates")
+        best = self._fitted(start, chosen, f"round {number + 1}: candidates")
+        if best is None and not near:  # the library promised more than it kept
+            chosen = self._elsewhere(start.model, rays, number)
+            best = self._fitted(start, chosen, f"round {number + 1}: places")
+        return best
+
+    def _fitted(self, start: Tested, chosen: Sequence[Members], title: str) -> Tested | None:
+        """The best of some sets of effects on top of a model; None if none is worth its price."""
+        tried = self._tried(start.model, list(dict.fromkeys(chosen)), title)
         best = self._refined(tried, CANDIDATES_FITTED, start.model.cost)
-        if best is None or best.cost >= start.model.cost - self._fitter.price:
+        if best is None:
             return None
-        return self.test(best)
+        gain = start.model.cost - best.cost
+        if gain > self._fitter.price:
+            return self.test(best)
+        # All statistics together may hardly notice what is plain along an effect's own direction.
+        if start.residual.p < self._alpha / _PLAIN and gain > -self._fitter.price:
+            tested = self.test(best)
+            return tested if tested.residual.p > self._alpha else None
+        return None
 
     def _elsewhere(self, model: Fitted, rays: Sequence[Ray], number: int) -> list[Members]:
         """Proposals with effects at places and in windows, judged by lanes and minutes too."""
@@ -247,11 +263,11 @@ class Selector:
         jobs: list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...] | None]] = []
         for hypothesis in dict.fromkeys(hypotheses):
             if hypothesis.key not in present:
-                levels = hypothesis.levels if number == 0 else _few(hypothesis)
+                levels = hypothesis.levels if number == 0 else a_few(hypothesis)
                 jobs += [(hypothesis, level, hypothesis.nominal) for level in levels]
         if what == "library":
             for hypothesis, values in model.members:
-                jobs += _changes(hypothesis, values)
+                jobs += both_ways(hypothesis, values)
         days = self._effort.bank if number == 0 else 3
         rays: list[Ray] = []
         engine = self._fitter.engine
@@ -287,7 +303,7 @@ class Selector:
 
     def _refined(self, models: Sequence[Fitted], count: int, gap: float) -> Fitted | None:
         """The best of several models once the most promising are fitted."""
-        ranked = sorted(models, key=lambda item: item.cost)[:count]
+        ranked = sorted(models, key=_cost)[:count]
         best: Fitted | None = None
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
@@ -317,7 +333,7 @@ class Selector:
                 self._kept(self._fitter.refine(self._fitter.simulate(part), 2))
                 for part in _parts(best.model.members)
             ]
-            least = min(fewer, key=lambda item: item.cost)
+            least = min(fewer, key=_cost)
             more = least.cost - best.model.cost
             if more > NEGLIGIBLE:
                 break
@@ -326,6 +342,10 @@ class Selector:
                 break
             best = tested
         return best
+
+
+def _cost(model: Fitted) -> float:
+    return model.cost
 
 
 def _parts(members: Members) -> list[Members]:
@@ -346,28 +366,6 @@ def _promising(proposals: Sequence[Proposal]) -> list[Proposal]:
             chosen += near[: CANDIDATES[size - 1]]
             least = own[0].expected
     return list(dict.fromkeys(chosen))
-
-
-def _changes(
-    hypothesis: Hypothesis, values: tuple[float, ...]
-) -> list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...]]]:
-    """Both ways in which an effect of the model may change: less, to nothing, and more."""
-    if not values or hypothesis.nominal is None:
-        return []
-    away = tuple(1.4 * v - 0.4 * n for v, n in zip(values, hypothesis.nominal, strict=True))
-    less = hypothesis.clipped(hypothesis.nominal)
-    found = [(hypothesis, level, values) for level in (less, hypothesis.clipped(away))]
-    return [item for item in found if item[1] != values]
-
-
-def _few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
-    """One strength on each side of nominal: enough to see what is still missing."""
-    levels, nominal = hypothesis.levels, hypothesis.nominal
-    if nominal is None or len(levels) < 2:
-        return levels
-    low = [level for level in levels if level < nominal]
-    high = [level for level in levels if level > nominal]
-    return tuple(side[len(side) // 2] for side in (low, high) if side)
 
 
 def _merged(members: Members, new: Members) -> Members:

@@ -6,6 +6,7 @@ the action with which the simulation does the same; the gate takes a' where h is
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,14 +15,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from ugat_marl.batched import one_thread
 from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.gate import Gate, GateConfig
-from ugat_marl.grounding.inverse import InverseConfig, InverseModel
+from ugat_marl.grounding.inverse import AnswerModel, InverseConfig, InverseModel
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.seeding import torch_generator
@@ -40,48 +41,53 @@ class Grounding:
         grounded: int64, what the inverse model answered.
         u: float32, its uncertainty.
         accepted: bool, whether the grounded action was taken.
+        delay_s: float32, for how long the greens are held back.
     """
 
     executed: NDArray[np.int64]
     grounded: NDArray[np.int64]
     u: NDArray[np.float32]
     accepted: NDArray[np.bool_]
+    delay_s: NDArray[np.float32]
 
 
-class GroundedActionTransform:
-    """f, h and gate of a network.
+class Transform(abc.ABC):
+    """Models and gate of a network: the policy's actions in, what the simulation is told out.
 
-    Args:
-        layouts: Agent to the division of its observation, in the environment's order.
-        seed: Decides the initial weights.
-        forward: Shape of the forward models.
-        inverse: Shape of the inverse models.
-        gate: How alpha is found.
+    Attributes:
+        stack: The agents.
+        forward: f of every intersection.
+        inverse: h of every intersection.
+        gate: Keeps or takes what h answers.
     """
 
-    def __init__(
-        self,
-        layouts: Mapping[str, AgentLayout],
-        seed: int,
-        forward: ForwardConfig | None = None,
-        inverse: InverseConfig | None = None,
-        gate: GateConfig | None = None,
-    ) -> None:
-        forward, inverse = forward or ForwardConfig(), inverse or InverseConfig()
-        if forward.include_phase != inverse.include_phase:
-            raise OptionError(
-                f"include_phase is {forward.include_phase} in the forward and "
-                f"{inverse.include_phase} in the inverse model; h must be given what f predicts"
-            )
-        self.stack = Stack(layouts)
-        self.forward = ForwardModel(self.stack, forward, torch_generator(seed, "forward"))
-        self.inverse = InverseModel(self.stack, inverse, torch_generator(seed, "inverse"))
-        self.gate = Gate(self.stack.agents, gate or GateConfig())
+    stack: Stack
+    forward: ForwardModel
+    inverse: AnswerModel
+    gate: Gate
+
+    @property
+    def models(self) -> dict[str, nn.Module]:
+        """Whatever has weights, under its name in a checkpoint."""
+        return {"forward": self.forward, "inverse": self.inverse}
 
     @property
     def fitted(self) -> bool:
         """Whether both models have been fitted; before that there is nothing to ground with."""
         return bool(self.forward.fitted) and bool(self.inverse.fitted)
+
+    @abc.abstractmethod
+    def ground(
+        self,
+        observations: Tensor,
+        actions: NDArray[np.int64],
+        permitted: NDArray[np.bool_] | None,
+    ) -> Grounding:
+        """`__call__`, once the models are fitted."""
+
+    @abc.abstractmethod
+    def fresh_inverse(self, method: Method) -> AnswerModel:
+        """An unfitted h of the same shape with this method of uncertainty."""
 
     @one_thread()
     @torch.no_grad()
@@ -106,21 +112,14 @@ class GroundedActionTransform:
                 "actions cannot be grounded before the models are fitted; "
                 "call grounding.fitting.fit first or load a checkpoint"
             )
-        asked = torch.from_numpy(actions)[:, None]
-        predicted = self.forward.predict(observations, asked)
-        answer = self.inverse.predict(observations, predicted)
-        grounded, u = answer.action[:, 0].numpy(), answer.u[:, 0].numpy()
-        allowed = None if permitted is None else permitted[np.arange(len(grounded)), grounded]
-        accepted = self.gate.decide(u, actions, grounded, allowed)
-        return Grounding(np.where(accepted, grounded, actions), grounded, u, accepted)
+        return self.ground(observations, actions, permitted)
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, statistics, method of uncertainty and gate, as tensors and plain values."""
         return {
             "method": asdict(self.inverse.method),
             "layouts": {a: list(_sizes(v)) for a, v in self.stack.layouts.items()},
-            "forward": self.forward.state_dict(),
-            "inverse": self.inverse.state_dict(),
+            **{name: model.state_dict() for name, model in self.models.items()},
             "gate": self.gate.state_dict(),
         }
 
@@ -137,16 +136,17 @@ class GroundedActionTransform:
                 "the grounding in the checkpoint belongs to other agents or another observation; "
                 f"this one has {len(own)} agents ({', '.join(self.stack.agents[:4])} ...)"
             )
-        method, parts = _method(state), _renamed(state.get("inverse"))
-        inverse = InverseModel(self.stack, self.inverse.config, torch_generator(0), method)
-        _refuse_foreign("forward", state.get("forward"), self.forward.state_dict())
-        _refuse_foreign("inverse", parts, inverse.state_dict())
+        method = _method(state)
+        found = {name: state.get(name) for name in self.models}
+        found["inverse"] = _renamed(found["inverse"])
+        for name, model in {**self.models, "inverse": self.fresh_inverse(method)}.items():
+            _refuse_foreign(name, found[name], model.state_dict())
         if not isinstance(state.get("gate"), Mapping):
             raise CheckpointError("the grounding in the checkpoint has no gate")
         self.gate.load_state_dict(state["gate"])
-        self.forward.load_state_dict(state["forward"])
         self.inverse.renew(method, torch_generator(0))
-        self.inverse.load_state_dict(parts)
+        for name, model in self.models.items():
+            model.load_state_dict(dict(found[name] or {}))
 
     def save(self, path: Path) -> None:
         """Writes `state_dict` to a file, whole or not at all.
@@ -167,6 +167,59 @@ class GroundedActionTransform:
             self.load_state_dict(state)
         except CheckpointError as error:
             raise CheckpointError(f"{path}: {error}") from None
+
+
+class GroundedActionTransform(Transform):
+    """Phase grounding, the paper's: the grounded action is another phase.
+
+    Args:
+        layouts: Agent to the division of its observation, in the environment's order.
+        seed: Decides the initial weights.
+        forward: Shape of the forward models.
+        inverse: Shape of the inverse models.
+        gate: How alpha is found.
+    """
+
+    inverse: InverseModel
+
+    def __init__(
+        self,
+        layouts: Mapping[str, AgentLayout],
+        seed: int,
+        forward: ForwardConfig | None = None,
+        inverse: InverseConfig | None = None,
+        gate: GateConfig | None = None,
+    ) -> None:
+        forward, inverse = forward or ForwardConfig(), inverse or InverseConfig()
+        if forward.include_phase != inverse.include_phase:
+            raise OptionError(
+                f"include_phase is {forward.include_phase} in the forward and "
+                f"{inverse.include_phase} in the inverse model; h must be given what f predicts"
+            )
+        self.stack = Stack(layouts)
+        self.forward = ForwardModel(self.stack, forward, torch_generator(seed, "forward"))
+        self.inverse = InverseModel(self.stack, inverse, torch_generator(seed, "inverse"))
+        self.gate = Gate(self.stack.agents, gate or GateConfig())
+
+    def ground(
+        self,
+        observations: Tensor,
+        actions: NDArray[np.int64],
+        permitted: NDArray[np.bool_] | None,
+    ) -> Grounding:
+        """f, then h, then the gate."""
+        asked = torch.from_numpy(actions)[:, None]
+        predicted = self.forward.predict(observations, asked)
+        answer = self.inverse.predict(observations, predicted)
+        grounded, u = answer.action[:, 0].numpy(), answer.u[:, 0].numpy()
+        allowed = None if permitted is None else permitted[np.arange(len(grounded)), grounded]
+        accepted = self.gate.decide(u, actions, grounded, allowed)
+        executed = np.where(accepted, grounded, actions)
+        return Grounding(executed, grounded, u, accepted, np.zeros_like(u))
+
+    def fresh_inverse(self, method: Method) -> InverseModel:
+        """An unfitted h of the same shape with this method of uncertainty."""
+        return InverseModel(self.stack, self.inverse.config, torch_generator(0), method)
 
 
 def _method(state: Mapping[str, Any]) -> Method:

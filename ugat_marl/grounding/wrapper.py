@@ -8,7 +8,7 @@ import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.errors import ActionError, OptionError
-from ugat_marl.grounding.transform import GroundedActionTransform
+from ugat_marl.grounding.transform import Transform
 from ugat_marl.policy import AnyParallelEnv
 
 Infos = dict[str, dict[str, Any]]
@@ -23,6 +23,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
     - ``grounded_action``: int, the inverse model's answer; -1 at reset.
     - ``uncertainty``: float, its u in (0, 1]; 1.0 at reset.
     - ``accepted``: int, 1 if the grounded action was executed.
+    - ``delay_s``: float, for how long the agent's greens were held back; 0.0 at reset.
 
     A grounded action that the agent's action mask forbids is never executed. An epoch of the gate
     is an episode of this environment.
@@ -35,7 +36,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         OptionError: The transform was made for other agents or observations.
     """
 
-    def __init__(self, env: AnyParallelEnv, transform: GroundedActionTransform) -> None:
+    def __init__(self, env: AnyParallelEnv, transform: Transform) -> None:
         super().__init__(env)
         _refuse_misfit(env, transform)
         self.transform = transform
@@ -70,13 +71,18 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         own = np.array([self._action(agent, actions) for agent in stack.agents])
         outcome = self.transform(self._seen, own, self._allowed)
         executed = dict(zip(stack.agents, outcome.executed.tolist(), strict=True))
+        if outcome.delay_s.any():
+            delays = dict(zip(stack.agents, outcome.delay_s.tolist(), strict=True))
+            env: Any = self.env
+            env.delay_greens(delays, interrupt=True)
         observations, rewards, terminations, truncations, infos = self.env.step(executed)
         if self.env.agents:
             self._notice(observations, infos)
         else:
             self.transform.gate.end_epoch()
-        columns = (outcome.grounded.tolist(), outcome.u.tolist(), outcome.accepted.tolist())
-        taken = dict(zip(stack.agents, zip(*columns, strict=True), strict=True))
+        columns = (outcome.grounded, outcome.u, outcome.accepted, outcome.delay_s)
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        taken = dict(zip(stack.agents, rows, strict=True))
         return observations, rewards, terminations, truncations, _extended(infos, acting, taken)
 
     def _notice(self, observations: dict[str, Any], infos: Infos) -> None:
@@ -100,22 +106,23 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
 
 
 def _extended(
-    infos: Infos, agents: list[str], taken: dict[str, tuple[int, float, bool]] | None = None
+    infos: Infos, agents: list[str], taken: dict[str, tuple[Any, ...]] | None = None
 ) -> Infos:
-    """Copies of the infos with the three keys of the grounding; other entries are kept."""
+    """Copies of the infos with the keys of the grounding; other entries are kept."""
     extended = dict(infos)
     for agent in agents:
-        grounded, u, accepted = taken[agent] if taken else (-1, 1.0, False)
+        grounded, u, accepted, delay_s = taken[agent] if taken else (-1, 1.0, False, 0.0)
         extended[agent] = {
             **infos.get(agent, {}),
             "grounded_action": grounded,
             "uncertainty": u,
             "accepted": int(accepted),
+            "delay_s": delay_s,
         }
     return extended
 
 
-def _refuse_misfit(env: AnyParallelEnv, transform: GroundedActionTransform) -> None:
+def _refuse_misfit(env: AnyParallelEnv, transform: Transform) -> None:
     layouts = transform.stack.layouts
     if tuple(env.possible_agents) != transform.stack.agents:
         raise OptionError(
