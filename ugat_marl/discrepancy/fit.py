@@ -34,6 +34,8 @@ NEARBY, FAR = 0.2, 0.9
 """Shares of its distance from nominal by which a value is moved for a derivative."""
 PLAIN = 10.0
 """Standard deviations that such a move is meant to make."""
+HALF_INTERVAL = 1.96
+"""Half of a 95 % interval, in standard errors."""
 NEAR = 0.2
 """Standard errors by which a value may be off."""
 INTERPOLATION = 0.02

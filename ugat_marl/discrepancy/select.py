@@ -6,12 +6,23 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ugat_marl.discrepancy.engine import OutOfTime
 from ugat_marl.discrepancy.features import Tally
-from ugat_marl.discrepancy.fit import WIDE, Fitted, Fitter, Members, effects_of, uncertainty
+from ugat_marl.discrepancy.fit import (
+    HALF_INTERVAL,
+    WIDE,
+    Fitted,
+    Fitter,
+    Members,
+    effects_of,
+    uncertainty,
+)
 from ugat_marl.discrepancy.hypotheses import Hypothesis, a_few, both_ways, settings_as_members
 from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.matched import Directions
+from ugat_marl.discrepancy.members import each_left_out, merged, names_of
 from ugat_marl.discrepancy.residual import Null, Residual
 from ugat_marl.discrepancy.search import Proposal, Ray, between, propose
 from ugat_marl.discrepancy.statistics import Array, shift
@@ -273,7 +284,7 @@ class Selector:
         engine = self._fitter.engine
         before = model.tallies[:days]
         numbers = engine.first(len(before))
-        models = [effects_of(_merged(model.members, ((h, level),))) for h, level, _ in jobs]
+        models = [effects_of(merged(model.members, ((h, level),))) for h, level, _ in jobs]
         with self._reporter.task(f"round {number + 1}: {what}", len(jobs)) as advance:
             engine.prepare([(effects, numbers) for effects in models], advance)
         for (hypothesis, level, origin), effects in zip(jobs, models, strict=True):
@@ -292,13 +303,13 @@ class Selector:
         found: list[Fitted] = []
         with self._reporter.task(title, len(chosen)) as advance:
             for new in chosen:
-                members = _merged(model.members, new)
+                members = merged(model.members, new)
                 if members:
                     try:
                         found.append(self._kept(self._fitter.simulate(members)))
                     except (SimulatorError, OptionError, ScenarioError) as error:
-                        self._reporter.say(f"note: {_names(members)} left out: {error}")
-                advance(note=_names(members))
+                        self._reporter.say(f"note: {names_of(members)} left out: {error}")
+                advance(note=names_of(members))
         return found
 
     def _refined(self, models: Sequence[Fitted], count: int, gap: float) -> Fitted | None:
@@ -310,7 +321,7 @@ class Selector:
                 if best is None or gap - model.cost > _HOPEFUL * (gap - best.cost):
                     found = self._kept(self._fitter.fitted(model))
                     best = found if best is None or found.cost < best.cost else best
-                advance(note=_names(model.members))
+                advance(note=names_of(model.members))
         return best
 
     def _kept(self, model: Fitted) -> Fitted:
@@ -331,14 +342,15 @@ class Selector:
         while len(best.model.members) > 1:
             fewer = [
                 self._kept(self._fitter.refine(self._fitter.simulate(part), 2))
-                for part in _parts(best.model.members)
+                for part in each_left_out(best.model.members)
             ]
             least = min(fewer, key=_cost)
-            more = least.cost - best.model.cost
-            if more > NEGLIGIBLE:
-                break
+            if least.cost - best.model.cost > NEGLIGIBLE:
+                if not (doubtful := [fewer[place] for place in _doubtful(best)]):
+                    break
+                least = min(doubtful, key=_cost)
             tested = self.test(least)
-            if more > 0.0 and tested.residual.p <= self._alpha:
+            if least.cost > best.model.cost and tested.residual.p <= self._alpha:
                 break
             best = tested
         return best
@@ -348,9 +360,18 @@ def _cost(model: Fitted) -> float:
     return model.cost
 
 
-def _parts(members: Members) -> list[Members]:
-    """The set without each of its effects."""
-    return [_without(members, index) for index in range(len(members))]
+def _doubtful(tested: Tested) -> list[int]:
+    """Places of the effects whose intervals hold the nominal value: they may not be there."""
+    found: list[int] = []
+    first = 0
+    for place, (hypothesis, values) in enumerate(tested.model.members):
+        errors = tested.errors[first : first + len(values)]
+        first += len(values)
+        if values and hypothesis.nominal is not None:
+            away = np.abs(np.subtract(values, hypothesis.nominal))
+            if (away <= HALF_INTERVAL * errors).all():
+                found.append(place)
+    return found
 
 
 def _promising(proposals: Sequence[Proposal]) -> list[Proposal]:
@@ -366,23 +387,3 @@ def _promising(proposals: Sequence[Proposal]) -> list[Proposal]:
             chosen += near[: CANDIDATES[size - 1]]
             least = own[0].expected
     return list(dict.fromkeys(chosen))
-
-
-def _merged(members: Members, new: Members) -> Members:
-    """A model with further effects, or with other values; those at nothing are left out."""
-    found = {hypothesis.key: (hypothesis, values) for hypothesis, values in members}
-    for hypothesis, values in new:
-        found[hypothesis.key] = (hypothesis, values)
-    return tuple(
-        (hypothesis, values)
-        for hypothesis, values in found.values()
-        if hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
-    )
-
-
-def _without(members: Members, place: int) -> Members:
-    return (*members[:place], *members[place + 1 :])
-
-
-def _names(members: Members) -> str:
-    return "+".join(hypothesis.name for hypothesis, _ in members)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ugat_marl.discrepancy.features import FEATURES
-from ugat_marl.discrepancy.fit import Fitted, Members
+from ugat_marl.discrepancy.fit import HALF_INTERVAL, Fitted, Members
 from ugat_marl.discrepancy.hypotheses import WINDOW, Hypothesis
 from ugat_marl.discrepancy.select import Selection, Selector, Tested
 from ugat_marl.discrepancy.verify import Verification
@@ -224,8 +224,8 @@ def effect_record(
         allowed = ranges[name]
         parameters[name] = {
             "value": value,
-            "low": max(value - 1.96 * error, allowed.low),
-            "high": min(value + 1.96 * error, allowed.high),
+            "low": max(value - HALF_INTERVAL * error, allowed.low),
+            "high": min(value + HALF_INTERVAL * error, allowed.high),
             "unit": allowed.unit,
         }
     for name, value in hypothesis.fixed:
