@@ -369,23 +369,6 @@ def test_a_green_is_held_back_always_or_once() -> None:
     assert shown == {"A": [(3, "ry"), (2, "rr"), (5, "Gr")], "B": back["B"]}
 
 
-def test_a_green_that_goes_on_is_interrupted_if_asked() -> None:
-    stay, switch = {"A": [(10.0, "Gr")]}, {"A": [(3.0, "yr"), (7.0, "rG")]}
-    delays = GreenDelays({"A": "Gr"}, {"A": 1.0}, 1)
-    delays.ask({"A": 4.0})
-    assert delays.hold(stay) == stay
-    delays.ask({"A": 4.0}, interrupt=True)
-    assert delays.hold(stay) == {"A": [(4, "rr"), (6, "Gr")]}
-    assert delays.hold(stay) == stay
-    delays.ask({"A": 9.0}, interrupt=True)
-    assert delays.hold(switch) == {"A": [(3, "yr"), (7, "rr")]}  # 9 s, and the late green
-    delays.ask({"A": 4.0}, interrupt=True)
-    stay = {"A": [(10.0, "rG")]}
-    assert delays.hold(stay) == {"A": [(3, "rr"), (7, "rG")]}  # it waits already
-    delays.ask({"A": 0.0}, interrupt=True)
-    assert delays.hold(stay) == stay
-
-
 def test_fractions_of_a_step_are_paid_with_the_next_green() -> None:
     delays = GreenDelays({"A": "Gr"}, {}, 1)
     delays.ask({"A": 1.5})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,9 @@ class Snapshot:
             empty unless the simulator was started with `waiting`.
         departed: Vehicles that entered the network since the start of the episode.
         backlog: Vehicles due but not yet in the network, for want of space.
+        mean_left: Vehicles that had left the lane's road, from this lane, averaged over the seconds
+            since the last snapshot, ``(lanes,)``: how many, and how early. Empty unless the
+            simulator was started with `crossings`, and in the first snapshot.
     """
 
     time_s: float
@@ -55,6 +58,12 @@ class Snapshot:
     waiting_s: NDArray[np.float64]
     departed: int
     backlog: int
+    mean_left: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+    def less(self, left: NDArray[np.float64]) -> Snapshot:
+        """This snapshot without the vehicles that have `left`, ``(lanes,)``; nobody arrives."""
+        halting = np.maximum(self.halting - left, 0.0)
+        return replace(self, vehicles=self.vehicles - left, halting=halting)
 
 
 @dataclass(frozen=True)

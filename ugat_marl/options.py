@@ -24,6 +24,8 @@ class EnvOptions:
         duration_s: Length of an episode in s; None for the scenario's own.
         simulator: ``"process"`` (any number at once, reproducible to the bit), ``"spawn"`` (the
             same without forking), or ``"inprocess"`` (one per process, a little faster).
+        crossings: Whether it is also measured when vehicles cross the stop lines, which roll-outs
+            then record; lanes are looked at every second, which takes time.
         render_mode: None, ``"rgb_array"`` (a picture from `render`) or ``"human"`` (sumo-gui).
     """
 
@@ -33,6 +35,7 @@ class EnvOptions:
     signals: str = "actions"
     duration_s: float | None = None
     simulator: str = "process"
+    crossings: bool = False
     render_mode: str | None = None
 
     def __post_init__(self) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.measurements import Snapshot
 from ugat_marl.observations import UNITS, Observer
 from ugat_marl.policy import Actions, AnyParallelEnv, Infos, Observations, Policy
 from ugat_marl.seeding import numpy_generator
@@ -106,6 +107,7 @@ class _Recording:
         self._recorder = TransitionRecorder(provenance_of(env, observer, seed))
         self._names = dict(zip(self._base.possible_agents, observer.agents, strict=True))
         self._seen = self._look()
+        self._before: Snapshot = self._base.snapshot
         self._step = 0
 
     def add(self, actions: Actions, rewards: Mapping[str, float], infos: Infos) -> None:
@@ -113,12 +115,23 @@ class _Recording:
         executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
         held = {agent: float(infos[agent].get("delay_s", 0.0)) for agent in self._names}
         acted, served, got, held = map(self._renamed, (actions, executed, rewards, held))
-        self._recorder.record(0, self._step, self._seen, acted, served, got, then, held)
+        row = self._seen, acted, served, got, then, held, self._served()
+        self._recorder.record(0, self._step, *row)
         self._seen = then
         self._step += 1
 
     def log(self) -> TransitionLog:
         return self._recorder.log()
+
+    def _served(self) -> dict[str, NDArray[np.float32]] | None:
+        """The features at the last decision without the vehicles that left since, on average."""
+        before, self._before = self._before, self._base.snapshot
+        left = self._before.mean_left
+        if not len(left):
+            return None
+        vectors = self._observer.observe(before.less(left), self._base.phases)
+        own = zip(self._observer.agents, vectors, self._observer.layouts, strict=True)
+        return {agent: vector[: layout.features] for agent, vector, layout in own}
 
     def _look(self) -> dict[str, NDArray[np.float32]]:
         vectors = self._observer.observe(self._base.snapshot, self._base.phases)

@@ -257,29 +257,20 @@ class GreenDelays:
         self._late_s = late_s
         self._step_s = step_s
         self._asked: Mapping[str, float] = {}
-        self._interrupt = False
         self._before = {tls: LateGreen.after(state) for tls, state in shown.items()}
 
-    def ask(self, seconds: Mapping[str, float], interrupt: bool = False) -> None:
-        """Holds greens back in the next `hold`, beyond the late green.
-
-        Args:
-            seconds: Traffic light to how long, in s.
-            interrupt: At a light that stays as it is, interrupt its greens for so long instead.
-        """
-        self._asked, self._interrupt = seconds, interrupt
+    def ask(self, seconds: Mapping[str, float]) -> None:
+        """Traffic light to how much longer greens that begin in the next `hold` stay red, in s."""
+        self._asked = seconds
 
     def hold(self, plans: Mapping[str, list[Segment]]) -> dict[str, list[Segment]]:
         """What is shown instead of `plans`, which are the same decision of every light."""
         shown = dict(plans)
         # A light that was ever delayed may wait across decisions, or owe a fraction of a step.
         for tls in plans:
-            asked = self._asked.get(tls, 0.0)
-            late = self._late_s.get(tls, 0.0) + asked
+            late = self._late_s.get(tls, 0.0) + self._asked.get(tls, 0.0)
             before = self._before[tls]
             waits = before.shown != before.commanded
-            if asked and self._interrupt and not waits and _stays(plans[tls], before):
-                before, late = before._replace(commanded=_all_red(before.commanded)), asked
             if late or waits or any(before.owed_s):
                 self._before[tls], shown[tls] = with_late_green(
                     plans[tls], late, self._step_s, before
@@ -288,14 +279,6 @@ class GreenDelays:
                 self._before[tls] = LateGreen.after(plans[tls][-1][1])
         self._asked = {}
         return shown
-
-
-def _stays(plan: Sequence[Segment], before: LateGreen) -> bool:
-    return len(plan) == 1 and plan[0][1] == before.commanded
-
-
-def _all_red(state: str) -> str:
-    return "".join("r" if letter in GREEN else letter for letter in state)
 
 
 def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -> LateGreen:

@@ -40,6 +40,7 @@ class Launch:
         begin_s: Start of the simulation on the scenario's clock.
         lanes: Lanes to measure.
         waiting: Whether to measure waiting times as well.
+        crossings: Whether to look every second for vehicles that leave a lane's road.
         gui: Whether to open a window.
         files: Names and content of the scenario's edited files.
     """
@@ -49,6 +50,7 @@ class Launch:
     begin_s: float
     lanes: tuple[str, ...]
     waiting: bool = False
+    crossings: bool = False
     gui: bool = False
     files: tuple[tuple[str, bytes], ...] = ()
 
@@ -115,6 +117,7 @@ def launch_of(
     lanes: Sequence[str],
     *,
     waiting: bool = False,
+    crossings: bool = False,
     gui: bool = False,
 ) -> Launch:
     """Lists SUMO's options, and the files that have to be written for it; writes nothing.
@@ -125,6 +128,7 @@ def launch_of(
         directory: A folder for the simulation alone; it is made when the simulation starts.
         lanes: Lanes to measure.
         waiting: Whether to measure waiting times.
+        crossings: Whether to look every second for vehicles that leave a lane's road.
         gui: Whether to open a window.
     """
     settings = scenario.settings
@@ -162,6 +166,7 @@ def launch_of(
         settings.begin_s,
         tuple(lanes),
         waiting,
+        crossings,
         gui,
         tuple(written.items()),
     )
@@ -190,6 +195,7 @@ class LibsumoSimulator:
         self._shown: dict[str, str] = {}
         self._time_s = 0.0
         self._limits = np.empty(0)
+        self._on: dict[str, tuple[int, str]] = {}
         self._owner = 0
 
     def start(self, launch: Launch) -> Snapshot:
@@ -218,7 +224,7 @@ class LibsumoSimulator:
             libsumo.start([program, *launch.arguments])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
             self._fail("SUMO did not start", error)
-        self._shown = {}
+        self._shown, self._on = {}, {}
         self._time_s = launch.begin_s
         limits = map(libsumo.lane.getMaxSpeed, launch.lanes)
         self._limits = np.fromiter(limits, np.float64, len(launch.lanes))
@@ -238,11 +244,17 @@ class LibsumoSimulator:
                 changes[offset].append((tls, state))
                 offset += duration
         begin = self._time_s
+        looks = [float(k) for k in range(1, int(seconds) + 1)] if self._launch.crossings else []
+        left = np.zeros(len(self._launch.lanes))
+        mean_left = left.copy()
         try:
-            for offset in sorted(changes):
+            for offset in sorted({*changes, *looks}):
                 if offset > 0:
                     libsumo.simulation.step(begin + offset)
-                for tls, state in changes[offset]:
+                if offset in looks:
+                    self._count_left(left)
+                    mean_left += left / len(looks)
+                for tls, state in changes.get(offset, ()):
                     if self._shown.get(tls) != state:
                         libsumo.trafficlight.setRedYellowGreenState(tls, state)
                         self._shown[tls] = state
@@ -250,7 +262,8 @@ class LibsumoSimulator:
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
             self._fail(f"SUMO failed after {begin:g} s", error)
         self._time_s = begin + seconds
-        return self._snapshot()
+        snapshot = self._snapshot()
+        return replace(snapshot, mean_left=mean_left) if looks else snapshot
 
     def vehicles(self) -> VehiclePicture:
         """Positions of all vehicles now."""
@@ -282,6 +295,19 @@ class LibsumoSimulator:
             # A forked child has a copy of the simulation and the parent's open files.
             if self._owner == os.getpid() and libsumo.simulation.isLoaded():
                 libsumo.simulation.close()
+
+    def _count_left(self, left: NDArray[np.float64]) -> None:
+        """Adds to `left`, ``(lanes,)``, who has left a lane's road since the last look."""
+        assert self._launch is not None
+        now: dict[str, tuple[int, str]] = {}
+        for index, lane in enumerate(self._launch.lanes):
+            road = lane.rpartition("_")[0]
+            for name in libsumo.lane.getLastStepVehicleIDs(lane):
+                now[name] = index, road
+        before, self._on = self._on, now
+        for name, (index, road) in before.items():
+            if now.get(name, (0, ""))[1] != road:
+                left[index] += 1.0
 
     def _snapshot(self) -> Snapshot:
         assert self._launch is not None

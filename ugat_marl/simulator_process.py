@@ -353,7 +353,7 @@ def _environment() -> dict[str, str]:
 
 
 def _snapshot(reply: Message) -> Snapshot:
-    lanes, waiting = reply.arrays
+    lanes, waiting, mean_left = reply.arrays
     header = reply.header
     return Snapshot(
         header["time_s"],
@@ -363,4 +363,5 @@ def _snapshot(reply: Message) -> Snapshot:
         waiting,
         header["departed"],
         header["backlog"],
+        mean_left,
     )

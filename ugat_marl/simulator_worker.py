@@ -56,7 +56,7 @@ def _message(snapshot: Snapshot) -> Message:
         "backlog": snapshot.backlog,
     }
     lanes = np.array([snapshot.vehicles, snapshot.halting, snapshot.mean_speed_mps])
-    return Message(header, [lanes, snapshot.waiting_s])
+    return Message(header, [lanes, snapshot.waiting_s, snapshot.mean_left])
 
 
 class _Worker:

@@ -202,7 +202,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             self._finish()
         return result
 
-    def delay_greens(self, seconds: Mapping[str, float], *, interrupt: bool = False) -> None:
+    def delay_greens(self, seconds: Mapping[str, float]) -> None:
         """Holds back the greens that begin in the next step; what ends is not touched.
 
         Observations and infos are blind to it, as they are to a late green of the scenario.
@@ -210,7 +210,6 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         Args:
             seconds: Agent to how long its links stay red beyond the usual, in s. Greens begin at
                 whole simulation steps; what is left over is added to the link's next green.
-            interrupt: Where a light keeps its phase, its greens are red for so long at first.
 
         Raises:
             ActionError: Of an unknown agent, negative or not finite.
@@ -220,7 +219,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             raise EpisodeError("delay_greens() needs a running episode; call reset() first")
         delays = checked_delays(seconds, self.agents)
         lights = {self.intersection_of[agent]: delay for agent, delay in delays.items()}
-        self._delays.ask(lights, interrupt)
+        self._delays.ask(lights)
 
     def state(self) -> NDArray[np.float32]:
         """All observations, one after the other; also after the last step."""
@@ -303,6 +302,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             directory,
             self._lanes.ids,
             waiting=self._observer.needs_waiting or self._rewarder.needs_waiting,
+            crossings=self.options.crossings,
             gui=self.render_mode == "human",
         )
         self.agents = []

@@ -22,7 +22,6 @@ from ugat_marl.evaluation import (
     fixed_policy,
     rule_factory,
 )
-from ugat_marl.grounding.transform import GroundedActionTransform
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
@@ -153,9 +152,7 @@ def transfer(
         _say_if_from_elsewhere(log, config, reporter)
     corrected = _corrected_env(config, scenario, env)
     learner = DQN.of(env, config.dqn, config.seed)
-    transform = GroundedActionTransform(
-        env.layouts, config.seed, config.ugat.forward, config.ugat.inverse, config.ugat.gate
-    )
+    transform = config.ugat.transform(env.layouts, config.seed)
     run = Run(directory, _identity(config, scenario, env, corrected), resume, reporter)
     try:
         state = State(learner, transform)
@@ -245,13 +242,14 @@ def _train(
         )
         return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
 
-    def world(domain: str, name: str, episodes: int) -> SimulatedWorld:
+    def world(domain: str, name: str, episodes: int, most_delay_s: int = 0) -> SimulatedWorld:
         def make() -> TrafficEnv:
-            return parallel_env(scenario, domain, **config.env_options)
+            crossings = config.ugat.most_delay_s > 0  # they tell best when a green began
+            return parallel_env(scenario, domain, crossings=crossings, **config.env_options)
 
-        return SimulatedWorld(make, name, episodes, config.ugat.rollout_epsilon)
+        return SimulatedWorld(make, name, episodes, config.ugat.rollout_epsilon, most_delay_s)
 
-    sim: World = world(config.sim, "sim", config.ugat.sim_rollouts)
+    sim: World = world(config.sim, "sim", config.ugat.sim_rollouts, config.ugat.most_delay_s)
     real: World = recorded or world(config.real, "real", config.ugat.real_rollouts)
     try:
         return train_ugat(state, env, sim, real, config.ugat, config.seed, run, probe)

@@ -19,8 +19,12 @@ SCHEMA: Mapping[str, pl.DataType] = {
     "delay_s": pl.Float32(),
     "reward": pl.Float32(),
     "next_observation": pl.List(pl.Float32()),
+    "served_features": pl.List(pl.Float32()),
 }
-OPTIONAL: Mapping[str, float] = {"delay_s": 0.0}
+OPTIONAL: Mapping[str, pl.Expr] = {
+    "delay_s": pl.lit(0.0, pl.Float32()),
+    "served_features": pl.lit([], pl.List(pl.Float32())),
+}
 """Columns that may be missing, and what they hold then."""
 VECTORS = ("observation", "next_observation")
 CHOICES = ("action", "executed")
@@ -42,7 +46,10 @@ def read_parquet(path: Path) -> tuple[pl.DataFrame, dict[str, str]]:
 
 
 def checked(
-    frame: pl.DataFrame, sizes: Mapping[str, int], phases: Mapping[str, int]
+    frame: pl.DataFrame,
+    sizes: Mapping[str, int],
+    phases: Mapping[str, int],
+    features: Mapping[str, int],
 ) -> pl.DataFrame:
     """The frame with exactly the columns and types of `SCHEMA`, every value possible.
 
@@ -50,6 +57,7 @@ def checked(
         frame: Any table; wider number types are converted where nothing is lost.
         sizes: Agent to the length of its observation vector.
         phases: Agent to its number of green phases.
+        features: Agent to its number of features.
 
     Raises:
         LogError: Names the column, and the first row at fault.
@@ -64,8 +72,13 @@ def checked(
     agent = pl.col("agent")
     size = agent.replace_strict(dict(sizes), return_dtype=pl.UInt32)
     limit = agent.replace_strict(dict(phases), return_dtype=pl.Int16)
+    own = agent.replace_strict(dict(features), return_dtype=pl.UInt32)
+    length = pl.col("served_features").list.len()
+    wrong = (length != own) & (length != 0)
+    _refuse_rows(frame, wrong, "served_features", "has the wrong length")
     for column in VECTORS:
         _refuse_rows(frame, pl.col(column).list.len() != size, column, "has the wrong length")
+    for column in (*VECTORS, "served_features"):
         bad = ~pl.col(column).list.eval(pl.element().is_finite().fill_null(False)).list.all()
         _refuse_rows(frame, bad, column, "holds a number that is not finite")
     for column in CHOICES:
@@ -82,7 +95,7 @@ def checked(
 def _converted(frame: pl.DataFrame) -> pl.DataFrame:
     columns: list[pl.Series] = []
     absent = [name for name in OPTIONAL if name not in frame.columns]
-    frame = frame.with_columns(pl.lit(OPTIONAL[name], SCHEMA[name]).alias(name) for name in absent)
+    frame = frame.with_columns(OPTIONAL[name].alias(name) for name in absent)
     for name, wanted in SCHEMA.items():
         if name not in frame.columns:
             raise LogError(f"column {name!r} is missing; a log has {', '.join(SCHEMA)}")

@@ -133,9 +133,12 @@ class Transitions:
         observation: ``(n, d)`` float32.
         action: ``(n,)`` int64, the phase the policy asked for.
         executed: ``(n,)`` int64, the phase that was served.
-        delay_s: ``(n,)`` float32, for how long the green was held back or interrupted on purpose.
+        delay_s: ``(n,)`` float32, for how long a beginning green was held back on purpose.
         reward: ``(n,)`` float32.
         next_observation: ``(n, d)`` float32.
+        served_features: ``(n, features)`` float32, the features at first without the vehicles that
+            left, averaged over the interval: what was served, and how early. ``(n, 0)`` if some
+            row was not measured.
         episode: ``(n,)`` int64.
         step: ``(n,)`` int64.
     """
@@ -146,6 +149,7 @@ class Transitions:
     delay_s: NDArray[np.float32]
     reward: NDArray[np.float32]
     next_observation: NDArray[np.float32]
+    served_features: NDArray[np.float32]
     episode: NDArray[np.int64]
     step: NDArray[np.int64]
 
@@ -172,6 +176,7 @@ class TransitionLog:
             frame,
             sizes={agent: layout.size for agent, layout in provenance.layouts.items()},
             phases={agent: layout.phases for agent, layout in provenance.layouts.items()},
+            features={agent: layout.features for agent, layout in provenance.layouts.items()},
         )
 
     @property
@@ -197,9 +202,9 @@ class TransitionLog:
         if agent not in self.provenance.layouts:
             raise LogError(f"the log has no agent {agent!r}; it has {', '.join(self.agents)}")
         rows = self.frame.filter(pl.col("agent") == agent).sort("episode", "step")
-        size = self.provenance.layouts[agent].size
+        layout = self.provenance.layouts[agent]
 
-        def vectors(column: str) -> NDArray[np.float32]:
+        def vectors(column: str, size: int = layout.size) -> NDArray[np.float32]:
             if rows.is_empty():  # exploding nothing still gives one null
                 return np.zeros((0, size), np.float32)
             return rows[column].explode().to_numpy().reshape(-1, size).copy()
@@ -214,6 +219,9 @@ class TransitionLog:
             delay_s=rows["delay_s"].to_numpy().astype(np.float32),
             reward=rows["reward"].to_numpy().astype(np.float32),
             next_observation=vectors("next_observation"),
+            served_features=vectors("served_features", layout.features)
+            if (rows["served_features"].list.len() == layout.features).all()
+            else np.zeros((len(rows), 0), np.float32),
             episode=numbers("episode"),
             step=numbers("step"),
         )
@@ -267,7 +275,8 @@ class TransitionLog:
             raise LogError(f"{path}: {error}") from None
 
 
-_Row = tuple[NDArray[np.float32], int, int, float, float, NDArray[np.float32]]
+_Row = tuple[NDArray[np.float32], int, int, float, float, NDArray[np.float32], NDArray[np.float32]]
+_NONE = np.zeros(0, np.float32)
 
 
 class TransitionRecorder:
@@ -293,8 +302,11 @@ class TransitionRecorder:
         rewards: Mapping[str, float],
         next_observations: Mapping[str, NDArray[np.float32]],
         delays_s: Mapping[str, float] | None = None,
+        served: Mapping[str, NDArray[np.float32]] | None = None,
     ) -> None:
-        """Adds one step of all agents; the arrays are copied. Without delays, none was held back.
+        """Adds one step of all agents; the arrays are copied.
+
+        Without delays no green was held back, without served features none were measured.
 
         Raises:
             LogError: An agent of the provenance is missing in one of the mappings.
@@ -308,6 +320,7 @@ class TransitionRecorder:
                     0.0 if delays_s is None else float(delays_s[agent]),
                     float(rewards[agent]),
                     np.array(next_observations[agent], np.float32),
+                    _NONE if served is None else np.array(served[agent], np.float32),
                 )
                 for agent in self._provenance.layouts
             ]
@@ -351,9 +364,12 @@ class TransitionRecorder:
                 "delay_s": np.array([row[3] for row in rows], np.float32),
                 "reward": np.array([row[4] for row in rows], np.float32),
                 "next_observation": _stacked(agent, layout, [row[5] for row in rows]),
+                "served_features": [row[6].tolist() for row in rows],
             },
-            schema_overrides={"observation": SCHEMA["observation"]}
-            | {"next_observation": SCHEMA["next_observation"]},
+            schema_overrides={
+                name: SCHEMA[name]
+                for name in ("observation", "next_observation", "served_features")
+            },
         )
 
 

@@ -11,25 +11,31 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.grounding.delays import TimedConfig
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.fit_report import FitReport
 from ugat_marl.grounding.fitting import fit
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig, GateReport
 from ugat_marl.grounding.inverse import InverseConfig
-from ugat_marl.grounding.transform import GroundedActionTransform
+from ugat_marl.grounding.timed import TimedTransform
+from ugat_marl.grounding.timed_fitting import fit_timed
+from ugat_marl.grounding.timed_report import TimedReport
+from ugat_marl.grounding.transform import GroundedActionTransform, Transform
 from ugat_marl.grounding.wrapper import GroundedEnv
 from ugat_marl.policy import AnyParallelEnv, Learner, Policy
 from ugat_marl.seeding import derive_seed
 from ugat_marl.training import Run
-from ugat_marl.transitions import TransitionLog
+from ugat_marl.transitions import AgentLayout, TransitionLog
 from ugat_marl.worlds import World
 
 CHUNK = 10
 """Episodes of plain training between two checkpoints."""
+
+GROUNDINGS = ("phase", "timed")
 
 DIRECT_LEARNER = "direct-learner.pt"
 """The learner as it was after plain training, in the run's folder: where controls start from."""
@@ -40,6 +46,8 @@ class UgatConfig:
     """Settings of the algorithm.
 
     Attributes:
+        grounding: What a grounded action is: "phase", another phase, as in the paper; "timed", the
+            policy's own phase with a green that begins later.
         pretrain_episodes: M, episodes in plain sim before the first iteration.
         iterations: I, rounds of rolling out, fitting and grounded training.
         grounded_episodes: E, episodes of training in the grounded sim per iteration.
@@ -48,13 +56,15 @@ class UgatConfig:
         rollout_epsilon: Chance of a random phase in these roll-outs.
         least_accuracy: Held-out accuracy h must have at an intersection before grounded actions
             are taken there (f and h must beat their trivial rivals, too); None obeys them from the
-            start, as the paper does.
+            start, as the paper does. With "timed" the share by which h must beat a guess.
         forward: Shape of f.
         inverse: Shape of h.
         fit: How f and h are fitted.
         gate: How alpha is found.
+        timed: How greens are delayed, with "timed".
     """
 
+    grounding: Literal["phase", "timed"] = "phase"
     pretrain_episodes: int = 60
     iterations: int = 4
     grounded_episodes: int = 10
@@ -66,8 +76,23 @@ class UgatConfig:
     inverse: InverseConfig = field(default_factory=InverseConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     gate: GateConfig = field(default_factory=GateConfig)
+    timed: TimedConfig = field(default_factory=TimedConfig)
+
+    @property
+    def most_delay_s(self) -> int:
+        """Longest of the random delays in the roll-outs for D_sim; 0 for none."""
+        return self.timed.most_s if self.grounding == "timed" else 0
+
+    def transform(self, layouts: Mapping[str, AgentLayout], seed: int) -> Transform:
+        """Unfitted models and gate for these agents."""
+        parts = self.forward, self.inverse, self.gate
+        if self.grounding == "timed":
+            return TimedTransform(layouts, seed, *parts, self.timed)
+        return GroundedActionTransform(layouts, seed, *parts)
 
     def __post_init__(self) -> None:
+        if self.grounding not in GROUNDINGS:
+            raise UnknownNameError("grounding", self.grounding, GROUNDINGS)
         for name, least in (
             ("pretrain_episodes", 0),
             ("iterations", 0),
@@ -98,7 +123,7 @@ class State:
     """
 
     learner: Learner
-    transform: GroundedActionTransform
+    transform: Transform
     direct: Policy | None = None
     simulated: list[TransitionLog] = field(default_factory=list)
     real: list[TransitionLog] = field(default_factory=list)
@@ -210,18 +235,23 @@ def _collect(
             advance()
 
 
-def _fit(state: State, config: UgatConfig, seed: int, run: Run, iteration: int) -> FitReport:
+def _fit(
+    state: State, config: UgatConfig, seed: int, run: Run, iteration: int
+) -> FitReport | TimedReport:
     transform = state.transform
-    with run.reporter.task(f"fitting f and h, round {iteration + 1}", 2 * config.fit.epochs) as go:
-        report = fit(
-            transform.forward,
-            transform.inverse,
-            TransitionLog.concatenate(state.real),
-            TransitionLog.concatenate(state.simulated),
-            config.fit,
-            seed,
-            on_epoch=lambda model, _epoch, loss: go(note=f"{model} {loss:.2g}"),
-        )
+    real, simulated = (TransitionLog.concatenate(logs) for logs in (state.real, state.simulated))
+    most = len(transform.models) * config.fit.epochs
+    with run.reporter.task(f"fitting f and h, round {iteration + 1}", most) as go:
+
+        def on_epoch(model: str, _epoch: int, loss: float) -> None:
+            go(note=f"{model} {loss:.2g}")
+
+        if isinstance(transform, TimedTransform):
+            report = fit_timed(transform, real, simulated, config.fit, seed, on_epoch)
+        else:
+            assert isinstance(transform, GroundedActionTransform)
+            models = transform.forward, transform.inverse
+            report = fit(*models, real, simulated, config.fit, seed, on_epoch)
     for warning in report.warnings:
         run.reporter.say(f"round {iteration + 1}: {warning}")
     return report
@@ -238,7 +268,7 @@ def _update_alpha(state: State, run: Run) -> GateReport:
 
 
 def _numbers(
-    report: FitReport, gate: GateReport, state: State, probe: Probe | None
+    report: FitReport | TimedReport, gate: GateReport, state: State, probe: Probe | None
 ) -> dict[str, float]:
     numbers = {**report.as_dict(), **{f"gate/{k}": v for k, v in gate.as_dict().items()}}
     if probe is not None:

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 from ugat_marl.errors import LogError
-from ugat_marl.policy import Policy
+from ugat_marl.grounding.random_delays import RandomDelays
+from ugat_marl.policy import AnyParallelEnv, Policy
 from ugat_marl.rollout import Exploring, observer_of, roll_out, until
 from ugat_marl.seeding import derive_seed
 from ugat_marl.traffic_env import TrafficEnv
@@ -38,22 +39,30 @@ class SimulatedWorld:
         name: Distinguishes the seeds of two worlds.
         episodes: Roll-outs per iteration.
         epsilon: Chance of a random phase.
+        most_delay_s: Longest of the random delays of greens; 0 for none.
     """
 
     def __init__(
-        self, make_env: Callable[[], TrafficEnv], name: str, episodes: int, epsilon: float
+        self,
+        make_env: Callable[[], TrafficEnv],
+        name: str,
+        episodes: int,
+        epsilon: float,
+        most_delay_s: int = 0,
     ) -> None:
         self._make_env = make_env
         self._name = name
         self._episodes = episodes
         self._epsilon = epsilon
-        self._env: TrafficEnv | None = None
+        self._most_delay_s = most_delay_s
+        self._env: AnyParallelEnv | None = None
         self._stop = threading.Event()
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
         """Plays the iteration's episodes and returns their transitions."""
         if self._env is None:
-            self._env = self._make_env()
+            env = self._make_env()
+            self._env = RandomDelays(env, self._most_delay_s) if self._most_delay_s else env
         exploring = Exploring(policy, self._epsilon)
         observer = observer_of(self._env)
         logs: list[TransitionLog] = []

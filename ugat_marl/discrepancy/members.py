@@ -27,4 +27,5 @@ def _without(members: Members, place: int) -> Members:
 
 
 def names_of(members: Members) -> str:
+    """Names of the effects, for progress and notes."""
     return "+".join(hypothesis.name for hypothesis, _ in members)

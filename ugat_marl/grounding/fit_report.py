@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -48,6 +49,22 @@ class TrainingRecord:
     split: str
     train_rows: int
     held_out_rows: int
+
+    def as_dict(self, prefix: str) -> dict[str, float]:
+        """Epochs and losses, as flat numbers."""
+        return {
+            f"{prefix}/epochs": float(self.epochs),
+            f"{prefix}/train_loss": self.train_loss,
+            f"{prefix}/held_out_loss": self.held_out_loss,
+        }
+
+
+def entries(name: str, values: Floats, agents: Sequence[str]) -> dict[str, float]:
+    """An array over agents as flat numbers: its mean, and one entry per agent."""
+    known = values[~np.isnan(values)]
+    numbers = {name: float(known.mean()) if len(known) else float("nan")}
+    own = zip(agents, values, strict=True)
+    return numbers | {f"{name}/{agent}": float(value) for agent, value in own}
 
 
 @dataclass(frozen=True)
@@ -184,17 +201,14 @@ class FitReport:
         """Flat numbers; arrays as their mean over agents and as one entry per agent."""
         numbers: dict[str, float] = {}
         for prefix, part in (("forward", self.forward), ("inverse", self.inverse)):
-            training = part.training
-            numbers[f"{prefix}/epochs"] = float(training.epochs)
-            numbers[f"{prefix}/train_loss"] = training.train_loss
-            numbers[f"{prefix}/held_out_loss"] = training.held_out_loss
+            numbers |= part.training.as_dict(prefix)
             for entry in fields(part):
                 value = getattr(part, entry.name)
                 if isinstance(value, np.ndarray):
-                    numbers |= self._entries(f"{prefix}/{entry.name}", value)
-        numbers |= self._entries("forward/ratio", self.forward.ratio)
+                    numbers |= entries(f"{prefix}/{entry.name}", value, self.agents)
+        numbers |= entries("forward/ratio", self.forward.ratio, self.agents)
         for name in ("agreement", "mean_u_on_predictions", "accuracy_on_real", "mean_u_on_real"):
-            numbers |= self._entries(name, getattr(self, name))
+            numbers |= entries(name, getattr(self, name), self.agents)
         calibration = self.inverse.calibration
         for entry in fields(calibration):
             value = getattr(calibration, entry.name)
@@ -205,26 +219,16 @@ class FitReport:
                 numbers[f"calibration/{entry.name}"] = value
         return numbers
 
-    def _entries(self, name: str, values: Floats) -> dict[str, float]:
-        known = values[~np.isnan(values)]
-        numbers = {name: float(known.mean()) if len(known) else float("nan")}
-        return numbers | {
-            f"{name}/{agent}": float(value)
-            for agent, value in zip(self.agents, values, strict=True)
-        }
-
 
 @torch.no_grad()
 def forward_report(
     model: ForwardModel,
-    data: StackedTransitions,
-    acted: Tensor,
+    predicted: Tensor,
+    happened: Tensor,
     held_out: Tensor,
     training: TrainingRecord,
 ) -> ForwardReport:
-    """Errors of f after the actions `acted`, on held-out rows with weights ``(agents, n)``."""
-    happened = model.change(data.observation, data.next_observation)
-    predicted = model(data.observation, acted, data.delay_s) * model.scale
+    """Errors of predicted changes on held-out rows; `held_out` weighs ``(agents, n)``."""
     outputs = model.valid_outputs.sum(-1)[:, 0].double()
     share = (held_out / held_out.sum(1, keepdim=True)).double()
 

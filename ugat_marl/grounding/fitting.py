@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from ugat_marl.batched import one_thread
@@ -55,7 +56,7 @@ def fit(
         LogError: A log is of other agents, or too short to be split, or the logs differ in
             scenario, observation or decision interval.
     """
-    _refuse_mismatch(real, simulated)
+    refuse_mismatch(real, simulated)
     f = fit_forward(forward, real, config, seed, on_epoch)
     h = fit_inverse(inverse, simulated, config, seed, on_epoch)
     ours, theirs = stack_log(simulated, inverse.stack), stack_log(real, inverse.stack)
@@ -68,7 +69,7 @@ def fit(
     )
 
 
-def _refuse_mismatch(real: TransitionLog, simulated: TransitionLog) -> None:
+def refuse_mismatch(real: TransitionLog, simulated: TransitionLog) -> None:
     """Models of different state spaces or intervals cannot be composed."""
     for name in ("observation", "decision_interval_s"):
         one, two = getattr(real.provenance, name), getattr(simulated.provenance, name)
@@ -86,32 +87,61 @@ def fit_forward(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None = None,
-    name: str = "forward",
 ) -> ForwardReport:
-    """Fits f by least squares on the change of the features, each agent on its own rows.
-
-    A model of delays learns what the *executed* action does when its green is held back so long.
-    """
+    """Fits f by least squares on the change of the features, each agent on its own rows."""
     data = stack_log(log, model.stack)
     parts = split(data, config.held_out_every, model.stack)
-    change = model.change(data.observation, data.next_observation)
+    lesson = Changes("forward", data.observation, data.next_observation, data.asked)
+    return fit_changes(model, lesson, parts, config, seed, on_epoch)
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What a model of changes learns from.
+
+    Attributes:
+        name: Of the model, in seeds and for the callback.
+        observation: ``(agents, n, width)``.
+        outcome: ``(agents, n, features or more)``, the features afterwards.
+        acted: ``(agents, n)`` int64, phases.
+        extra: ``(agents, n, extra)`` further inputs, if there are any.
+    """
+
+    name: str
+    observation: Tensor
+    outcome: Tensor
+    acted: Tensor
+    extra: Tensor | None = None
+
+
+def fit_changes(
+    model: ForwardModel,
+    asked: Changes,
+    parts: Split,
+    config: FitConfig,
+    seed: int,
+    on_epoch: EpochCallback | None,
+) -> ForwardReport:
+    """Fits a model of changes by least squares."""
+    change = model.change(asked.observation, asked.outcome)
     if not (bool(model.fitted) and config.warm_start):
-        generator = torch_generator(seed, name, "weights")
-        fresh = ForwardModel(model.stack, model.config, generator, model.delays)
-        model.load_state_dict(fresh.state_dict())
-        model.fit_scale(data.observation, change, parts.train)
+        model.renew(torch_generator(seed, asked.name, "weights"))
+        model.fit_scale(asked.observation, change, parts.train)
     outputs = model.valid_outputs.sum(-1)
-    acted = data.executed if model.delays else data.asked
+
+    def predicted(columns: Tensor | slice) -> Tensor:
+        extra = None if asked.extra is None else asked.extra[:, columns]
+        return model(asked.observation[:, columns], asked.acted[:, columns], extra)
 
     def loss(columns: Tensor, _epoch: int) -> Tensor:
-        delay_s = data.delay_s[:, columns]
-        predicted = model(data.observation[:, columns], acted[:, columns], delay_s)
-        error = predicted - change[:, columns] / model.scale
+        error = predicted(columns) - change[:, columns] / model.scale
         return (error**2).sum(-1) / outputs
 
-    generator = torch_generator(seed, name, "batches")
-    record = train_model(name, model, loss, parts, config, generator, on_epoch)
-    return forward_report(model, data, acted, parts.held_out, record)
+    generator = torch_generator(seed, asked.name, "batches")
+    record = train_model(asked.name, model, loss, parts, config, generator, on_epoch)
+    with torch.no_grad():
+        found = predicted(slice(None)) * model.scale
+    return forward_report(model, found, change, parts.held_out, record)
 
 
 @one_thread()

@@ -16,9 +16,6 @@ from ugat_marl.errors import OptionError
 from ugat_marl.grounding.scaling import SMALLEST_SPREAD, Standardiser
 from ugat_marl.grounding.stacked import Stack
 
-DELAY_SCALE_S = 5.0
-"""Delay that is 1 at the input of a model."""
-
 
 @dataclass(frozen=True)
 class ForwardConfig:
@@ -45,13 +42,13 @@ class ForwardModel(nn.Module):
         stack: The agents.
         config: Shape of the models.
         generator: Source of the initial weights.
-        delays: Whether the delay of the action's green is an input, too.
+        extra: Number of further inputs.
     """
 
     fitted: Tensor
     scale: Tensor
     offsets: Tensor
-    delay_place: Tensor
+    extra_places: Tensor
     valid_outputs: Tensor
 
     def __init__(
@@ -59,51 +56,56 @@ class ForwardModel(nn.Module):
         stack: Stack,
         config: ForwardConfig,
         generator: torch.Generator,
-        delays: bool = False,
+        extra: int = 0,
     ) -> None:
         super().__init__()
         self.stack = stack
         self.config = config
-        self.delays = delays
         heads = stack.heads(config.include_phase)
-        fan_in = [size + k + delays for size, k in zip(stack.sizes, stack.phases, strict=True)]
+        fan_in = [size + k + extra for size, k in zip(stack.sizes, stack.phases, strict=True)]
+        self._fan_in, self._outputs = fan_in, max(heads)
         self.standardise = Standardiser(len(heads), stack.width)
-        self.network = BatchedMLP(fan_in, config.hidden, max(heads), generator)
         self.width = max(fan_in)
         self.register_buffer("scale", torch.ones(len(heads), 1, 1))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
         self.register_buffer("offsets", torch.tensor(stack.sizes)[:, None, None], persistent=False)
         self.register_buffer("valid_outputs", mask_of(heads)[:, None, :], persistent=False)
         behind = torch.tensor(stack.sizes) + torch.tensor(stack.phases)
-        self.register_buffer("delay_place", behind[:, None, None], persistent=False)
+        places = behind[:, None, None] + torch.arange(extra)
+        self.register_buffer("extra_places", places, persistent=False)
+        self.renew(generator)
 
-    def forward(self, observation: Tensor, action: Tensor, delay_s: Tensor | None = None) -> Tensor:
+    def renew(self, generator: torch.Generator) -> None:
+        """Forgets everything: a new network with weights from `generator`."""
+        self.network = BatchedMLP(self._fan_in, self.config.hidden, self._outputs, generator)
+        self.fitted.fill_(False)
+
+    def forward(self, observation: Tensor, action: Tensor, extra: Tensor | None = None) -> Tensor:
         """Predicted change in units of ``scale``: ``(agents, batch, outputs)``, 0 in padding.
 
         Args:
             observation: ``(agents, batch, width)``.
             action: ``(agents, batch)`` int64.
-            delay_s: ``(agents, batch)`` float32, where delays are an input; none is no delay.
+            extra: ``(agents, batch, extra)`` float32, the further inputs; none is zeros.
         """
         inputs = nn.functional.pad(
             self.standardise(observation), (0, self.width - observation.shape[-1])
         )
         # The one-hot action stands directly behind the agent's own numbers, not behind the padding.
         inputs = inputs.scatter(2, self.offsets + action[..., None], 1.0)
-        if delay_s is not None and self.delays:
-            place = self.delay_place.expand(-1, action.shape[1], -1)
-            inputs = inputs.scatter(2, place, delay_s[..., None] / DELAY_SCALE_S)
+        if extra is not None:
+            inputs = inputs.scatter(2, self.extra_places.expand(-1, action.shape[1], -1), extra)
         return self.network(inputs) * self.valid_outputs
 
-    def predict(self, observation: Tensor, action: Tensor, delay_s: Tensor | None = None) -> Tensor:
+    def predict(self, observation: Tensor, action: Tensor) -> Tensor:
         """Predicted features (and phase, if included) of s', ``(agents, batch, outputs)``."""
-        change = self(observation, action, delay_s) * self.scale
+        change = self(observation, action) * self.scale
         return observation[..., : change.shape[-1]] * self.valid_outputs + change
 
     def change(self, observation: Tensor, next_observation: Tensor) -> Tensor:
         """The change that happened, ``(agents, batch, outputs)`` in the features' own unit."""
         size = self.valid_outputs.shape[-1]
-        return (next_observation - observation)[..., :size] * self.valid_outputs
+        return (next_observation[..., :size] - observation[..., :size]) * self.valid_outputs
 
     def fit_scale(self, observation: Tensor, change: Tensor, weight: Tensor) -> None:
         """Takes the statistics of inputs and of changes from the training rows."""

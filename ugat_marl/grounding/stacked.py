@@ -44,6 +44,14 @@ class Stack:
         """Length of each agent's predicted part: its features, with its phase if asked for."""
         return [layout.features + layout.phases * include_phase for layout in self.layouts.values()]
 
+    def current_phase(self, observation: Tensor) -> Tensor:
+        """The phase shown, ``(agents, batch)``, in observations ``(agents, batch, width)``."""
+        found = torch.zeros(observation.shape[:2], dtype=torch.long)
+        for i, layout in enumerate(self.layouts.values()):
+            shown = observation[i, :, layout.features : layout.features + layout.phases]
+            found[i] = shown.argmax(-1)
+        return found
+
     def observations(self, observations: Mapping[str, NDArray[np.float32]]) -> Tensor:
         """One observation per agent as ``(agents, 1, width)`` float32."""
         rows = np.zeros((len(self.agents), 1, self.width), np.float32)
@@ -68,6 +76,8 @@ class StackedTransitions:
     Attributes:
         observation: ``(agents, n, width)`` float32.
         next_observation: ``(agents, n, width)`` float32.
+        served_features: ``(agents, n, features)`` float32, as in `Transitions`; None if they were
+            not measured everywhere.
         asked: ``(agents, n)`` int64, the action the policy chose.
         executed: ``(agents, n)`` int64, the phase that was served.
         delay_s: ``(agents, n)`` float32, for how long its green was held back.
@@ -78,12 +88,22 @@ class StackedTransitions:
 
     observation: Tensor
     next_observation: Tensor
+    served_features: Tensor | None
     asked: Tensor
     executed: Tensor
     delay_s: Tensor
     episode: Tensor
     step: Tensor
     weight: Tensor
+
+    @property
+    def outcome(self) -> Tensor:
+        """The features that tell most of what a green did: of those served, else those after.
+
+        Counts after ten seconds hardly know when a green began: often the same number of vehicles
+        has got through, and others have arrived.
+        """
+        return self.next_observation if self.served_features is None else self.served_features
 
 
 def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
@@ -120,8 +140,15 @@ def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
         episode[i, :k] = torch.from_numpy(np.searchsorted(number, own.episode))
         step[i, :k] = torch.from_numpy(own.step)
         weight[i, :k] = 1.0
+    served: Tensor | None = None
+    if all(own.served_features.shape[1] for own in rows):
+        most = max(layout.features for layout in stack.layouts.values())
+        served = torch.zeros(count, n, most)
+        for i, own in enumerate(rows):
+            part = torch.from_numpy(own.served_features)
+            served[i, : len(own), : part.shape[1]] = part
     return StackedTransitions(
-        observation, following, asked, executed, delay_s, episode, step, weight
+        observation, following, served, asked, executed, delay_s, episode, step, weight
     )
 
 

@@ -74,7 +74,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         if outcome.delay_s.any():
             delays = dict(zip(stack.agents, outcome.delay_s.tolist(), strict=True))
             env: Any = self.env
-            env.delay_greens(delays, interrupt=True)
+            env.delay_greens(delays)
         observations, rewards, terminations, truncations, infos = self.env.step(executed)
         if self.env.agents:
             self._notice(observations, infos)

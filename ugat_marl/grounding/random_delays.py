@@ -1,0 +1,60 @@
+"""Greens that begin late by chance: how the simulation is asked what a delay does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pettingzoo.utils import BaseParallelWrapper
+
+from ugat_marl.policy import AnyParallelEnv
+from ugat_marl.seeding import numpy_generator
+
+LEAST_CHANCE = 0.5
+
+
+class RandomDelays(BaseParallelWrapper[str, Any, Any]):
+    """Delays greens by random whole seconds, and says so in the infos, under ``delay_s``.
+
+    How often is drawn anew for every episode, so that traffic flows in some and jams in others:
+    what a delay does has to be known in both.
+
+    Args:
+        env: An environment of the suite.
+        most_s: Longest delay.
+    """
+
+    def __init__(self, env: AnyParallelEnv, most_s: int) -> None:
+        super().__init__(env)
+        self._most_s = most_s
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Starts an episode; `seed` decides the delays, too."""
+        self._generator = numpy_generator(seed or 0, "delays")
+        self._chance = self._generator.uniform(LEAST_CHANCE, 1.0)
+        return self.env.reset(seed=seed, options=options)
+
+    def step(
+        self, actions: dict[str, Any]
+    ) -> tuple[
+        dict[str, Any],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Executes the actions with delays."""
+        agents = list(self.env.agents)
+        drawn = self._generator.integers(self._most_s + 1, size=len(agents))
+        drawn = drawn * (self._generator.random(len(agents)) < self._chance)
+        delays = dict(zip(agents, drawn.astype(float).tolist(), strict=True))
+        env: Any = self.env
+        env.delay_greens(delays)
+        before = dict(zip(agents, env.unwrapped.phases, strict=True))
+        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        told = dict(infos)
+        for agent in agents:  # only a green that begins can be late
+            begins = infos[agent]["executed_action"] != before[agent]
+            told[agent] = {**infos[agent], "delay_s": delays[agent] * begins}
+        return observations, rewards, terminations, truncations, told

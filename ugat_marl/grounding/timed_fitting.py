@@ -1,0 +1,144 @@
+"""Fits timed grounding: f on the street, a model with delays and h on the simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ugat_marl.batched import one_thread
+from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.fit_loop import EpochCallback, Split, split
+from ugat_marl.grounding.fit_report import TrainingRecord
+from ugat_marl.grounding.fitting import (
+    Changes,
+    Questions,
+    fit_answers,
+    fit_changes,
+    refuse_mismatch,
+)
+from ugat_marl.grounding.lost_time import Means, lost_time
+from ugat_marl.grounding.off_data import OffData
+from ugat_marl.grounding.stacked import Stack, StackedTransitions, stack_log
+from ugat_marl.grounding.timed import TimedTransform
+from ugat_marl.grounding.timed_report import DelayReport, TimedReport, mean_error, off_data_auroc
+from ugat_marl.seeding import torch_generator
+from ugat_marl.transitions import TransitionLog
+
+
+@one_thread()
+def fit_timed(
+    transform: TimedTransform,
+    real: TransitionLog,
+    simulated: TransitionLog,
+    config: FitConfig,
+    seed: int,
+    on_epoch: EpochCallback | None = None,
+) -> TimedReport:
+    """Fits all models of a timed grounding, and measures them.
+
+    Args:
+        transform: Changed in place.
+        real: Transitions of the world to be matched.
+        simulated: Transitions of the simulation under random delays.
+        config: How to train.
+        seed: Decides fresh weights, the order of batches, and what is drawn.
+        on_epoch: Called after every epoch.
+
+    Raises:
+        LogError: As `fitting.fit`.
+    """
+    refuse_mismatch(real, simulated)
+    stack, model = transform.stack, transform.simulated
+    street, data = _alike(stack_log(real, stack), stack_log(simulated, stack))
+    parts = split(street, config.held_out_every, stack)
+    lesson = Changes("forward", street.observation, street.outcome, street.asked)
+    f = fit_changes(transform.forward, lesson, parts, config, seed, on_epoch)
+    parts = split(data, config.held_out_every, stack)
+    extra = model.extra(data.delay_s)
+    lesson = Changes("simulated", data.observation, data.outcome, data.executed, extra)
+    g = fit_changes(model, lesson, parts, config, seed, on_epoch)
+    begins = _begins(data, stack)
+    parts = Split(parts.train * begins, parts.held_out * begins, parts.kind)
+    known = Means.of(model, replace(data, weight=parts.train))
+    street = replace(street, weight=street.weight * _begins(street, stack))
+    lost = lost_time(model, street, known, transform.timed.spread_s)
+    transform.constants.delay_s.copy_(lost.phase_s)
+    h = _fit_delays(transform, data, parts, known.spread[:, None], config, seed, on_epoch)
+    return TimedReport(stack.agents, f, g, lost, h, transform.timed.most_s)
+
+
+def _alike(
+    one: StackedTransitions, two: StackedTransitions
+) -> tuple[StackedTransitions, StackedTransitions]:
+    """Both with means over intervals, or neither."""
+    if one.served_features is None or two.served_features is None:
+        return replace(one, served_features=None), replace(two, served_features=None)
+    return one, two
+
+
+def _begins(data: StackedTransitions, stack: Stack) -> Tensor:
+    """Where a green begins, ``(agents, n)``: elsewhere it cannot be late."""
+    return stack.current_phase(data.observation) != data.executed
+
+
+def _fit_delays(
+    transform: TimedTransform,
+    data: StackedTransitions,
+    parts: Split,
+    spread: Tensor,
+    config: FitConfig,
+    seed: int,
+    on_epoch: EpochCallback | None,
+) -> DelayReport:
+    """Fits h to what the model of the simulation makes of every state under some delay.
+
+    Not to single transitions: from one of those the delay can hardly be told, and whoever guesses
+    it well under noise guesses the middle of the range. f, whose output h is to read, predicts
+    means, and so does the model.
+    """
+    model, simulated = transform.inverse, transform.simulated
+    generator = torch_generator(seed, "inverse", "delays")
+    answers = torch.randint(model.most_s + 1, data.executed.shape, generator=generator)
+    with torch.no_grad():
+        extra = simulated.extra(answers.float())
+        change = simulated(data.observation, data.executed, extra)
+        noise = torch.randn(change.shape, generator=generator) * spread
+        change = (change + transform.timed.target_noise * noise) * simulated.scale
+    inputs = model.inputs(data.observation, data.executed, change)
+    off_data = OffData.around(inputs, parts.train, transform.stack, model.action_columns)
+    asked = Questions(inputs, answers, off_data)
+    record = fit_answers(model, asked, parts, config, seed, on_epoch)
+    return _report(transform, data, parts, asked, record, torch_generator(seed, "off data"))
+
+
+@torch.no_grad()
+def _report(
+    transform: TimedTransform,
+    data: StackedTransitions,
+    parts: Split,
+    asked: Questions,
+    record: TrainingRecord,
+    generator: torch.Generator,
+) -> DelayReport:
+    model = transform.inverse
+    seconds = torch.arange(model.most_s + 1, dtype=torch.float32)
+    answer = model.answer(asked.inputs)
+    happened = transform.simulated.change(data.observation, data.outcome)
+    single = model.predict(data.observation, data.executed, happened)
+    held = parts.held_out
+    drawn = asked.off_data.draw(int(held.sum(1).max().clamp(min=1)), generator, state_share=1.0)
+    on, off = answer.u[held.bool()], model.answer(drawn).u.flatten()
+    return DelayReport(
+        training=record,
+        error_s=mean_error((answer.probability * seconds).sum(-1), asked.answers.float(), held),
+        error_on_transitions_s=mean_error(
+            (single.probability * seconds).sum(-1), data.delay_s, held
+        ),
+        guess_s=float((seconds - seconds.mean()).abs().mean()),
+        mean_u=float(on.mean()),
+        mean_u_off_data=float(off.mean()),
+        auroc_off_data=off_data_auroc(on, off),
+        uncertainty=model.method.name,
+    )

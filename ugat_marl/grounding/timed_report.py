@@ -1,0 +1,128 @@
+"""What a fit of timed grounding was worth, measured on episodes it did not see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ugat_marl.grounding.calibration import auroc
+from ugat_marl.grounding.fit_report import ForwardReport, TrainingRecord, entries
+from ugat_marl.grounding.lost_time import LostTime
+from ugat_marl.grounding.uncertainty import MethodName
+
+Floats = NDArray[np.float64]
+END_S = 0.5
+"""A best delay so close to the longest one tried may well be longer."""
+
+
+@dataclass(frozen=True)
+class DelayReport:
+    """Held-out quality of h, per agent where an array; delays and errors in s.
+
+    Attributes:
+        training: How the training went.
+        error_s: Mean absolute error on the changes it was trained to read, of held-out states.
+        error_on_transitions_s: The same on single transitions as they happened, whose noise no
+            answer can see through.
+        guess_s: Mean absolute error of always answering the middle of the range.
+        mean_u: Mean uncertainty on held-out states.
+        mean_u_off_data: Mean u on inputs drawn around, not from, the data.
+        auroc_off_data: Probability that u is higher off the data than on it.
+        uncertainty: Where u came from.
+    """
+
+    training: TrainingRecord
+    error_s: Floats
+    error_on_transitions_s: Floats
+    guess_s: float
+    mean_u: float
+    mean_u_off_data: float
+    auroc_off_data: float
+    uncertainty: MethodName
+
+
+@dataclass(frozen=True)
+class TimedReport:
+    """What the parts of timed grounding are worth.
+
+    Attributes:
+        agents: Names, the order of all arrays.
+        forward: f, on held-out real transitions.
+        simulated: The model of the simulation with delays, on held-out simulated transitions.
+        lost: The delays that fit the street best.
+        inverse: h.
+        most_s: Longest delay tried.
+    """
+
+    agents: tuple[str, ...]
+    forward: ForwardReport
+    simulated: ForwardReport
+    lost: LostTime
+    inverse: DelayReport
+    most_s: int
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons to doubt the delays; empty if there are none."""
+        found = [
+            self._where("f is no better than predicting no change", self.forward.ratio >= 1.0),
+            self._where(
+                "the model of the simulation is no better than predicting no change",
+                self.simulated.ratio >= 1.0,
+            ),
+            self._where(
+                f"the best delay is the longest one tried ({self.most_s} s; raise timed most_s)",
+                self.lost.best_s > self.most_s - END_S,
+            ),
+        ]
+        if self.inverse.uncertainty == "none":
+            found.append("without uncertainty u is 0, and the gate takes every answer of h")
+        elif self.inverse.auroc_off_data <= 0.5:
+            found.append(f"u does not rise off the data (AUROC {self.inverse.auroc_off_data:.2f})")
+        return tuple(sentence for sentence in found if sentence)
+
+    def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
+        """Agents whose h may be obeyed, for `Gate.trust`; the others take the best constant.
+
+        f and the model of the simulation beat "no change", and h, on its own task, a guess by the
+        share `least_accuracy`.
+        """
+        better = (self.forward.ratio < 1.0) & (self.simulated.ratio < 1.0)
+        return better & (self.inverse.error_s < (1.0 - least_accuracy) * self.inverse.guess_s)
+
+    def as_dict(self) -> dict[str, float]:
+        """Flat numbers; arrays as their mean over agents and as one entry per agent."""
+        numbers: dict[str, float] = {}
+        for prefix, part in (("forward", self.forward), ("simulated", self.simulated)):
+            numbers |= part.training.as_dict(prefix)
+            for name in ("error", "no_change", "ratio"):
+                numbers |= entries(f"{prefix}/{name}", getattr(part, name), self.agents)
+        numbers |= self.inverse.training.as_dict("inverse")
+        for name in ("error_s", "error_on_transitions_s"):
+            numbers |= entries(f"inverse/{name}", getattr(self.inverse, name), self.agents)
+        for name in ("guess_s", "mean_u", "mean_u_off_data", "auroc_off_data"):
+            numbers[f"inverse/{name}"] = getattr(self.inverse, name)
+        for name in ("best_s", "low_s", "high_s"):
+            numbers |= entries(f"lost_time/{name}", getattr(self.lost, name), self.agents)
+        return numbers
+
+    def _where(self, complaint: str, where: NDArray[np.bool_]) -> str:
+        names = [agent for agent, hit in zip(self.agents, where, strict=True) if hit]
+        shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+        return f"{complaint} at {len(names)} of {len(self.agents)} ({shown})" if names else ""
+
+
+def mean_error(found_s: Tensor, true_s: Tensor, weight: Tensor) -> Floats:
+    """Mean absolute error per agent, ``(agents,)``; NaN without rows."""
+    total = ((found_s - true_s).abs() * weight).sum(1).double()
+    return (total / weight.sum(1).double()).numpy()
+
+
+def off_data_auroc(on: Tensor, off: Tensor) -> float:
+    """Probability that u is higher off the data than on it."""
+    both = torch.cat([on, off]).numpy()
+    return auroc(both, np.arange(len(both)) >= len(on))
