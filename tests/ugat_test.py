@@ -329,7 +329,8 @@ SHORT = replace(
 def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
     repaired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = replace(SHORT, corrected=str(repaired), control=True)
+    late = "late_green=*,2"
+    config = replace(SHORT, corrected=str(repaired), control=True, further=(late, "V4"))
     trained: list[tuple[str, int]] = []
     learn = transfer_module.DQN.learn
 
@@ -339,7 +340,11 @@ def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
 
     monkeypatch.setattr(transfer_module.DQN, "learn", counting)
     found = transfer(config, tmp_path / "run")
-    assert found.policies[:4] == ["direct transfer", "UGAT", "more plain sim", "corrected sim"]
+    names = ["direct transfer", "UGAT", "more plain sim"]
+    further = [f"further in {late}", "further in V4"]
+    assert found.policies[:6] == [*names, *further, "corrected sim"]
+    for name in (late, "V4"):  # from where direct transfer stood, as long as the control
+        assert sum(episodes for domain, episodes in trained if domain == name) == 4
     assert found.domains == ["sim", "V4"]
     assert found.notes["corrected sim"] == str(repaired)
     assert {r.seed for r in found.results if r.policy == "corrected sim"} == {
@@ -348,7 +353,7 @@ def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
     there = [episodes for domain, episodes in trained if domain == str(repaired)]
     assert sum(there) == config.episodes == 12
     mine = weights(tmp_path / "run", "corrected-sim")
-    for other in ("ugat", "direct-transfer", "more-plain-sim"):
+    for other in ("ugat", "direct-transfer", "more-plain-sim", "further-in-v4"):
         assert not np.array_equal(mine, weights(tmp_path / "run", other))
 
 

@@ -127,7 +127,7 @@ class _Recording:
         """The features at the last decision without the vehicles that left since, on average."""
         before, self._before = self._before, self._base.snapshot
         left = self._before.mean_left
-        if not len(left):
+        if not len(left) or self._observer.needs_waiting:  # who has left says nothing of waiting
             return None
         vectors = self._observer.observe(before.less(left), self._base.phases)
         own = zip(self._observer.agents, vectors, self._observer.layouts, strict=True)

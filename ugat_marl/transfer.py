@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -67,6 +68,9 @@ class TransferConfig:
         evaluation_seeds: Episodes behind every number of the table.
         tuning_seeds: Episodes behind the choice of the best rule.
         control: Also train as many further episodes in plain sim, for comparison.
+        further: Domains in which direct transfer is trained on as long as the control is, for one
+            policy each: "late_green=*,3" is a constant delay of all greens, "V4" is fine-tuning in
+            the real domain itself.
         corrected: A corrected simulation, as `ugat-marl diagnose` writes it, or any other domain: a
             further policy is trained there from scratch, for as many episodes as UGAT in all.
         ugat: Settings of the algorithm.
@@ -85,6 +89,7 @@ class TransferConfig:
     evaluation_seeds: int = 5
     tuning_seeds: int = 2
     control: bool = True
+    further: tuple[str, ...] = ()
     corrected: str | None = None
     ugat: Annotated[UgatConfig, arg(name="")] = field(default_factory=UgatConfig)
     dqn: DQNConfig = field(default_factory=DQNConfig)
@@ -97,6 +102,8 @@ class TransferConfig:
             raise OptionError(
                 f"real = {self.real!r} is the simulation itself; name another domain, such as V4"
             )
+        if len({describe(domain) for domain in self.further}) < len(self.further):
+            raise OptionError(f"further holds one twice: {' '.join(self.further)}")
         if self.corrected is not None and describe(self.corrected) == describe(self.sim):
             raise OptionError(
                 f"corrected = {self.corrected!r} is the simulation itself; name the scenario that "
@@ -150,7 +157,13 @@ def transfer(
         log = TransitionLog.read(config.real_log)
         recorded = RecordedWorld(log, env)  # refuses a misfit before anything is written
         _say_if_from_elsewhere(log, config, reporter)
-    corrected = _corrected_env(config, scenario, env)
+    others = {
+        f"further in {describe(domain)}": _other_env(config, scenario, env, "further", domain)
+        for domain in config.further
+    }
+    corrected: TrafficEnv | None = None
+    if config.corrected is not None:
+        corrected = _other_env(config, scenario, env, "corrected", config.corrected)
     learner = DQN.of(env, config.dqn, config.seed)
     transform = config.ugat.transform(env.layouts, config.seed)
     run = Run(directory, _identity(config, scenario, env, corrected), resume, reporter)
@@ -164,16 +177,18 @@ def transfer(
         policies[UGAT] = policy
         if config.control:
             policies[CONTROL] = _control(config, env, run)
+        for name, other in others.items():
+            policies[name] = _further(config, other, run, name)
         if corrected is not None:
             policies[CORRECTED] = _from_scratch(config, corrected, run)
     finally:
-        env.close()
-        if corrected is not None:
-            corrected.close()
+        for made in (env, corrected, *others.values()):
+            if made is not None:
+                made.close()
         run.close()
     for name, trained in policies.items():
         if isinstance(trained, DQNPolicy):
-            trained.save(directory / "policies" / f"{name.replace(' ', '-').lower()}.pt")
+            trained.save(directory / "policies" / f"{_file(name)}.pt")
     table = judge(config, scenario, policies, reporter)
     table.write(directory / "table.json")
     return table
@@ -265,16 +280,21 @@ def _control(config: TransferConfig, env: TrafficEnv, run: Run) -> Policy:
     return _trained_on(config, env, run, start, progress, "control: more plain sim")
 
 
-def _corrected_env(
-    config: TransferConfig, scenario: Scenario, sim: TrafficEnv
-) -> TrafficEnv | None:
-    """The corrected simulation, if one is asked for; its policies must fit the others' worlds."""
-    if config.corrected is None:
-        return None
-    env = parallel_env(scenario, config.corrected, **config.env_options)
+def _further(config: TransferConfig, env: TrafficEnv, run: Run, name: str) -> Policy:
+    """Direct transfer trained on in another domain, for as many episodes as the control."""
+    progress = run.directory / f"{_file(name)}-learner.pt"
+    start = progress if progress.exists() else run.directory / DIRECT_LEARNER
+    return _trained_on(config, env, run, start, progress, name)
+
+
+def _other_env(
+    config: TransferConfig, scenario: Scenario, sim: TrafficEnv, option: str, domain: str
+) -> TrafficEnv:
+    """Another domain to train in; its policies must fit the others' worlds."""
+    env = parallel_env(scenario, domain, **config.env_options)
     if AgentSet.of(env) != AgentSet.of(sim):
         raise ScenarioError(
-            f"corrected = {config.corrected!r} has other agents, observations or phases than "
+            f"{option} = {domain!r} has other agents, observations or phases than "
             f"scenario {scenario.id!r}: {AgentSet.of(env)}, not {AgentSet.of(sim)}; take a "
             "corrected scenario of this one"
         )
@@ -313,6 +333,11 @@ def _trained_on(
     return learner.policy()
 
 
+def _file(name: str) -> str:
+    """The name of a policy as the name of a file."""
+    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
+
+
 def _digest(path: Path) -> str:
     """A log is the same if its content is, wherever it lies."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
@@ -322,7 +347,7 @@ def _identity(
     config: TransferConfig, scenario: Scenario, env: TrafficEnv, corrected: TrafficEnv | None
 ) -> dict[str, Any]:
     settings = asdict(config)
-    for judging in ("evaluation_seeds", "tuning_seeds", "control"):
+    for judging in ("evaluation_seeds", "tuning_seeds", "control", "further"):
         settings.pop(judging)
     settings.pop("corrected")  # a scenario is the same if its hash is, wherever it lies
     settings["real_log"] = _digest(config.real_log) if config.real_log else None

@@ -64,7 +64,8 @@ class Means:
         """Of a fitted model; the rows with weight are those it was fitted to."""
         change = model.change(data.observation, data.outcome) / model.scale
         error = model(data.observation, data.executed, model.extra(data.delay_s)) - change
-        mean = (data.weight[..., None] * error**2).sum(1) / data.weight.sum(1, keepdim=True)
+        count = data.weight.sum(1, keepdim=True).clamp(min=1.0)
+        mean = (data.weight[..., None] * error**2).sum(1) / count
         classes = model.most_s + 1
         cell = data.executed * classes + data.delay_s.round().long().clamp(max=model.most_s)
         rows = torch.zeros(len(mean), model.stack.actions * classes)

@@ -60,12 +60,14 @@ def fit_timed(
     lesson = Changes("simulated", data.observation, data.outcome, data.executed, extra)
     g = fit_changes(model, lesson, parts, config, seed, on_epoch)
     begins = _begins(data, stack)
-    parts = Split(parts.train * begins, parts.held_out * begins, parts.kind)
-    known = Means.of(model, replace(data, weight=parts.train))
+    known = Means.of(model, replace(data, weight=parts.train * begins))
     street = replace(street, weight=street.weight * _begins(street, stack))
     lost = lost_time(model, street, known, transform.timed.spread_s)
     transform.constants.delay_s.copy_(lost.phase_s)
-    h = _fit_delays(transform, data, parts, known.spread[:, None], config, seed, on_epoch)
+    data = replace(data, weight=data.weight * begins)
+    h = _fit_delays(
+        transform, data, _where(begins, parts), known.spread[:, None], config, seed, on_epoch
+    )
     return TimedReport(stack.agents, f, g, lost, h, transform.timed.most_s)
 
 
@@ -81,6 +83,20 @@ def _alike(
 def _begins(data: StackedTransitions, stack: Stack) -> Tensor:
     """Where a green begins, ``(agents, n)``: elsewhere it cannot be late."""
     return stack.current_phase(data.observation) != data.executed
+
+
+def _where(begins: Tensor, parts: Split) -> Split:
+    """The rows in which a green begins; all of an agent's, if it lacks such rows on one side.
+
+    The head of h is shared: without rows of one agent the loss of all would be no number.
+    """
+    train, held_out = parts.train * begins, parts.held_out * begins
+    enough = (train.any(1) & held_out.any(1))[:, None]
+    return Split(
+        torch.where(enough, train, parts.train),
+        torch.where(enough, held_out, parts.held_out),
+        parts.kind,
+    )
 
 
 def _fit_delays(
@@ -127,7 +143,7 @@ def _report(
     answer = model.answer(asked.inputs)
     happened = transform.simulated.change(data.observation, data.outcome)
     single = model.predict(data.observation, data.executed, happened)
-    held = parts.held_out
+    held = parts.held_out * data.weight  # nothing is known of an agent that had to take all rows
     drawn = asked.off_data.draw(int(held.sum(1).max().clamp(min=1)), generator, state_share=1.0)
     on, off = answer.u[held.bool()], model.answer(drawn).u.flatten()
     return DelayReport(
