@@ -220,7 +220,7 @@ def test_a_log_recorded_in_a_grounded_simulation_says_what_was_held_back(env: Tr
 
 SMALL = TransferConfig(
     scenario="single-v1",
-    real="V4",
+    real="late_green=*,2",
     duration_s=150,
     evaluation_seeds=1,
     tuning_seeds=1,
@@ -296,7 +296,8 @@ def test_a_run_with_timed_grounding_resumes_where_it_was(tmp_path: Path) -> None
     for step in (1, 2):
         for name in (
             "lost_time/best_s", "lost_time/low_s/signal_0", "lost_time/high_s",
-            "forward/ratio", "simulated/ratio", "inverse/guess_s", "gate/alpha", "att_s/V4",
+            "forward/ratio", "simulated/ratio", "inverse/guess_s", "gate/alpha",
+            "att_s/late_green=*,2",
         ):  # fmt: skip
             assert (step, name) in numbers, name
         assert 0 <= numbers[step, "lost_time/low_s"] <= numbers[step, "lost_time/best_s"]
