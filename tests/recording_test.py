@@ -292,5 +292,7 @@ def test_a_foreign_directory_is_refused_before_anything_is_measured(
     call = ["record", str(data / "crossing"), "--out", str(tmp_path)]
     assert main(call) == 2
     assert "'thesis.tex'" in capsys.readouterr().err
-    assert main(["record", "nowhere-v1", "--out", str(tmp_path / "new")]) == 2
+    for wrong in (["nowhere-v1"], [call[1], "--domain", "V9"], [call[1], "--policy", "nobody"]):
+        assert main(["record", *wrong, "--out", str(tmp_path / "new")]) == 2
+        assert not (tmp_path / "new").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]

@@ -46,7 +46,8 @@ from ugat_marl.worlds import RecordedWorld, SimulatedWorld, World
 EVALUATION_SEED = 1000
 """First seed of the reported episodes; apart from those of training and of the search for rules."""
 
-DIRECT, UGAT, CONTROL = "direct transfer", "UGAT", "more plain sim"
+DIRECT, UGAT, TIMED = "direct transfer", "UGAT", "UGAT, timed"
+CONTROL = "more plain sim"
 CORRECTED = "corrected sim"
 
 
@@ -174,7 +175,7 @@ def transfer(
         policies: dict[str, Policy] = {}
         if state.direct is not None:
             policies[DIRECT] = state.direct
-        policies[UGAT] = policy
+        policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
         if config.control:
             policies[CONTROL] = _control(config, env, run)
         for name, other in others.items():

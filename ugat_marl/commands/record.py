@@ -10,7 +10,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.commands.arguments import LengthS, Workers
-from ugat_marl.effects import load
+from ugat_marl.effects import in_domain, load
 from ugat_marl.evaluation import policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.measured.writing import require_replaceable, write_measured
@@ -62,12 +62,14 @@ class Record:
     def run(self, console: Console) -> int:
         """Records and writes."""
         scenario = load(self.scenario)
+        in_domain(scenario, self.domain)  # a wrong name is an error before anything is written
+        policy = policy_factory(self.policy)
         require_replaceable(self.out)
         require_writable(self.out / "periods.csv")
         measured = record(
             scenario,
             self.domain,
-            policy_factory(self.policy),
+            policy,
             periods=self.periods,
             seed=self.seed,
             duration_s=self.duration_s,

@@ -88,26 +88,31 @@ def lost_time(
     stack = model.stack
     grid = torch.linspace(0.0, model.most_s, round(model.most_s / STEP_S) + 1)
     change = model.change(data.observation, data.outcome) / model.scale
-    outputs = model.valid_outputs.double()
+    rows = torch.zeros(len(stack.agents), stack.actions).scatter_add_(1, data.executed, data.weight)
+    enough = known.rows.sum(-1) >= LEAST_ROWS * known.rows.shape[-1]
+    use = (enough & (rows >= LEAST_ROWS))[..., None] * model.valid_outputs
     cost = torch.zeros(len(stack.agents), stack.actions, len(grid), dtype=torch.float64)
+    misfit = torch.zeros_like(cost)
     for place, seconds in enumerate(grid.tolist()):
         extra = model.extra(torch.full_like(data.delay_s, seconds))
         error = change - model(data.observation, data.executed, extra)
-        mean, rows = _by_phase(error, data.weight, data.executed, stack.actions)
+        mean = _by_phase(error * data.weight[..., None], data.executed, rows)
         simulated = _between(known.rows, seconds)
         chance = 1.0 / rows.clamp(min=1.0) + 1.0 / simulated.clamp(min=1.0)
         chance = (chance[..., None] * known.spread[:, None] ** 2).double()
-        use = outputs * ((rows >= LEAST_ROWS) & (simulated >= LEAST_ROWS))[..., None]
-        cost[:, :, place] = (use * (mean**2 / chance + chance.log())).sum(-1)
+        misfit[:, :, place] = (use * mean**2 / chance).sum(-1)
+        cost[:, :, place] = misfit[:, :, place] + (use * chance.log()).sum(-1)
+    # What no delay explains is the model's own error; it makes the delays less certain.
+    excess = (misfit.sum(1).amin(-1) / use.sum((1, 2)).clamp(min=1.0)).clamp(min=1.0)[:, None]
     total = cost.sum(1)
-    likely = total - total.amin(-1, keepdim=True)
+    likely = (total - total.amin(-1, keepdim=True)) / excess
     best = grid[total.argmin(-1)]
     inside = (likely <= LEVEL).numpy()
     low = [float(grid[row.argmax()]) for row in inside]
     high = [float(grid[len(grid) - 1 - row[::-1].argmax()]) for row in inside]
     prior = ((grid - best[:, None]) / phase_s) ** 2
     return LostTime(
-        phase_s=grid[(cost + prior[:, None, :]).argmin(-1)].float(),
+        phase_s=grid[(cost / excess[..., None] + prior[:, None, :]).argmin(-1)].float(),
         best_s=best.double().numpy(),
         low_s=np.array(low),
         high_s=np.array(high),
@@ -115,13 +120,12 @@ def lost_time(
     )
 
 
-def _by_phase(error: Tensor, weight: Tensor, phase: Tensor, phases: int) -> tuple[Tensor, Tensor]:
-    """Mean errors, ``(agents, phases, outputs)``, and their numbers of rows."""
-    agents, _, outputs = error.shape
-    rows = torch.zeros(agents, phases).scatter_add_(1, phase, weight)
+def _by_phase(values: Tensor, phase: Tensor, rows: Tensor) -> Tensor:
+    """Means of ``(agents, n, outputs)`` over the `rows` of every phase: float64, one per phase."""
+    agents, _, outputs = values.shape
     places = phase[..., None].expand(-1, -1, outputs)
-    total = torch.zeros(agents, phases, outputs).scatter_add_(1, places, error * weight[..., None])
-    return (total / rows.clamp(min=1.0)[..., None]).double(), rows
+    total = torch.zeros(agents, rows.shape[1], outputs).scatter_add_(1, places, values)
+    return (total / rows.clamp(min=1.0)[..., None]).double()
 
 
 def _between(rows: Tensor, seconds: float) -> Tensor:

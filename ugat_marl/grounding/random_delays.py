@@ -26,12 +26,14 @@ class RandomDelays(BaseParallelWrapper[str, Any, Any]):
     def __init__(self, env: AnyParallelEnv, most_s: int) -> None:
         super().__init__(env)
         self._most_s = most_s
+        self._generator = numpy_generator(0, "delays")
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Starts an episode; `seed` decides the delays, too."""
-        self._generator = numpy_generator(seed or 0, "delays")
+        if seed is not None:
+            self._generator = numpy_generator(seed, "delays")
         self._chance = self._generator.uniform(LEAST_CHANCE, 1.0)
         return self.env.reset(seed=seed, options=options)
 
@@ -46,6 +48,8 @@ class RandomDelays(BaseParallelWrapper[str, Any, Any]):
     ]:
         """Executes the actions with delays."""
         agents = list(self.env.agents)
+        if not agents:  # after the last step; the environment itself says so
+            return self.env.step(actions)
         drawn = self._generator.integers(self._most_s + 1, size=len(agents))
         drawn = drawn * (self._generator.random(len(agents)) < self._chance)
         delays = dict(zip(agents, drawn.astype(float).tolist(), strict=True))
