@@ -195,3 +195,15 @@ def test_impossible_states_are_refused_and_change_nothing(change: dict) -> None:
 def test_impossible_options_are_refused(options: dict) -> None:
     with pytest.raises(OptionError, match="allowed"):
         GateConfig(**options)
+
+
+def test_where_there_is_nothing_to_ground_nothing_is_logged() -> None:
+    gate = Gate(AGENTS, GateConfig())
+    asked = np.array([True, False])
+    found = gate.decide(np.array([0.2, 0.8]), KEEP, OTHER, asked=asked)
+    assert found.tolist() == [True, False]
+    gate.decide(np.array([0.4, 0.6]), KEEP, OTHER)
+    report = gate.update()
+    assert report.decisions.tolist() == [2, 1]
+    assert report.acceptance.tolist() == [1.0, 1.0]
+    assert gate.alpha.tolist() == pytest.approx([0.3, 0.6])

@@ -121,6 +121,7 @@ class Gate:
         action: NDArray[np.int64],
         grounded: NDArray[np.int64],
         permitted: NDArray[np.bool_] | None = None,
+        asked: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.bool_]:
         """Which grounded actions are taken; logs u and counts.
 
@@ -129,15 +130,18 @@ class Gate:
             action: ``(agents,)`` the policy's actions.
             grounded: ``(agents,)`` the grounded actions.
             permitted: ``(agents,)`` false where the grounded action is masked out.
+            asked: ``(agents,)`` false where there is nothing to ground; that is not logged.
 
         Returns:
-            ``(agents,)`` bool: u < alpha, permitted, and the agent's models trusted.
+            ``(agents,)`` bool: u < alpha, permitted, asked, and the agent's models trusted.
         """
         accepted = (u < self.alpha) & self.trusted
         if permitted is not None:
             accepted = accepted & permitted
-        self._running += (u, np.ones_like(u))
-        self._counts += (np.ones_like(u), accepted, accepted & (action != grounded), u)
+        one = np.ones_like(u) if asked is None else asked.astype(u.dtype)
+        accepted = accepted & (one > 0)
+        self._running += (u * one, one)
+        self._counts += (one, accepted, accepted & (action != grounded), u * one)
         return accepted
 
     def end_epoch(self) -> None:

@@ -111,6 +111,7 @@ class TimedTransform(Transform):
             u[:, 0].numpy(),
             usual[:, 0].round().long().numpy(),
             found[:, 0].round().long().numpy(),
+            asked=switched,
         )
         delay = np.where(accepted, found[:, 0].numpy(), usual[:, 0].numpy())
         delay = np.where(switched, delay, 0.0).astype(np.float32)
