@@ -18,7 +18,7 @@ from ugat_marl.grounding.calibration import (
     risk_by_coverage,
     spearman,
 )
-from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.fit_config import PAIRS, FitConfig
 from ugat_marl.grounding.fit_loop import split
 from ugat_marl.grounding.fitting import fit, fit_forward, fit_inverse
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
@@ -163,8 +163,20 @@ def test_report_is_flat_numbers(fitted) -> None:
         "mean_u_on_predictions",
         "accuracy_on_real/a_0",
         "mean_u_on_real",
+        "accuracy_on_means",
     ):
         assert math.isfinite(numbers[name]), name
+
+
+def test_h_reads_means_best_if_it_learnt_from_means() -> None:
+    log = planted(0.1, noise=0.3)  # arrivals scatter more than what a phase does
+    found = {}
+    for pairs in PAIRS:
+        f, h = models()
+        found[pairs] = fit(f, h, log, log, dataclasses.replace(QUICK, pairs=pairs), seed=0)
+    observed, smoothed = (found[pairs].accuracy_on_means.mean() for pairs in PAIRS)
+    assert smoothed > observed + 0.05
+    assert found["observed"].inverse.accuracy.mean() >= found["smoothed"].inverse.accuracy.mean()
 
 
 def test_a_poor_fit_says_so() -> None:
@@ -344,7 +356,7 @@ def test_epochs_are_reported_as_they_end() -> None:
     config = FitConfig(epochs=3)
     fit(f, h, log, log, config, 0, on_epoch=lambda *args: seen.append(args))
     assert [(name, epoch) for name, epoch, _ in seen] == [
-        (name, epoch) for name in ("forward", "inverse") for epoch in (1, 2, 3)
+        (name, epoch) for name in ("forward", "simulated", "inverse") for epoch in (1, 2, 3)
     ]
 
 

@@ -240,7 +240,7 @@ def _fit(
 ) -> FitReport | TimedReport:
     transform = state.transform
     real, simulated = (TransitionLog.concatenate(logs) for logs in (state.real, state.simulated))
-    most = len(transform.models) * config.fit.epochs
+    most = 3 * config.fit.epochs  # f, a model of the simulation, and h
     with run.reporter.task(f"fitting f and h, round {iteration + 1}", most) as go:
 
         def on_epoch(model: str, _epoch: int, loss: float) -> None:

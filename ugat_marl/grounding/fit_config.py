@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.uncertainty import Method, MethodName
+
+PAIRS = ("observed", "smoothed")
 
 
 @dataclass(frozen=True)
@@ -16,6 +19,9 @@ class FitConfig:
     Attributes:
         uncertainty: How h says that it is unsure: "edl" (evidential), "dropout" (Concrete Dropout),
             "ensemble" (Deep Ensembles), or "none", with which every grounded action is taken.
+        pairs: What h learns from in phase grounding: "observed" transitions, as in the paper, or
+            "smoothed" ones (s, what a model of the simulation expects of a). f, whose output h has
+            to read, predicts means; single transitions scatter around them.
         members: Networks of an ensemble.
         passes: Thinned networks that dropout averages over.
         epochs: Most passes over the training rows.
@@ -35,6 +41,7 @@ class FitConfig:
     """
 
     uncertainty: MethodName = "edl"
+    pairs: Literal["observed", "smoothed"] = "observed"
     members: int = 5
     passes: int = 20
     epochs: int = 100
@@ -54,6 +61,8 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         _ = self.method  # refuses what is impossible
+        if self.pairs not in PAIRS:
+            raise OptionError(f"fit pairs is {self.pairs!r}; allowed: {', '.join(PAIRS)}")
         for name, least in (("epochs", 1), ("batch_size", 1), ("patience", 1), ("kl_epochs", 0)):
             if getattr(self, name) < least:
                 raise OptionError(f"fit {name} is {getattr(self, name)}; allowed: >= {least}")

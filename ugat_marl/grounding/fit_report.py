@@ -153,6 +153,8 @@ class FitReport:
         accuracy_on_real: Per agent, share of held-out real transitions whose action h names. What
             it lacks of h's own accuracy is the gap itself, in actions, without f's part in it.
         mean_u_on_real: Per agent, mean u of these answers: how foreign the real world is to h.
+        accuracy_on_means: Per agent, accuracy of h on held-out simulated states and what a model of
+            the simulation expects of their actions: means, such as f predicts.
     """
 
     agents: tuple[str, ...]
@@ -162,6 +164,7 @@ class FitReport:
     mean_u_on_predictions: Floats
     accuracy_on_real: Floats
     mean_u_on_real: Floats
+    accuracy_on_means: Floats
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -207,7 +210,13 @@ class FitReport:
                 if isinstance(value, np.ndarray):
                     numbers |= entries(f"{prefix}/{entry.name}", value, self.agents)
         numbers |= entries("forward/ratio", self.forward.ratio, self.agents)
-        for name in ("agreement", "mean_u_on_predictions", "accuracy_on_real", "mean_u_on_real"):
+        for name in (
+            "agreement",
+            "mean_u_on_predictions",
+            "accuracy_on_real",
+            "mean_u_on_real",
+            "accuracy_on_means",
+        ):
             numbers |= entries(name, getattr(self, name), self.agents)
         calibration = self.inverse.calibration
         for entry in fields(calibration):
@@ -294,7 +303,7 @@ def on_predictions(
 ) -> tuple[Floats, Floats]:
     """Per agent, agreement and mean u of h fed by f in held-out simulated states."""
     predicted = forward.predict(data.observation, data.executed)
-    return _answers(inverse, data, predicted, held_out)
+    return answers_to(inverse, data, predicted, held_out)
 
 
 @torch.no_grad()
@@ -302,12 +311,14 @@ def on_transitions(
     inverse: InverseModel, data: StackedTransitions, held_out: Tensor
 ) -> tuple[Floats, Floats]:
     """Per agent, accuracy and mean u of h on transitions as they happened, real ones say."""
-    return _answers(inverse, data, data.next_observation, held_out)
+    return answers_to(inverse, data, data.next_observation, held_out)
 
 
-def _answers(
+@torch.no_grad()
+def answers_to(
     inverse: InverseModel, data: StackedTransitions, next_features: Tensor, held_out: Tensor
 ) -> tuple[Floats, Floats]:
+    """Per agent, accuracy and mean u of h asked what led to `next_features`."""
     answer = inverse.predict(data.observation, next_features)
     share = held_out.double() / held_out.double().sum(1, keepdim=True)
     agreement = ((answer.action == data.executed) * share).sum(1)

@@ -17,6 +17,7 @@ from ugat_marl.grounding.fit_report import (
     ForwardReport,
     InverseReport,
     TrainingRecord,
+    answers_to,
     forward_report,
     inverse_report,
     on_predictions,
@@ -25,7 +26,7 @@ from ugat_marl.grounding.fit_report import (
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.inverse import AnswerModel, InverseModel
 from ugat_marl.grounding.off_data import OffData
-from ugat_marl.grounding.stacked import stack_log
+from ugat_marl.grounding.stacked import StackedTransitions, stack_log
 from ugat_marl.grounding.uncertainty import Lesson
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import TransitionLog
@@ -58,15 +59,41 @@ def fit(
     """
     refuse_mismatch(real, simulated)
     f = fit_forward(forward, real, config, seed, on_epoch)
-    h = fit_inverse(inverse, simulated, config, seed, on_epoch)
     ours, theirs = stack_log(simulated, inverse.stack), stack_log(real, inverse.stack)
+    means = _expected(forward, ours, config, seed, on_epoch)
+    pairs = means if config.pairs == "smoothed" else None
+    h = fit_inverse(inverse, simulated, config, seed, on_epoch, pairs)
     held_out = split(ours, config.held_out_every, inverse.stack).held_out
     held_out_real = split(theirs, config.held_out_every, inverse.stack).held_out
     agreement, u_on_predictions = on_predictions(forward, inverse, ours, held_out)
     accuracy_on_real, u_on_real = on_transitions(inverse, theirs, held_out_real)
+    accuracy_on_means, _ = answers_to(inverse, ours, means, held_out)
     return FitReport(
-        forward.stack.agents, f, h, agreement, u_on_predictions, accuracy_on_real, u_on_real
+        agents=forward.stack.agents,
+        forward=f,
+        inverse=h,
+        agreement=agreement,
+        mean_u_on_predictions=u_on_predictions,
+        accuracy_on_real=accuracy_on_real,
+        mean_u_on_real=u_on_real,
+        accuracy_on_means=accuracy_on_means,
     )
+
+
+def _expected(
+    forward: ForwardModel,
+    data: StackedTransitions,
+    config: FitConfig,
+    seed: int,
+    on_epoch: EpochCallback | None,
+) -> Tensor:
+    """What the simulation makes of its states and actions on average, ``(agents, n, outputs)``."""
+    model = ForwardModel(forward.stack, forward.config, torch_generator(seed, "simulated"))
+    lesson = Changes("simulated", data.observation, data.next_observation, data.executed)
+    parts = split(data, config.held_out_every, forward.stack)
+    fit_changes(model, lesson, parts, config, seed, on_epoch)
+    with torch.no_grad():
+        return model.predict(data.observation, data.executed)
 
 
 def refuse_mismatch(real: TransitionLog, simulated: TransitionLog) -> None:
@@ -151,11 +178,16 @@ def fit_inverse(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None = None,
+    outcome: Tensor | None = None,
 ) -> InverseReport:
-    """Fits h with the loss of the method asked for; the head learns from all agents at once."""
+    """Fits h with the loss of the method asked for; the head learns from all agents at once.
+
+    With an `outcome`, ``(agents, n, features or more)``, h learns to read that in the place of the
+    next observation.
+    """
     data = stack_log(log, model.stack)
     parts = split(data, config.held_out_every, model.stack)
-    inputs = model.inputs(data.observation, data.next_observation)
+    inputs = model.inputs(data.observation, data.next_observation if outcome is None else outcome)
     off_data = OffData.around(inputs, parts.train, model.stack)
     record = fit_answers(
         model, Questions(inputs, data.executed, off_data), parts, config, seed, on_epoch
