@@ -71,7 +71,7 @@ class Street:
         """The diagnosis with a smaller library and fewer days."""
         config = DiagnosisConfig(
             leave_out=tuple(sorted(library() - set(among))),
-            effort=effort or Effort(base=40, bank=2, fit=6, test=20),
+            effort=effort or Effort(base=32, bank=2, fit=5, test=16),
             **{"cache": self.cache, **options},
         )
         return diagnose(self.scenario, measured, out, config)

@@ -16,7 +16,7 @@ from ugat_marl.discrepancy.workflow import DiagnosisConfig
 from ugat_marl.errors import MeasuredDataError, OptionError, UnknownNameError
 from ugat_marl.measured.data import Finding, Measured
 
-FEW = Effort(base=24, bank=2, fit=6, test=24)
+FEW = Effort(base=24, bank=2, fit=5, test=16)
 DETECTORS = {"undercount", "dropout", "swapped"}
 """Faults of detectors cost no simulation beyond that of plain days."""
 
