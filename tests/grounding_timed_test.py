@@ -162,7 +162,7 @@ def test_a_delay_longer_than_any_tried_is_pointed_out() -> None:
     _, report = fitted(street({"a_0": 6.0, "b_0": 0.0}, seed=5))
     assert report.lost.best_s[0] > MOST_S - 0.5
     assert (
-        "the best delay is the longest one tried (4 s; raise timed most_s) at 1 of 2 (a_0)"
+        "the best delay is the longest tried (4 s; raise timed most_s) at 1 of 2 (a_0)"
         in report.warnings
     )
 

@@ -67,6 +67,13 @@ def entries(name: str, values: Floats, agents: Sequence[str]) -> dict[str, float
     return numbers | {f"{name}/{agent}": float(value) for agent, value in own}
 
 
+def said_of(complaint: str, where: NDArray[np.bool_], agents: Sequence[str]) -> str:
+    """A sentence about the agents that `where`, ``(agents,)``, marks; empty if it marks none."""
+    names = [agent for agent, hit in zip(agents, where, strict=True) if hit]
+    shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+    return f"{complaint} at {len(names)} of {len(agents)} ({shown})" if names else ""
+
+
 @dataclass(frozen=True)
 class ForwardReport:
     """Held-out error of f, per agent: root mean squares in the unit of the features.
@@ -171,8 +178,12 @@ class FitReport:
         """Reasons not to obey the grounded actions yet; empty if there are none."""
         h, calibration = self.inverse, self.inverse.calibration
         found = [
-            self._weak("f is no better than predicting no change", self.forward.ratio >= 1.0),
-            self._weak("h is no better than the most frequent phase", h.accuracy <= h.majority),
+            said_of(
+                "f is no better than predicting no change", self.forward.ratio >= 1.0, self.agents
+            ),
+            said_of(
+                "h is no better than the most frequent phase", h.accuracy <= h.majority, self.agents
+            ),
         ]
         if h.uncertainty == "none":
             found.append("without uncertainty u is 0, and the gate takes every grounded action")
@@ -194,11 +205,6 @@ class FitReport:
         h = self.inverse
         better = (self.forward.ratio < 1.0) & (h.accuracy > h.majority)
         return better & (h.accuracy >= least_accuracy)
-
-    def _weak(self, complaint: str, where: NDArray[np.bool_]) -> str:
-        names = [agent for agent, hit in zip(self.agents, where, strict=True) if hit]
-        shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
-        return f"{complaint} at {len(names)} of {len(self.agents)} ({shown})" if names else ""
 
     def as_dict(self) -> dict[str, float]:
         """Flat numbers; arrays as their mean over agents and as one entry per agent."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ugat_marl.grounding.calibration import auroc
-from ugat_marl.grounding.fit_report import ForwardReport, TrainingRecord, entries
+from ugat_marl.grounding.fit_report import ForwardReport, TrainingRecord, entries, said_of
 from ugat_marl.grounding.lost_time import LostTime
 from ugat_marl.grounding.uncertainty import MethodName
 
@@ -69,15 +69,18 @@ class TimedReport:
     def warnings(self) -> tuple[str, ...]:
         """Reasons to doubt the delays; empty if there are none."""
         found = [
-            self._where("f is no better than predicting no change", self.forward.ratio >= 1.0),
-            self._where(
-                "the model of the simulation is no better than predicting no change",
-                self.simulated.ratio >= 1.0,
-            ),
-            self._where(
-                f"the best delay is the longest one tried ({self.most_s} s; raise timed most_s)",
-                self.lost.best_s > self.most_s - END_S,
-            ),
+            said_of(complaint, where, self.agents)
+            for complaint, where in (
+                ("f is no better than predicting no change", self.forward.ratio >= 1.0),
+                (
+                    "the model of the simulation is no better than predicting no change",
+                    self.simulated.ratio >= 1.0,
+                ),
+                (
+                    f"the best delay is the longest tried ({self.most_s} s; raise timed most_s)",
+                    self.lost.best_s > self.most_s - END_S,
+                ),
+            )
         ]
         if self.inverse.uncertainty == "none":
             found.append("without uncertainty u is 0, and the gate takes every answer of h")
@@ -109,11 +112,6 @@ class TimedReport:
         for name in ("best_s", "low_s", "high_s"):
             numbers |= entries(f"lost_time/{name}", getattr(self.lost, name), self.agents)
         return numbers
-
-    def _where(self, complaint: str, where: NDArray[np.bool_]) -> str:
-        names = [agent for agent, hit in zip(self.agents, where, strict=True) if hit]
-        shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
-        return f"{complaint} at {len(names)} of {len(self.agents)} ({shown})" if names else ""
 
 
 def mean_error(found_s: Tensor, true_s: Tensor, weight: Tensor) -> Floats:
