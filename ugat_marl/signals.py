@@ -257,7 +257,8 @@ class GreenDelays:
         self._late_s = late_s
         self._step_s = step_s
         self._asked: Mapping[str, float] = {}
-        self._before = {tls: LateGreen.after(state) for tls, state in shown.items()}
+        self._commanded = dict(shown)
+        self._held: dict[str, LateGreen] = {}  # lights that wait, or owe a fraction of a step
 
     def ask(self, seconds: Mapping[str, float]) -> None:
         """Traffic light to how much longer greens that begin in the next `hold` stay red, in s."""
@@ -266,17 +267,15 @@ class GreenDelays:
     def hold(self, plans: Mapping[str, list[Segment]]) -> dict[str, list[Segment]]:
         """What is shown instead of `plans`, which are the same decision of every light."""
         shown = dict(plans)
-        # A light that was ever delayed may wait across decisions, or owe a fraction of a step.
-        for tls in plans:
+        for tls, plan in plans.items():
             late = self._late_s.get(tls, 0.0) + self._asked.get(tls, 0.0)
-            before = self._before[tls]
-            waits = before.shown != before.commanded
-            if late or waits or any(before.owed_s):
-                self._before[tls], shown[tls] = with_late_green(
-                    plans[tls], late, self._step_s, before
-                )
-            else:
-                self._before[tls] = LateGreen.after(plans[tls][-1][1])
+            before = self._held.pop(tls, None)
+            if late or before:
+                before = before or LateGreen.after(self._commanded[tls])
+                after, shown[tls] = with_late_green(plan, late, self._step_s, before)
+                if after.shown != after.commanded or any(after.owed_s):
+                    self._held[tls] = after
+            self._commanded[tls] = plan[-1][1]
         self._asked = {}
         return shown
 

@@ -177,9 +177,10 @@ def transfer(
             policies[DIRECT] = state.direct
         policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
         if config.control:
-            policies[CONTROL] = _control(config, env, run)
+            title = "control: more plain sim"
+            policies[CONTROL] = _further(config, env, run, "control-learner.pt", title)
         for name, other in others.items():
-            policies[name] = _further(config, other, run, name)
+            policies[name] = _further(config, other, run, f"{_file(name)}-learner.pt", name)
         if corrected is not None:
             policies[CORRECTED] = _from_scratch(config, corrected, run)
     finally:
@@ -274,18 +275,11 @@ def _train(
         real.close()
 
 
-def _control(config: TransferConfig, env: TrafficEnv, run: Run) -> Policy:
-    """Direct transfer trained on, in plain sim, for as many episodes as the iterations had."""
-    progress = run.directory / "control-learner.pt"
+def _further(config: TransferConfig, env: TrafficEnv, run: Run, file: str, title: str) -> Policy:
+    """Direct transfer trained on in `env`, for as many episodes as the iterations had."""
+    progress = run.directory / file
     start = progress if progress.exists() else run.directory / DIRECT_LEARNER
-    return _trained_on(config, env, run, start, progress, "control: more plain sim")
-
-
-def _further(config: TransferConfig, env: TrafficEnv, run: Run, name: str) -> Policy:
-    """Direct transfer trained on in another domain, for as many episodes as the control."""
-    progress = run.directory / f"{_file(name)}-learner.pt"
-    start = progress if progress.exists() else run.directory / DIRECT_LEARNER
-    return _trained_on(config, env, run, start, progress, name)
+    return _trained_on(config, env, run, start, progress, title)
 
 
 def _other_env(

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.delays import DelayedForward, DelayModel, TimedConfig, likely_delay
-from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
-from ugat_marl.grounding.gate import Gate, GateConfig
+from ugat_marl.grounding.forward import ForwardConfig
+from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.inverse import InverseConfig
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.transform import Grounding, Transform
@@ -66,16 +66,14 @@ class TimedTransform(Transform):
                 "timed grounding does not change phases, so that include_phase says nothing; "
                 "leave it off"
             )
+        super().__init__(layouts, seed, forward, gate)
         self.timed = timed or TimedConfig()
-        self.stack = Stack(layouts)
-        self.forward = ForwardModel(self.stack, forward, torch_generator(seed, "forward"))
         most_s = self.timed.most_s
         self.simulated = DelayedForward(
             self.stack, forward, most_s, torch_generator(seed, "simulated")
         )
         self.inverse = DelayModel(self.stack, inverse, most_s, torch_generator(seed, "inverse"))
         self.constants = _Constants(self.stack)
-        self.gate = Gate(self.stack.agents, gate or GateConfig())
 
     @property
     def models(self) -> dict[str, nn.Module]:

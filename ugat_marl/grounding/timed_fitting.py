@@ -74,7 +74,7 @@ def fit_timed(
 def _alike(
     one: StackedTransitions, two: StackedTransitions
 ) -> tuple[StackedTransitions, StackedTransitions]:
-    """Both with means over intervals, or neither."""
+    """Both with the features that were served, or neither."""
     if one.served_features is None or two.served_features is None:
         return replace(one, served_features=None), replace(two, served_features=None)
     return one, two

@@ -54,6 +54,12 @@ class Grounding:
 class Transform(abc.ABC):
     """Models and gate of a network: the policy's actions in, what the simulation is told out.
 
+    Args:
+        layouts: Agent to the division of its observation, in the environment's order.
+        seed: Decides the initial weights.
+        forward: Shape of the forward models.
+        gate: How alpha is found.
+
     Attributes:
         stack: The agents.
         forward: f of every intersection.
@@ -61,10 +67,18 @@ class Transform(abc.ABC):
         gate: Keeps or takes what h answers.
     """
 
-    stack: Stack
-    forward: ForwardModel
     inverse: AnswerModel
-    gate: Gate
+
+    def __init__(
+        self,
+        layouts: Mapping[str, AgentLayout],
+        seed: int,
+        forward: ForwardConfig,
+        gate: GateConfig | None,
+    ) -> None:
+        self.stack = Stack(layouts)
+        self.forward = ForwardModel(self.stack, forward, torch_generator(seed, "forward"))
+        self.gate = Gate(self.stack.agents, gate or GateConfig())
 
     @property
     def models(self) -> dict[str, nn.Module]:
@@ -196,10 +210,8 @@ class GroundedActionTransform(Transform):
                 f"include_phase is {forward.include_phase} in the forward and "
                 f"{inverse.include_phase} in the inverse model; h must be given what f predicts"
             )
-        self.stack = Stack(layouts)
-        self.forward = ForwardModel(self.stack, forward, torch_generator(seed, "forward"))
+        super().__init__(layouts, seed, forward, gate)
         self.inverse = InverseModel(self.stack, inverse, torch_generator(seed, "inverse"))
-        self.gate = Gate(self.stack.agents, gate or GateConfig())
 
     def ground(
         self,
