@@ -1,4 +1,4 @@
-"""Independent deep Q-learning, one network per intersection, all of them computed together.
+"""Deep Q-learning for all intersections at once: a network for each, or one that they share.
 
 Mnih et al. 2015 with double Q-learning (van Hasselt et al. 2016), a softly updated target network
 and exploration that persists. It is the learner of the UGAT paper, made stronger: with a weak one,
@@ -22,14 +22,9 @@ from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_config import DQNConfig
-from ugat_marl.learners.dqn_policy import (
-    DQNPolicy,
-    greedy_actions,
-    header,
-    parse_header,
-    q_network,
-)
+from ugat_marl.learners.dqn_policy import DQNPolicy, header, parse_header
 from ugat_marl.learners.exploration import StickyExploration
+from ugat_marl.learners.q_network import flatten_parameters, greedy_actions, q_network
 from ugat_marl.learners.replay import Replay
 from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
@@ -51,7 +46,7 @@ class _Tally:
 
 
 class DQN:
-    """Learns one Q-network per agent of a parallel environment.
+    """Learns one Q-network per agent of a parallel environment, or one for all of them.
 
     Works for any `ParallelEnv` with Box vectors and Discrete actions in which all agents stay to
     the end; spaces may differ between agents. Episodes that end by truncation are bootstrapped
@@ -77,9 +72,9 @@ class DQN:
         self.episodes = 0
         self.decisions = 0
         self.updates = 0
-        hidden = self.config.hidden
-        self._online = q_network(agents, hidden, torch_generator(seed, "dqn", "weights"))
-        self._target = q_network(agents, hidden, torch.Generator())
+        hidden, shared = self.config.hidden, self.config.shared
+        self._online = q_network(agents, hidden, shared, torch_generator(seed, "dqn", "weights"))
+        self._target = q_network(agents, hidden, shared, torch.Generator())
         self._weights = flatten_parameters(self._online)
         self._target_weights = flatten_parameters(self._target)
         self._target_weights.data.copy_(self._weights.data)
@@ -151,7 +146,8 @@ class DQN:
         swing from episode to episode (measured on Hangzhou after 20 to 60 episodes, one seed: 6 to
         26 s of mean travel time worse).
         """
-        return DQNPolicy(self.agents, self.config.hidden, self._target_weights, self.env_options)
+        hidden, shared = self.config.hidden, self.config.shared
+        return DQNPolicy(self.agents, hidden, self._target_weights, self.env_options, shared)
 
     def _episode(self, env: AnyParallelEnv, seed: int) -> dict[str, float]:
         number = self.episodes
@@ -223,7 +219,7 @@ class DQN:
         losses = nn.functional.huber_loss(
             chosen, wanted, reduction="none", delta=self.config.huber_delta
         )
-        # the sum over agents keeps their networks independent of how many there are
+        # the sum over agents keeps networks of their own independent of how many there are
         losses.mean(dim=1).sum().backward()
         self._adam.step()
         assert self._weights.grad is not None
@@ -256,7 +252,7 @@ class DQN:
             CheckpointError: The networks have diverged (NaN); a file at `path` stays as it was.
         """
         content = {
-            **header(self.agents, self.config.hidden, self.env_options),
+            **header(self.agents, self.config.hidden, self.env_options, self.config.shared),
             "counters": {name: getattr(self, name) for name in _COUNTERS}
             | {"added": self._replay.added},
             "tensors": {name: tensor.clone() for name, tensor in self._tensors().items()},
@@ -266,7 +262,7 @@ class DQN:
         write_checkpoint(path, _KIND, content)
 
     def load(self, path: Path) -> None:
-        """Restores what `save` wrote; settings other than `hidden` remain this learner's own.
+        """Restores what `save` wrote; settings but `hidden` and `shared` remain this learner's own.
 
         Raises:
             CheckpointError: Missing, cut short, not finite, or of other agents or sizes. The
@@ -274,9 +270,10 @@ class DQN:
         """
         content = read_checkpoint(path, _KIND)
         try:
-            agents, hidden, env_options = parse_header(content)
+            agents, hidden, env_options, shared = parse_header(content)
             _require_same(path, "agents", agents, self.agents)
             _require_same(path, "hidden sizes", hidden, self.config.hidden)
+            _require_same(path, "settings 'shared'", shared, self.config.shared)
             counters = {name: int(content["counters"][name]) for name in (*_COUNTERS, "added")}
             tensors = _like(path, content["tensors"], self._tensors())
             stored = _like(path, content["replay"], self._replay.rows(counters["added"]))
@@ -300,24 +297,6 @@ class DQN:
             "centre": self._centre,
             "scale": self._scale,
         }
-
-
-def flatten_parameters(module: nn.Module) -> nn.Parameter:
-    """Moves all parameters of `module`, and their gradients, into one vector each.
-
-    The module computes on views of the vector, so that the optimiser and the target network's
-    update are single operations over all agents and layers.
-    """
-    parameters = list(module.parameters())
-    flat = nn.Parameter(nn.utils.parameters_to_vector(parameters).detach().clone())
-    flat.grad = torch.zeros_like(flat)
-    start = 0
-    for parameter in parameters:
-        end = start + parameter.numel()
-        parameter.data = flat.data[start:end].view_as(parameter)
-        parameter.grad = flat.grad[start:end].view_as(parameter)
-        start = end
-    return flat
 
 
 def _require_same(path: Path, what: str, found: object, own: object) -> None:

@@ -9,7 +9,7 @@ from ugat_marl.errors import OptionError
 
 @dataclass(frozen=True)
 class DQNConfig:
-    """Settings of independent DQN.
+    """Settings of DQN.
 
     Rewards are centred and scaled per agent before learning: the mean and the standard deviation
     of each agent's rewards over the first `warmup_decisions` are measured once and then frozen, so
@@ -23,7 +23,7 @@ class DQNConfig:
     decay learned faster; hidden layers of 64 were no better than of 48.
 
     Attributes:
-        hidden: Sizes of the hidden layers of every agent's network.
+        hidden: Sizes of the hidden layers of every network.
         learning_rate: Step size of Adam.
         discount: Weight of the next decision's value (gamma), 0.95-0.98 in the literature.
         batch_size: Transitions per update and agent.
@@ -38,6 +38,8 @@ class DQNConfig:
             epsilon-greedy.
         huber_delta: Errors beyond this (in scaled reward) count linearly.
         reward_scale: Factor on all rewards; None measures it per agent.
+        shared: One network for all agents, told for which of them it computes, instead of one for
+            each; it learns from the transitions of all.
     """
 
     hidden: tuple[int, ...] = (48, 48)
@@ -54,6 +56,7 @@ class DQNConfig:
     sticky_decisions: int = 3
     huber_delta: float = 1.0
     reward_scale: float | None = None
+    shared: bool = False
 
     def __post_init__(self) -> None:
         # a list, as JSON has it, would differ from the tuple of a checkpoint

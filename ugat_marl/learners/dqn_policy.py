@@ -12,23 +12,27 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ugat_marl.batched import BatchedMLP
 from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError
 from ugat_marl.learners.agents import AgentSet
+from ugat_marl.learners.q_network import greedy_actions, q_network
 from ugat_marl.policy import Actions, Infos, Observations
 
 _KIND = "ugat_marl.dqn_policy"
 
 
 class DQNPolicy:
-    """Takes the allowed action of highest Q in every agent's own network.
+    """Takes every agent's allowed action of highest Q.
 
     Args:
         agents: The agents it acts for.
         hidden: Sizes of the hidden layers of each network.
         parameters: All parameters as one vector, as `flatten_parameters` orders them; copied.
         env_options: Options of the environment the policy relies on.
+        shared: Whether all agents share one network.
+
+    Raises:
+        ValueError: `parameters` are those of other networks.
     """
 
     def __init__(
@@ -37,12 +41,17 @@ class DQNPolicy:
         hidden: tuple[int, ...],
         parameters: Tensor | NDArray[np.float32],
         env_options: Mapping[str, Any],
+        shared: bool = False,
     ) -> None:
         self.agents = agents
         self.hidden = hidden
+        self.shared = shared
         self.env_options: Mapping[str, Any] = dict(env_options)
-        self._network = q_network(agents, hidden, torch.Generator())
+        self._network = q_network(agents, hidden, shared, torch.Generator())
         vector = torch.as_tensor(parameters).detach().clone()
+        needed = sum(parameter.numel() for parameter in self._network.parameters())
+        if vector.shape != (needed,):
+            raise ValueError(f"parameters of shape {tuple(vector.shape)}, needed: ({needed},)")
         nn.utils.vector_to_parameters(vector, self._network.parameters())
         self._network.requires_grad_(False)
 
@@ -72,7 +81,7 @@ class DQNPolicy:
 
     def save(self, path: Path) -> None:
         """Writes the policy to one file; `load` reads it."""
-        content = {**header(self.agents, self.hidden, self.env_options)}
+        content = header(self.agents, self.hidden, self.env_options, self.shared)
         parameters = torch.from_numpy(self.parameters)
         write_checkpoint(path, _KIND, {**content, "parameters": parameters})
 
@@ -85,30 +94,19 @@ class DQNPolicy:
         """
         content = read_checkpoint(path, _KIND)
         try:
-            agents, hidden, env_options = parse_header(content)
-            return cls(agents, hidden, content["parameters"], env_options)
+            agents, hidden, env_options, shared = parse_header(content)
+            return cls(agents, hidden, content["parameters"], env_options, shared)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{path}: not a whole policy ({error}); save it again") from None
 
     def __reduce__(self) -> tuple[type[DQNPolicy], tuple[Any, ...]]:
         # numpy, since torch would send tensors between processes through shared memory
-        return DQNPolicy, (self.agents, self.hidden, self.parameters, self.env_options)
-
-
-def q_network(agents: AgentSet, hidden: tuple[int, ...], generator: torch.Generator) -> BatchedMLP:
-    """One Q-network per agent: observation to the value of each action, padded."""
-    return BatchedMLP(agents.observation_sizes, hidden, agents.most_actions, generator)
-
-
-def greedy_actions(network: nn.Module, stacked: Tensor, allowed: Tensor) -> NDArray[np.int64]:
-    """Allowed action of highest value for one observation of every agent, ``(agents,)``."""
-    with torch.no_grad():
-        values = network(stacked.unsqueeze(1)).squeeze(1)
-        return values.masked_fill(~allowed, -torch.inf).argmax(dim=1).numpy()
+        own = (self.agents, self.hidden, self.parameters, self.env_options, self.shared)
+        return DQNPolicy, own
 
 
 def header(
-    agents: AgentSet, hidden: tuple[int, ...], env_options: Mapping[str, Any]
+    agents: AgentSet, hidden: tuple[int, ...], env_options: Mapping[str, Any], shared: bool
 ) -> dict[str, Any]:
     """What a checkpoint says about itself.
 
@@ -127,15 +125,21 @@ def header(
         "action_counts": list(agents.action_counts),
         "hidden": list(hidden),
         "env_options": options,
+        "shared": shared,
     }
 
 
-def parse_header(content: Mapping[str, Any]) -> tuple[AgentSet, tuple[int, ...], dict[str, Any]]:
-    """Agents, hidden sizes and environment options out of what `header` made."""
+def parse_header(
+    content: Mapping[str, Any],
+) -> tuple[AgentSet, tuple[int, ...], dict[str, Any], bool]:
+    """Agents, hidden sizes, environment options and `shared` out of what `header` made."""
     agents = AgentSet(
         tuple(content["agents"]),
         tuple(content["observation_sizes"]),
         tuple(content["action_counts"]),
     )
     options = cast(dict[str, Any], json.loads(content["env_options"]))
-    return agents, tuple(content["hidden"]), options
+    shared = content.get("shared", False)  # older files do not have it
+    if not isinstance(shared, bool):
+        raise TypeError(f"shared = {shared!r} is not a bool")
+    return agents, tuple(content["hidden"]), options, shared

@@ -1,0 +1,89 @@
+"""The networks behind Q: one for every agent, or one that all agents share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ugat_marl.batched import BatchedLinear, BatchedMLP
+from ugat_marl.learners.agents import AgentSet
+
+
+class SharedMLP(nn.Module):
+    """One multi-layer perceptron with ReLU for all agents, told for which of them it computes.
+
+    A one-hot of the agent appended to its observation (Gupta, Egorov, Kochenderfer 2017; Terry et
+    al. 2020) adds one row of the first layer's weights to its output. That row is kept as the
+    agent's own bias of that layer, which saves the product. The rows begin alike: agents that
+    observe the same begin with the same Q, and differ once their rewards do.
+
+    Args:
+        agents: Number of agents.
+        n_in: Input size, of the widest observation.
+        hidden: Sizes of the hidden layers.
+        n_out: Output size, of the largest agent.
+        generator: Source of the initial weights.
+    """
+
+    def __init__(
+        self,
+        agents: int,
+        n_in: int,
+        hidden: Sequence[int],
+        n_out: int,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        first, *rest = *hidden, n_out
+        initial = BatchedLinear([n_in], first, generator)
+        self.weight = nn.Parameter(initial.weight.detach()[0])
+        self.agent_bias = nn.Parameter(initial.bias.detach().repeat(agents, 1, 1))
+        self.rest: nn.Module = nn.Identity()
+        if rest:
+            self.rest = nn.Sequential(nn.ReLU(), BatchedMLP([first], rest[:-1], n_out, generator))
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Maps ``(agents, batch, n_in)`` to ``(agents, batch, n_out)``."""
+        agents, batch, _ = inputs.shape
+        first = inputs @ self.weight + self.agent_bias
+        # the samples of all agents are one batch of the layers that follow
+        return self.rest(first.view(1, agents * batch, -1)).view(agents, batch, -1)
+
+
+def q_network(
+    agents: AgentSet, hidden: Sequence[int], shared: bool, generator: torch.Generator
+) -> nn.Module:
+    """Observations ``(agents, batch, widest_observation)`` to the values of actions, padded."""
+    if shared:
+        n_in, n_out = agents.widest_observation, agents.most_actions
+        return SharedMLP(len(agents), n_in, hidden, n_out, generator)
+    return BatchedMLP(agents.observation_sizes, hidden, agents.most_actions, generator)
+
+
+def greedy_actions(network: nn.Module, stacked: Tensor, allowed: Tensor) -> NDArray[np.int64]:
+    """Allowed action of highest value for one observation of every agent, ``(agents,)``."""
+    with torch.no_grad():
+        values = network(stacked.unsqueeze(1)).squeeze(1)
+        return values.masked_fill(~allowed, -torch.inf).argmax(dim=1).numpy()
+
+
+def flatten_parameters(module: nn.Module) -> nn.Parameter:
+    """Moves all parameters of `module`, and their gradients, into one vector each.
+
+    The module computes on views of the vector, so that the optimiser and the target network's
+    update are single operations over all agents and layers.
+    """
+    parameters = list(module.parameters())
+    flat = nn.Parameter(nn.utils.parameters_to_vector(parameters).detach().clone())
+    flat.grad = torch.zeros_like(flat)
+    start = 0
+    for parameter in parameters:
+        end = start + parameter.numel()
+        parameter.data = flat.data[start:end].view_as(parameter)
+        parameter.grad = flat.grad[start:end].view_as(parameter)
+        start = end
+    return flat
