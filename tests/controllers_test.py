@@ -12,6 +12,7 @@ import pytest
 
 from ugat_marl.controllers import (
     NAMES,
+    RULES,
     STANDARD_RULES,
     FixedTime,
     LargestQueue,
@@ -21,7 +22,9 @@ from ugat_marl.controllers import (
     Streets,
     controller_for,
     covering_phases,
+    example_of,
     parse_spec,
+    spell,
 )
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.network import Intersection, Lane, Network
@@ -41,6 +44,7 @@ INCOMING = ("n_0", "n_1", "w_0")
 OUTGOING = ("s_0", "w_0", "e_0", "e_1")
 PHASES = ("GGrr", "rgGr", "rrrG")
 CAPACITY = {"n_0": 40.0, "n_1": 20.0, "w_0": 10.0, "s_0": 40.0, "e_0": 10.0, "e_1": 20.0}
+FREE_FLOW_S = dict.fromkeys(CAPACITY, 20.0)
 AGENT = "signal_0"
 
 
@@ -49,7 +53,7 @@ def crossing(phases: tuple[str, ...] = PHASES, links: tuple[Link, ...] = LINKS) 
 
 
 def streets(interval_s: float = 10.0) -> Streets:
-    return Streets({AGENT: crossing()}, CAPACITY, interval_s)
+    return Streets({AGENT: crossing()}, CAPACITY, FREE_FLOW_S, interval_s, 5.0)
 
 
 def env(**changes: Any) -> Any:
@@ -59,6 +63,7 @@ def env(**changes: Any) -> Any:
         intersection_of={AGENT: "x"},
         possible_agents=[AGENT],
         decision_interval_s=10.0,
+        scenario=SimpleNamespace(control=SimpleNamespace(yellow_s=3.0, all_red_s=2.0)),
         **changes,
     )
     base.unwrapped = base
@@ -126,7 +131,9 @@ def test_a_phase_that_stays_best_goes_on_and_ties_do_not_switch():
     assert rule.act(observe({"w_0": 9}), ALL) == {AGENT: 0}
 
 
-@pytest.mark.parametrize("spec", ["largest-queue:20", "max-pressure:20", "fixed-time:10", "random"])
+@pytest.mark.parametrize(
+    "spec", [*(name for name in NAMES if name != "programme"), "fixed-time:10"]
+)
 def test_masked_phases_are_not_chosen(spec: str):
     controller = controller_for(spec, env())
     controller.reset(1)
@@ -180,12 +187,20 @@ def test_random_depends_on_the_seed_only_and_is_uniform_over_the_allowed():
 
 def test_environment_options_say_what_each_controller_needs():
     options = {name: dict(controller_for(name, env()).env_options) for name in NAMES}
+    movements = {"observation": "movements"}
     assert options == {
+        "actuated": movements,
+        "delay-actuated": {"observation": "waiting"},
         "fixed-time": {},
-        "largest-queue": {"observation": "movements"},
-        "max-pressure": {"observation": "movements"},
+        "green-wave": {},
+        "largest-queue": movements,
+        "longest-waiting": {"observation": "waiting"},
+        "max-pressure": movements,
+        "max-pressure-loss": movements,
         "programme": {"signals": "programme"},
         "random": {},
+        "sotl": movements,
+        "webster": movements,
     }
     assert controller_for("programme", env()).act(observe(), ALL) == {AGENT: 0}
 
@@ -205,23 +220,45 @@ def test_spellings():
     made = controller_for("largest-queue:37.5", env())
     assert isinstance(made, LargestQueue)
     assert made.hold_s == 37.5
-    assert parse_spec("fixed-time") == ("fixed-time", 30.0)
-    assert parse_spec("max-pressure:10") == ("max-pressure", 10.0)
+    assert parse_spec("fixed-time") == ("fixed-time", (30.0,))
+    assert parse_spec("max-pressure:10") == ("max-pressure", (10.0,))
+    assert parse_spec("actuated:60") == ("actuated", (60.0, 3.0))
+    assert parse_spec("actuated:60:2") == ("actuated", (60.0, 2.0))
+    assert parse_spec("programme") == ("programme", ())
     assert isinstance(controller_for("programme", env()), ProgrammeControl)
     with pytest.raises(UnknownNameError, match="Did you mean 'largest-queue'"):
         controller_for("larges-queue:30", env())
     for spec in ("fixed-time:soon", "max-pressure:0", "largest-queue:", "largest-queue:nan"):
         with pytest.raises(OptionError, match="seconds above 0"):
             parse_spec(spec)
-    with pytest.raises(OptionError, match="takes no seconds"):
+    with pytest.raises(OptionError, match="headway that ends a green.*'actuated:40:3'"):
+        parse_spec("actuated:40:-1")
+    with pytest.raises(OptionError, match="vehicles an hour and lane above 0.*'webster:1800'"):
+        parse_spec("webster:much")
+    with pytest.raises(OptionError, match="random takes no number; write 'random'"):
         parse_spec("random:3")
+    with pytest.raises(
+        OptionError, match="takes time of a phase in seconds; write 'fixed-time:30'"
+    ):
+        parse_spec("fixed-time:30:4")
     with pytest.raises(OptionError, match="held -1 s"):
         LargestQueue(streets(), -1)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_the_written_out_defaults_and_all_that_tuning_tries_are_spellings(name: str):
+    rule = RULES[name]
+    assert parse_spec(example_of(name)) == parse_spec(name)
+    for place, parameter in enumerate(rule.parameters):
+        for value in parameter.choices:
+            values = [p.default for p in rule.parameters]
+            values[place] = value
+            assert parse_spec(spell(name, values)) == (name, tuple(values))
+
+
 def test_several_intersections_are_held_apart():
     other = dataclasses.replace(crossing(), id="y")
-    two = Streets({AGENT: crossing(), "signal_1": other}, CAPACITY, 10.0)
+    two = Streets({AGENT: crossing(), "signal_1": other}, CAPACITY, FREE_FLOW_S, 10.0, 5.0)
     rule = LargestQueue(two, 20)
 
     def both(first: dict[str, int], second: dict[str, int]) -> Any:
