@@ -199,7 +199,7 @@ def test_h_answers_with_the_delay_of_the_street(planted) -> None:
     data = stack_log(street(PLANTED, seed=8, episodes=1), made.stack)
     switched = made.stack.current_phase(data.observation) != data.executed
     with torch.no_grad():
-        found, u = made.delays(data.observation, data.executed)
+        found, u = made.delays(data.observation, data.observation, data.executed)
     mean = [float(found[i][switched[i]].mean()) for i in range(2)]
     assert mean == pytest.approx([2.0, 0.0], abs=0.5)
     assert ((u > 0) & (u <= 1)).all()

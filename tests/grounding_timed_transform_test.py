@@ -204,7 +204,7 @@ def test_where_h_is_not_trusted_the_constant_is_taken_and_not_zero() -> None:
     made.constants.delay_s.copy_(torch.full((2, 4), 2.0))
     observations, own = state((0, 1)), np.array([2, 0])
     u = made(observations, own).u
-    answers, again = made.delays(observations, torch.from_numpy(own)[:, None])
+    answers, again = made.delays(observations, observations, torch.from_numpy(own)[:, None])
     assert again[:, 0].tolist() == pytest.approx(u.tolist())
     for accepted in ([True, False], [False, True], [False, False], [True, True]):
         made.gate.alpha = np.where(accepted, u + 1e-3, u)  # u = alpha is refused as well

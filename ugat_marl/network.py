@@ -173,6 +173,19 @@ class Network:
         )
 
 
+def within(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str, tuple[str, ...]]:
+    """For each name the others at most `hops` roads away, nearest first."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name in neighbours:
+        reached, frontier = [name], [name]
+        for _ in range(hops):
+            ahead = (other for one in frontier for other in neighbours[one])
+            frontier = list(dict.fromkeys(other for other in ahead if other not in reached))
+            reached += frontier
+        found[name] = tuple(reached[1:])
+    return found
+
+
 def signal_widths(scenario: Scenario) -> dict[str, int]:
     """How many letters the state of each traffic light has, controlled by an agent or not.
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.measurements import Snapshot
 from ugat_marl.naming import group_names, member_names
-from ugat_marl.network import Network
+from ugat_marl.network import Network, within
 from ugat_marl.transitions import AgentLayout
 
 ObservationName = Literal["count", "queue", "pressure", "waiting", "density", "movements"]
@@ -200,21 +200,8 @@ def _downstream_matrix(network: Network) -> NDArray[np.float64]:
 def _within(network: Network, hops: int) -> list[list[int]]:
     """For each intersection the others at most `hops` roads away, nearest first."""
     position = {item.id: index for index, item in enumerate(network.intersections)}
-    found: list[list[int]] = []
-    for item in network.intersections:
-        reached = [item.id]
-        frontier = [item.id]
-        for _ in range(hops):
-            frontier = [
-                other
-                for name in frontier
-                for other in network.intersections[position[name]].neighbours
-                if other not in reached
-            ]
-            frontier = list(dict.fromkeys(frontier))
-            reached += frontier
-        found.append([position[name] for name in reached[1:]])
-    return found
+    near = within({item.id: item.neighbours for item in network.intersections}, hops)
+    return [[position[name] for name in others] for others in near.values()]
 
 
 def _slices(sizes: Sequence[int]) -> list[slice]:

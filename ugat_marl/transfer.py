@@ -23,6 +23,7 @@ from ugat_marl.evaluation import (
     fixed_policy,
     rule_factory,
 )
+from ugat_marl.grounding.view import neighbours_of
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
@@ -166,7 +167,7 @@ def transfer(
     if config.corrected is not None:
         corrected = _other_env(config, scenario, env, "corrected", config.corrected)
     learner = DQN.of(env, config.dqn, config.seed)
-    transform = config.ugat.transform(env.layouts, config.seed)
+    transform = config.ugat.transform(env.layouts, config.seed, neighbours_of(env))
     run = Run(directory, _identity(config, scenario, env, corrected), resume, reporter)
     try:
         state = State(learner, transform)

@@ -25,6 +25,7 @@ from ugat_marl.grounding.timed import TimedTransform
 from ugat_marl.grounding.timed_fitting import fit_timed
 from ugat_marl.grounding.timed_report import TimedReport
 from ugat_marl.grounding.transform import GroundedActionTransform, Transform
+from ugat_marl.grounding.view import InputsConfig, Neighbours
 from ugat_marl.grounding.wrapper import GroundedEnv
 from ugat_marl.policy import AnyParallelEnv, Learner, Policy
 from ugat_marl.seeding import derive_seed
@@ -57,6 +58,7 @@ class UgatConfig:
         least_accuracy: Held-out accuracy h must have at an intersection before grounded actions
             are taken there (f and h must beat their trivial rivals, too); None obeys them from the
             start, as the paper does. With "timed" the share by which h must beat a guess.
+        inputs: What f and h see beside the intersection's own state and action.
         forward: Shape of f.
         inverse: Shape of h.
         fit: How f and h are fitted.
@@ -72,6 +74,7 @@ class UgatConfig:
     real_rollouts: int = 3
     rollout_epsilon: float = 0.3
     least_accuracy: float | None = None
+    inputs: InputsConfig = field(default_factory=InputsConfig)
     forward: ForwardConfig = field(default_factory=ForwardConfig)
     inverse: InverseConfig = field(default_factory=InverseConfig)
     fit: FitConfig = field(default_factory=FitConfig)
@@ -83,12 +86,24 @@ class UgatConfig:
         """Longest of the random delays in the roll-outs for D_sim; 0 for none."""
         return self.timed.most_s if self.grounding == "timed" else 0
 
-    def transform(self, layouts: Mapping[str, AgentLayout], seed: int) -> Transform:
-        """Unfitted models and gate for these agents."""
-        parts = self.forward, self.inverse, self.gate
+    def transform(
+        self,
+        layouts: Mapping[str, AgentLayout],
+        seed: int,
+        neighbours: Neighbours | None = None,
+    ) -> Transform:
+        """Unfitted models and gate for these agents.
+
+        Args:
+            layouts: Agent to the division of its observation.
+            seed: Decides the initial weights.
+            neighbours: Agent to the agents one road away (`grounding.view.neighbours_of`); needed
+                for inputs with hops.
+        """
+        parts, around = (self.forward, self.inverse, self.gate), (self.inputs, neighbours)
         if self.grounding == "timed":
-            return TimedTransform(layouts, seed, *parts, self.timed)
-        return GroundedActionTransform(layouts, seed, *parts)
+            return TimedTransform(layouts, seed, *parts, self.timed, *around)
+        return GroundedActionTransform(layouts, seed, *parts, *around)
 
     def __post_init__(self) -> None:
         if self.grounding not in GROUNDINGS:

@@ -13,6 +13,7 @@ from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.inverse import AnswerModel, InverseConfig
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import InversePrediction, Method
+from ugat_marl.grounding.view import View
 
 ANSWERS = ("state", "constant")
 
@@ -60,6 +61,7 @@ class DelayedForward(ForwardModel):
         config: Shape of the models.
         most_s: Longest delay.
         generator: Source of the initial weights.
+        view: What the models see beside s, a and the delay; nothing unless given.
     """
 
     def __init__(
@@ -68,8 +70,9 @@ class DelayedForward(ForwardModel):
         config: ForwardConfig,
         most_s: int,
         generator: torch.Generator,
+        view: View | None = None,
     ) -> None:
-        super().__init__(stack, config, generator, extra=most_s)
+        super().__init__(stack, config, generator, extra=most_s, view=view)
         self.most_s = most_s
 
     def extra(self, delay_s: Tensor) -> Tensor:
@@ -87,6 +90,7 @@ class DelayModel(AnswerModel):
         most_s: Longest delay; the classes are 0, 1, ..., `most_s` s.
         generator: Source of the initial weights.
         method: Which uncertainty; the evidential one unless given.
+        view: What the models see beside s, a and the change; nothing unless given.
     """
 
     def __init__(
@@ -96,26 +100,28 @@ class DelayModel(AnswerModel):
         most_s: int,
         generator: torch.Generator,
         method: Method | None = None,
+        view: View | None = None,
     ) -> None:
         self.most_s = most_s
+        view = view or View(stack)
         heads = stack.heads(include_phase=False)
-        sizes = zip(stack.sizes, heads, stack.phases, strict=True)
+        sizes = zip(view.sizes, heads, stack.phases, strict=True)
         fan_in = [size + head + phases for size, head, phases in sizes]
         classes = torch.ones(len(fan_in), most_s + 1, dtype=torch.bool)
-        super().__init__(stack, config, fan_in, classes, generator, method)
+        super().__init__(view, config, fan_in, classes, generator, method)
 
     def inputs(self, observation: Tensor, action: Tensor, change: Tensor) -> Tensor:
         """State, change and action directly behind each other; unscaled.
 
         Args:
-            observation: ``(agents, batch, width)``.
+            observation: ``(agents, batch, view.width)``, as `view` makes it.
             action: ``(agents, batch)`` int64, the phase that turns green.
             change: ``(agents, batch, features)``.
         """
         batch = action.shape[1]
         found = torch.zeros(len(self._fan_in), batch, max(self._fan_in))
         for i, (size, layout) in enumerate(
-            zip(self.stack.sizes, self.stack.layouts.values(), strict=True)
+            zip(self.view.sizes, self.stack.layouts.values(), strict=True)
         ):
             end = size + layout.features
             found[i, :, :size] = observation[i, :, :size]
@@ -127,8 +133,10 @@ class DelayModel(AnswerModel):
     def action_columns(self) -> Tensor:
         """``(agents, 1, width)`` bool, where the action stands in the inputs."""
         found = torch.zeros(len(self._fan_in), 1, max(self._fan_in), dtype=torch.bool)
-        for i, layout in enumerate(self.stack.layouts.values()):
-            start = layout.size + layout.features
+        for i, (size, layout) in enumerate(
+            zip(self.view.sizes, self.stack.layouts.values(), strict=True)
+        ):
+            start = size + layout.features
             found[i, 0, start : start + layout.phases] = True
         return found
 

@@ -265,12 +265,12 @@ def inverse_report(
     generator: torch.Generator,
 ) -> InverseReport:
     """Accuracy of h and calibration of its u on the held-out rows."""
-    answer = model.predict(data.observation, data.next_observation)
+    inputs = model.inputs(model.view.of(data), data.next_observation)
+    answer = model.answer(inputs)
     kept = held_out.bool().numpy()
     wrong = (answer.action != data.executed).numpy()
     u = answer.u.numpy()
-    inputs = model.inputs(data.observation, data.next_observation)
-    drawn = OffData.around(inputs, train, model.stack).draw(
+    drawn = OffData.around(inputs, train, model.view).draw(
         int(held_out.sum(1).max()), generator, state_share=1.0
     )
     off = model.answer(drawn).u.flatten().numpy()
@@ -308,7 +308,7 @@ def on_predictions(
     forward: ForwardModel, inverse: InverseModel, data: StackedTransitions, held_out: Tensor
 ) -> tuple[Floats, Floats]:
     """Per agent, agreement and mean u of h fed by f in held-out simulated states."""
-    predicted = forward.predict(data.observation, data.executed)
+    predicted = forward.predict(forward.view.of(data), data.executed)
     return answers_to(inverse, data, predicted, held_out)
 
 
@@ -325,7 +325,7 @@ def answers_to(
     inverse: InverseModel, data: StackedTransitions, next_features: Tensor, held_out: Tensor
 ) -> tuple[Floats, Floats]:
     """Per agent, accuracy and mean u of h asked what led to `next_features`."""
-    answer = inverse.predict(data.observation, next_features)
+    answer = inverse.predict(inverse.view.of(data), next_features)
     share = held_out.double() / held_out.double().sum(1, keepdim=True)
     agreement = ((answer.action == data.executed) * share).sum(1)
     return agreement.numpy(), (answer.u * share).sum(1).numpy()

@@ -88,12 +88,13 @@ def _expected(
     on_epoch: EpochCallback | None,
 ) -> Tensor:
     """What the simulation makes of its states and actions on average, ``(agents, n, outputs)``."""
-    model = ForwardModel(forward.stack, forward.config, torch_generator(seed, "simulated"))
-    lesson = Changes("simulated", data.observation, data.next_observation, data.executed)
+    generator, seen = torch_generator(seed, "simulated"), forward.view.of(data)
+    model = ForwardModel(forward.stack, forward.config, generator, view=forward.view)
+    lesson = Changes("simulated", seen, data.next_observation, data.executed)
     parts = split(data, config.held_out_every, forward.stack)
     fit_changes(model, lesson, parts, config, seed, on_epoch)
     with torch.no_grad():
-        return model.predict(data.observation, data.executed)
+        return model.predict(seen, data.executed)
 
 
 def refuse_mismatch(real: TransitionLog, simulated: TransitionLog) -> None:
@@ -118,7 +119,7 @@ def fit_forward(
     """Fits f by least squares on the change of the features, each agent on its own rows."""
     data = stack_log(log, model.stack)
     parts = split(data, config.held_out_every, model.stack)
-    lesson = Changes("forward", data.observation, data.next_observation, data.asked)
+    lesson = Changes("forward", model.view.of(data), data.next_observation, data.asked)
     return fit_changes(model, lesson, parts, config, seed, on_epoch)
 
 
@@ -128,7 +129,7 @@ class Changes:
 
     Attributes:
         name: Of the model, in seeds and for the callback.
-        observation: ``(agents, n, width)``.
+        observation: ``(agents, n, view.width)``, as the model's view makes it.
         outcome: ``(agents, n, features or more)``, the features afterwards.
         acted: ``(agents, n)`` int64, phases.
         extra: ``(agents, n, extra)`` further inputs, if there are any.
@@ -187,8 +188,9 @@ def fit_inverse(
     """
     data = stack_log(log, model.stack)
     parts = split(data, config.held_out_every, model.stack)
-    inputs = model.inputs(data.observation, data.next_observation if outcome is None else outcome)
-    off_data = OffData.around(inputs, parts.train, model.stack)
+    then = data.next_observation if outcome is None else outcome
+    inputs = model.inputs(model.view.of(data), then)
+    off_data = OffData.around(inputs, parts.train, model.view)
     record = fit_answers(
         model, Questions(inputs, data.executed, off_data), parts, config, seed, on_epoch
     )

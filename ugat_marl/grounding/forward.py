@@ -15,6 +15,7 @@ from ugat_marl.batched import BatchedMLP, mask_of
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.scaling import SMALLEST_SPREAD, Standardiser
 from ugat_marl.grounding.stacked import Stack
+from ugat_marl.grounding.view import View
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class ForwardModel(nn.Module):
         config: Shape of the models.
         generator: Source of the initial weights.
         extra: Number of further inputs.
+        view: What the models see beside s and a; nothing unless given.
     """
 
     fitted: Tensor
@@ -57,20 +59,23 @@ class ForwardModel(nn.Module):
         config: ForwardConfig,
         generator: torch.Generator,
         extra: int = 0,
+        view: View | None = None,
     ) -> None:
         super().__init__()
         self.stack = stack
+        self.view = view or View(stack)
         self.config = config
         heads = stack.heads(config.include_phase)
-        fan_in = [size + k + extra for size, k in zip(stack.sizes, stack.phases, strict=True)]
+        sizes = self.view.sizes
+        fan_in = [size + k + extra for size, k in zip(sizes, stack.phases, strict=True)]
         self._fan_in, self._outputs = fan_in, max(heads)
-        self.standardise = Standardiser(len(heads), stack.width)
+        self.standardise = Standardiser(len(heads), self.view.width)
         self.width = max(fan_in)
         self.register_buffer("scale", torch.ones(len(heads), 1, 1))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("offsets", torch.tensor(stack.sizes)[:, None, None], persistent=False)
+        self.register_buffer("offsets", torch.tensor(sizes)[:, None, None], persistent=False)
         self.register_buffer("valid_outputs", mask_of(heads)[:, None, :], persistent=False)
-        behind = torch.tensor(stack.sizes) + torch.tensor(stack.phases)
+        behind = torch.tensor(sizes) + torch.tensor(stack.phases)
         places = behind[:, None, None] + torch.arange(extra)
         self.register_buffer("extra_places", places, persistent=False)
         self.renew(generator)
@@ -84,7 +89,7 @@ class ForwardModel(nn.Module):
         """Predicted change in units of ``scale``: ``(agents, batch, outputs)``, 0 in padding.
 
         Args:
-            observation: ``(agents, batch, width)``.
+            observation: ``(agents, batch, view.width)``, as `view` makes it.
             action: ``(agents, batch)`` int64.
             extra: ``(agents, batch, extra)`` float32, the further inputs; none is zeros.
         """

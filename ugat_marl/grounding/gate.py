@@ -115,6 +115,13 @@ class Gate:
         """
         self.trusted = np.asarray(agents, bool).copy()
 
+    def accepts(
+        self, u: NDArray[np.floating[Any]], permitted: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.bool_]:
+        """Which grounded actions `decide` would take; nothing is logged."""
+        accepted = (u < self.alpha) & self.trusted
+        return accepted if permitted is None else accepted & permitted
+
     def decide(
         self,
         u: NDArray[np.floating[Any]],
@@ -135,9 +142,7 @@ class Gate:
         Returns:
             ``(agents,)`` bool: u < alpha, permitted, asked, and the agent's models trusted.
         """
-        accepted = (u < self.alpha) & self.trusted
-        if permitted is not None:
-            accepted = accepted & permitted
+        accepted = self.accepts(u, permitted)
         one = np.ones_like(u) if asked is None else asked.astype(u.dtype)
         accepted = accepted & (one > 0)
         self._running += (u * one, one)

@@ -18,6 +18,7 @@ from ugat_marl.grounding.evidential import EvidentialNet
 from ugat_marl.grounding.scaling import Standardiser
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import AnswerNet, InversePrediction, Method, NetShape
+from ugat_marl.grounding.view import View
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class AnswerModel(nn.Module):
     """A network that answers inputs with one of some classes and an uncertainty.
 
     Args:
-        stack: The agents.
+        view: The agents, and what their models see beside their own state.
         config: Shape of the models.
         fan_in: Number of inputs of each agent.
         valid_answers: ``(agents, classes)`` bool, the classes each agent has.
@@ -61,7 +62,7 @@ class AnswerModel(nn.Module):
 
     def __init__(
         self,
-        stack: Stack,
+        view: View,
         config: InverseConfig,
         fan_in: list[int],
         valid_answers: Tensor,
@@ -69,7 +70,8 @@ class AnswerModel(nn.Module):
         method: Method | None,
     ) -> None:
         super().__init__()
-        self.stack = stack
+        self.stack = view.stack
+        self.view = view
         self.config = config
         self._fan_in = fan_in
         self.standardise = Standardiser(len(fan_in), max(fan_in))
@@ -107,6 +109,7 @@ class InverseModel(AnswerModel):
         config: Shape of the models.
         generator: Source of the initial weights.
         method: Which uncertainty; the evidential one unless given.
+        view: What the models see beside s and s'; nothing unless given.
     """
 
     columns: Tensor
@@ -118,11 +121,13 @@ class InverseModel(AnswerModel):
         config: InverseConfig,
         generator: torch.Generator,
         method: Method | None = None,
+        view: View | None = None,
     ) -> None:
+        view = view or View(stack)
         heads = stack.heads(config.include_phase)
-        fan_in = [size + head for size, head in zip(stack.sizes, heads, strict=True)]
-        super().__init__(stack, config, fan_in, stack.valid_actions, generator, method)
-        columns, valid = _columns(stack.sizes, heads)
+        fan_in = [size + head for size, head in zip(view.sizes, heads, strict=True)]
+        super().__init__(view, config, fan_in, stack.valid_actions, generator, method)
+        columns, valid = _columns(view.sizes, heads)
         self.register_buffer("columns", columns, persistent=False)
         self.register_buffer("valid_inputs", valid, persistent=False)
 
@@ -130,7 +135,7 @@ class InverseModel(AnswerModel):
         """The state, and directly behind it the change of its features; unscaled.
 
         Args:
-            observation: ``(agents, batch, width)``.
+            observation: ``(agents, batch, view.width)``, as `view` makes it.
             next_features: ``(agents, batch, features)`` of s', with the phase if included; columns
                 of a whole next observation beyond them are ignored.
         """

@@ -63,7 +63,8 @@ class Means:
     def of(cls, model: DelayedForward, data: StackedTransitions) -> Means:
         """Of a fitted model; the rows with weight are those it was fitted to."""
         change = model.change(data.observation, data.outcome) / model.scale
-        error = model(data.observation, data.executed, model.extra(data.delay_s)) - change
+        seen = model.view.of(data)
+        error = model(seen, data.executed, model.extra(data.delay_s)) - change
         count = data.weight.sum(1, keepdim=True).clamp(min=1.0)
         mean = (data.weight[..., None] * error**2).sum(1) / count
         classes = model.most_s + 1
@@ -85,7 +86,7 @@ def lost_time(
         known: What the model leaves open.
         phase_s: How far single phases are expected to lie from their intersection, in s.
     """
-    stack = model.stack
+    stack, seen = model.stack, model.view.of(data)
     grid = torch.linspace(0.0, model.most_s, round(model.most_s / STEP_S) + 1)
     change = model.change(data.observation, data.outcome) / model.scale
     rows = torch.zeros(len(stack.agents), stack.actions).scatter_add_(1, data.executed, data.weight)
@@ -95,7 +96,7 @@ def lost_time(
     misfit = torch.zeros_like(cost)
     for place, seconds in enumerate(grid.tolist()):
         extra = model.extra(torch.full_like(data.delay_s, seconds))
-        error = change - model(data.observation, data.executed, extra)
+        error = change - model(seen, data.executed, extra)
         mean = _by_phase(error * data.weight[..., None], data.executed, rows)
         simulated = _between(known.rows, seconds)
         chance = 1.0 / rows.clamp(min=1.0) + 1.0 / simulated.clamp(min=1.0)

@@ -2,8 +2,8 @@
 
 The evidential loss alone says nothing about inputs far from the data, where a network of ReLUs
 grows ever more confident: on planted dynamics u was 0.26 on the data and 0.10 off it. So a state is
-drawn from a box around the observed ones, and so is the change of its features; the current phase
-stays a valid one, or it alone would give the invented rows away.
+drawn from a box around the observed ones, and so is the change of its features; the phases shown
+stay valid ones, or they alone would give the invented rows away.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from ugat_marl.grounding.stacked import Stack
+from ugat_marl.grounding.view import View
 
 REACH = 1.5
 """Half-width of the box in units of the observed range: three times as wide as the data."""
@@ -27,7 +27,7 @@ class OffData:
         inputs: ``(agents, n, width)`` unscaled inputs of h.
         candidates: Columns of `inputs` to start from, ``(m,)``.
         low: ``(agents, 1, width)`` lower end of the box; ``high`` the upper.
-        kept: ``(agents, 1, width)`` bool, the phase and padding: never redrawn.
+        kept: ``(agents, 1, width)`` bool, phases: never redrawn.
         change: ``(agents, 1, width)`` bool, the change of the features.
     """
 
@@ -40,27 +40,26 @@ class OffData:
 
     @classmethod
     def around(
-        cls, inputs: Tensor, weight: Tensor, stack: Stack, fixed: Tensor | None = None
+        cls, inputs: Tensor, weight: Tensor, view: View, fixed: Tensor | None = None
     ) -> OffData:
         """The box around the rows of `inputs` with weight, ``(agents, n)``.
 
         Args:
             inputs: ``(agents, n, width)``: the observation, and directly behind it the change.
             weight: ``(agents, n)``.
-            stack: The agents.
+            view: Says how long an observation is, and where it shows phases.
             fixed: ``(agents, 1, width)`` bool, what else is never redrawn.
         """
         own = weight.bool()[..., None]
         low = torch.where(own, inputs, torch.inf).amin(1, keepdim=True)
         high = torch.where(own, inputs, -torch.inf).amax(1, keepdim=True)
         centre, reach = (high + low) / 2, (high - low) * REACH
-        kept = torch.zeros(low.shape, dtype=torch.bool)
+        kept = nn.functional.pad(view.lights, (0, low.shape[-1] - view.width))
         change = torch.zeros(low.shape, dtype=torch.bool)
-        for i, layout in enumerate(stack.layouts.values()):
-            kept[i, 0, layout.features : layout.features + layout.phases] = True
-            change[i, 0, layout.size :] = True
+        for i, size in enumerate(view.sizes):
+            change[i, 0, size:] = True
         if fixed is not None:
-            kept |= fixed
+            kept = kept | fixed
         candidates = weight.bool().all(0).nonzero()[:, 0]
         if not len(candidates):  # agents measured at different times share no column
             candidates = weight.bool().any(0).nonzero()[:, 0]

@@ -8,7 +8,7 @@ is not trusted, the delay is the one that fits all the street's transitions best
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -20,9 +20,11 @@ from ugat_marl.grounding.delays import DelayedForward, DelayModel, TimedConfig, 
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.inverse import InverseConfig
+from ugat_marl.grounding.joint import running
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.transform import Grounding, Transform
 from ugat_marl.grounding.uncertainty import Method
+from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import AgentLayout
 
@@ -47,6 +49,8 @@ class TimedTransform(Transform):
         inverse: Shape of the inverse models.
         gate: How alpha is found.
         timed: How greens are delayed.
+        inputs: What the models see beside the intersection's own state and action.
+        neighbours: Agent to the agents one road away, for inputs with hops.
     """
 
     inverse: DelayModel
@@ -59,6 +63,8 @@ class TimedTransform(Transform):
         inverse: InverseConfig | None = None,
         gate: GateConfig | None = None,
         timed: TimedConfig | None = None,
+        inputs: InputsConfig | None = None,
+        neighbours: Neighbours | None = None,
     ) -> None:
         forward, inverse = forward or ForwardConfig(), inverse or InverseConfig()
         if forward.include_phase or inverse.include_phase:
@@ -66,13 +72,16 @@ class TimedTransform(Transform):
                 "timed grounding does not change phases, so that include_phase says nothing; "
                 "leave it off"
             )
-        super().__init__(layouts, seed, forward, gate)
+        super().__init__(layouts, seed, forward, gate, inputs, neighbours)
         self.timed = timed or TimedConfig()
         most_s = self.timed.most_s
+        # What the street does is compared with it, so that both see the same.
         self.simulated = DelayedForward(
-            self.stack, forward, most_s, torch_generator(seed, "simulated")
+            self.stack, forward, most_s, torch_generator(seed, "simulated"), self.forward.view
         )
-        self.inverse = DelayModel(self.stack, inverse, most_s, torch_generator(seed, "inverse"))
+        self.inverse = DelayModel(
+            self.stack, inverse, most_s, torch_generator(seed, "inverse"), view=self.local
+        )
         self.constants = _Constants(self.stack)
 
     @property
@@ -83,7 +92,12 @@ class TimedTransform(Transform):
     def fresh_inverse(self, method: Method) -> DelayModel:
         """An unfitted h of the same shape with this method of uncertainty."""
         return DelayModel(
-            self.stack, self.inverse.config, self.timed.most_s, torch_generator(0), method
+            self.stack,
+            self.inverse.config,
+            self.timed.most_s,
+            torch_generator(0),
+            method,
+            self.local,
         )
 
     def ground(
@@ -91,20 +105,26 @@ class TimedTransform(Transform):
         observations: Tensor,
         actions: NDArray[np.int64],
         permitted: NDArray[np.bool_] | None,
+        earlier: Sequence[Moment],
     ) -> Grounding:
         """The policy's phases, with a delay where they change.
 
         The gate sees delays in whole seconds; an action counts as changed if h's delay is another
         than the one taken without h.
         """
-        del permitted  # no phase is changed
         asked = torch.from_numpy(actions)[:, None]
         usual = self.constants.delay_s.gather(1, asked)
         switched = (self.stack.current_phase(observations) != asked)[:, 0].numpy()
         if self.timed.answer == "constant":
             delay = np.where(switched, usual[:, 0].numpy(), 0.0).astype(np.float32)
             return Grounding(actions, actions, np.zeros_like(delay), np.ones_like(switched), delay)
-        found, u = self.delays(observations, asked)
+        # No phase is changed, so that it is known at once what runs at the neighbours.
+        phases = torch.from_numpy(running(actions, permitted))[:, None]
+        found, u = self.delays(
+            self.forward.view.seen(observations, phases, earlier),
+            self.local.seen(observations, phases),
+            asked,
+        )
         accepted = self.gate.decide(
             u[:, 0].numpy(),
             usual[:, 0].round().long().numpy(),
@@ -115,14 +135,15 @@ class TimedTransform(Transform):
         delay = np.where(switched, delay, 0.0).astype(np.float32)
         return Grounding(actions, actions, u[:, 0].numpy(), accepted, delay)
 
-    def delays(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+    def delays(self, seen: Tensor, local: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """H's delays in s, in the light of the best constants, and its u: ``(agents, batch)``.
 
         Args:
-            observations: ``(agents, batch, width)``.
+            seen: ``(agents, batch, forward.view.width)``, the observations as f sees them.
+            local: ``(agents, batch, local.width)``, the same as h sees them.
             actions: ``(agents, batch)`` int64, phases that turn green.
         """
-        change = self.forward(observations, actions) * self.forward.scale
-        answer = self.inverse.predict(observations, actions, change)
+        change = self.forward(seen, actions) * self.forward.scale
+        answer = self.inverse.predict(local, actions, change)
         usual = self.constants.delay_s.gather(1, actions)
         return likely_delay(answer.probability, usual, self.timed.spread_s), answer.u

@@ -53,11 +53,11 @@ def fit_timed(
     stack, model = transform.stack, transform.simulated
     street, data = _alike(stack_log(real, stack), stack_log(simulated, stack))
     parts = split(street, config.held_out_every, stack)
-    lesson = Changes("forward", street.observation, street.outcome, street.asked)
+    lesson = Changes("forward", transform.forward.view.of(street), street.outcome, street.asked)
     f = fit_changes(transform.forward, lesson, parts, config, seed, on_epoch)
     parts = split(data, config.held_out_every, stack)
     extra = model.extra(data.delay_s)
-    lesson = Changes("simulated", data.observation, data.outcome, data.executed, extra)
+    lesson = Changes("simulated", model.view.of(data), data.outcome, data.executed, extra)
     g = fit_changes(model, lesson, parts, config, seed, on_epoch)
     begins = _begins(data, stack)
     known = Means.of(model, replace(data, weight=parts.train * begins))
@@ -115,15 +115,16 @@ def _fit_delays(
     means, and so does the model.
     """
     model, simulated = transform.inverse, transform.simulated
+    seen = model.view.of(data)
     generator = torch_generator(seed, "inverse", "delays")
     answers = torch.randint(model.most_s + 1, data.executed.shape, generator=generator)
     with torch.no_grad():
         extra = simulated.extra(answers.float())
-        change = simulated(data.observation, data.executed, extra)
+        change = simulated(simulated.view.of(data), data.executed, extra)
         noise = torch.randn(change.shape, generator=generator) * spread
         change = (change + transform.timed.target_noise * noise) * simulated.scale
-    inputs = model.inputs(data.observation, data.executed, change)
-    off_data = OffData.around(inputs, parts.train, transform.stack, model.action_columns)
+    inputs = model.inputs(seen, data.executed, change)
+    off_data = OffData.around(inputs, parts.train, model.view, model.action_columns)
     asked = Questions(inputs, answers, off_data)
     record = fit_answers(model, asked, parts, config, seed, on_epoch)
     return _report(transform, data, parts, asked, record, torch_generator(seed, "off data"))
@@ -142,7 +143,7 @@ def _report(
     seconds = torch.arange(model.most_s + 1, dtype=torch.float32)
     answer = model.answer(asked.inputs)
     happened = transform.simulated.change(data.observation, data.outcome)
-    single = model.predict(data.observation, data.executed, happened)
+    single = model.predict(model.view.of(data), data.executed, happened)
     held = parts.held_out * data.weight  # nothing is known of an agent that had to take all rows
     drawn = asked.off_data.draw(int(held.sum(1).max().clamp(min=1)), generator, state_share=1.0)
     on, off = answer.u[held.bool()], model.answer(drawn).u.flatten()

@@ -7,7 +7,7 @@ the action with which the simulation does the same; the gate takes a' where h is
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,10 @@ from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.gate import Gate, GateConfig
 from ugat_marl.grounding.inverse import AnswerModel, InverseConfig, InverseModel
+from ugat_marl.grounding.joint import alone, together
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import Method
+from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours, View
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import AgentLayout
 
@@ -59,9 +61,13 @@ class Transform(abc.ABC):
         seed: Decides the initial weights.
         forward: Shape of the forward models.
         gate: How alpha is found.
+        inputs: What the models see beside the intersection's own state and action.
+        neighbours: Agent to the agents one road away, for inputs with hops.
 
     Attributes:
         stack: The agents.
+        inputs: What the models see.
+        local: The view of h: the neighbours, if there are hops; f's view has the history, too.
         forward: f of every intersection.
         inverse: h of every intersection.
         gate: Keeps or takes what h answers.
@@ -75,9 +81,17 @@ class Transform(abc.ABC):
         seed: int,
         forward: ForwardConfig,
         gate: GateConfig | None,
+        inputs: InputsConfig | None,
+        neighbours: Neighbours | None,
     ) -> None:
         self.stack = Stack(layouts)
-        self.forward = ForwardModel(self.stack, forward, torch_generator(seed, "forward"))
+        self.inputs = inputs or InputsConfig()
+        near = self.inputs.near(self.stack.agents, neighbours)
+        self.local = View(self.stack, near=near)
+        view = View(self.stack, self.inputs.history, near)
+        self.forward = ForwardModel(
+            self.stack, forward, torch_generator(seed, "forward"), view=view
+        )
         self.gate = Gate(self.stack.agents, gate or GateConfig())
 
     @property
@@ -96,6 +110,7 @@ class Transform(abc.ABC):
         observations: Tensor,
         actions: NDArray[np.int64],
         permitted: NDArray[np.bool_] | None,
+        earlier: Sequence[Moment],
     ) -> Grounding:
         """`__call__`, once the models are fitted."""
 
@@ -110,13 +125,15 @@ class Transform(abc.ABC):
         observations: Tensor,
         actions: NDArray[np.int64],
         permitted: NDArray[np.bool_] | None = None,
+        earlier: Sequence[Moment] = (),
     ) -> Grounding:
-        """Grounds one action per agent, all of them in one pass.
+        """Grounds one action per agent, all of them together.
 
         Args:
             observations: ``(agents, 1, width)`` float32, padded (`Stack.observations`).
             actions: ``(agents,)`` the policy's actions.
             permitted: ``(agents, phases)`` action masks; a masked grounded action is not taken.
+            earlier: The decisions of this episode before, latest first, for models with a history.
 
         Raises:
             EpisodeError: The models have not been fitted.
@@ -126,13 +143,14 @@ class Transform(abc.ABC):
                 "actions cannot be grounded before the models are fitted; "
                 "call grounding.fitting.fit first or load a checkpoint"
             )
-        return self.ground(observations, actions, permitted)
+        return self.ground(observations, actions, permitted, earlier)
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, statistics, method of uncertainty and gate, as tensors and plain values."""
         return {
             "method": asdict(self.inverse.method),
             "layouts": {a: list(_sizes(v)) for a, v in self.stack.layouts.items()},
+            "inputs": _sights(self.inputs, self.local),
             **{name: model.state_dict() for name, model in self.models.items()},
             "gate": self.gate.state_dict(),
         }
@@ -149,6 +167,14 @@ class Transform(abc.ABC):
             raise CheckpointError(
                 "the grounding in the checkpoint belongs to other agents or another observation; "
                 f"this one has {len(own)} agents ({', '.join(self.stack.agents[:4])} ...)"
+            )
+        sights = _sights(self.inputs, self.local)
+        # Checkpoints from before there were inputs do not say theirs.
+        kept = state.get("inputs", _sights(InputsConfig(), View(self.stack)))
+        if kept != sights:
+            raise CheckpointError(
+                f"the models in the checkpoint see {kept!r}, these see {sights!r}; use the same "
+                "inputs (history, hops) and the same network"
             )
         method = _method(state)
         found = {name: state.get(name) for name in self.models}
@@ -192,6 +218,8 @@ class GroundedActionTransform(Transform):
         forward: Shape of the forward models.
         inverse: Shape of the inverse models.
         gate: How alpha is found.
+        inputs: What the models see beside the intersection's own state and action.
+        neighbours: Agent to the agents one road away, for inputs with hops.
     """
 
     inverse: InverseModel
@@ -203,6 +231,8 @@ class GroundedActionTransform(Transform):
         forward: ForwardConfig | None = None,
         inverse: InverseConfig | None = None,
         gate: GateConfig | None = None,
+        inputs: InputsConfig | None = None,
+        neighbours: Neighbours | None = None,
     ) -> None:
         forward, inverse = forward or ForwardConfig(), inverse or InverseConfig()
         if forward.include_phase != inverse.include_phase:
@@ -210,28 +240,40 @@ class GroundedActionTransform(Transform):
                 f"include_phase is {forward.include_phase} in the forward and "
                 f"{inverse.include_phase} in the inverse model; h must be given what f predicts"
             )
-        super().__init__(layouts, seed, forward, gate)
-        self.inverse = InverseModel(self.stack, inverse, torch_generator(seed, "inverse"))
+        super().__init__(layouts, seed, forward, gate, inputs, neighbours)
+        self.inverse = InverseModel(
+            self.stack, inverse, torch_generator(seed, "inverse"), view=self.local
+        )
 
     def ground(
         self,
         observations: Tensor,
         actions: NDArray[np.int64],
         permitted: NDArray[np.bool_] | None,
+        earlier: Sequence[Moment],
     ) -> Grounding:
-        """f, then h, then the gate."""
+        """f, then h, then the gate; where neighbours are seen, until all answers hold together."""
         asked = torch.from_numpy(actions)[:, None]
-        predicted = self.forward.predict(observations, asked)
-        answer = self.inverse.predict(observations, predicted)
-        grounded, u = answer.action[:, 0].numpy(), answer.u[:, 0].numpy()
-        allowed = None if permitted is None else permitted[np.arange(len(grounded)), grounded]
-        accepted = self.gate.decide(u, actions, grounded, allowed)
+
+        def answer(phases: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+            running = torch.from_numpy(phases)[:, None]
+            seen = self.forward.view.seen(observations, running, earlier)
+            predicted = self.forward.predict(seen, asked)
+            found = self.inverse.predict(self.local.seen(observations, running), predicted)
+            return found.action[:, 0].numpy(), found.u[:, 0].numpy()
+
+        if self.local.joint:
+            settled = together(answer, self.gate, actions, permitted)
+        else:
+            settled = alone(answer, actions, permitted)
+        grounded, u = settled.grounded, settled.u
+        accepted = self.gate.decide(u, actions, grounded, settled.allowed)
         executed = np.where(accepted, grounded, actions)
         return Grounding(executed, grounded, u, accepted, np.zeros_like(u))
 
     def fresh_inverse(self, method: Method) -> InverseModel:
         """An unfitted h of the same shape with this method of uncertainty."""
-        return InverseModel(self.stack, self.inverse.config, torch_generator(0), method)
+        return InverseModel(self.stack, self.inverse.config, torch_generator(0), method, self.local)
 
 
 def _method(state: Mapping[str, Any]) -> Method:
@@ -251,6 +293,11 @@ def _renamed(parts: Any) -> Any:
         return parts
     old = ("encoders.", "head.")
     return {f"net.{k}" if str(k).startswith(old) else k: value for k, value in parts.items()}
+
+
+def _sights(inputs: InputsConfig, local: View) -> dict[str, Any]:
+    """What models see, in plain values."""
+    return {**asdict(inputs), "near": {agent: list(near) for agent, near in local.near.items()}}
 
 
 def _sizes(layout: AgentLayout) -> tuple[int, int, int]:

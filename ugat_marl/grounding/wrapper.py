@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
 
 import numpy as np
+import torch
 from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.errors import ActionError, OptionError
 from ugat_marl.grounding.transform import Transform
+from ugat_marl.grounding.view import Moment
 from ugat_marl.policy import AnyParallelEnv
 
 Infos = dict[str, dict[str, Any]]
@@ -26,7 +29,8 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
     - ``delay_s``: float, for how long the agent's greens were held back; 0.0 at reset.
 
     A grounded action that the agent's action mask forbids is never executed. An epoch of the gate
-    is an episode of this environment.
+    is an episode of this environment. Models with a history are shown what was observed and what
+    ran in the episode; by ``executed_action`` in the infos, where the environment says so.
 
     Args:
         env: The simulation.
@@ -40,6 +44,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         super().__init__(env)
         _refuse_misfit(env, transform)
         self.transform = transform
+        self._earlier: deque[Moment] = deque(maxlen=transform.inputs.history - 1)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -47,6 +52,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         """Starts an episode of the wrapped environment."""
         self.transform.gate.end_epoch()
         observations, infos = self.env.reset(seed=seed, options=options)
+        self._earlier.clear()
         self._notice(observations, infos)
         return observations, _extended(infos, self.env.agents)
 
@@ -69,7 +75,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
             return self.env.step(actions)
         stack = self.transform.stack
         own = np.array([self._action(agent, actions) for agent in stack.agents])
-        outcome = self.transform(self._seen, own, self._allowed)
+        outcome = self.transform(self._seen, own, self._allowed, self._earlier)
         executed = dict(zip(stack.agents, outcome.executed.tolist(), strict=True))
         if outcome.delay_s.any():
             delays = dict(zip(stack.agents, outcome.delay_s.tolist(), strict=True))
@@ -77,6 +83,8 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
             env.delay_greens(delays)
         observations, rewards, terminations, truncations, infos = self.env.step(executed)
         if self.env.agents:
+            ran = [infos.get(a, {}).get("executed_action", executed[a]) for a in stack.agents]
+            self._earlier.appendleft(Moment(self._seen, torch.tensor(ran)[:, None]))
             self._notice(observations, infos)
         else:
             self.transform.gate.end_epoch()

@@ -1,0 +1,202 @@
+"""What a model sees beside its own state: earlier states, and the neighbours with what they do.
+
+A view widens the observations of a `Stack` to the right, so that an agent's own numbers still begin
+at 0: ``own | earlier ones, each with the phase that ran | neighbours, each with the phase that
+runs``. The same function makes it of a log and while an episode runs. Where an episode has not
+lasted long enough, its first observation stands in for earlier ones, without a phase.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ugat_marl.errors import LogError, OptionError
+from ugat_marl.grounding.stacked import Stack, StackedTransitions
+from ugat_marl.network import within
+from ugat_marl.policy import AnyParallelEnv
+
+Neighbours = Mapping[str, Sequence[str]]
+"""Agent to the agents around it."""
+
+UNKNOWN = -1
+"""The phase of a decision that nobody has seen."""
+
+
+@dataclass(frozen=True)
+class InputsConfig:
+    """What f and h are told beside the intersection's own state and action.
+
+    Attributes:
+        history: Observations f sees, the current one and the last ones before it, with the phases
+            that ran since.
+        hops: How many roads away intersections are whose features and phases f and h see, with the
+            phases that run in the step. The joint-local grounding of JL-GAT (Turnau et al. 2025).
+    """
+
+    history: int = 1
+    hops: int = 0
+
+    def __post_init__(self) -> None:
+        if self.history < 1:
+            raise OptionError(f"inputs history is {self.history}; allowed: >= 1")
+        if self.hops < 0:
+            raise OptionError(f"inputs hops is {self.hops}; allowed: 0 or a number of roads")
+
+    def near(self, agents: Sequence[str], neighbours: Neighbours | None) -> Neighbours:
+        """The neighbours each agent's models see, nearest first; none without hops.
+
+        Raises:
+            OptionError: There are hops, but nothing, or nothing sensible, is known of neighbours.
+        """
+        if not self.hops:
+            return {}
+        if neighbours is None:
+            raise OptionError(
+                f"inputs hops is {self.hops}, but nobody says who is near whom; give neighbours, "
+                "such as ugat_marl.grounding.view.neighbours_of(env), or leave hops at 0"
+            )
+        foreign = {*neighbours, *(n for near in neighbours.values() for n in near)} ^ {*agents}
+        if foreign:
+            raise OptionError(
+                f"neighbours and agents differ in {sorted(foreign)[:4]}; name the neighbours of "
+                f"every agent: {', '.join(agents[:4])}{', ...' * (len(agents) > 4)}"
+            )
+        return within(neighbours, self.hops)
+
+
+def neighbours_of(env: AnyParallelEnv) -> dict[str, tuple[str, ...]]:
+    """The agents one road away from each agent of an environment of the suite, wrapped or not."""
+    base: Any = env.unwrapped
+    agent = {light: name for name, light in base.intersection_of.items()}
+    return {
+        agent[item.id]: tuple(agent[other] for other in item.neighbours)
+        for item in base.network.intersections
+    }
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A decision of all agents, in any number of episodes.
+
+    Attributes:
+        observation: ``(agents, n, width)`` float32.
+        executed: ``(agents, n)`` int64, the phases that ran from then on; -1 is not known.
+    """
+
+    observation: Tensor
+    executed: Tensor
+
+
+class View:
+    """Widens observations by what lies before and around them.
+
+    Args:
+        stack: The agents.
+        history: Observations of an agent itself, the current one included.
+        near: Agent to the neighbours it sees; agents that are left out see none.
+
+    Attributes:
+        sizes: Length of each agent's widened observation; ``width`` is the largest.
+        lights: ``(agents, 1, width)`` bool, where phases stand: 0 or 1, and one of them is 1.
+        joint: Whether somebody sees a neighbour.
+    """
+
+    def __init__(self, stack: Stack, history: int = 1, near: Neighbours | None = None) -> None:
+        self.stack = stack
+        self.history = history
+        self.near = {agent: tuple((near or {}).get(agent, ())) for agent in stack.agents}
+        self.joint = any(self.near.values())
+        places = [self._places(agent) for agent in stack.agents]
+        self.sizes = [len(own) for own in places]
+        self.width = max(self.sizes)
+        # Padding reads the last column of all, which is zero.
+        nothing = len(stack.agents) * history * (stack.width + stack.actions)
+        self._columns = torch.full((len(places), self.width), nothing)
+        self.lights = torch.zeros(len(places), 1, self.width, dtype=torch.bool)
+        for i, own in enumerate(places):
+            self._columns[i, : len(own)] = torch.tensor([column for column, _ in own])
+            self.lights[i, 0, : len(own)] = torch.tensor([light for _, light in own])
+
+    def seen(self, now: Tensor, running: Tensor, earlier: Sequence[Moment] = ()) -> Tensor:
+        """Widened observations ``(agents, n, width)``.
+
+        Args:
+            now: ``(agents, n, stack.width)``, what is observed.
+            running: ``(agents, n)`` int64, the phases that run from now on; of an agent's own
+                nothing is shown.
+            earlier: The decisions before, latest first; as many as there have been.
+        """
+        if self.history == 1 and not self.joint:
+            return now
+        moments = [Moment(now, running), *earlier][: self.history]
+        while len(moments) < self.history:
+            unknown = torch.full_like(running, UNKNOWN)
+            moments.append(Moment(moments[-1].observation, unknown))
+        parts = [part for m in moments for part in (m.observation, self._shown(m.executed))]
+        rows = torch.cat(parts, -1).transpose(0, 1).flatten(1)
+        rows = nn.functional.pad(rows, (0, 1))[:, self._columns.flatten()]
+        return rows.view(-1, *self._columns.shape).transpose(0, 1).contiguous()
+
+    def of(self, data: StackedTransitions) -> Tensor:
+        """Widened observations of all rows of a log, ``(agents, n, width)``.
+
+        Raises:
+            LogError: Neighbours are seen, but the agents were not recorded at the same times.
+        """
+        if self.history == 1 and not self.joint:
+            return data.observation
+        if self.joint:
+            _refuse_unequal_times(data, self.stack)
+        row = torch.arange(data.step.shape[1]).expand_as(data.step)
+        goes_on = (data.episode[:, 1:] == data.episode[:, :-1]) & (data.step.diff(dim=1) == 1)
+        begins = nn.functional.pad(~goes_on, (1, 0), value=True)
+        first = torch.where(begins, row, 0).cummax(1).values
+        earlier: list[Moment] = []
+        for lag in range(1, self.history):
+            before = (row - lag).maximum(first)
+            places = before[..., None].expand_as(data.observation)
+            executed = torch.where(row - lag >= first, data.executed.gather(1, before), UNKNOWN)
+            earlier.append(Moment(data.observation.gather(1, places), executed))
+        return self.seen(data.observation, data.executed, earlier)
+
+    def _shown(self, phase: Tensor) -> Tensor:
+        """Phases ``(agents, n)`` one-hot; an unknown one is zeros."""
+        shown = nn.functional.one_hot(phase.clamp(min=0), self.stack.actions)
+        return shown * (phase != UNKNOWN)[..., None].float()
+
+    def _places(self, agent: str) -> list[tuple[int, bool]]:
+        """Where each number of an agent lies in a row of all moments; and if it is a light."""
+        stack = self.stack
+
+        def moment(name: str, lag: int, end: int, executed: bool) -> list[tuple[int, bool]]:
+            layout = stack.layouts[name]
+            start = (stack.agents.index(name) * self.history + lag) * (stack.width + stack.actions)
+            lit = range(layout.features, layout.features + layout.phases)
+            observed = [(start + k, k in lit) for k in range(end)]
+            first = start + stack.width
+            return observed + [(first + k, True) for k in range(layout.phases * executed)]
+
+        size = stack.layouts[agent].size
+        found = moment(agent, 0, size, executed=False)
+        for lag in range(1, self.history):
+            found += moment(agent, lag, size, executed=True)
+        for name in self.near[agent]:
+            layout = stack.layouts[name]
+            found += moment(name, 0, layout.features + layout.phases, executed=True)
+        return found
+
+
+def _refuse_unequal_times(data: StackedTransitions, stack: Stack) -> None:
+    for times in (data.episode, data.step):
+        for agent, own in zip(stack.agents, times, strict=True):
+            if not torch.equal(own, times[0]):
+                raise LogError(
+                    f"the log has rows of {agent} at other times than of {stack.agents[0]}; models "
+                    "that see their neighbours need all agents at every decision: record whole "
+                    "episodes, or leave hops at 0"
+                )
