@@ -1,38 +1,27 @@
-"""Policies x domains x seeds -> scores with intervals, gaps and regret.
-
-The gap of a policy is its score in a domain minus its score in the first one, usually ``sim``, seed
-by seed. It mixes physics with policy: slow vehicles are slow under any policy. The regret is how
-far the policy is, in that domain, from the best policy known there; that part transfer can win
-back.
-"""
+"""Policies x domains x seeds -> scores with intervals, gaps and regret; races between rules."""
 
 from __future__ import annotations
 
 import concurrent.futures
-import json
 import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ugat_marl.controllers import STANDARD_RULES, controller_for, parse_spec
 from ugat_marl.effects import Domain, describe, in_domain
 from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.files import write_whole
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_policy import DQNPolicy
-from ugat_marl.metrics import MEASURES, Scores, bootstrap_interval
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Advance, Reporter, Silent
+from ugat_marl.results import Evaluation, Result, Trial
 from ugat_marl.rollout import roll_out, until
 from ugat_marl.scenario import Scenario
-from ugat_marl.seeding import numpy_generator
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
 PolicyFactory = Callable[[TrafficEnv], Policy]
@@ -40,123 +29,6 @@ PolicyFactory = Callable[[TrafficEnv], Policy]
 
 TUNING_SEED = 9001
 """First of the seeds the best rule is searched on; never those a result is reported on."""
-
-
-@dataclass(frozen=True)
-class Result:
-    """One episode.
-
-    Attributes:
-        policy: Name of the policy.
-        domain: Name of the domain.
-        seed: Seed of the episode.
-        scores: How it went.
-    """
-
-    policy: str
-    domain: str
-    seed: int
-    scores: Scores
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Mean over seeds with a 95 % bootstrap interval (nan for a single seed), and the median."""
-
-    mean: float
-    low: float
-    high: float
-    median: float
-
-    @classmethod
-    def of(cls, values: NDArray[np.float64]) -> Estimate:
-        """The estimate from one value per seed."""
-        low, high = bootstrap_interval(values, numpy_generator(0, "bootstrap"))
-        return cls(float(values.mean()), low, high, float(np.median(values)))
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """All episodes of an evaluation.
-
-    Attributes:
-        scenario: Id of the scenario.
-        scenario_hash: Its hash.
-        results: One per policy, domain and seed.
-        notes: What else a reader must know, such as which rule was the best one.
-    """
-
-    scenario: str
-    scenario_hash: str
-    results: tuple[Result, ...]
-    notes: Mapping[str, str]
-
-    @property
-    def policies(self) -> list[str]:
-        """Names of the policies, in the order they were evaluated."""
-        return list(dict.fromkeys(result.policy for result in self.results))
-
-    @property
-    def domains(self) -> list[str]:
-        """Names of the domains, in the order they were evaluated."""
-        return list(dict.fromkeys(result.domain for result in self.results))
-
-    def values(self, policy: str, domain: str, measure: str) -> NDArray[np.float64]:
-        """One value per seed, in the order of the seeds."""
-        found = [r for r in self.results if r.policy == policy and r.domain == domain]
-        found.sort(key=lambda result: result.seed)
-        return np.array([getattr(result.scores, measure) for result in found])
-
-    def estimate(self, policy: str, domain: str, measure: str) -> Estimate:
-        """Mean and interval of a measure."""
-        return Estimate.of(self.values(policy, domain, measure))
-
-    def gap(self, policy: str, domain: str, measure: str) -> Estimate:
-        """The measure in `domain` minus that in the first domain, paired by seed."""
-        real = self.values(policy, domain, measure)
-        return Estimate.of(real - self.values(policy, self.domains[0], measure))
-
-    def regret(self, policy: str, domain: str) -> Estimate:
-        """ATT above that of the best policy evaluated in the domain, in s, paired by seed."""
-        best = min(self.policies, key=lambda name: self.estimate(name, domain, "att_s").mean)
-        mine = self.values(policy, domain, "att_s")
-        return Estimate.of(mine - self.values(best, domain, "att_s"))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything, for JSON: the summary and every episode."""
-        summary: list[dict[str, Any]] = []
-        for policy in self.policies:
-            for domain in self.domains:
-                row: dict[str, Any] = {"policy": policy, "domain": domain}
-                for measure in MEASURES:
-                    row[measure] = asdict(self.estimate(policy, domain, measure))
-                    if domain != self.domains[0]:
-                        row[f"{measure}_gap"] = asdict(self.gap(policy, domain, measure))
-                row["regret_s"] = asdict(self.regret(policy, domain))
-                summary.append(row)
-        return {
-            "scenario": self.scenario,
-            "scenario_hash": self.scenario_hash,
-            "notes": dict(self.notes),
-            "summary": summary,
-            "episodes": [
-                {"policy": r.policy, "domain": r.domain, "seed": r.seed, **asdict(r.scores)}
-                for r in self.results
-            ],
-        }
-
-    def write(self, path: Path) -> None:
-        """Writes `as_dict` as JSON, whole or not at all; what has no value is null."""
-        content = json.dumps(_without_nan(self.as_dict()), indent=1, allow_nan=False)
-        write_whole(path, content + "\n")
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 @dataclass(frozen=True)
@@ -229,23 +101,75 @@ def best_rules(
 ) -> dict[str, str]:
     """For each domain the rule with the smallest mean ATT on the tuning seeds.
 
+    The rules are raced: after each seed the worse half is left behind.
+
     Returns:
         Name of the domain to the spelling of the rule.
     """
-    found = evaluate(
-        scenario,
-        {rule: _controller_factory(rule) for rule in rules},
-        domains,
-        seeds,
-        duration_s=duration_s,
-        workers=workers,
-        reporter=reporter,
-        title="best rule of each domain",
+    found: dict[str, str] = {}
+    for domain in domains:
+        trials = race(
+            scenario,
+            domain,
+            rules,
+            [[seed] for seed in seeds],
+            duration_s=duration_s,
+            workers=workers,
+            reporter=reporter,
+            title=f"best rule in {describe(domain)}",
+        )
+        found[describe(domain)] = trials[0].spec
+    return found
+
+
+def race(
+    scenario: Scenario,
+    domain: Domain,
+    specs: Sequence[str],
+    seeds: Sequence[Sequence[int]],
+    *,
+    duration_s: float | None = None,
+    workers: int | None = None,
+    reporter: Reporter | None = None,
+    title: str = "racing",
+) -> tuple[Trial, ...]:
+    """Plays all rules with the first seeds, the better half with the next ones too, and so on.
+
+    Args:
+        scenario: Where.
+        domain: In which domain.
+        specs: Spellings of the rules.
+        seeds: The seeds of each rung.
+        duration_s: Length of an episode; None for the scenario's own.
+        workers: Simulations at a time; None for the number of cores.
+        reporter: Shows progress.
+        title: What to call the work there.
+
+    Returns:
+        All rules: those of the last rung by their ATT, then those left behind before it, ....
+    """
+    played: dict[str, list[float]] = {spec: [] for spec in specs}
+    running, left = list(played), list[str]()
+    for rung, own in enumerate(seeds):
+        found = evaluate(
+            scenario,
+            {spec: _controller_factory(spec) for spec in running},
+            [domain],
+            own,
+            duration_s=duration_s,
+            workers=workers,
+            reporter=reporter,
+            title=title,
+        )
+        for spec in running:
+            played[spec] += found.values(spec, found.domains[0], "att_s").tolist()
+        running.sort(key=lambda spec: float(np.mean(played[spec])))  # stable: the first of equals
+        if rung + 1 < len(seeds):
+            kept = max(2, math.ceil(len(running) / 2))
+            running, left = running[:kept], running[kept:] + left
+    return tuple(
+        Trial(spec, float(np.mean(played[spec])), len(played[spec])) for spec in running + left
     )
-    return {
-        domain: min(rules, key=lambda rule: found.estimate(rule, domain, "att_s").mean)
-        for domain in found.domains
-    }
 
 
 def rule_factory(spec: str) -> PolicyFactory:

@@ -61,6 +61,12 @@ def write_whole(path: Path, content: bytes | str) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def user_cache(name: str) -> Path:
+    """Where results of the kind `name` are remembered between runs: the user's cache folder."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "ugat_marl" / name
+
+
 def read_bytes(path: Path) -> bytes:
     """The content of `path`, unpacked if its name ends in ``.gz``.
 

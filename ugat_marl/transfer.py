@@ -34,6 +34,7 @@ from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
 from ugat_marl.transitions import TransitionLog
+from ugat_marl.tuning import LEAST_BUDGET, TUNED_RULES, tuned_rules
 from ugat_marl.ugat import (
     CHUNK,
     DIRECT_LEARNER,
@@ -69,6 +70,8 @@ class TransferConfig:
         duration_s: Length of an episode in s; default: the scenario's own.
         evaluation_seeds: Episodes behind every number of the table.
         tuning_seeds: Episodes behind the choice of the best rule.
+        rule_budget: Tune every rule in every domain with up to so many episodes before the best is
+            chosen; without it the rules are taken with their usual settings.
         control: Also train as many further episodes in plain sim, for comparison.
         further: Domains in which direct transfer is trained on as long as the control is, for one
             policy each: "late_green=*,3" is a constant delay of all greens, "V4" is fine-tuning in
@@ -90,6 +93,7 @@ class TransferConfig:
     duration_s: float | None = None
     evaluation_seeds: int = 5
     tuning_seeds: int = 2
+    rule_budget: int | None = None
     control: bool = True
     further: tuple[str, ...] = ()
     corrected: str | None = None
@@ -100,6 +104,8 @@ class TransferConfig:
         for name in ("evaluation_seeds", "tuning_seeds"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if self.rule_budget is not None and self.rule_budget < LEAST_BUDGET:
+            raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
         if describe(self.real) == describe(self.sim):
             raise OptionError(
                 f"real = {self.real!r} is the simulation itself; name another domain, such as V4"
@@ -213,13 +219,15 @@ def judge(
     reporter: Reporter,
 ) -> Evaluation:
     """Evaluates policies beside the rules that are best in each domain."""
-    rules = best_rules(
-        scenario,
-        config.domains,
-        seeds=[TUNING_SEED + k for k in range(config.tuning_seeds)],
-        duration_s=config.duration_s,
-        reporter=reporter,
-    )
+    seeds = [TUNING_SEED + k for k in range(config.tuning_seeds)]
+    options: dict[str, Any] = {"duration_s": config.duration_s, "reporter": reporter}
+    budget = config.rule_budget
+    if budget is None:
+        rules = best_rules(scenario, config.domains, seeds=seeds, **options)
+        searched = ", ".join(STANDARD_RULES)
+    else:
+        rules = tuned_rules(scenario, config.domains, budget, seeds=seeds, **options)
+        searched = f"{', '.join(TUNED_RULES)}; each tuned with up to {budget} episodes"
     factories: dict[str, PolicyFactory] = {
         name: fixed_policy(policy) for name, policy in policies.items()
     }
@@ -234,7 +242,7 @@ def judge(
         reporter=reporter,
         notes={
             **{f"best rule in {domain}": rule for domain, rule in rules.items()},
-            "rules searched": ", ".join(STANDARD_RULES),
+            "rules searched": searched,
             "training seed": str(config.seed),
             **({} if config.corrected is None else {CORRECTED: describe(config.corrected)}),
         },
@@ -343,7 +351,7 @@ def _identity(
     config: TransferConfig, scenario: Scenario, env: TrafficEnv, corrected: TrafficEnv | None
 ) -> dict[str, Any]:
     settings = asdict(config)
-    for judging in ("evaluation_seeds", "tuning_seeds", "control", "further"):
+    for judging in ("evaluation_seeds", "tuning_seeds", "rule_budget", "control", "further"):
         settings.pop(judging)
     settings.pop("corrected")  # a scenario is the same if its hash is, wherever it lies
     settings["real_log"] = _digest(config.real_log) if config.real_log else None

@@ -110,10 +110,13 @@ NAMES = tuple(RULES)
 STANDARD_RULES = (
     *(f"largest-queue:{hold_s}" for hold_s in (10, 20, 30, 40)),
     *(f"max-pressure:{hold_s}" for hold_s in (10, 20, 30)),
-    *(f"fixed-time:{green_s}" for green_s in (20, 30, 40)),
-    "programme",
+    *(f"max-pressure-loss:{hold_s}" for hold_s in (10, 20)),
     *(f"actuated:{longest_s}" for longest_s in (40, 80)),
-    "webster",
+    "sotl:300:20",
+    "longest-waiting:30",
+    "webster:1500",
+    "fixed-time:30",
+    "programme",
 )
 """What the search for the best rule of a domain tries."""
 

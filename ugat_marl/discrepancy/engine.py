@@ -26,7 +26,7 @@ from ugat_marl.discrepancy.site import Greens, Site
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
-from ugat_marl.files import write_whole
+from ugat_marl.files import user_cache, write_whole
 from ugat_marl.measured.data import Period
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
@@ -262,8 +262,7 @@ class Engine:
 
 def default_cache() -> Path:
     """Where tallies are remembered between runs: the user's cache folder."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "ugat_marl" / "replicates"
+    return user_cache("replicates")
 
 
 def _versions() -> tuple[str, ...]:

@@ -17,9 +17,10 @@ from typing import Any
 
 from ugat_marl.effects import Domain, describe, in_domain, load
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.evaluation import Estimate, Evaluation, PolicyFactory, evaluate
+from ugat_marl.evaluation import PolicyFactory, evaluate
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
+from ugat_marl.results import Estimate, Evaluation
 from ugat_marl.scenario import Scenario
 
 _FILE, _CORRECTED, _SCHEMA = "diagnosis.json", "corrected", "ugat-marl/diagnosis/"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -11,8 +11,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from ugat_marl.evaluation import Estimate, Evaluation
 from ugat_marl.metrics import MEASURES
+from ugat_marl.results import Estimate, Evaluation, Tuned
 
 
 def transfer_table(found: Evaluation) -> RenderableType:
@@ -37,7 +37,7 @@ def transfer_table(found: Evaluation) -> RenderableType:
             cells += [
                 _with_interval(found.estimate(policy, domain, "att_s")),
                 _signed(found.gap(policy, domain, "att_s")),
-                _number(found.regret(policy, domain).mean),
+                number(found.regret(policy, domain).mean),
             ]
         table.add_row(Text(policy), *cells)
     return table
@@ -61,9 +61,9 @@ def measures_table(found: Evaluation) -> RenderableType:
         for policy in found.policies:
             estimates = [found.estimate(policy, domain, measure) for measure in MEASURES]
             estimates.append(found.regret(policy, domain))
-            table.add_row(Text(policy), *(_number(e.mean) for e in estimates))
+            table.add_row(Text(policy), *(number(e.mean) for e in estimates))
             if not math.isnan(estimates[0].low):
-                halves = (f"±{_number((e.high - e.low) / 2)}" for e in estimates)
+                halves = (f"±{number((e.high - e.low) / 2)}" for e in estimates)
                 table.add_row(*_dim("  95 % interval", *halves))
             if domain != found.domains[0]:
                 gaps = [found.gap(policy, domain, measure) for measure in MEASURES]
@@ -72,6 +72,35 @@ def measures_table(found: Evaluation) -> RenderableType:
         blocks += [Text(line, style="dim") for line in _backlog(found, domain)]
     blocks.append(Text(_legend(found), style="dim"))
     return Group(*blocks)
+
+
+def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
+    """The best settings of each rule, the best rule first."""
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        title=Text(f"{title}: rules at their best"),
+        title_justify="left",
+        caption=Text(
+            "ATT: mean in s over the tuning seeds, all vehicles due. worst: of the settings "
+            "tried. Numbers after a name are its settings; see docs/controllers.md."
+        ),
+        caption_justify="left",
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("best setting", max_width=28, overflow="fold")
+    for heading in ("ATT s", "worst s", "settings", "episodes"):
+        table.add_column(heading, justify="right")
+    for tuned in sorted(found, key=lambda each: each.best.att_s):
+        worst = max(trial.att_s for trial in tuned.trials)
+        table.add_row(
+            Text(tuned.best.spec),
+            number(tuned.best.att_s),
+            number(worst) if len(tuned.trials) > 1 else "-",
+            str(len(tuned.trials)),
+            str(tuned.episodes),
+        )
+    return table
 
 
 def policy_gap_table(
@@ -103,9 +132,9 @@ def policy_gap_table(
         att = [row[world] for world in ("sim", "corrected", "real")]
         table.add_row(
             Text(policy),
-            *(_number(item["mean"]) for item in att),
-            _number(row["before"]),
-            _number(row["after"]),
+            *(number(item["mean"]) for item in att),
+            number(row["before"]),
+            number(row["after"]),
             "-" if row["shrink"] is None else f"{100 * row['shrink']:.0f} %",
         )
         if any(item["low"] is not None for item in att):
@@ -115,13 +144,13 @@ def policy_gap_table(
 
 def _limits(att: Mapping[str, float | None]) -> str:
     low, high = att["low"], att["high"]
-    return "-" if low is None or high is None else f"{_number(low)}-{_number(high)}"
+    return "-" if low is None or high is None else f"{number(low)}-{number(high)}"
 
 
 def _backlog(found: Evaluation, domain: str) -> list[str]:
     """Who kept vehicles out of the network, which throughput and queue do not show."""
     waiting = {name: found.estimate(name, domain, "backlog").mean for name in found.policies}
-    kept_out = [f"{name} {_number(mean)}" for name, mean in waiting.items() if mean >= 0.5]
+    kept_out = [f"{name} {number(mean)}" for name, mean in waiting.items() if mean >= 0.5]
     return [f"vehicles due that never entered: {', '.join(kept_out)}"] if kept_out else []
 
 
@@ -146,7 +175,7 @@ def _medians(found: Evaluation) -> list[str]:
     for domain in found.domains:
         both = {name: found.estimate(name, domain, "att_s") for name in found.policies}
         if any(abs(e.mean - e.median) > 0.1 * e.median for e in both.values()):
-            values = ", ".join(f"{name} {_number(e.median)}" for name, e in both.items())
+            values = ", ".join(f"{name} {number(e.median)}" for name, e in both.items())
             lines.append(f"medians in {domain}: {values}")
     return lines
 
@@ -169,16 +198,16 @@ def _dim(*cells: str) -> list[Text]:
 
 def _with_interval(estimate: Estimate) -> str:
     if math.isnan(estimate.low):
-        return _number(estimate.mean)
-    return f"{_number(estimate.mean)} ({_number(estimate.low)}-{_number(estimate.high)})"
+        return number(estimate.mean)
+    return f"{number(estimate.mean)} ({number(estimate.low)}-{number(estimate.high)})"
 
 
 def _signed(estimate: Estimate) -> str:
-    text = _number(estimate.mean)
+    text = number(estimate.mean)
     return text if text.startswith("-") else f"+{text}"
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
     """Three significant digits, or whole numbers above a hundred."""
     if math.isnan(value):
         return "-"

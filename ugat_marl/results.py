@@ -1,0 +1,180 @@
+"""Scores of policies in domains, seed by seed, and what follows from them.
+
+The gap of a policy is its score in a domain minus its score in the first one, usually ``sim``, seed
+by seed. It mixes physics with policy: slow vehicles are slow under any policy. The regret is how
+far the policy is, in that domain, from the best policy known there; that part transfer can win
+back.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.files import write_whole
+from ugat_marl.metrics import MEASURES, Scores, bootstrap_interval
+from ugat_marl.seeding import numpy_generator
+
+
+@dataclass(frozen=True)
+class Result:
+    """One episode.
+
+    Attributes:
+        policy: Name of the policy.
+        domain: Name of the domain.
+        seed: Seed of the episode.
+        scores: How it went.
+    """
+
+    policy: str
+    domain: str
+    seed: int
+    scores: Scores
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Mean over seeds with a 95 % bootstrap interval (nan for a single seed), and the median."""
+
+    mean: float
+    low: float
+    high: float
+    median: float
+
+    @classmethod
+    def of(cls, values: NDArray[np.float64]) -> Estimate:
+        """The estimate from one value per seed."""
+        low, high = bootstrap_interval(values, numpy_generator(0, "bootstrap"))
+        return cls(float(values.mean()), low, high, float(np.median(values)))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All episodes of an evaluation.
+
+    Attributes:
+        scenario: Id of the scenario.
+        scenario_hash: Its hash.
+        results: One per policy, domain and seed.
+        notes: What else a reader must know, such as which rule was the best one.
+    """
+
+    scenario: str
+    scenario_hash: str
+    results: tuple[Result, ...]
+    notes: Mapping[str, str]
+
+    @property
+    def policies(self) -> list[str]:
+        """Names of the policies, in the order they were evaluated."""
+        return list(dict.fromkeys(result.policy for result in self.results))
+
+    @property
+    def domains(self) -> list[str]:
+        """Names of the domains, in the order they were evaluated."""
+        return list(dict.fromkeys(result.domain for result in self.results))
+
+    def values(self, policy: str, domain: str, measure: str) -> NDArray[np.float64]:
+        """One value per seed, in the order of the seeds."""
+        found = [r for r in self.results if r.policy == policy and r.domain == domain]
+        found.sort(key=lambda result: result.seed)
+        return np.array([getattr(result.scores, measure) for result in found])
+
+    def estimate(self, policy: str, domain: str, measure: str) -> Estimate:
+        """Mean and interval of a measure."""
+        return Estimate.of(self.values(policy, domain, measure))
+
+    def gap(self, policy: str, domain: str, measure: str) -> Estimate:
+        """The measure in `domain` minus that in the first domain, paired by seed."""
+        real = self.values(policy, domain, measure)
+        return Estimate.of(real - self.values(policy, self.domains[0], measure))
+
+    def regret(self, policy: str, domain: str) -> Estimate:
+        """ATT above that of the best policy evaluated in the domain, in s, paired by seed."""
+        best = min(self.policies, key=lambda name: self.estimate(name, domain, "att_s").mean)
+        mine = self.values(policy, domain, "att_s")
+        return Estimate.of(mine - self.values(best, domain, "att_s"))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, for JSON: the summary and every episode."""
+        summary: list[dict[str, Any]] = []
+        for policy in self.policies:
+            for domain in self.domains:
+                row: dict[str, Any] = {"policy": policy, "domain": domain}
+                for measure in MEASURES:
+                    row[measure] = asdict(self.estimate(policy, domain, measure))
+                    if domain != self.domains[0]:
+                        row[f"{measure}_gap"] = asdict(self.gap(policy, domain, measure))
+                row["regret_s"] = asdict(self.regret(policy, domain))
+                summary.append(row)
+        return {
+            "scenario": self.scenario,
+            "scenario_hash": self.scenario_hash,
+            "notes": dict(self.notes),
+            "summary": summary,
+            "episodes": [
+                {"policy": r.policy, "domain": r.domain, "seed": r.seed, **asdict(r.scores)}
+                for r in self.results
+            ],
+        }
+
+    def write(self, path: Path) -> None:
+        """Writes `as_dict` as JSON, whole or not at all; what has no value is null."""
+        content = json.dumps(_without_nan(self.as_dict()), indent=1, allow_nan=False)
+        write_whole(path, content + "\n")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One setting of a rule.
+
+    Attributes:
+        spec: Its spelling.
+        att_s: Mean ATT over its episodes.
+        episodes: How many it was given; those that fell behind have fewer.
+    """
+
+    spec: str
+    att_s: float
+    episodes: int
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """A rule with the best of its settings.
+
+    Attributes:
+        rule: Name of the rule.
+        domain: Name of the domain.
+        trials: Everything tried, the best one first.
+    """
+
+    rule: str
+    domain: str
+    trials: tuple[Trial, ...]
+
+    @property
+    def best(self) -> Trial:
+        """The setting that won."""
+        return self.trials[0]
+
+    @property
+    def episodes(self) -> int:
+        """Episodes played for it."""
+        return sum(trial.episodes for trial in self.trials)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
