@@ -47,8 +47,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "bench.fitting:FittingBench",
         "what each uncertainty costs and is worth",
     ),
+    "bench strength": (
+        "bench.strength:StrengthBench",
+        "is the learner as good as the best rule where it was trained?",
+    ),
     "bench memory": ("bench.memory:MemoryBench", "memory over many resets"),
-    "bench all": ("bench.everything:AllBench", "all four"),
+    "bench all": ("bench.everything:AllBench", "all but strength"),
 }
 
 USAGE_ERROR = 2

@@ -1,4 +1,4 @@
-"""The suite's figures, measured: speed of the environment, cost of learning and fitting, memory.
+"""The suite's figures, measured: speed of the environment, cost and worth of learning, memory.
 
 Every bench is a frozen dataclass of options with a ``run()`` that returns a `Report`: rows, targets
 and what they were measured on. Ratios are taken between runs of the same round, next to each other
@@ -11,6 +11,7 @@ from ugat_marl.bench.learning import LearningBench
 from ugat_marl.bench.memory import MemoryBench
 from ugat_marl.bench.report import Report, Spread, Target
 from ugat_marl.bench.speed import EnvBench
+from ugat_marl.bench.strength import StrengthBench
 
 __all__ = [
     "AllBench",
@@ -20,5 +21,6 @@ __all__ = [
     "MemoryBench",
     "Report",
     "Spread",
+    "StrengthBench",
     "Target",
 ]

@@ -15,7 +15,7 @@ from ugat_marl.progress import Reporter
 
 @dataclass(frozen=True)
 class AllBench:
-    """All benches, one after the other.
+    """All benches that measure the machine's time and memory, one after the other.
 
     Examples:
         ugat-marl bench all --env.rounds 3 --out bench
