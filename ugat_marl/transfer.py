@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,8 +11,9 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from ugat_marl.controllers import STANDARD_RULES
+from ugat_marl.controls import Control, file_name, train_control
 from ugat_marl.effects import describe, in_domain, load
-from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.evaluation import (
     TUNING_SEED,
     Evaluation,
@@ -23,13 +23,16 @@ from ugat_marl.evaluation import (
     fixed_policy,
     rule_factory,
 )
+from ugat_marl.grounding.random_delays import RandomDelays
 from ugat_marl.grounding.view import neighbours_of
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
+from ugat_marl.placebo import PLACEBOS, Placebo, answer_with_noise
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Reporter, Silent
+from ugat_marl.randomised import randomised_env
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
@@ -43,7 +46,7 @@ from ugat_marl.ugat import (
     restore,
     train_ugat,
 )
-from ugat_marl.worlds import RecordedWorld, SimulatedWorld, World
+from ugat_marl.worlds import RecordedWorld, ShuffledWorld, SimulatedWorld, World
 
 EVALUATION_SEED = 1000
 """First seed of the reported episodes; apart from those of training and of the search for rules."""
@@ -51,6 +54,13 @@ EVALUATION_SEED = 1000
 DIRECT, UGAT, TIMED = "direct transfer", "UGAT", "UGAT, timed"
 CONTROL = "more plain sim"
 CORRECTED = "corrected sim"
+RANDOMISED = "domain randomisation"
+RANDOM_DELAY = "random delay"
+FINE_TUNED = "fine-tuned on the same data"
+ORACLE = "trained in real"
+
+ADDED = ("control", "further", "randomised", "random_delay_s", "fine_tuned", "oracle")
+"""Options that add policies to the table and change none of the others."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +88,16 @@ class TransferConfig:
             the real domain itself.
         corrected: A corrected simulation, as `ugat-marl diagnose` writes it, or any other domain: a
             further policy is trained there from scratch, for as many episodes as UGAT in all.
+        randomised: Also train from scratch, for as many episodes as UGAT in all, each of them in a
+            world drawn from the ranges of the effects.
+        random_delay_s: Also train direct transfer on, as long as the control, while greens begin
+            late by random whole seconds up to this.
+        fine_tuned: Also train direct transfer on in the real domain, for as many episodes as UGAT
+            sees of it.
+        oracle: Also train from scratch in the real domain, for as many episodes as UGAT in all.
+        placebo: A negative control, with which grounding must do nothing: "same-world" takes D_real
+            from the simulation, "shuffled" deals out anew what followed in D_real, "noise" puts
+            noise in the place of f.
         ugat: Settings of the algorithm.
         dqn: Settings of the learner.
     """
@@ -97,6 +117,11 @@ class TransferConfig:
     control: bool = True
     further: tuple[str, ...] = ()
     corrected: str | None = None
+    randomised: bool = False
+    random_delay_s: int | None = None
+    fine_tuned: bool = False
+    oracle: bool = False
+    placebo: Placebo = "none"
     ugat: Annotated[UgatConfig, arg(name="")] = field(default_factory=UgatConfig)
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
@@ -106,9 +131,10 @@ class TransferConfig:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
         if self.rule_budget is not None and self.rule_budget < LEAST_BUDGET:
             raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
-        if describe(self.real) == describe(self.sim):
+        if describe(self.real) == describe(self.sim) and self.placebo != "same-world":
             raise OptionError(
-                f"real = {self.real!r} is the simulation itself; name another domain, such as V4"
+                f"real = {self.real!r} is the simulation itself; name another domain, such as V4, "
+                'or ask for the placebo "same-world"'
             )
         if len({describe(domain) for domain in self.further}) < len(self.further):
             raise OptionError(f"further holds one twice: {' '.join(self.further)}")
@@ -119,6 +145,20 @@ class TransferConfig:
             )
         if self.real == "none" and self.real_log is None:
             raise OptionError('real = "none" needs a real_log: something must be known of the real')
+        self._refuse_impossible_controls()
+
+    def _refuse_impossible_controls(self) -> None:
+        if self.placebo not in PLACEBOS:
+            raise UnknownNameError("placebo", self.placebo, PLACEBOS)
+        if self.placebo == "same-world" and self.real_log is not None:
+            raise OptionError('the placebo "same-world" takes the place of a real_log; give one')
+        if self.random_delay_s is not None and self.random_delay_s < 1:
+            raise OptionError(f"random_delay_s = {self.random_delay_s}: must be at least 1")
+        for name in ("fine_tuned", "oracle"):
+            if getattr(self, name) and len(self.domains) < 2:
+                raise OptionError(f"{name} needs a real domain to train in, not {self.real!r}")
+        if self.fine_tuned and self.real_log is not None:
+            raise OptionError("fine_tuned acts in the real domain, which a real_log does not allow")
 
     @property
     def env_options(self) -> dict[str, Any]:
@@ -133,7 +173,8 @@ class TransferConfig:
     @property
     def domains(self) -> list[str]:
         """The domains the policies are judged in."""
-        return [self.sim] if self.real == "none" else [self.sim, self.real]
+        only = self.real == "none" or describe(self.real) == describe(self.sim)
+        return [self.sim] if only else [self.sim, self.real]
 
     @property
     def episodes(self) -> int:
@@ -165,16 +206,12 @@ def transfer(
         log = TransitionLog.read(config.real_log)
         recorded = RecordedWorld(log, env)  # refuses a misfit before anything is written
         _say_if_from_elsewhere(log, config, reporter)
-    others = {
-        f"further in {describe(domain)}": _other_env(config, scenario, env, "further", domain)
-        for domain in config.further
-    }
-    corrected: TrafficEnv | None = None
-    if config.corrected is not None:
-        corrected = _other_env(config, scenario, env, "corrected", config.corrected)
+    controls = _controls(config, scenario, env)
     learner = DQN.of(env, config.dqn, config.seed)
     transform = config.ugat.transform(env.layouts, config.seed, neighbours_of(env))
-    run = Run(directory, _identity(config, scenario, env, corrected), resume, reporter)
+    if config.placebo == "noise":
+        answer_with_noise(transform.forward, config.seed)
+    run = Run(directory, _identity(config, scenario, env, controls), resume, reporter)
     try:
         state = State(learner, transform)
         restore(state, run, DQNPolicy.load)
@@ -183,21 +220,17 @@ def transfer(
         if state.direct is not None:
             policies[DIRECT] = state.direct
         policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
-        if config.control:
-            title = "control: more plain sim"
-            policies[CONTROL] = _further(config, env, run, "control-learner.pt", title)
-        for name, other in others.items():
-            policies[name] = _further(config, other, run, f"{_file(name)}-learner.pt", name)
-        if corrected is not None:
-            policies[CORRECTED] = _from_scratch(config, corrected, run)
+        direct = directory / DIRECT_LEARNER
+        for control in controls:
+            trained = train_control(control, config.dqn, config.seed, run, direct, CHUNK)
+            policies[control.name] = trained
     finally:
-        for made in (env, corrected, *others.values()):
-            if made is not None:
-                made.close()
+        for made in (env, *(control.env for control in controls)):
+            made.close()
         run.close()
     for name, trained in policies.items():
         if isinstance(trained, DQNPolicy):
-            trained.save(directory / "policies" / f"{_file(name)}.pt")
+            trained.save(directory / "policies" / f"{file_name(name)}.pt")
     table = judge(config, scenario, policies, reporter)
     table.write(directory / "table.json")
     return table
@@ -276,7 +309,10 @@ def _train(
         return SimulatedWorld(make, name, episodes, config.ugat.rollout_epsilon, most_delay_s)
 
     sim: World = world(config.sim, "sim", config.ugat.sim_rollouts, config.ugat.most_delay_s)
-    real: World = recorded or world(config.real, "real", config.ugat.real_rollouts)
+    street = config.sim if config.placebo == "same-world" else config.real
+    real: World = recorded or world(street, "real", config.ugat.real_rollouts)
+    if config.placebo == "shuffled":
+        real = ShuffledWorld(real)
     try:
         return train_ugat(state, env, sim, real, config.ugat, config.seed, run, probe)
     finally:
@@ -284,11 +320,37 @@ def _train(
         real.close()
 
 
-def _further(config: TransferConfig, env: TrafficEnv, run: Run, file: str, title: str) -> Policy:
-    """Direct transfer trained on in `env`, for as many episodes as the iterations had."""
-    progress = run.directory / file
-    start = progress if progress.exists() else run.directory / DIRECT_LEARNER
-    return _trained_on(config, env, run, start, progress, title)
+def _controls(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> list[Control]:
+    """The policies asked for beside UGAT's; their environments are not started."""
+
+    def world(option: str, domain: str) -> TrafficEnv:
+        return _other_env(config, scenario, env, option, domain)
+
+    plain, whole = config.ugat.pretrain_episodes, config.episodes
+    found: list[Control] = []
+    if config.control:
+        title = "control: more plain sim"
+        found.append(Control(CONTROL, env, whole, file="control-learner.pt", title=title))
+    for domain in config.further:
+        name = f"further in {describe(domain)}"
+        found.append(Control(name, world("further", domain), whole))
+    if config.random_delay_s is not None:
+        late = RandomDelays(world("sim", config.sim), config.random_delay_s)
+        found.append(Control(f"{RANDOM_DELAY} 0-{config.random_delay_s} s", late, whole))
+    if config.fine_tuned:
+        seen = config.ugat.iterations * config.ugat.real_rollouts
+        found.append(Control(FINE_TUNED, world("real", config.real), plain + seen))
+    if config.randomised:
+        worlds = randomised_env(scenario, config.env_options, config.sim)
+        found.append(Control(RANDOMISED, worlds, whole, from_direct=False))
+    if config.corrected is not None:
+        made = world("corrected", config.corrected)
+        file = "corrected-learner.pt"
+        found.append(Control(CORRECTED, made, whole, from_direct=False, file=file))
+    if config.oracle:
+        made = world("real", config.real)
+        found.append(Control(ORACLE, made, whole, from_direct=False, file="oracle-learner.pt"))
+    return found
 
 
 def _other_env(
@@ -305,59 +367,26 @@ def _other_env(
     return env
 
 
-def _from_scratch(config: TransferConfig, env: TrafficEnv, run: Run) -> Policy:
-    """The same learner from the same seed, with all its episodes in `env`."""
-    progress = run.directory / "corrected-learner.pt"
-    start = progress if progress.exists() else None
-    return _trained_on(config, env, run, start, progress, CORRECTED)
-
-
-def _trained_on(
-    config: TransferConfig,
-    env: TrafficEnv,
-    run: Run,
-    start: Path | None,
-    progress: Path,
-    title: str,
-) -> Policy:
-    """The learner in `start`, or a fresh one, trained until it has the episodes UGAT has.
-
-    It is saved to `progress` every few episodes, where an interrupted run goes on.
-    """
-    learner = DQN.of(env, config.dqn, config.seed)
-    if start is not None:
-        learner.load(start)
-    left = config.episodes - learner.episodes
-    with run.reporter.task(title, max(left, 0)) as advance:
-        while left > 0:
-            episodes = min(CHUNK, left)
-            learner.learn(env, episodes, config.seed, lambda _number, _numbers: advance())
-            learner.save(progress)
-            left -= episodes
-    return learner.policy()
-
-
-def _file(name: str) -> str:
-    """The name of a policy as the name of a file."""
-    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
-
-
 def _digest(path: Path) -> str:
     """A log is the same if its content is, wherever it lies."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _identity(
-    config: TransferConfig, scenario: Scenario, env: TrafficEnv, corrected: TrafficEnv | None
+    config: TransferConfig, scenario: Scenario, env: TrafficEnv, controls: Sequence[Control]
 ) -> dict[str, Any]:
     settings = asdict(config)
-    for judging in ("evaluation_seeds", "tuning_seeds", "rule_budget", "control", "further"):
-        settings.pop(judging)
+    for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", *ADDED):
+        settings.pop(other)
+    if config.placebo == "none":  # runs from before there were any can be resumed
+        settings.pop("placebo")
     settings.pop("corrected")  # a scenario is the same if its hash is, wherever it lies
     settings["real_log"] = _digest(config.real_log) if config.real_log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":
         hashes["real"] = in_domain(scenario, config.real).hash
-    if corrected is not None:
-        hashes["corrected"] = corrected.scenario.hash
+    for control in controls:
+        if control.name == CORRECTED:
+            corrected: Any = control.env
+            hashes["corrected"] = corrected.scenario.hash
     return {**settings, "scenario_hash": hashes, "domains": [describe(d) for d in config.domains]}

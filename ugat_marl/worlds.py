@@ -6,11 +6,13 @@ import threading
 from collections.abc import Callable
 from typing import Protocol
 
+import polars as pl
+
 from ugat_marl.errors import LogError
 from ugat_marl.grounding.random_delays import RandomDelays
 from ugat_marl.policy import AnyParallelEnv, Policy
 from ugat_marl.rollout import Exploring, observer_of, roll_out, until
-from ugat_marl.seeding import derive_seed
+from ugat_marl.seeding import derive_seed, numpy_generator
 from ugat_marl.traffic_env import TrafficEnv
 from ugat_marl.transitions import TransitionLog
 
@@ -125,3 +127,50 @@ class RecordedWorld:
 
     def close(self) -> None:
         """Nothing to give up."""
+
+
+class ShuffledWorld:
+    """Another world whose transitions lead anywhere: a negative control.
+
+    Among the rows of an agent, what followed is dealt out anew. Where vehicles were and what they
+    did next is as it was; that one came of the other is not.
+
+    Args:
+        world: Where the transitions come from.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
+        """The other world's transitions, shuffled."""
+        log = self._world.collect(policy, iteration, seed)
+        return None if log is None else shuffled(log, derive_seed(seed, "shuffled", iteration))
+
+    def stop(self) -> None:
+        """Ends what is under way in the other world."""
+        self._world.stop()
+
+    def close(self) -> None:
+        """Gives up what the other world holds."""
+        self._world.close()
+
+
+def shuffled(log: TransitionLog, seed: int) -> TransitionLog:
+    """The log with the outcomes of each agent's rows in random order.
+
+    What is seen next and what was served belong together, and stay so; state, action and reward
+    stay where they are.
+
+    Args:
+        log: Any log; it does not change.
+        seed: Of the order.
+    """
+    outcomes = ["next_observation", "served_features"]
+    parts: list[pl.DataFrame] = []
+    for agent in log.agents:
+        own = log.frame.filter(pl.col("agent") == agent)
+        order = numpy_generator(seed, "shuffled", agent).permutation(own.height)
+        parts.append(own.with_columns(own[name].gather(order) for name in outcomes))
+    frame = pl.concat(parts).sort("episode", "step", maintain_order=True)
+    return TransitionLog(log.provenance, frame)

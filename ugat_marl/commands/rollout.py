@@ -38,6 +38,7 @@ class Rollout:
         observation: What to record: count, queue, pressure, waiting, density, movements.
         neighbours: How many roads away intersections are recorded too.
         duration_s: Length of an episode in s; default: the scenario's own.
+        crossings: Also record when vehicles cross the stop lines: timed grounding reads it.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -50,6 +51,7 @@ class Rollout:
     observation: str = "count"
     neighbours: int = 0
     duration_s: float | None = None
+    crossings: bool = False
 
     def run(self, console: Console) -> int:
         """Records and writes."""
@@ -60,7 +62,8 @@ class Rollout:
         probe = parallel_env(scenario, self.domain, duration_s=self.duration_s)
         policy = policy_factory(self.policy)(probe)
         observer = observer_of(probe, self.observation, self.neighbours)
-        env = parallel_env(scenario, self.domain, duration_s=self.duration_s, **policy.env_options)
+        options = {"duration_s": self.duration_s, "crossings": self.crossings}
+        env = parallel_env(scenario, self.domain, **options, **policy.env_options)
         logs: list[TransitionLog] = []
         try:
             with Bars(console).task(f"{self.policy} in {env.domain}", self.episodes) as advance:
