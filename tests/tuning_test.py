@@ -45,7 +45,7 @@ class Streets:
         for spec in policies:
             for seed in seeds:
                 self.played.append((spec, domains[0], seed))
-        XX
+                values = parse_spec(spec)[1]
                 best = 50.0 if domains[0] == "sim" else 20.0
                 att_s = 100 + abs((values or (35.0,))[0] - best) + self.luck.get((spec, seed), 0.0)
                 results.append(Result(spec, domains[0], seed, replace(BASE, att_s=att_s)))
