@@ -28,8 +28,8 @@ class Evaluate:
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
-        policies: Rules (fixed-time:30, largest-queue:20, max-pressure:10, programme, random) and
-            files of trained policies.
+        policies: Rules (such as fixed-time:30, actuated:40, largest-queue:20, max-pressure:10,
+            programme; docs/controllers.md has them all) and files of trained policies.
         domains: Domains; gaps are taken against the first.
         seeds: Number of episodes of each policy in each domain.
         first_seed: Seed of the first of them.
