@@ -27,8 +27,13 @@ def machine_facts() -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": {name: version_of(name) for name in _LIBRARIES},
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": shlex.join([_program(), *sys.argv[1:]]),
     }
+
+
+def _program() -> str:
+    name = Path(sys.argv[0]).name
+    return "ugat-marl" if name == "__main__.py" else name
 
 
 def cpu_model() -> str:

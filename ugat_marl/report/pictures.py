@@ -13,7 +13,7 @@ from ugat_marl.evaluation import Evaluation
 from ugat_marl.files import replacing
 from ugat_marl.training import Metrics
 
-_COLOURS = ("#4c78a8", "#e45756", "#f58518", "#54a24b", "#b279a2")
+COLOURS = ("#4c78a8", "#e45756", "#f58518", "#54a24b", "#b279a2")
 
 
 def transfer_picture(found: Evaluation, metrics: Metrics, path: Path) -> None:
@@ -66,8 +66,8 @@ def _risks(axes: Any, found: dict[int, dict[str, float]]) -> None:
         risks = [v for name, v in sorted(found[step].items()) if name.startswith("risk_by_cov")]
         shares = [(i + 1) / len(risks) for i in range(len(risks))]
         label = f"iteration {step} (AUROC {found[step]['auroc']:.2f}, ECE {found[step]['ece']:.2f})"
-        axes.plot(shares, risks, "o-", color=_COLOURS[number], label=label)
-        axes.axhline(risks[-1], color=_COLOURS[number], ls="--", lw=1)
+        axes.plot(shares, risks, "o-", color=COLOURS[number], label=label)
+        axes.axhline(risks[-1], color=COLOURS[number], ls="--", lw=1)
     axes.set_xlabel("share of answers taken, lowest u first")
     axes.set_ylabel("wrong among them")
     axes.set_ylim(bottom=0)
@@ -80,7 +80,7 @@ def _levels(axes: Any, found: dict[int, dict[str, float]]) -> None:
     for number, (name, label) in enumerate(
         (("mean_u", "on held-out data"), ("mean_u_off_data", "off the data"))
     ):
-        axes.plot(steps, [found[s][name] for s in steps], "o-", color=_COLOURS[number], label=label)
+        axes.plot(steps, [found[s][name] for s in steps], "o-", color=COLOURS[number], label=label)
     axes.set_xlabel("iteration")
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylabel("mean u")
@@ -100,7 +100,7 @@ def _bars(axes: Any, found: Evaluation) -> None:
         spots = places + (number - (len(found.domains) - 1) / 2) * width
         axes.bar(
             spots, means, width * 0.92, yerr=np.stack([low, high]), label=domain,
-            color=_COLOURS[number % len(_COLOURS)], error_kw={"lw": 1, "capsize": 2},
+            color=COLOURS[number % len(COLOURS)], error_kw={"lw": 1, "capsize": 2},
         )  # fmt: skip
         for spot, mean, above in zip(spots, means, high, strict=True):
             axes.annotate(
@@ -129,7 +129,7 @@ def _curves(axes: Any, found: Evaluation, metrics: Metrics) -> None:
             for stage, step, name, value in metrics.rows
             if stage == "iteration" and name == f"att_s/{domain}"
         )
-        colour = _COLOURS[number % len(_COLOURS)]
+        colour = COLOURS[number % len(COLOURS)]
         if points:
             axes.plot(*zip(*points, strict=True), "o-", color=colour, label=f"in {domain}")
         rule = f"rule {found.notes.get(f'best rule in {domain}')}"

@@ -1,0 +1,120 @@
+"""Intervals, paired tests and shares of regret, against tables and sums done by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ugat_marl.comparison import (
+    Comparison,
+    Interval,
+    PairedTest,
+    Trial,
+    student_p,
+    student_quantile,
+)
+from ugat_marl.metrics import Scores
+from ugat_marl.report.comparison_tables import as_csv, markdown, seeds_csv
+
+BLANK = Scores(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+FACTS = {
+    "command": "ugat-marl paper main", "cpu": "some", "cores": 2, "python": "3.11",
+    "versions": {"torch": "2"}, "date": "2026-01-02T03:04:05",
+}  # fmt: skip
+
+
+def trials(setting: str, by_seed: dict[int | None, tuple[float, float]]) -> list[Trial]:
+    """Two episodes per domain whose mean is the ATT asked for, as (sim, V4)."""
+    return [
+        Trial(setting, "V4", domain, training, seed, replace(BLANK, att_s=att + off))
+        for training, both in by_seed.items()
+        for domain, att in zip(("sim", "V4"), both, strict=True)
+        for seed, off in ((1, -1.0), (2, 1.0))
+    ]
+
+
+@pytest.fixture
+def found() -> Comparison:
+    rows = [
+        *trials("direct transfer", {0: (70.0, 200.0), 1: (72.0, 240.0)}),
+        *trials("UGAT", {1: (71.0, 150.0), 0: (71.0, 130.0)}),
+        *trials("constant delay 2 s", {0: (70.0, 120.0), 1: (70.0, 160.0)}),
+        *trials("best rule, tuned there", {None: (80.0, 120.0)}),
+    ]
+    return Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
+
+
+@pytest.mark.parametrize(
+    ("degrees", "quantile"),
+    [(1, 12.706), (2, 4.303), (3, 3.182), (4, 2.776), (5, 2.571), (9, 2.262), (30, 2.042)],
+)
+def test_quantiles_are_those_of_the_printed_tables(degrees: int, quantile: float) -> None:
+    assert student_quantile(0.975, degrees) == pytest.approx(quantile, abs=5e-4)
+    assert student_p(quantile, degrees) == pytest.approx(0.05, abs=1e-4)
+
+
+def test_p_values_are_symmetric_and_bounded() -> None:
+    assert student_p(0.0, 4) == 1.0
+    assert student_p(-2.0, 4) == student_p(2.0, 4)
+    assert 0.0 <= student_p(1e9, 4) < 1e-9
+    assert student_p(1.0, 1) == pytest.approx(0.5)  # Cauchy: P(|t| > 1) = 1/2
+
+
+def test_an_interval_by_hand() -> None:
+    found = Interval.of(np.array([1.0, 2.0, 3.0]))
+    half = 4.3027 / math.sqrt(3)  # the standard deviation is 1
+    assert (found.mean, found.low, found.high) == pytest.approx((2.0, 2 - half, 2 + half), abs=1e-3)
+    assert math.isnan(Interval.of(np.array([5.0])).low)
+
+
+def test_a_paired_test_sees_what_an_unpaired_one_would_not() -> None:
+    one, other = np.array([10.0, 50.0, 90.0]), np.array([11.0, 52.0, 91.0])
+    test = PairedTest.of(one, other)
+    assert test.difference.mean == pytest.approx(-4 / 3)
+    # t = (4/3) / (0.57735 / sqrt 3) = 4; with two degrees of freedom p = 1 - 4 / sqrt(2 + 16)
+    assert test.p == pytest.approx(1 - 4 / math.sqrt(18))
+    assert (test.better, test.count) == (3, 3)
+
+
+def test_equal_differences() -> None:
+    same = np.array([3.0, 4.0])
+    assert PairedTest.of(same, same).p == 1.0
+    assert PairedTest.of(same - 1, same).p == 0.0
+
+
+def test_values_are_in_the_order_of_the_training_seeds(found: Comparison) -> None:
+    assert found.training_seeds == [0, 1]
+    assert found.values("UGAT", "V4", "att_s").tolist() == [130.0, 150.0]
+    assert found.values("best rule, tuned there", "V4", "att_s").tolist() == [120.0, 120.0]
+    assert found.gaps("direct transfer", "V4", "att_s").tolist() == [130.0, 168.0]
+
+
+def test_regret_won_back_by_hand(found: Comparison) -> None:
+    assert found.best("V4") == "best rule, tuned there"
+    assert found.won_back("UGAT", "V4", "direct transfer") == pytest.approx((220 - 140) / 100)
+    assert found.won_back("direct transfer", "V4", "direct transfer") == 0.0
+    assert found.won_back("best rule, tuned there", "V4", "direct transfer") == 1.0
+    # the gap: 149 s before, (130 - 71 + 150 - 71) / 2 = 69 after
+    assert found.reduction("UGAT", "V4", "direct transfer") == pytest.approx(1 - 69 / 149)
+
+
+def test_nothing_to_win_has_no_share() -> None:
+    rows = trials("direct transfer", {0: (70.0, 80.0)}) + trials("UGAT", {0: (70.0, 90.0)})
+    found = Comparison("toy", "0", "sim", tuple(rows), {"table": "main"})
+    assert math.isnan(found.won_back("UGAT", "V4", "direct transfer"))
+
+
+def test_pages_hold_the_numbers(found: Comparison) -> None:
+    page = markdown(found, "direct transfer", FACTS)
+    assert "# toy: main" in page
+    assert "| UGAT | −54 % |" in page
+    assert "| UGAT | 0.80 |" in page
+    assert "| best constant | 2 s |" in page
+    assert "| UGAT | -80.0 (" in page
+    table = as_csv(found).splitlines()
+    assert len(table) == 5
+    assert table[0].startswith("scenario,setting,domain,training_seeds,att_s,")
+    assert "UGAT,V4,0,130.0,71.0,0.0" in seeds_csv(found).splitlines()

@@ -1,0 +1,152 @@
+"""``ugat-marl paper``: the tables of the UGAT paper, and those it lacks."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from rich.console import Console
+from tyro.conf import arg
+
+from ugat_marl.bench.machine import machine_facts, usable_cores
+from ugat_marl.comparison import Comparison
+from ugat_marl.errors import OptionError
+from ugat_marl.files import require_writable, write_whole
+from ugat_marl.paper.settings import DIRECT, GROUNDED_NAME
+from ugat_marl.paper.tables import PaperConfig, compare
+from ugat_marl.progress import Bars
+from ugat_marl.report.comparison_pictures import gap_picture, radar_picture
+from ugat_marl.report.comparison_tables import as_csv, markdown, seeds_csv, terminal_tables
+
+
+@dataclass(frozen=True)
+class _Paper:
+    """What all tables have in common."""
+
+    config: Annotated[PaperConfig, arg(name="")]
+    out: Path = Path("results")
+    runs: Path = Path("runs/paper")
+    jobs: int | None = None
+
+    table: ClassVar[str]
+
+    def run(self, console: Console) -> int:
+        """Trains, plays, prints the table, writes it as Markdown, CSV and PNG."""
+        if self.jobs is not None and self.jobs < 1:
+            raise OptionError(f"jobs = {self.jobs}: must be at least 1")
+        for scenario in self.config.scenario:
+            folder = self.out / self._folder(scenario)
+            require_writable(folder / "table.md")
+            jobs = self.jobs or usable_cores()
+            found = compare(self.table, scenario, self.config, self.runs, jobs, Bars(console))
+            _write(found, folder)
+            console.print(terminal_tables(found, DIRECT))
+            console.print(f"table and pictures: {folder}\ntrainings: {self.runs}", soft_wrap=True)
+        return 0
+
+    def _folder(self, scenario: str) -> str:
+        name = Path(scenario).name.removesuffix(".sumocfg")
+        return f"{re.sub(r'[^A-Za-z0-9_.+-]+', '-', name).strip('-')}/{self.table}"
+
+
+@dataclass(frozen=True)
+class Main(_Paper):
+    """UGAT beside direct transfer and every control an honest table needs.
+
+    Trained on in plain sim, under domain randomisation, with random and with constant delays of
+    greens, fine-tuned on as much real data, trained in the real domain, and the best rule tuned
+    there. Finished trainings are kept in --runs and used again, by the other tables, too; a killed
+    run goes on where it was.
+
+    Examples:
+        ugat-marl paper main
+        ugat-marl paper main --scenario grid4x4-v1 --domains V3 V4 --seeds 3 --episodes 40
+
+    Attributes:
+        config: What is trained, how often, and how it is judged.
+        out: Folder of the tables.
+        runs: Folder of the trainings.
+        jobs: Trainings at a time; default: one per core.
+    """
+
+    table: ClassVar[str] = "main"
+
+
+@dataclass(frozen=True)
+class Ablation(_Paper):
+    """UGAT without its parts: static α, no gate, no uncertainty, no grounding (paper, Table 3).
+
+    Examples:
+        ugat-marl paper ablation
+        ugat-marl paper ablation --domains V1 V4 --groundings phase
+
+    Attributes:
+        config: What is trained, how often, and how it is judged.
+        out: Folder of the tables.
+        runs: Folder of the trainings.
+        jobs: Trainings at a time; default: one per core.
+    """
+
+    table: ClassVar[str] = "ablation"
+
+
+@dataclass(frozen=True)
+class Alpha(_Paper):
+    """Static thresholds α against the dynamic one (paper, Table 4).
+
+    Examples:
+        ugat-marl paper alpha
+
+    Attributes:
+        config: What is trained, how often, and how it is judged.
+        out: Folder of the tables.
+        runs: Folder of the trainings.
+        jobs: Trainings at a time; default: one per core.
+    """
+
+    table: ClassVar[str] = "alpha"
+
+
+@dataclass(frozen=True)
+class Uncertainty(_Paper):
+    """Evidential, Concrete Dropout, Deep Ensembles and none, as bars of the gaps (paper, Fig. 4).
+
+    Examples:
+        ugat-marl paper uncertainty --domains V1 V2 V3 V4
+
+    Attributes:
+        config: What is trained, how often, and how it is judged.
+        out: Folder of the tables.
+        runs: Folder of the trainings.
+        jobs: Trainings at a time; default: one per core.
+    """
+
+    table: ClassVar[str] = "uncertainty"
+
+
+@dataclass(frozen=True)
+class Gap(_Paper):
+    """What direct transfer loses in each real domain, as radar charts (paper, Fig. 3).
+
+    Examples:
+        ugat-marl paper gap --scenario single-v1 grid2x2-v1
+
+    Attributes:
+        config: What is trained, how often, and how it is judged.
+        out: Folder of the tables.
+        runs: Folder of the trainings.
+        jobs: Trainings at a time; default: one per core.
+    """
+
+    table: ClassVar[str] = "gap"
+
+
+def _write(found: Comparison, folder: Path) -> None:
+    write_whole(folder / "table.md", markdown(found, DIRECT, machine_facts()) + "\n")
+    write_whole(folder / "table.csv", as_csv(found))
+    write_whole(folder / "seeds.csv", seeds_csv(found))
+    drawn = [DIRECT, *(name for name in GROUNDED_NAME.values() if name in found.settings)]
+    radar_picture(found, drawn, folder / "radar.png")
+    gap_picture(found, folder / "gaps.png")

@@ -1,0 +1,249 @@
+"""Settings x training seeds x domains: what a method is worth, with intervals over training seeds.
+
+One training is one sample. Episodes of its evaluation are averaged first; intervals are Student's
+over training seeds, and two settings are compared seed by seed: the same seed means the same
+initial weights, the same episodes of plain training and the same traffic in the evaluation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.metrics import MEASURES, Scores
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One episode of one trained policy.
+
+    Attributes:
+        setting: How the policy was made.
+        target: The real domain it was made for; results of a policy that knows none stand there
+            once per domain.
+        domain: Where the episode was played: the simulation or the target.
+        training_seed: Seed of the training; None for a rule, which has none.
+        seed: Seed of the episode.
+        scores: How it went.
+    """
+
+    setting: str
+    target: str
+    domain: str
+    training_seed: int | None
+    seed: int
+    scores: Scores
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean over training seeds with its 95 % interval (nan for a single seed)."""
+
+    mean: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Floats) -> Interval:
+        """Student's interval of the mean of ``(n,)`` values."""
+        mean, count = float(values.mean()), values.size
+        if count < 2:
+            return cls(mean, math.nan, math.nan)
+        half = student_quantile(0.975, count - 1) * float(values.std(ddof=1)) / math.sqrt(count)
+        return cls(mean, mean - half, mean + half)
+
+
+@dataclass(frozen=True)
+class PairedTest:
+    """A difference between two settings, seed by seed.
+
+    Attributes:
+        difference: One minus the other.
+        p: Two-sided, of Student's paired test; nan for a single seed.
+        better: Number of seeds in which the difference is below zero.
+        count: Number of seeds.
+    """
+
+    difference: Interval
+    p: float
+    better: int
+    count: int
+
+    @classmethod
+    def of(cls, one: Floats, other: Floats) -> PairedTest:
+        """Of two settings, ``(n,)`` each, in the same order of seeds."""
+        differences = one - other
+        count, better = differences.size, int((differences < 0).sum())
+        p = math.nan
+        if count > 1:
+            spread = float(differences.std(ddof=1))
+            t = abs(float(differences.mean())) * math.sqrt(count)
+            # Equal differences leave no doubt, or none to settle.
+            p = student_p(t / spread, count - 1) if spread > 0 else float(t == 0)
+        return cls(Interval.of(differences), p, better, count)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All trials of a table.
+
+    Attributes:
+        scenario: Id of the scenario.
+        scenario_hash: Its hash.
+        sim: The simulation, as the trials spell it.
+        trials: One per setting, target, domain, training seed and episode.
+        notes: What else a reader must know.
+    """
+
+    scenario: str
+    scenario_hash: str
+    sim: str
+    trials: tuple[Trial, ...]
+    notes: Mapping[str, str]
+
+    @property
+    def settings(self) -> list[str]:
+        """Names of the settings, in their order."""
+        return list(dict.fromkeys(trial.setting for trial in self.trials))
+
+    @property
+    def targets(self) -> list[str]:
+        """The real domains, in their order."""
+        return list(dict.fromkeys(trial.target for trial in self.trials))
+
+    @property
+    def training_seeds(self) -> list[int]:
+        """Seeds of the trainings, ascending."""
+        return sorted({t.training_seed for t in self.trials if t.training_seed is not None})
+
+    def has(self, setting: str, target: str) -> bool:
+        """Whether there are trials of the setting for that domain."""
+        return any(t.setting == setting and t.target == target for t in self.trials)
+
+    def values(self, setting: str, target: str, measure: str, domain: str | None = None) -> Floats:
+        """Means over the episodes, one per training seed, ``(n,)``.
+
+        A rule stands beside every training with the same value.
+
+        Args:
+            setting: Name of the setting.
+            target: The real domain it was made for.
+            measure: A field of `Scores`.
+            domain: Where it was played; default: the target.
+        """
+        domain = target if domain is None else domain
+        found: dict[int | None, list[float]] = {}
+        for t in self.trials:
+            if (t.setting, t.target, t.domain) == (setting, target, domain):
+                found.setdefault(t.training_seed, []).append(getattr(t.scores, measure))
+        if None in found:
+            return np.full(max(len(self.training_seeds), 1), float(np.mean(found[None])))
+        means = [float(np.mean(found[seed])) for seed in sorted(found, key=lambda s: s or 0)]
+        return np.array(means)
+
+    def estimate(
+        self, setting: str, target: str, measure: str, domain: str | None = None
+    ) -> Interval:
+        """Mean and interval over training seeds."""
+        return Interval.of(self.values(setting, target, measure, domain))
+
+    def gaps(self, setting: str, target: str, measure: str) -> Floats:
+        """The measure in the target minus that in the simulation, one per training seed."""
+        there = self.values(setting, target, measure)
+        return there - self.values(setting, target, measure, self.sim)
+
+    def test(self, one: str, other: str, target: str, measure: str = "att_s") -> PairedTest:
+        """Two settings in a domain, by the same training seeds."""
+        return PairedTest.of(self.values(one, target, measure), self.values(other, target, measure))
+
+    def best(self, target: str, among: Sequence[str] | None = None) -> str:
+        """The setting with the lowest mean ATT in a domain."""
+        names = [name for name in among or self.settings if self.has(name, target)]
+        return min(names, key=lambda name: float(self.values(name, target, "att_s").mean()))
+
+    def won_back(self, setting: str, target: str, direct: str) -> float:
+        """Share of the regret of `direct` that is gone: 1 is as good as the best setting there.
+
+        A ratio of means over training seeds; nan where direct transfer leaves nothing to win.
+        """
+        best = float(self.values(self.best(target), target, "att_s").mean())
+        start = float(self.values(direct, target, "att_s").mean())
+        mine = float(self.values(setting, target, "att_s").mean())
+        return (start - mine) / (start - best) if start > best else math.nan
+
+    def reduction(self, setting: str, target: str, direct: str, measure: str = "att_s") -> float:
+        """By how much smaller the gap is than that of `direct`, as a share (paper, Table 2).
+
+        nan where direct transfer has no gap.
+        """
+        start = float(self.gaps(direct, target, measure).mean())
+        mine = float(self.gaps(setting, target, measure).mean())
+        return 1.0 - mine / start if start else math.nan
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One flat row per setting and target: means, intervals and gaps of all measures."""
+        found: list[dict[str, Any]] = []
+        for setting in self.settings:
+            for target in self.targets:
+                if not self.has(setting, target):
+                    continue
+                row: dict[str, Any] = {
+                    "scenario": self.scenario,
+                    "setting": setting,
+                    "domain": target,
+                    "training_seeds": self.values(setting, target, "att_s").size,
+                }
+                for measure in MEASURES:
+                    for name, values in (
+                        (measure, self.values(setting, target, measure)),
+                        (f"{measure}_sim", self.values(setting, target, measure, self.sim)),
+                        (f"{measure}_gap", self.gaps(setting, target, measure)),
+                    ):
+                        interval = Interval.of(values)
+                        row |= {
+                            name: interval.mean,
+                            f"{name}_low": interval.low,
+                            f"{name}_high": interval.high,
+                        }
+                found.append(row)
+        return found
+
+
+def student_p(t: float, degrees: int) -> float:
+    """Two-sided p-value of Student's t (Abramowitz and Stegun 26.7.3, 26.7.4).
+
+    Args:
+        t: The statistic.
+        degrees: Degrees of freedom, at least 1.
+    """
+    angle = math.atan(abs(t) / math.sqrt(degrees))
+    cosine, sine = math.cos(angle), math.sin(angle)
+    odd = degrees % 2 == 1
+    term = cosine if odd else 1.0
+    total = term if degrees > 1 else 0.0
+    for k in range(3 if odd else 2, degrees - 1, 2):
+        term *= cosine**2 * (k - 1) / k
+        total += term
+    inside = 2.0 / math.pi * (angle + sine * total) if odd else sine * total
+    return min(max(1.0 - inside, 0.0), 1.0)
+
+
+def student_quantile(level: float, degrees: int) -> float:
+    """The t below which Student's distribution has `level`, for 0.5 < level < 1."""
+    low, high = 0.0, 1.0
+    while student_p(high, degrees) > 2.0 * (1.0 - level):
+        high *= 2.0
+    for _ in range(80):
+        middle = (low + high) / 2.0
+        if student_p(middle, degrees) > 2.0 * (1.0 - level):
+            low = middle
+        else:
+            high = middle
+    return high

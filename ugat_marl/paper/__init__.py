@@ -1,0 +1,1 @@
+"""The paper's tables, and those it lacks: many trainings, resumable, beside each other."""

@@ -1,0 +1,160 @@
+"""What stands in the rows of a table: ways to come to a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from ugat_marl.errors import OptionError
+from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.gate import GateConfig
+from ugat_marl.ugat import UgatConfig
+
+Kind = Literal["direct", "grounded", "further", "scratch", "randomised", "delays", "rule"]
+
+DIRECT = "direct transfer"
+PLAIN = "more plain sim"
+PHASE = "UGAT"
+TIMED = "UGAT, timed"
+RANDOMISED = "domain randomisation"
+RANDOM_DELAY = "random delay"
+FINE_TUNED = "fine-tuned on the same data"
+ORACLE = "trained in real"
+RULE = "best rule, tuned there"
+
+TABLES = ("main", "ablation", "alpha", "uncertainty", "gap")
+GROUNDED_NAME = {"phase": PHASE, "timed": TIMED}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to come to a policy.
+
+    Attributes:
+        name: What it is called in the table.
+        kind: "direct" (plain training), "grounded" (UGAT), "further" (direct transfer trained on
+            in `world`), "scratch" (all episodes in `world`), "randomised" (all episodes in worlds
+            drawn at random), "delays" (direct transfer trained on under random delays), "rule".
+        world: Domain to train in; None for the real domain of the column.
+        ugat: Of UGAT, for "grounded".
+        episodes: Of training beyond, or instead of, the plain ones; None for as many as UGAT has.
+    """
+
+    name: str
+    kind: Kind
+    world: str | None = None
+    ugat: UgatConfig = field(default_factory=UgatConfig)
+    episodes: int | None = None
+
+    @property
+    def knows_target(self) -> bool:
+        """Whether the policy depends on the real domain it is judged in."""
+        by_world = self.kind in ("further", "scratch") and self.world is None
+        return by_world or self.kind in ("grounded", "rule")
+
+
+def settings_of(
+    table: str,
+    ugat: UgatConfig,
+    sim: str,
+    groundings: Sequence[str] = ("phase", "timed"),
+    constants: Sequence[int] = (1, 2, 3, 4, 5),
+) -> list[Setting]:
+    """The rows of a table.
+
+    Args:
+        table: One of `TABLES`.
+        ugat: Settings that the rows share.
+        sim: The simulation.
+        groundings: Which kinds of grounding to try: "phase", "timed".
+        constants: Constant delays in s that "main" sweeps.
+
+    Raises:
+        OptionError: A grounding, delay or table that does not exist.
+    """
+    for grounding in groundings:
+        if grounding not in GROUNDED_NAME:
+            raise OptionError(f"grounding {grounding!r}: allowed are phase and timed")
+    if not groundings:
+        raise OptionError("groundings is empty; name phase, timed, or both")
+    if wrong := [seconds for seconds in constants if seconds < 1]:
+        raise OptionError(f"constants holds {wrong[0]}: delays are whole seconds, at least 1")
+    bases = {name: replace(ugat, grounding=name) for name in groundings}
+    direct, rule = Setting(DIRECT, "direct"), Setting(RULE, "rule")
+    if table == "main":
+        return [direct, *_grounded(bases), *_controls(ugat, sim, constants), rule]
+    if table == "ablation":
+        rows = [direct, Setting(PLAIN, "further", sim)]
+        return rows + [row for name, base in bases.items() for row in _ablated(name, base)]
+    if table == "alpha":
+        return [direct] + [row for name, base in bases.items() for row in _alphas(name, base)]
+    if table == "uncertainty":
+        return [direct] + [row for name, base in bases.items() for row in _methods(name, base)]
+    if table == "gap":
+        return [direct, rule]
+    raise OptionError(f"table {table!r}: allowed are {', '.join(TABLES)}")
+
+
+def constant_name(seconds: int) -> str:
+    """The row of a constant delay."""
+    return f"constant delay {seconds} s"
+
+
+def _grounded(bases: dict[str, UgatConfig]) -> list[Setting]:
+    return [Setting(GROUNDED_NAME[name], "grounded", ugat=base) for name, base in bases.items()]
+
+
+def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Setting]:
+    seen = ugat.iterations * ugat.real_rollouts
+    return [
+        Setting(PLAIN, "further", sim),
+        Setting(RANDOMISED, "randomised"),
+        Setting(RANDOM_DELAY, "delays", sim),
+        *(Setting(constant_name(s), "further", f"late_green=*,{s}") for s in constants),
+        Setting(FINE_TUNED, "further", episodes=seen),
+        Setting(ORACLE, "scratch"),
+    ]
+
+
+def _ablated(name: str, base: UgatConfig) -> list[Setting]:
+    """Table 3 of the paper: static threshold, no uncertainty; the gate alone, too."""
+    full = GROUNDED_NAME[name]
+    static = replace(base, gate=replace(base.gate, mode="static", static_alpha=0.5))
+    ungated = replace(base, gate=replace(base.gate, mode="infinite"))
+    plain = replace(ungated, fit=replace(base.fit, uncertainty="none"))
+    return [
+        Setting(full, "grounded", ugat=base),
+        Setting(f"{full}: α = 0.5", "grounded", ugat=static),
+        Setting(f"{full}: no gate", "grounded", ugat=ungated),
+        Setting(f"{full}: no uncertainty (GAT)", "grounded", ugat=plain),
+    ]
+
+
+def _alphas(name: str, base: UgatConfig) -> list[Setting]:
+    full = GROUNDED_NAME[name]
+    static = [
+        Setting(f"{full}: α = {alpha}", "grounded", ugat=replace(base, gate=_static(base, alpha)))
+        for alpha in (0.2, 0.4, 0.5, 0.6, 0.8)
+    ]
+    pooled = replace(base, gate=replace(base.gate, scope="pooled"))
+    rows = [*static, Setting(full, "grounded", ugat=base)]
+    return [*rows, Setting(f"{full}: α pooled over the network", "grounded", ugat=pooled)]
+
+
+def _static(base: UgatConfig, alpha: float) -> GateConfig:
+    return replace(base.gate, mode="static", static_alpha=alpha)
+
+
+def _methods(name: str, base: UgatConfig) -> list[Setting]:
+    full = GROUNDED_NAME[name]
+    methods: dict[str, FitConfig] = {
+        "evidential": replace(base.fit, uncertainty="edl"),
+        "Concrete Dropout": replace(base.fit, uncertainty="dropout"),
+        "Deep Ensembles": replace(base.fit, uncertainty="ensemble"),
+        "none (GAT)": replace(base.fit, uncertainty="none"),
+    }
+    return [
+        Setting(f"{full}: {method}", "grounded", ugat=replace(base, fit=fit))
+        for method, fit in methods.items()
+    ]

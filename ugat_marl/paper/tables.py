@@ -1,0 +1,207 @@
+"""A table of the paper: what is trained for it, and what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ugat_marl.comparison import Comparison, Trial
+from ugat_marl.effects import describe, in_domain, load
+from ugat_marl.errors import OptionError
+from ugat_marl.learners.dqn_config import DQNConfig
+from ugat_marl.paper.job import Job
+from ugat_marl.paper.runner import Planned, done, perform_all
+from ugat_marl.paper.settings import DIRECT, Kind, Setting, settings_of
+from ugat_marl.progress import Reporter
+from ugat_marl.transfer import EVALUATION_SEED
+from ugat_marl.ugat import UgatConfig
+
+
+@dataclass(frozen=True)
+class PaperConfig:
+    """What is trained, how often, and how it is judged.
+
+    Attributes:
+        scenario: Scenarios, one table each.
+        domains: The real domains; default: V1 to V4, for "ablation" and "alpha" only V1, as in
+            the paper.
+        sim: The simulation to train in.
+        seeds: Number of trainings of every setting, with the seeds 0, 1, ...
+        first_seed: First of these seeds.
+        episodes: Plain training before the first iteration.
+        iterations: Rounds of rolling out, fitting and grounded training.
+        grounded_episodes: Episodes of training per iteration.
+        sim_rollouts: Episodes added to D_sim per iteration.
+        real_rollouts: Episodes added to D_real per iteration.
+        groundings: Kinds of grounding: phase, timed, or both.
+        constants: Constant delays in s that "main" sweeps.
+        evaluation_seeds: Episodes every policy is played for in each domain.
+        tuning_seeds: Episodes behind the choice of the best rule.
+        observation: What agents see.
+        reward: What agents want.
+        neighbours: How many roads away intersections are seen too.
+        duration_s: Length of an episode in s; default: the scenario's own.
+        dqn: Settings of the learner.
+    """
+
+    scenario: tuple[str, ...] = ("single-v1",)
+    domains: tuple[str, ...] = ()
+    sim: str = "sim"
+    seeds: int = 5
+    first_seed: int = 0
+    episodes: int = 60
+    iterations: int = 4
+    grounded_episodes: int = 10
+    sim_rollouts: int = 3
+    real_rollouts: int = 3
+    groundings: tuple[str, ...] = ("phase", "timed")
+    constants: tuple[int, ...] = (1, 2, 3, 4, 5)
+    evaluation_seeds: int = 5
+    tuning_seeds: int = 2
+    observation: str = "count"
+    reward: str = "queue"
+    neighbours: int = 0
+    duration_s: float | None = None
+    dqn: DQNConfig = field(default_factory=DQNConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("seeds", "evaluation_seeds", "tuning_seeds", "episodes"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if not self.scenario:
+            raise OptionError("scenario is empty; name one, such as single-v1")
+        names = [describe(domain) for domain in self.domains]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
+        if describe(self.sim) in names:
+            raise OptionError(f"domain {self.sim!r} is the simulation itself; name real ones")
+        _ = self.ugat  # refuses what is impossible
+
+    @property
+    def ugat(self) -> UgatConfig:
+        """Settings of the algorithm that all rows share."""
+        return UgatConfig(
+            pretrain_episodes=self.episodes,
+            iterations=self.iterations,
+            grounded_episodes=self.grounded_episodes,
+            sim_rollouts=self.sim_rollouts,
+            real_rollouts=self.real_rollouts,
+        )
+
+    @property
+    def all_episodes(self) -> int:
+        """Episodes every policy but direct transfer is trained for in all."""
+        return self.episodes + self.iterations * self.grounded_episodes
+
+    def targets(self, table: str) -> list[str]:
+        """The real domains of a table."""
+        default = ("V1",) if table in ("ablation", "alpha") else ("V1", "V2", "V3", "V4")
+        return [describe(domain) for domain in self.domains or default]
+
+    def settings(self, table: str) -> list[Setting]:
+        """The rows of a table."""
+        return settings_of(table, self.ugat, self.sim, self.groundings, self.constants)
+
+
+def compare(
+    table: str,
+    scenario: str,
+    config: PaperConfig,
+    folder: Path,
+    processes: int,
+    reporter: Reporter,
+) -> Comparison:
+    """Trains and plays whatever a table still lacks, and puts it together.
+
+    Args:
+        table: One of `settings.TABLES`.
+        scenario: One of the scenarios.
+        config: What is trained.
+        folder: Where the folders of the jobs lie; finished ones are used again.
+        processes: Jobs at a time.
+        reporter: Shows progress.
+    """
+    loaded = load(scenario)
+    for target in config.targets(table):
+        in_domain(loaded, target)  # a wrong name is an error now, not in an hour
+    planner = Planner(table, scenario, config)
+    plan = [job for row in config.settings(table) for job in planner.jobs(row)]
+    perform_all(planner.bases + plan, folder, processes, reporter, f"paper {table}")
+    trials = [trial for row in config.settings(table) for trial in planner.trials(row, folder)]
+    return Comparison(loaded.id, loaded.hash, describe(config.sim), tuple(trials), {"table": table})
+
+
+class Planner:
+    """The jobs of a table's rows."""
+
+    def __init__(self, table: str, scenario: str, config: PaperConfig) -> None:
+        self._scenario = scenario
+        self._config = config
+        self._targets = config.targets(table)
+        self._seeds = range(config.first_seed, config.first_seed + config.seeds)
+        plain = Setting(DIRECT, "direct")
+        self._bases = {seed: self._planned(plain, None, seed) for seed in self._seeds}
+
+    @property
+    def bases(self) -> list[Planned]:
+        """Plain training, one per seed: what other jobs start from."""
+        return list(self._bases.values())
+
+    def jobs(self, row: Setting) -> list[Planned]:
+        """All jobs of a row."""
+        return [planned for _, planned in self._columns(row)]
+
+    def trials(self, row: Setting, folder: Path) -> list[Trial]:
+        """What the finished jobs of a row say, column by column."""
+        found: list[Trial] = []
+        for target, planned in self._columns(row):
+            scores = done(planned, folder)
+            assert scores is not None
+            sim, seed = self._config.sim, planned.job.seed
+            for (domain, episode), own in sorted(scores.items()):
+                if domain in (sim, target) and episode in planned.job.evaluation_seeds:
+                    found.append(Trial(row.name, target, describe(domain), seed, episode, own))
+        return found
+
+    def _columns(self, row: Setting) -> list[tuple[str, Planned]]:
+        seeds: Sequence[int | None] = [None] if row.kind == "rule" else list(self._seeds)
+        return [
+            (target, self._planned(row, target if row.knows_target else None, seed))
+            for target in self._targets
+            for seed in seeds
+        ]
+
+    def _planned(self, row: Setting, target: str | None, seed: int | None) -> Planned:
+        config = self._config
+        starts = row.kind in ("grounded", "further", "delays")
+        job = Job(
+            kind=row.kind,
+            scenario=self._scenario,
+            sim=config.sim,
+            target=target,
+            world=row.world,
+            seed=seed,
+            episodes=self._episodes(row),
+            start=self._bases[seed].name if starts and seed is not None else None,
+            options={
+                "observation": config.observation,
+                "reward": config.reward,
+                "neighbours": config.neighbours,
+                "duration_s": config.duration_s,
+            },
+            ugat=row.ugat if row.kind == "grounded" else None,
+            dqn=config.dqn,
+            tuning_seeds=config.tuning_seeds if row.kind == "rule" else 0,
+            domains=(config.sim, target) if target else (config.sim, *self._targets),
+            evaluation_seeds=tuple(EVALUATION_SEED + k for k in range(config.evaluation_seeds)),
+        )
+        return Planned.of(job)
+
+    def _episodes(self, row: Setting) -> int:
+        """Of training in all."""
+        config = self._config
+        by_kind: dict[Kind, int] = {"direct": config.episodes, "rule": 0, "grounded": 0}
+        if row.episodes is not None:
+            return config.episodes + row.episodes
+        return by_kind.get(row.kind, config.all_episodes)
