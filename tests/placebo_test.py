@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.fit_loop import split
 from ugat_marl.grounding.fit_report import FitReport
 from ugat_marl.grounding.fitting import fit
 from ugat_marl.grounding.forward import ForwardConfig
@@ -76,13 +77,32 @@ def test_of_the_same_world_nothing_is_changed() -> None:
         assert acceptance > 0.5 and changed <= 0.05
 
 
-def test_shuffled_data_show_in_what_h_makes_of_the_street(honest) -> None:
+def test_a_gate_that_asks_for_proof_stays_shut_on_shuffled_data(honest) -> None:
     """u does not show them: f answers with the mean, and h knows which phase leads there."""
-    _, report = fitted(shuffled(played(3, seed=1), seed=0))
+    made, report = fitted(shuffled(played(3, seed=1), seed=0))
     own = honest[1]
     assert (own.accuracy_on_real > 0.7).all() and (own.agreement > 0.9).all()
     assert (report.accuracy_on_real < CHANCE + 0.15).all()
     assert (report.agreement < CHANCE + 0.2).all()
+    # Of two independent numbers one is as far off as sqrt(2) of the other's deviation: the mean
+    # beats "no change" without knowing anything.
+    assert (report.forward.ratio < 0.9).all()
+    assert (report.forward.error >= report.forward.mean_outcome).all()
+    assert (own.forward.error < 0.6 * own.forward.mean_outcome).all()
+    assert any("f is no better than one answer for every state" in w for w in report.warnings)
+    assert not report.trusted(0.8).any() and own.trusted(0.8).all()
+    made.gate.trust(report.trusted(0.8))
+    assert grounded(made)[:2] == (0.0, 0.0)
+
+
+def test_the_rival_with_one_answer_is_the_mean_of_the_rows_trained_on(honest) -> None:
+    data = stack_log(played(3, seed=1), STACK)
+    parts = split(data, FIT.held_out_every, STACK)
+    for i, layout in enumerate(LAYOUTS.values()):
+        after = data.next_observation[i, :, : layout.features].numpy()
+        train, held_out = parts.train[i].bool().numpy(), parts.held_out[i].bool().numpy()
+        error = np.sqrt(((after[held_out] - after[train].mean(0)) ** 2).mean())
+        assert honest[1].forward.mean_outcome[i] == pytest.approx(error, rel=1e-4)
 
 
 def test_noise_is_as_large_as_what_happens_and_knows_nothing() -> None:

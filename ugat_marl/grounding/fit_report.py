@@ -82,16 +82,32 @@ class ForwardReport:
         training: How the training went.
         error: Of f.
         no_change: Of predicting that nothing changes.
+        mean_outcome: Of predicting the mean of what follows, whatever the state.
     """
 
     training: TrainingRecord
     error: Floats
     no_change: Floats
+    mean_outcome: Floats
 
     @property
     def ratio(self) -> Floats:
         """Error over the error of no change, per agent: below 1, f has learnt something."""
         return self.error / np.maximum(self.no_change, 1e-12)
+
+    @property
+    def learnt(self) -> NDArray[np.bool_]:
+        """Agents whose f beats both: without the second, it does so on rows that are mixed up."""
+        return (self.ratio < 1.0) & (self.error < self.mean_outcome)
+
+    def doubts(self, model: str, agents: Sequence[str]) -> list[str]:
+        """What is wrong with it; sentences, some of them empty."""
+        poor = self.ratio >= 1.0
+        mixed = ~self.learnt & ~poor
+        return [
+            said_of(f"{model} is no better than predicting no change", poor, agents),
+            said_of(f"{model} is no better than one answer for every state", mixed, agents),
+        ]
 
 
 @dataclass(frozen=True)
@@ -178,9 +194,7 @@ class FitReport:
         """Reasons not to obey the grounded actions yet; empty if there are none."""
         h, calibration = self.inverse, self.inverse.calibration
         found = [
-            said_of(
-                "f is no better than predicting no change", self.forward.ratio >= 1.0, self.agents
-            ),
+            *self.forward.doubts("f", self.agents),
             said_of(
                 "h is no better than the most frequent phase", h.accuracy <= h.majority, self.agents
             ),
@@ -200,10 +214,10 @@ class FitReport:
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
         """Agents whose models may be obeyed, for `Gate.trust`; ``(agents,)``.
 
-        f beats "no change", and h both the most frequent phase and `least_accuracy`.
+        f has learnt something, and h beats both the most frequent phase and `least_accuracy`.
         """
         h = self.inverse
-        better = (self.forward.ratio < 1.0) & (h.accuracy > h.majority)
+        better = self.forward.learnt & (h.accuracy > h.majority)
         return better & (h.accuracy >= least_accuracy)
 
     def as_dict(self) -> dict[str, float]:
@@ -240,19 +254,22 @@ def forward_report(
     model: ForwardModel,
     predicted: Tensor,
     happened: Tensor,
+    off_mean: Tensor,
     held_out: Tensor,
     training: TrainingRecord,
 ) -> ForwardReport:
-    """Errors of predicted changes on held-out rows; `held_out` weighs ``(agents, n)``."""
+    """Errors of predicted changes on held-out rows; `held_out` weighs ``(agents, n)``.
+
+    `off_mean` is by how much the features that followed differ from their mean in training.
+    """
     outputs = model.valid_outputs.sum(-1)[:, 0].double()
     share = (held_out / held_out.sum(1, keepdim=True)).double()
 
     def root_mean_square(error: Tensor) -> Floats:
         return ((error.double() ** 2).sum(-1) * share).sum(1).div(outputs).sqrt().numpy()
 
-    return ForwardReport(
-        training, root_mean_square(predicted - happened), root_mean_square(happened)
-    )
+    errors = (predicted - happened, happened, off_mean)
+    return ForwardReport(training, *map(root_mean_square, errors))
 
 
 @torch.no_grad()

@@ -169,7 +169,10 @@ def fit_changes(
     record = train_model(asked.name, model, loss, parts, config, generator, on_epoch)
     with torch.no_grad():
         found = predicted(slice(None)) * model.scale
-    return forward_report(model, found, change, parts.held_out, record)
+    followed = asked.observation[..., : change.shape[-1]] * model.valid_outputs + change
+    share = (parts.train / parts.train.sum(1, keepdim=True))[..., None]
+    off_mean = followed - (followed * share).sum(1, keepdim=True)
+    return forward_report(model, found, change, off_mean, parts.held_out, record)
 
 
 @one_thread()

@@ -69,18 +69,13 @@ class TimedReport:
     def warnings(self) -> tuple[str, ...]:
         """Reasons to doubt the delays; empty if there are none."""
         found = [
-            said_of(complaint, where, self.agents)
-            for complaint, where in (
-                ("f is no better than predicting no change", self.forward.ratio >= 1.0),
-                (
-                    "the model of the simulation is no better than predicting no change",
-                    self.simulated.ratio >= 1.0,
-                ),
-                (
-                    f"the best delay is the longest tried ({self.most_s} s; raise timed most_s)",
-                    self.lost.best_s > self.most_s - END_S,
-                ),
-            )
+            *self.forward.doubts("f", self.agents),
+            *self.simulated.doubts("the model of the simulation", self.agents),
+            said_of(
+                f"the best delay is the longest tried ({self.most_s} s; raise timed most_s)",
+                self.lost.best_s > self.most_s - END_S,
+                self.agents,
+            ),
         ]
         if self.inverse.uncertainty == "none":
             found.append("without uncertainty u is 0, and the gate takes every answer of h")
@@ -91,10 +86,10 @@ class TimedReport:
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
         """Agents whose h may be obeyed, for `Gate.trust`; the others take the best constant.
 
-        f and the model of the simulation beat "no change", and h, on its own task, a guess by the
-        share `least_accuracy`.
+        f and the model of the simulation have learnt something, and h, on its own task, beats a
+        guess by the share `least_accuracy`.
         """
-        better = (self.forward.ratio < 1.0) & (self.simulated.ratio < 1.0)
+        better = self.forward.learnt & self.simulated.learnt
         return better & (self.inverse.error_s < (1.0 - least_accuracy) * self.inverse.guess_s)
 
     def as_dict(self) -> dict[str, float]:
@@ -102,7 +97,7 @@ class TimedReport:
         numbers: dict[str, float] = {}
         for prefix, part in (("forward", self.forward), ("simulated", self.simulated)):
             numbers |= part.training.as_dict(prefix)
-            for name in ("error", "no_change", "ratio"):
+            for name in ("error", "no_change", "mean_outcome", "ratio"):
                 numbers |= entries(f"{prefix}/{name}", getattr(part, name), self.agents)
         numbers |= self.inverse.training.as_dict("inverse")
         for name in ("error_s", "error_on_transitions_s"):
