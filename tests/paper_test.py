@@ -143,7 +143,7 @@ def test_a_job_is_done_when_everything_was_played(tmp_path: Path) -> None:
 def test_a_table_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     call = [
         "paper", "gap", "--domains", "V4", "--episodes", "1", "--seeds", "1", "--duration-s", "120",
-        "--evaluation-seeds", "2", "--tuning-seeds", "1",
+        "--evaluation-seeds", "2", "--rule-budget", "2",
         "--out", str(tmp_path / "results"), "--runs", str(tmp_path / "runs"),
     ]  # fmt: skip
     assert main(call) == 0

@@ -22,9 +22,10 @@ from rich.console import Console
 
 from ugat_marl.effects import in_domain, load
 from ugat_marl.errors import UgatMarlError
-from ugat_marl.evaluation import TUNING_SEED, best_rules, evaluate, fixed_policy, rule_factory
+from ugat_marl.evaluation import evaluate, fixed_policy, rule_factory
 from ugat_marl.files import write_whole
 from ugat_marl.grounding.random_delays import RandomDelays
+from ugat_marl.grounding.view import neighbours_of
 from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
@@ -36,6 +37,7 @@ from ugat_marl.randomised import randomised_env
 from ugat_marl.recipes import simulated_worlds, train_until
 from ugat_marl.traffic_env import parallel_env
 from ugat_marl.training import Run
+from ugat_marl.tuning import tuned_rules
 from ugat_marl.ugat import State, UgatConfig, restore, train_ugat
 
 JOB, SCORES, POLICY, LEARNER, RULE = (
@@ -61,7 +63,7 @@ class Job:
         options: Of the environments.
         ugat: For "grounded".
         dqn: Settings of the learner.
-        tuning_seeds: Episodes behind the choice of a rule.
+        rule_budget: Most episodes in which each rule is tuned, for "rule".
         domains: Where the policy is played; not part of the job's identity.
         evaluation_seeds: When it is played; not part of the identity either.
     """
@@ -77,7 +79,7 @@ class Job:
     options: dict[str, str | int | float | None]
     ugat: UgatConfig | None
     dqn: DQNConfig
-    tuning_seeds: int
+    rule_budget: int
     domains: tuple[str, ...] = ()
     evaluation_seeds: tuple[int, ...] = field(default=())
 
@@ -150,16 +152,12 @@ def perform(job: Job, folder: Path, reporter: Reporter) -> None:
 
 
 def _rule(job: Job, folder: Path) -> str:
-    """The rule that is best in the target, on seeds of its own."""
+    """The rule that is best in the target, each tuned there, on seeds of its own."""
     assert job.target is not None
     saved = folder / RULE
     if not saved.exists():
-        found = best_rules(
-            load(job.scenario),
-            [job.target],
-            seeds=[TUNING_SEED + k for k in range(job.tuning_seeds)],
-            duration_s=_duration(job),
-            workers=1,
+        found = tuned_rules(
+            load(job.scenario), [job.target], job.rule_budget, duration_s=_duration(job), workers=1
         )
         write_whole(saved, "\n".join(found.values()))
     return saved.read_text()
@@ -213,7 +211,7 @@ def _grounded(job: Job, folder: Path, reporter: Reporter) -> DQN:
         before = _start(job, folder)
         assert before is not None
         learner.load(before)
-        transform = job.ugat.transform(env.layouts, job.seed)
+        transform = job.ugat.transform(env.layouts, job.seed, neighbours_of(env))
         state = State(learner, transform, learner.policy(), pretrained=job.ugat.pretrain_episodes)
         restore(state, run, DQNPolicy.load)
         train_ugat(state, env, sim, real, job.ugat, job.seed, run)

@@ -15,6 +15,7 @@ from ugat_marl.paper.runner import Planned, done, perform_all
 from ugat_marl.paper.settings import DIRECT, Kind, Setting, settings_of
 from ugat_marl.progress import Reporter
 from ugat_marl.transfer import EVALUATION_SEED
+from ugat_marl.tuning import BUDGET, LEAST_BUDGET
 from ugat_marl.ugat import UgatConfig
 
 
@@ -37,7 +38,7 @@ class PaperConfig:
         groundings: Kinds of grounding: phase, timed, or both.
         constants: Constant delays in s that "main" sweeps.
         evaluation_seeds: Episodes every policy is played for in each domain.
-        tuning_seeds: Episodes behind the choice of the best rule.
+        rule_budget: Most episodes in which each rule is tuned in each domain.
         observation: What agents see.
         reward: What agents want.
         neighbours: How many roads away intersections are seen too.
@@ -58,7 +59,7 @@ class PaperConfig:
     groundings: tuple[str, ...] = ("phase", "timed")
     constants: tuple[int, ...] = (1, 2, 3, 4, 5)
     evaluation_seeds: int = 5
-    tuning_seeds: int = 2
+    rule_budget: int = BUDGET
     observation: str = "count"
     reward: str = "queue"
     neighbours: int = 0
@@ -66,9 +67,11 @@ class PaperConfig:
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "evaluation_seeds", "tuning_seeds", "episodes"):
+        for name in ("seeds", "evaluation_seeds", "episodes"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if self.rule_budget < LEAST_BUDGET:
+            raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
         if not self.scenario:
             raise OptionError("scenario is empty; name one, such as single-v1")
         names = [describe(domain) for domain in self.domains]
@@ -192,7 +195,7 @@ class Planner:
             },
             ugat=row.ugat if row.kind == "grounded" else None,
             dqn=config.dqn,
-            tuning_seeds=config.tuning_seeds if row.kind == "rule" else 0,
+            rule_budget=config.rule_budget if row.kind == "rule" else 0,
             domains=(config.sim, target) if target else (config.sim, *self._targets),
             evaluation_seeds=tuple(EVALUATION_SEED + k for k in range(config.evaluation_seeds)),
         )
