@@ -17,7 +17,7 @@ from ugat_marl.grounding.fitting import fit
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import Gate, GateConfig
 from ugat_marl.grounding.inverse import InverseConfig
-from ugat_marl.grounding.joint import PASSES, alone, running, together
+from ugat_marl.grounding.joint import PASSES, Settled, alone, running, together, turns
 from ugat_marl.grounding.transform import GroundedActionTransform
 from ugat_marl.grounding.view import InputsConfig
 from ugat_marl.transitions import AgentLayout, Provenance, TransitionLog, TransitionRecorder
@@ -28,6 +28,13 @@ Table = Callable[[np.ndarray], list[int]]
 
 def gate(agents: int, alpha: float = 0.5) -> Gate:
     return Gate([f"x_{i}" for i in range(agents)], GateConfig("static", alpha))
+
+
+def settled_among(answer, gate: Gate, own, permitted=None) -> Settled:
+    """Grounded together; each is a neighbour of the next."""
+    names = gate.agents
+    near = {name: names[i + 1 : i + 2] for i, name in enumerate(names)}
+    return together(answer, gate, turns(names, near), np.array(own), permitted)
 
 
 def asked_of(table: Table, u: float = 0.0):
@@ -47,27 +54,43 @@ def asked_of(table: Table, u: float = 0.0):
 def test_a_chain_is_followed_down_to_its_end() -> None:
     """Everyone does what its upstream neighbour does; the first turns from 0 to 1."""
     answer, told = asked_of(lambda phases: [1, *phases[:-1]])
-    settled = together(answer, gate(4), np.zeros(4, np.int64), None)
+    settled = settled_among(answer, gate(4), [0, 0, 0, 0])
     assert settled.grounded.tolist() == [1, 1, 1, 1] == told[-1]
     assert told == [[0, 0, 0, 0], [1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0], [1, 1, 1, 1]]
 
 
 def test_answers_that_do_not_depend_on_others_take_two_passes() -> None:
     answer, told = asked_of(lambda _: [1, 0])
-    together(answer, gate(2), np.array([0, 0]), None)
+    settled_among(answer, gate(2), [0, 0])
     assert told == [[0, 0], [1, 0]]
     told.clear()
-    together(answer, gate(2), np.array([1, 0]), None)
+    settled_among(answer, gate(2), [1, 0])
     assert told == [[1, 0]]  # nothing is grounded: nothing to tell
+
+
+def test_two_that_follow_each_other_change_their_minds_in_turn() -> None:
+    """Each wants what the other does: at the same time they would swap for ever."""
+    answer, told = asked_of(lambda phases: [phases[1], phases[0]])
+    settled = settled_among(answer, gate(2), [0, 1])
+    assert told == [[0, 1], [1, 1]] and settled.allowed is not None and settled.allowed.all()
+
+
+def test_no_two_neighbours_have_the_same_turn() -> None:
+    assert turns("abcd", {"a": "b", "b": "c", "c": "d"}).tolist() == [
+        [True, False, True, False],
+        [False, True, False, True],
+    ]
+    assert turns("abc", {"c": "ab", "a": "b"}).astype(int).tolist() == np.eye(3).tolist()
+    assert turns("ab", {}).tolist() == [[True, True]]
 
 
 def test_who_never_settles_keeps_its_own_action() -> None:
     """The first wants what the second does, the second the opposite of the first."""
     answer, told = asked_of(lambda phases: [phases[1], 1 - phases[0]])
-    own = np.array([0, 0])
-    settled = together(answer, gate(2), own, None)
+    own = [0, 0]
+    settled = settled_among(answer, gate(2), own)
     assert len(told) > PASSES
-    assert settled.allowed is not None and not settled.allowed.all()
+    assert settled.allowed is not None and settled.allowed.sum() == 1  # it is enough for the other
     executed = np.where(settled.allowed, settled.grounded, own)
     assert executed.tolist() == told[-1]
 
@@ -75,10 +98,10 @@ def test_who_never_settles_keeps_its_own_action() -> None:
 def test_the_gate_has_its_say_in_every_pass_and_keeps_its_books() -> None:
     answer, told = asked_of(lambda phases: [1, *phases[:-1]], u=0.6)
     strict = gate(3, 0.5)
-    assert together(answer, strict, np.zeros(3, np.int64), None).grounded.tolist() == [1, 0, 0]
+    assert settled_among(answer, strict, [0, 0, 0]).grounded.tolist() == [1, 0, 0]
     assert told == [[0, 0, 0]]  # nothing is accepted, so nothing changes
     strict.alpha = np.array([1.0, 0.5, 1.0])
-    together(answer, strict, np.zeros(3, np.int64), None)
+    settled_among(answer, strict, [0, 0, 0])
     assert told[-1] == [1, 0, 0]
     assert not strict.report().decisions.any()
 
@@ -90,7 +113,7 @@ def test_a_light_that_may_not_change_is_told_as_it_is() -> None:
     either = np.array([[True, True, False], held])
     assert running(np.array([2, 2]), either).tolist() == [2, 2]  # nobody knows which of the two
     answer, told = asked_of(lambda _: [1, 1])
-    settled = together(answer, gate(2), np.array([0, 0]), np.array([free, held]))
+    settled = settled_among(answer, gate(2), [0, 0], np.array([free, held]))
     assert told == [[0, 2], [1, 2]]
     assert settled.allowed is not None and settled.allowed.tolist() == [True, False]
 
@@ -107,7 +130,7 @@ def test_whatever_the_models_answer_they_were_told_what_runs(data: st.DataObject
     own = rng.integers(phases, size=agents)
     permitted[np.arange(agents), own] |= ~permitted.any(1)
     doors = gate(agents)
-    settled = together(answer, doors, own, permitted)
+    settled = settled_among(answer, doors, own, permitted)
     executed = np.where(doors.accepts(settled.u, settled.allowed), settled.grounded, own)
     assert running(executed, permitted).tolist() == told[-1]
     assert len(told) <= PASSES * (agents + 1)
@@ -211,7 +234,7 @@ def test_fed_what_a_asked_for_f_of_b_expects_what_does_not_come(
 ) -> None:
     """The subject of the test above, broken."""
 
-    def apart(answer, _gate, actions, permitted):
+    def apart(answer, _gate, _in_turn, actions, permitted):
         return alone(answer, actions, permitted)
 
     monkeypatch.setattr(transform_module, "together", apart)

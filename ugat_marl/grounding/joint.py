@@ -4,13 +4,14 @@ Models that see their neighbours are told which phases run there, and those are 
 neighbours are grounded. With roads in both directions everyone is upstream of somebody who is
 upstream of them, so that no order of the agents gives each the final phases of the others. The
 answer is a fixed point: all agents are grounded for the phases the others ask for, again for those
-that would then run, and so on until nothing changes. An agent that goes on changing its mind is
-left with its own action, so that an end always comes.
+that would then run, and so on until nothing changes. Neighbours change their minds in turn, or two
+of them could go on answering each other's last word. Who does so nevertheless is left with its own
+action, so that an end always comes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +19,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.grounding.gate import Gate
 
-PASSES = 6
-"""Times all agents are grounded before those that have not settled keep their own actions."""
+PASSES = 10
+"""Times all agents are grounded before some that have not settled keep their own actions."""
 
 Answer = Callable[[NDArray[np.int64]], tuple[NDArray[np.int64], NDArray[np.float32]]]
 """Grounded actions and their u, ``(agents,)`` each, if these phases run everywhere."""
@@ -39,6 +40,16 @@ class Settled:
     grounded: NDArray[np.int64]
     u: NDArray[np.float32]
     allowed: NDArray[np.bool_] | None
+
+
+def turns(agents: Sequence[str], near: Mapping[str, Sequence[str]]) -> NDArray[np.bool_]:
+    """Who may change its mind at the same time: nobody and a neighbour; ``(turns, agents)``."""
+    pairs = {(a, b) for a in agents for b in near.get(a, ())}
+    turn: dict[str, int] = {}
+    for agent in agents:
+        taken = {turn[b] for b in turn if (agent, b) in pairs or (b, agent) in pairs}
+        turn[agent] = next(k for k in range(len(agents)) if k not in taken)
+    return np.arange(max(turn.values()) + 1)[:, None] == np.array([turn[a] for a in agents])
 
 
 def running(actions: NDArray[np.int64], permitted: NDArray[np.bool_] | None) -> NDArray[np.int64]:
@@ -63,32 +74,42 @@ def alone(
 
 
 def together(
-    answer: Answer, gate: Gate, actions: NDArray[np.int64], permitted: NDArray[np.bool_] | None
+    answer: Answer,
+    gate: Gate,
+    in_turn: NDArray[np.bool_],
+    actions: NDArray[np.int64],
+    permitted: NDArray[np.bool_] | None,
 ) -> Settled:
     """Grounds all agents until the phases they were told of are those that will run.
 
     Args:
         answer: Asks the models; called at least once.
         gate: Says which answers would be taken; its books are left alone.
+        in_turn: ``(turns, agents)`` bool, as `turns` makes it.
         actions: ``(agents,)`` the policy's actions.
         permitted: ``(agents, phases)`` action masks.
     """
-    will_run = running(actions, permitted)
-    given_up = np.zeros(len(actions), bool)
+    own = running(actions, permitted)
+    told, given_up, turn = own, np.zeros(len(actions), bool), 0
     while True:
-        told = will_run
-        for _ in range(PASSES):
-            told = will_run
+        for count in range(1, PASSES + 1):
             grounded, u = answer(told)
             allowed = ~given_up
             if permitted is not None:
                 allowed = allowed & _allowed(grounded, permitted)
             executed = np.where(gate.accepts(u, allowed), grounded, actions)
             will_run = running(executed, permitted)
-            if np.array_equal(will_run, told):
+            changes = will_run != told
+            if not changes.any():
                 return Settled(grounded, u, allowed)
-        # Whoever has given up runs its own action from then on, so these are always new ones.
-        given_up |= will_run != told
+            while not (in_turn[turn] & changes).any():
+                turn = (turn + 1) % len(in_turn)
+            movers = in_turn[turn] & changes
+            turn = (turn + 1) % len(in_turn)
+            if count == PASSES:  # whoever gives up never moves again, so that these are new ones
+                given_up = given_up | movers
+                will_run = own
+            told = np.where(movers, will_run, told)
 
 
 def _allowed(actions: NDArray[np.int64], permitted: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.gate import Gate, GateConfig
 from ugat_marl.grounding.inverse import AnswerModel, InverseConfig, InverseModel
-from ugat_marl.grounding.joint import alone, together
+from ugat_marl.grounding.joint import alone, together, turns
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours, View
@@ -244,6 +244,7 @@ class GroundedActionTransform(Transform):
         self.inverse = InverseModel(
             self.stack, inverse, torch_generator(seed, "inverse"), view=self.local
         )
+        self._in_turn = turns(self.stack.agents, self.local.near)
 
     def ground(
         self,
@@ -263,7 +264,7 @@ class GroundedActionTransform(Transform):
             return found.action[:, 0].numpy(), found.u[:, 0].numpy()
 
         if self.local.joint:
-            settled = together(answer, self.gate, actions, permitted)
+            settled = together(answer, self.gate, self._in_turn, actions, permitted)
         else:
             settled = alone(answer, actions, permitted)
         grounded, u = settled.grounded, settled.u
