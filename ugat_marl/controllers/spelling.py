@@ -113,9 +113,7 @@ STANDARD_RULES = (
     *(f"max-pressure-loss:{hold_s}" for hold_s in (10, 20)),
     *(f"actuated:{longest_s}" for longest_s in (40, 80)),
     "sotl:300:20",
-    "longest-waiting:30",
     "webster:1500",
-    "fixed-time:30",
     "programme",
 )
 """What the search for the best rule of a domain tries."""
