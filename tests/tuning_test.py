@@ -12,13 +12,14 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from ugat_marl import evaluation, tuning
+from ugat_marl import evaluation, transfer, tuning
 from ugat_marl.__main__ import main
-from ugat_marl.controllers import RULES, parse_spec
+from ugat_marl.controllers import RULES, STANDARD_RULES, parse_spec
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.evaluation import TUNING_SEED, best_rules, race
 from ugat_marl.metrics import Scores
+from ugat_marl.progress import Silent
 from ugat_marl.report.tables import tuning_table
 from ugat_marl.results import Evaluation, Result, Trial, Tuned
 from ugat_marl.transfer import EVALUATION_SEED, TransferConfig
@@ -166,6 +167,28 @@ def test_tuned_rules_are_better_than_their_defaults(streets: Streets) -> None:
     names = ("largest-queue", "programme")
     found = tuned_rules(load("single-v1"), ["sim", "V4"], 24, names=names)
     assert found == {"sim": "largest-queue:50", "V4": "largest-queue:20"}
+
+
+def test_a_run_is_judged_beside_tuned_rules_where_asked(
+    streets: Streets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def judged(scenario: Any, policies: Any, domains: Any, seeds: Any, **options: Any) -> Any:
+        return sorted(policies), options["notes"]
+
+    monkeypatch.setattr(transfer, "evaluate", judged)
+    scenario = load("single-v1")
+
+    def judge(rule_budget: int | None) -> Any:
+        config = TransferConfig("single-v1", rule_budget=rule_budget)
+        return transfer.judge(config, scenario, {}, Silent())
+
+    policies, notes = judge(None)
+    assert policies == ["rule largest-queue:20", "rule largest-queue:40"]
+    assert notes["rules searched"] == ", ".join(STANDARD_RULES)
+    policies, notes = judge(24)
+    assert policies == ["rule actuated:20:2", "rule fixed-time:50"]
+    assert notes["best rule in V4"] == "actuated:20:2"
+    assert notes["rules searched"].endswith("webster; each tuned with up to 24 episodes")
 
 
 def test_what_cannot_be_tuned_is_refused() -> None:
