@@ -6,7 +6,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ugat_marl.discrepancy.study import heard
+from ugat_marl.discrepancy.select import Effort
+from ugat_marl.discrepancy.study import effort_for, heard
 from ugat_marl.measured.data import Detector, Measured, Passages, Period
 
 NAMES = ("one", "two", "three", "four")
@@ -63,3 +64,14 @@ def test_counts_in_intervals_say_nothing_of_silence() -> None:
     counts = pl.DataFrame({"period_id": ["day0"], "detector_id": ["one"], "count": [3]})
     data = Measured(DETECTORS, (Period("day0", 0.0, 100.0, "fit", {}, {}),), counts=counts)
     assert names(heard(data)) == NAMES
+
+
+def test_larger_networks_are_simulated_for_fewer_days() -> None:
+    efforts = [effort_for(count) for count in (1, 4, 5, 8, 9, 64)]
+    assert efforts[0] == efforts[1] == Effort()
+    assert efforts[2] == efforts[3]
+    assert efforts[4] == efforts[5]
+    for more, fewer in ((efforts[0], efforts[2]), (efforts[2], efforts[4])):
+        for name in ("base", "bank", "fit", "test"):
+            assert getattr(fewer, name) <= getattr(more, name)
+    assert all(effort.test <= effort.base for effort in efforts)

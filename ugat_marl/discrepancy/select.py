@@ -279,7 +279,7 @@ class Selector:
         if what == "library":
             for hypothesis, values in model.members:
                 jobs += both_ways(hypothesis, values)
-        days = self._effort.bank if number == 0 else 3
+        days = self._effort.bank
         rays: list[Ray] = []
         engine = self._fitter.engine
         before = model.tallies[:days]

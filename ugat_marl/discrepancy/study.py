@@ -31,8 +31,10 @@ from ugat_marl.scenario import Scenario
 
 PRICE = 14.0
 """What an effect must take off the distance to be worth naming."""
-MANY = 4
-"""With more intersections every day says more, and costs more: fewer are simulated."""
+EFFORTS = ((4, Effort()), (8, Effort(40, 3, 5, 32)))
+"""Numbers of days for so many intersections. With more of them every day says more, since effects
+on the whole network are seen at each, and costs more: fewer are simulated."""
+LEAST_EFFORT = Effort(24, 2, 3, 16)
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,6 @@ class Study:
             deadline=time.monotonic() + config.budget_s,
             workers=config.workers,
         )
-        several = len(site.intersections) > MANY
         return cls(
             scenario,
             network,
@@ -138,7 +139,7 @@ class Study:
             Pools.of(site),
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
-            config.effort or (Effort(40, 3, 5, 32) if several else Effort()),
+            config.effort or effort_for(len(site.intersections)),
             _tallies(site, engine, measured, periods),
             _tallies(site, engine, measured, measured.of("heldout") or periods),
             ruled_out,
@@ -224,6 +225,11 @@ class Study:
             self.null,
             reporter,
         )
+
+
+def effort_for(intersections: int) -> Effort:
+    """Numbers of days that suit the size of a network."""
+    return next((effort for most, effort in EFFORTS if intersections <= most), LEAST_EFFORT)
 
 
 def heard(measured: Measured) -> tuple[Detector, ...]:
