@@ -125,7 +125,7 @@ def descendants() -> set[int]:
 
 def _zombie(process: int) -> bool:
     with Listening():
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
     return True
 
 
