@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import polars as pl
 import pytest
 import torch
 
+import ugat_marl.transfer as transfer_module
 from ugat_marl.errors import CheckpointError, LogError, OptionError
 from ugat_marl.grounding.delays import TimedConfig
 from ugat_marl.grounding.fit_config import FitConfig
@@ -29,8 +31,9 @@ from ugat_marl.network import within
 from ugat_marl.rollout import observer_of, roll_out
 from ugat_marl.seeding import torch_generator
 from ugat_marl.traffic_env import parallel_env
+from ugat_marl.transfer import TransferConfig, transfer
 from ugat_marl.transitions import AgentLayout, Provenance, TransitionLog, TransitionRecorder
-from ugat_marl.ugat import UgatConfig
+from ugat_marl.ugat import State, UgatConfig
 
 LAYOUTS = {"a_0": AgentLayout(2, 3, 1), "b_0": AgentLayout(1, 2), "c_0": AgentLayout(3, 2)}
 ROW = {"a_0": ("b_0",), "b_0": ("a_0", "c_0"), "c_0": ("b_0",)}
@@ -252,7 +255,7 @@ def test_agents_recorded_at_different_times_have_no_neighbours_but_a_past() -> N
 # --- models that see more
 
 
-def test_checkpoints_know_what_their_models_saw(tmp_path: Any) -> None:
+def test_checkpoints_know_what_their_models_saw(tmp_path: Path) -> None:
     inputs = InputsConfig(history=2, hops=1)
 
     def made(how: InputsConfig, near: Any = ROW) -> GroundedActionTransform:
@@ -304,3 +307,23 @@ def test_both_groundings_fit_and_ground_with_all_inputs(grounding: Any) -> None:
     assert outcomes[0].u.tolist() != outcomes[1].u.tolist()
     other = dataclasses.replace(data, executed=data.executed.roll(1, 1))
     assert not torch.equal(made.local.of(data), made.local.of(other))
+
+
+def test_a_run_finds_the_neighbours_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Begun(Exception):
+        pass
+
+    def begun(state: State, *_others: Any) -> None:
+        raise Begun(state.transform)
+
+    monkeypatch.setattr(transfer_module, "train_ugat", begun)
+    config = TransferConfig("grid2x2-v1", ugat=UgatConfig(inputs=InputsConfig(history=2, hops=1)))
+    with pytest.raises(Begun) as told:
+        transfer(config, tmp_path / "run")
+    (made,) = told.value.args
+    near = made.local.near
+    assert made.forward.view.history == 2 and made.forward.view.near == near
+    assert len(near) == 4 and all(len(others) == 2 for others in near.values())
+    assert all(agent in near[other] for agent, others in near.items() for other in others)
