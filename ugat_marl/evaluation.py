@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ugat_marl.controllers import STANDARD_RULES, controller_for, parse_spec
-from ugat_marl.effects import Domain, describe, in_domain
+from ugat_marl.effects import Domain, describe
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_policy import DQNPolicy
@@ -35,7 +35,7 @@ TUNING_SEED = 9001
 class _Task:
     name: str
     make: PolicyFactory
-    domain: Domain
+    world: TrafficEnv
     seeds: tuple[int, ...]
 
 
@@ -67,21 +67,20 @@ def evaluate(
     names = [describe(domain) for domain in domains]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
-    for domain in domains:
-        in_domain(scenario, domain)  # a wrong name is an error now, not in an hour
-    probe = parallel_env(scenario, domains[0], duration_s=duration_s)
+    # Made once, and a wrong name is an error now, not in an hour.
+    worlds = [parallel_env(scenario, domain, duration_s=duration_s) for domain in domains]
     for make in policies.values():
-        make(probe)  # and so is a wrong policy
+        make(worlds[0])  # so is a wrong policy
     workers = workers or _usable_cores()
     per_task = max(1, len(seeds) * len(policies) * len(domains) // (4 * workers))
     tasks = [
-        _Task(name, make, domain, tuple(seeds[start : start + per_task]))
-        for domain in domains
+        _Task(name, make, world, tuple(seeds[start : start + per_task]))
+        for world in worlds
         for name, make in policies.items()
         for start in range(0, len(seeds), per_task)
     ]
     with (reporter or Silent()).task(title, len(seeds) * len(policies) * len(domains)) as advance:
-        results = _play_all(scenario, tasks, duration_s, workers, advance)
+        results = _play_all(tasks, workers, advance)
     order = {
         (name, describe(domain)): i for i, (name, domain) in enumerate(_pairs(policies, domains))
     }
@@ -225,13 +224,7 @@ def _pairs(
     return [(name, domain) for name in policies for domain in domains]
 
 
-def _play_all(
-    scenario: Scenario,
-    tasks: Sequence[_Task],
-    duration_s: float | None,
-    workers: int,
-    advance: Advance,
-) -> list[Result]:
+def _play_all(tasks: Sequence[_Task], workers: int, advance: Advance) -> list[Result]:
     """Threads suffice: the simulations run in processes of their own."""
     stop = threading.Event()
     lock = threading.Lock()
@@ -243,7 +236,7 @@ def _play_all(
 
     pool = concurrent.futures.ThreadPoolExecutor(workers)
     try:
-        running = {pool.submit(_play, scenario, t, duration_s, stop, done) for t in tasks}
+        running = {pool.submit(_play, t, stop, done) for t in tasks}
         while running:  # wakes up now and then, so that Ctrl-C is heard
             finished, running = concurrent.futures.wait(
                 running, timeout=0.2, return_when=concurrent.futures.FIRST_COMPLETED
@@ -256,21 +249,14 @@ def _play_all(
     return results
 
 
-def _play(
-    scenario: Scenario,
-    task: _Task,
-    duration_s: float | None,
-    stop: threading.Event,
-    done: Callable[[], None],
-) -> list[Result]:
-    probe = parallel_env(scenario, task.domain, duration_s=duration_s)
-    policy = task.make(probe)
-    env = parallel_env(scenario, task.domain, duration_s=duration_s, **policy.env_options)
+def _play(task: _Task, stop: threading.Event, done: Callable[[], None]) -> list[Result]:
+    policy = task.make(task.world)
+    env = parallel_env(task.world.scenario, **policy.env_options)  # its domain is in its files
     results: list[Result] = []
     try:
         for seed in task.seeds:
             roll_out(env, policy, seed, on_step=until(stop))
-            results.append(Result(task.name, env.domain, seed, env.scores()))
+            results.append(Result(task.name, task.world.domain, seed, env.scores()))
             done()
     finally:
         env.close()
