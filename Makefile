@@ -2,6 +2,7 @@
 #
 #   make demo       trains a policy across the gap on a shipped network and prints the table
 #   make test       builds the wheel, installs it into .venv and tests it
+#   make test-all   the same, and small versions of the paper's tables (half an hour)
 #   make check      format, lint, types, architecture, tests
 #   make bench      the figures of docs/, measured on this machine
 #   make scenarios  builds the shipped scenarios again from their sources
@@ -25,7 +26,7 @@ unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV
 export PYTHONSAFEPATH := 1
 export PYTHONNOUSERSITE := 1
 
-.PHONY: help demo test check static format lint types architecture bench scenarios oldest python environment environment-dev
+.PHONY: help demo test test-all check static format lint types architecture bench scenarios oldest python environment environment-dev
 .DEFAULT_GOAL := help
 
 help:
@@ -39,6 +40,10 @@ demo: environment
 
 test: environment-dev
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
+
+test-all: environment-dev
+	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
+	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m nightly $(TESTS)/nightly $(ARGS)
 
 check: static
 	@$(MAKE) --no-print-directory test

@@ -22,6 +22,7 @@ from ugat_marl.grounding.timed import TimedTransform
 from ugat_marl.grounding.timed_fitting import fit_timed
 from ugat_marl.grounding.timed_report import TimedReport
 from ugat_marl.transitions import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.worlds import shuffled
 
 LAYOUTS = {"a_0": AgentLayout(6, 3), "b_0": AgentLayout(4, 2, 2)}
 SHAPES = {
@@ -316,3 +317,13 @@ def test_logs_that_cannot_be_composed_are_refused() -> None:
         fitted(TransitionLog(other, real.frame))
     with pytest.raises(LogError, match="record at least two whole episodes"):
         fitted(street(PLANTED, seed=2, episodes=1, steps=1))
+
+
+def test_streets_of_which_f_knows_nothing_lose_no_time_that_one_could_know_of(planted) -> None:
+    """Shuffled rows have a delay that fits best, too; it means nothing."""
+    made, report = fitted(shuffled(street(PLANTED, seed=1), seed=0))
+    assert not report.forward.learnt.any()
+    assert report.lost.best_s.max() > 0.5
+    assert not made.constants.delay_s.any()
+    assert planted[1].forward.learnt.all()
+    assert planted[0].constants.delay_s.max() > 1.5

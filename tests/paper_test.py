@@ -14,9 +14,10 @@ from ugat_marl.errors import MeasurementError, OptionError
 from ugat_marl.metrics import Scores
 from ugat_marl.paper.job import JOB, SCORES, read_scores
 from ugat_marl.paper.runner import LOG, Planned, done, perform_all
-from ugat_marl.paper.settings import DIRECT, TABLES, TIMED, Setting, settings_of
+from ugat_marl.paper.settings import TABLES, Setting, settings_of
 from ugat_marl.paper.tables import PaperConfig, Planner
 from ugat_marl.progress import Silent
+from ugat_marl.transfer import DIRECT, TIMED
 from ugat_marl.ugat import UgatConfig
 
 SHORT = PaperConfig(episodes=10, iterations=2, grounded_episodes=5, real_rollouts=3, seeds=2)

@@ -1,17 +1,21 @@
-"""Ways to train a policy: plainly, on in another world, or grounded; each can be taken up again."""
+"""Ways to train a policy without grounding, and the worlds that grounding learns from."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.effects import Domain
 from ugat_marl.learners.dqn import DQN
-from ugat_marl.policy import AnyParallelEnv
+from ugat_marl.learners.dqn_config import DQNConfig
+from ugat_marl.policy import AnyParallelEnv, Policy
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
+from ugat_marl.training import Run
 from ugat_marl.ugat import CHUNK, UgatConfig
 from ugat_marl.worlds import SimulatedWorld
 
@@ -73,3 +77,54 @@ def simulated_worlds(
         world(sim, "sim", ugat.sim_rollouts, ugat.most_delay_s),
         world(real, "real", ugat.real_rollouts),
     )
+
+
+@dataclass(frozen=True)
+class Control:
+    """A policy to be trained without any grounding.
+
+    Attributes:
+        name: What the table calls it.
+        env: Where it is trained.
+        episodes: Of its life, those of direct transfer included where it goes on from there.
+        from_direct: Whether it goes on from direct transfer, or begins from scratch.
+        file: Where its learner is kept, in the folder of the run; "" for a name like its own.
+        title: What its progress is called; "" for its name.
+    """
+
+    name: str
+    env: AnyParallelEnv
+    episodes: int
+    from_direct: bool = True
+    file: str = ""
+    title: str = ""
+
+    def learner_path(self, run: Run) -> Path:
+        """Where its learner is saved every few episodes."""
+        return run.directory / (self.file or f"{file_name(self.name)}-learner.pt")
+
+
+def train_control(control: Control, config: DQNConfig, seed: int, run: Run, direct: Path) -> Policy:
+    """Trains until the learner has its episodes; where it was interrupted, it goes on.
+
+    Args:
+        control: What to train.
+        config: Settings of the learner.
+        seed: Root of every random choice.
+        run: Where it is saved.
+        direct: The learner of direct transfer.
+    """
+    learner = DQN.of(control.env, config, seed)
+    progress = control.learner_path(run)
+    if progress.exists():
+        learner.load(progress)
+    elif control.from_direct:
+        learner.load(direct)
+    title = control.title or control.name
+    train_until(learner, control.env, control.episodes, seed, progress, run.reporter, title)
+    return learner.policy()
+
+
+def file_name(name: str) -> str:
+    """The name of a policy as the name of a file."""
+    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from ugat_marl.controllers import STANDARD_RULES
-from ugat_marl.controls import Control, file_name, train_control
 from ugat_marl.effects import describe, in_domain, load
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.evaluation import (
@@ -33,20 +32,20 @@ from ugat_marl.placebo import PLACEBOS, Placebo, answer_with_noise
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.randomised import randomised_env
+from ugat_marl.recipes import Control, file_name, simulated_worlds, train_control
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
 from ugat_marl.transitions import TransitionLog
 from ugat_marl.tuning import LEAST_BUDGET, TUNED_RULES, tuned_rules
 from ugat_marl.ugat import (
-    CHUNK,
     DIRECT_LEARNER,
     State,
     UgatConfig,
     restore,
     train_ugat,
 )
-from ugat_marl.worlds import RecordedWorld, ShuffledWorld, SimulatedWorld, World
+from ugat_marl.worlds import RecordedWorld, ShuffledWorld, World
 
 EVALUATION_SEED = 1000
 """First seed of the reported episodes; apart from those of training and of the search for rules."""
@@ -222,7 +221,7 @@ def transfer(
         policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
         direct = directory / DIRECT_LEARNER
         for control in controls:
-            trained = train_control(control, config.dqn, config.seed, run, direct, CHUNK)
+            trained = train_control(control, config.dqn, config.seed, run, direct)
             policies[control.name] = trained
     finally:
         for made in (env, *(control.env for control in controls)):
@@ -301,16 +300,10 @@ def _train(
         )
         return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
 
-    def world(domain: str, name: str, episodes: int, most_delay_s: int = 0) -> SimulatedWorld:
-        def make() -> TrafficEnv:
-            crossings = config.ugat.most_delay_s > 0  # they tell best when a green began
-            return parallel_env(scenario, domain, crossings=crossings, **config.env_options)
-
-        return SimulatedWorld(make, name, episodes, config.ugat.rollout_epsilon, most_delay_s)
-
-    sim: World = world(config.sim, "sim", config.ugat.sim_rollouts, config.ugat.most_delay_s)
     street = config.sim if config.placebo == "same-world" else config.real
-    real: World = recorded or world(street, "real", config.ugat.real_rollouts)
+    worlds = simulated_worlds(scenario, config.sim, street, config.ugat, config.env_options)
+    sim: World = worlds[0]
+    real: World = recorded or worlds[1]
     if config.placebo == "shuffled":
         real = ShuffledWorld(real)
     try:

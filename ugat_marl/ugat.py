@@ -56,8 +56,9 @@ class UgatConfig:
         real_rollouts: Episodes added to D_real per iteration.
         rollout_epsilon: Chance of a random phase in these roll-outs.
         least_accuracy: Held-out accuracy h must have at an intersection before grounded actions
-            are taken there (f and h must beat their trivial rivals, too); None obeys them from the
-            start, as the paper does. With "timed" the share by which h must beat a guess.
+            are taken there; f and h must beat their trivial rivals, too, which is all that 0 asks.
+            None obeys them from the start, as the paper does. With "timed" the share by which h
+            must beat a guess.
         inputs: What f and h see beside the intersection's own state and action.
         forward: Shape of f.
         inverse: Shape of h.
@@ -73,7 +74,7 @@ class UgatConfig:
     sim_rollouts: int = 3
     real_rollouts: int = 3
     rollout_epsilon: float = 0.3
-    least_accuracy: float | None = None
+    least_accuracy: float | None = 0.0
     inputs: InputsConfig = field(default_factory=InputsConfig)
     forward: ForwardConfig = field(default_factory=ForwardConfig)
     inverse: InverseConfig = field(default_factory=InverseConfig)

@@ -14,11 +14,12 @@ from ugat_marl.bench.machine import machine_facts, usable_cores
 from ugat_marl.comparison import Comparison
 from ugat_marl.errors import OptionError
 from ugat_marl.files import require_writable, write_whole
-from ugat_marl.paper.settings import DIRECT, GROUNDED_NAME
+from ugat_marl.paper.settings import GROUNDED_NAME
 from ugat_marl.paper.tables import PaperConfig, compare
 from ugat_marl.progress import Bars
 from ugat_marl.report.comparison_pictures import gap_picture, radar_picture
 from ugat_marl.report.comparison_tables import as_csv, markdown, seeds_csv, terminal_tables
+from ugat_marl.transfer import DIRECT
 
 
 @dataclass(frozen=True)

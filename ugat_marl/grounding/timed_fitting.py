@@ -63,7 +63,9 @@ def fit_timed(
     known = Means.of(model, replace(data, weight=parts.train * begins))
     street = replace(street, weight=street.weight * _begins(street, stack))
     lost = lost_time(model, street, known, transform.timed.spread_s)
-    transform.constants.delay_s.copy_(lost.phase_s)
+    # Models that know nothing of a street or of the simulation know of no lost time either.
+    learnt = torch.from_numpy(f.learnt & g.learnt)
+    transform.constants.delay_s.copy_(lost.phase_s * learnt[:, None])
     data = replace(data, weight=data.weight * begins)
     h = _fit_delays(
         transform, data, _where(begins, parts), known.spread[:, None], config, seed, on_epoch

@@ -9,22 +9,24 @@ from typing import Literal
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.gate import GateConfig
+from ugat_marl.transfer import (
+    CONTROL,
+    DIRECT,
+    FINE_TUNED,
+    ORACLE,
+    RANDOM_DELAY,
+    RANDOMISED,
+    TIMED,
+    UGAT,
+)
 from ugat_marl.ugat import UgatConfig
 
 Kind = Literal["direct", "grounded", "further", "scratch", "randomised", "delays", "rule"]
 
-DIRECT = "direct transfer"
-PLAIN = "more plain sim"
-PHASE = "UGAT"
-TIMED = "UGAT, timed"
-RANDOMISED = "domain randomisation"
-RANDOM_DELAY = "random delay"
-FINE_TUNED = "fine-tuned on the same data"
-ORACLE = "trained in real"
 RULE = "best rule, tuned there"
 
 TABLES = ("main", "ablation", "alpha", "uncertainty", "gap")
-GROUNDED_NAME = {"phase": PHASE, "timed": TIMED}
+GROUNDED_NAME = {"phase": UGAT, "timed": TIMED}
 
 
 @dataclass(frozen=True)
@@ -80,12 +82,14 @@ def settings_of(
         raise OptionError("groundings is empty; name phase, timed, or both")
     if wrong := [seconds for seconds in constants if seconds < 1]:
         raise OptionError(f"constants holds {wrong[0]}: delays are whole seconds, at least 1")
-    bases = {name: replace(ugat, grounding=name) for name in groundings}
+    # The paper's grounding obeys its models from the start.
+    least = {"phase": None, "timed": ugat.least_accuracy}
+    bases = {g: replace(ugat, grounding=g, least_accuracy=least[g]) for g in groundings}
     direct, rule = Setting(DIRECT, "direct"), Setting(RULE, "rule")
     if table == "main":
         return [direct, *_grounded(bases), *_controls(ugat, sim, constants), rule]
     if table == "ablation":
-        rows = [direct, Setting(PLAIN, "further", sim)]
+        rows = [direct, Setting(CONTROL, "further", sim)]
         return rows + [row for name, base in bases.items() for row in _ablated(name, base)]
     if table == "alpha":
         return [direct] + [row for name, base in bases.items() for row in _alphas(name, base)]
@@ -108,7 +112,7 @@ def _grounded(bases: dict[str, UgatConfig]) -> list[Setting]:
 def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Setting]:
     seen = ugat.iterations * ugat.real_rollouts
     return [
-        Setting(PLAIN, "further", sim),
+        Setting(CONTROL, "further", sim),
         Setting(RANDOMISED, "randomised"),
         Setting(RANDOM_DELAY, "delays", sim),
         *(Setting(constant_name(s), "further", f"late_green=*,{s}") for s in constants),
@@ -123,11 +127,16 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
     static = replace(base, gate=replace(base.gate, mode="static", static_alpha=0.5))
     ungated = replace(base, gate=replace(base.gate, mode="infinite"))
     plain = replace(ungated, fit=replace(base.fit, uncertainty="none"))
+    proven = replace(base, least_accuracy=0.0)
     return [
         Setting(full, "grounded", ugat=base),
         Setting(f"{full}: α = 0.5", "grounded", ugat=static),
         Setting(f"{full}: no gate", "grounded", ugat=ungated),
         Setting(f"{full}: no uncertainty (GAT)", "grounded", ugat=plain),
+        *(
+            [Setting(f"{full}: where f and h are proven", "grounded", ugat=proven)]
+            * (base != proven)
+        ),
     ]
 
 

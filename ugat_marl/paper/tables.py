@@ -12,9 +12,9 @@ from ugat_marl.errors import OptionError
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.paper.job import Job
 from ugat_marl.paper.runner import Planned, done, perform_all
-from ugat_marl.paper.settings import DIRECT, Kind, Setting, settings_of
+from ugat_marl.paper.settings import Kind, Setting, settings_of
 from ugat_marl.progress import Reporter
-from ugat_marl.transfer import EVALUATION_SEED
+from ugat_marl.transfer import DIRECT, EVALUATION_SEED
 from ugat_marl.tuning import BUDGET, LEAST_BUDGET
 from ugat_marl.ugat import UgatConfig
 

@@ -1,0 +1,79 @@
+"""Small versions of the paper's tables: does each show the direction its effect has?
+
+`make test-all` runs them; a quarter of an hour of two cores. All share their trainings, in a folder
+that is kept between runs of this file in one session.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.comparison import Comparison
+from ugat_marl.paper.settings import RULE, constant_name
+from ugat_marl.paper.tables import PaperConfig, compare
+from ugat_marl.progress import Silent
+from ugat_marl.transfer import CONTROL, DIRECT, ORACLE, TIMED, UGAT
+
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
+
+DOMAIN = "V4"
+CONFIG = PaperConfig(
+    domains=(DOMAIN,), seeds=2, first_seed=20, episodes=30, iterations=2, sim_rollouts=3,
+    real_rollouts=2, constants=(3,), evaluation_seeds=2, rule_budget=11,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+def table(name: str, runs: Path) -> Comparison:
+    return compare(name, "single-v1", CONFIG, runs, 2, Silent())
+
+
+def att(found: Comparison, setting: str, domain: str | None = None) -> float:
+    return found.estimate(setting, DOMAIN, "att_s", domain).mean
+
+
+def test_main(runs: Path) -> None:
+    found = table("main", runs)
+    assert att(found, DIRECT) > 1.3 * att(found, DIRECT, "sim")  # there is a gap
+    assert att(found, ORACLE) < att(found, DIRECT)  # and something to win
+    assert att(found, constant_name(3)) < att(found, DIRECT)
+    assert att(found, TIMED) < att(found, DIRECT)
+    assert found.won_back(TIMED, DOMAIN, DIRECT) >= 0.7
+    assert att(found, TIMED, "sim") <= 1.05 * att(found, DIRECT, "sim")  # at no cost in sim
+    assert att(found, TIMED) < att(found, CONTROL)
+    assert att(found, RULE) < att(found, DIRECT)
+    assert found.test(TIMED, DIRECT, DOMAIN).better == CONFIG.seeds
+
+
+def test_ablation(runs: Path) -> None:
+    found = table("ablation", runs)
+    for part in ("α = 0.5", "no gate", "no uncertainty (GAT)"):
+        # a rejection falls back to the best constant: every variant wins most of it back
+        assert found.reduction(f"{TIMED}: {part}", DOMAIN, DIRECT) > 0.3
+    # phase grounding that obeys h from the start is no better than timed grounding
+    assert att(found, f"{UGAT}: no gate") > att(found, TIMED)
+
+
+def test_alpha(runs: Path) -> None:
+    found = table("alpha", runs)
+    low, high = (att(found, f"{UGAT}: α = {alpha}") for alpha in (0.2, 0.8))
+    assert low != high  # the threshold reaches the training
+    assert found.reduction(f"{TIMED}: α = 0.2", DOMAIN, DIRECT) > 0.3
+
+
+def test_uncertainty(runs: Path) -> None:
+    found = table("uncertainty", runs)
+    for method in ("evidential", "Concrete Dropout", "Deep Ensembles", "none (GAT)"):
+        assert found.reduction(f"{TIMED}: {method}", DOMAIN, DIRECT) > 0.3
+
+
+def test_gap(runs: Path) -> None:
+    found = table("gap", runs)
+    for measure, worse in (("att_s", 1), ("queue", 1), ("delay", 1), ("throughput", -1)):
+        assert worse * found.gaps(DIRECT, DOMAIN, measure).mean() > 0
