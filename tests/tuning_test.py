@@ -14,7 +14,7 @@ from rich.console import Console
 
 from ugat_marl import evaluation, transfer, tuning
 from ugat_marl.__main__ import main
-from ugat_marl.controllers import RULES, STANDARD_RULES, parse_spec
+from ugat_marl.controllers import RULES, STANDARD_RULES, parse_spec, spell
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.evaluation import TUNING_SEED, best_rules, race
@@ -110,8 +110,11 @@ def test_a_race_stays_within_its_budget(settings: int, extra: int) -> None:
 
 def test_a_small_budget_thins_the_settings_out_evenly() -> None:
     assert settings_of("fixed-time", 100) == [f"fixed-time:{s}" for s in (10, 20, 30, 40, 50, 60)]
-    assert settings_of("fixed-time", 5) == ["fixed-time:20", "fixed-time:40", "fixed-time:60"]
-    assert settings_of("fixed-time", 2) == ["fixed-time:20", "fixed-time:50"]
+    assert settings_of("fixed-time", 5) == ["fixed-time:30", "fixed-time:40", "fixed-time:60"]
+    assert settings_of("fixed-time", 2) == ["fixed-time:30", "fixed-time:50"]
+    for name, rule in RULES.items():  # the usual setting is never thinned out
+        usual = spell(name, [parameter.default for parameter in rule.parameters])
+        assert all(usual in settings_of(name, budget) for budget in (2, 5, 8, 16, 24, 100))
     both = len(RULES["actuated"].parameters[0].choices) * len(
         RULES["actuated"].parameters[1].choices
     )

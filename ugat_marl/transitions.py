@@ -257,13 +257,13 @@ class TransitionLog:
             self.frame.write_parquet(temporary, metadata={METADATA_KEY: self.provenance.to_json()})
 
     @classmethod
-    def read(cls, path: Path) -> TransitionLog:
+    def read(cls, path: Path | str) -> TransitionLog:
         """Reads and checks what `write` wrote, here or elsewhere.
 
         Raises:
             LogError: Missing, cut short, not a transition log, or with impossible contents.
         """
-        frame, metadata = read_parquet(path)
+        frame, metadata = read_parquet(Path(path))
         if METADATA_KEY not in metadata:
             raise LogError(
                 f"{path}: a Parquet file, but not a transition log: its metadata lacks "

@@ -164,14 +164,17 @@ def rungs(settings: int, budget: int) -> list[list[int]]:
 
 
 def settings_of(name: str, budget: int) -> list[str]:
-    """The spellings of a rule that a budget pays to race, spread evenly over all of them."""
+    """The spellings of a rule that a budget pays to race: the usual one, others spread evenly."""
     rule = RULES[name]
     values = itertools.product(*(parameter.choices for parameter in rule.parameters))
     specs = [spell(name, list(each)) for each in values]
     many = len(specs)
     while many > 1 and sum(_fields(many)) > budget:
         many -= 1
-    return [specs[(2 * k + 1) * len(specs) // (2 * many)] for k in range(many)]
+    kept = [(2 * k + 1) * len(specs) // (2 * many) for k in range(many)]
+    usual = specs.index(spell(name, [parameter.default for parameter in rule.parameters]))
+    kept[min(range(many), key=lambda k: abs(kept[k] - usual))] = usual
+    return [specs[k] for k in kept]
 
 
 def _fields(settings: int) -> list[int]:
