@@ -356,3 +356,13 @@ def test_routes_are_counted_per_hour(data: Path) -> None:
         "S_C": {"C_N": pytest.approx(180.0)},
         "W_C": {"C_E": pytest.approx(180.0)},
     }
+
+
+def test_parking_is_tried_on_every_lane_of_a_small_site() -> None:
+    allowed = library([])
+    found = Proposer(SITE, ROUTES, allowed).everywhere()
+    assert [dict(item.fixed)["lane"] for item in found] == [f"{arm}_in_0" for arm in ARMS]
+    assert {item.name for item in found} == {"parking"}
+    assert Proposer(SITE, ROUTES, allowed - {"parking"}).everywhere() == []
+    many = replace(SITE, lanes=SITE.lanes * 7)
+    assert Proposer(many, ROUTES, allowed).everywhere() == []

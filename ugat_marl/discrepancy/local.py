@@ -30,6 +30,8 @@ from ugat_marl.measured.data import Passages, Period
 Array = NDArray[np.float64]
 
 _DWELL_S = 40.0
+_MOST_LANES = 24
+"""With more incoming lanes not every one of them is tried."""
 _FLOW = (
     "gap_long", "occupied_in_green", "gap9+", "free_speed", "queue_over", "platoon_gap",
     "count_advance", "count_stop",
@@ -74,6 +76,17 @@ class Proposer:
         found += self._places(reference, distance)
         found += fault_hypotheses(self._site, reference, distance, periods)
         return [item for item in found if item.name in self._allowed]
+
+    def everywhere(self) -> list[Hypothesis]:
+        """What may be wrong at any of the places, if there are few: parking on each lane.
+
+        A lane on which vehicles stand is avoided; its neighbour takes what it loses, so that
+        neither pools nor single statistics show it, and no other effect leads there.
+        """
+        lanes = self._site.lanes
+        if len(lanes) > _MOST_LANES or "parking" not in self._allowed:
+            return []
+        return [_parking(lane.id) for lane in lanes]
 
     def directed(self, distance: Distance) -> dict[str, float]:
         """What the best origin, turn and stretch would explain: few counts, but the right ones."""
@@ -211,11 +224,7 @@ class Proposer:
         """Lanes for parking, edges for slow roads, traffic lights for lost time and clocks."""
         found: list[Hypothesis] = []
         lanes = self._site.lanes
-        found += [
-            Hypothesis("parking", (("lane", lane), ("dwell_s", _DWELL_S)), ("per_hour",),
-                       ((20.0,),), (0.0,), 3.0)
-            for lane in self._disturbed(distance)
-        ]  # fmt: skip
+        found += [_parking(lane) for lane in self._disturbed(distance)]
         speed = distance.z["lane"][: len(lanes), INDEX["free_speed"]]
         by_edge: dict[str, float] = defaultdict(float)
         for lane, value in zip(lanes, speed, strict=True):
@@ -289,6 +298,11 @@ class Proposer:
                 Hypothesis("clock_drift", place, ("seconds_per_hour",), ((sign,),), (0.0,), 0.5)
             )
         return found
+
+
+def _parking(lane: str) -> Hypothesis:
+    fixed = (("lane", lane), ("dwell_s", _DWELL_S))
+    return Hypothesis("parking", fixed, ("per_hour",), ((20.0,),), (0.0,), 3.0)
 
 
 def _later(counts: Array, bins: float) -> Array:

@@ -143,6 +143,7 @@ class Selector:
         self._first = fitter.base.distance(fitter.data)
         self._seen: dict[str, Fitted] = {}
         self._rays: tuple[Ray, ...] = ()
+        self._places: tuple[Ray, ...] = ()
 
     def looked_closer(self, base: Tested) -> Tested:
         """The test of the scenario as it is once it is known where single effects would show.
@@ -151,7 +152,8 @@ class Selector:
             OutOfTime: The budget does not suffice for that.
         """
         data = self._fitter.data
-        directions = Directions(self._library_rays(base.model, 0))
+        self._places = tuple(self._bank(base.model, self._proposer.everywhere(), 0, "places"))
+        directions = Directions((*self._library_rays(base.model, 0), *self._places))
         null = self._null(base.model.tallies, len(data), directions)
         return replace(base, null=null, residual=null.test(data))
 
@@ -184,7 +186,7 @@ class Selector:
         for name, difference in self._first.difference.items():
             extra[name] = extra[name] + (TOLERANCE * difference) ** 2
         fitted = tuple(change for change, _ in fitter.changes(model))
-        directions = Directions(self._rays, extra, fitted)
+        directions = Directions((*self._rays, *self._places), extra, fitted)
         null = self._null(days, len(fitter.data), directions)
         return Tested(model, null, null.test(fitter.data, extra), errors, extra)
 
@@ -241,9 +243,12 @@ class Selector:
         present = {item.key for item in self._library}
         found = self._proposer.hypotheses(model.reference, model.distance, self._periods)
         local = [item for item in found if item.key not in present]
-        added = self._bank(model, local, number, "places")
+        known = [] if number else list(self._places)  # worked out upon the scenario as it is
+        places = {ray.hypothesis.key for ray in known}
+        added = self._bank(model, [h for h in local if h.key not in places], number, "places")
+        added += known
         proposals = propose([*rays, *added], self._whitener(model, None), self._fitter.price)
-        places = {item.key for item in local}
+        places |= {item.key for item in local}
         alone = [item for item in proposals if len(item.members) == 1]
         best: dict[str, Members] = {}
         for item in alone:
@@ -292,7 +297,8 @@ class Selector:
                 found = engine.replicates(effects, numbers)
             except (SimulatorError, OptionError, ScenarioError) as error:
                 # it cannot be there: the lane is too short to park on, say
-                self._reporter.say(f"note: {hypothesis.name} left out: {error}")
+                if what == "library":
+                    self._reporter.say(f"note: {hypothesis.name} left out: {error}")
                 continue
             difference, variance = shift(self._fitter.pools, [item.tally for item in found], before)
             rays.append(Ray(hypothesis, level, difference, variance, origin))
@@ -344,13 +350,17 @@ class Selector:
                 self._kept(self._fitter.refine(self._fitter.simulate(part), 2))
                 for part in each_left_out(best.model.members)
             ]
+            doubtful = [fewer[place] for place in _doubtful(best)]
             least = min(fewer, key=_cost)
             if least.cost - best.model.cost > NEGLIGIBLE:
-                if not (doubtful := [fewer[place] for place in _doubtful(best)]):
+                if not doubtful:
                     break
                 least = min(doubtful, key=_cost)
             tested = self.test(least)
-            if least.cost > best.model.cost and tested.residual.p <= self._alpha:
+            enough = tested.residual.p > self._alpha
+            # What may not be there is not named, either, where nothing suffices.
+            vain = least in doubtful and best.residual.p <= self._alpha
+            if least.cost > best.model.cost and not enough and not vain:
                 break
             best = tested
         return best
