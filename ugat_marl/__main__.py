@@ -35,6 +35,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "commands.diagnose:Diagnose",
         "where a simulation and measured data disagree, and why",
     ),
+    "export": ("commands.export:Export", "a trained policy as TorchScript, ONNX or matrices"),
     "check": ("commands.check:Check", "is a scenario sound, its environment conformant?"),
     "scenarios": ("commands.scenarios:Scenarios", "the networks and domains that can be named"),
     "paper main": ("commands.paper:Main", "UGAT and every control, with intervals over seeds"),
