@@ -1,0 +1,72 @@
+"""An answer within a time, or none: functions that are asked in a thread of their own."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+Answer = TypeVar("Answer")
+_Question = tuple[Callable[..., Any], tuple[Any, ...]]
+_Questions = queue.SimpleQueue[_Question | None]
+_Answers = queue.SimpleQueue[tuple[Any, BaseException | None]]
+
+
+class NoAnswer(Exception):
+    """The function raised; the message says what."""
+
+
+class Late(NoAnswer):
+    """There was no answer in time."""
+
+
+class Answering:
+    """Asks functions, one at a time, and waits no longer than it is told to.
+
+    A thread cannot be ended from outside: a function that is late is left to finish, its answer is
+    thrown away, and nothing is asked before. The thread does not keep the program alive.
+    """
+
+    def __init__(self) -> None:
+        self._questions: _Questions = queue.SimpleQueue()
+        self._answers: _Answers = queue.SimpleQueue()
+        self._owed = 0
+        arguments = (self._questions, self._answers)
+        threading.Thread(target=_serve, args=arguments, daemon=True, name="policy").start()
+
+    def ask(self, function: Callable[..., Answer], *arguments: Any, within_s: float) -> Answer:
+        """The function's answer.
+
+        Raises:
+            Late: None within `within_s`, or the last question has not been answered yet.
+            NoAnswer: The function raised, be it `SystemExit`.
+        """
+        while self._owed:
+            try:
+                self._answers.get_nowait()
+            except queue.Empty:
+                raise Late("still busy with an earlier decision") from None
+            self._owed -= 1
+        self._questions.put((function, arguments))
+        try:
+            answer, error = self._answers.get(timeout=max(within_s, 0.0))
+        except queue.Empty:
+            self._owed += 1
+            raise Late(f"no answer within {1e3 * within_s:.0f} ms") from None
+        if error is not None:
+            raise NoAnswer(f"{type(error).__name__}: {error}") from error
+        return answer
+
+    def close(self) -> None:
+        """Lets the thread end as soon as it is free."""
+        self._questions.put(None)
+
+
+def _serve(questions: _Questions, answers: _Answers) -> None:
+    while (question := questions.get()) is not None:
+        function, arguments = question
+        try:
+            answers.put((function(*arguments), None))
+        except BaseException as error:  # noqa: BLE001 - told where it was asked
+            answers.put((None, error))

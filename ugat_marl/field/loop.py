@@ -1,0 +1,330 @@
+"""The field loop: once per decision it reads, checks, decides and acts.
+
+A decision is ready within `Limits.answer_ms`, whether the policy answers or not; whatever it
+answers goes through the signal machines of `ugat_marl.field.safety`.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ugat_marl.actions import checked_phases
+from ugat_marl.errors import OptionError
+from ugat_marl.field.answering import Answering, Late, NoAnswer
+from ugat_marl.field.safety import Light, Trust, fixed_time, merged
+from ugat_marl.field.site import Site
+from ugat_marl.field.street import LaneCount, Street
+from ugat_marl.field.watchdog import Limits, Watchdog
+from ugat_marl.files import require_writable, write_whole
+from ugat_marl.policy import Policy
+from ugat_marl.signals import GREEN, Segment
+
+_WARM_UP_S = 30.0
+_WRITE_EVERY_S = 1.0
+
+Source = Literal["policy", "fallback", "both"]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One decision for all lights.
+
+    Attributes:
+        time_s: When, on the street's clock.
+        phases: Traffic light to the phase asked for.
+        fallback: Lights that follow the fixed-time plan, and why.
+        read_ms: Time it took to read the counts.
+        latency_ms: From the start of reading until every light had its plan.
+    """
+
+    time_s: float
+    phases: Mapping[str, int]
+    fallback: Mapping[str, str]
+    read_ms: float
+    latency_ms: float
+
+    @property
+    def source(self) -> Source:
+        """Who decided."""
+        if not self.fallback:
+            return "policy"
+        return "fallback" if len(self.fallback) == len(self.phases) else "both"
+
+    def line(self) -> str:
+        """The decision as a line of JSON."""
+        return json.dumps(
+            {
+                "time_s": self.time_s,
+                "source": self.source,
+                "reasons": dict(self.fallback),
+                "phases": dict(self.phases),
+                "read_ms": round(self.read_ms, 3),
+                "latency_ms": round(self.latency_ms, 3),
+            }
+        )
+
+
+class DecisionLog:
+    """A file with one line of JSON per decision, whole at any moment.
+
+    It is written anew beside its place and renamed, after a decision and at most once a second, so
+    that a killed loop leaves all lines but those of its last second. Lines that are there stay.
+
+    Args:
+        path: The file.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        require_writable(path)
+        self.path = path
+        self._content = path.read_bytes() if path.exists() else b""
+        if self._content and not self._content.endswith(b"\n"):
+            raise OptionError(f"{path}: does not end with a whole line; give the log another name")
+        self._written = time.monotonic()
+
+    def add(self, decision: Decision) -> None:
+        """Adds a line."""
+        self._content += decision.line().encode() + b"\n"
+        if time.monotonic() - self._written >= _WRITE_EVERY_S:
+            self.write()
+
+    def write(self) -> None:
+        """Writes what there is."""
+        write_whole(self.path, self._content)
+        self._written = time.monotonic()
+
+
+@dataclass
+class Summary:
+    """What became of a run.
+
+    Attributes:
+        decisions: Decisions made.
+        latencies_ms: Of each of them.
+        light_decisions: Decisions times lights.
+        reasons: Kind of fault to the decisions of single lights it sent to the plan.
+    """
+
+    decisions: int = 0
+    latencies_ms: list[float] = field(default_factory=list)
+    light_decisions: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+
+    def add(self, decision: Decision) -> None:
+        """Counts a decision."""
+        self.decisions += 1
+        self.latencies_ms.append(decision.latency_ms)
+        self.light_decisions += len(decision.phases)
+        self.reasons.update(reason.partition(":")[0] for reason in decision.fallback.values())
+
+    @property
+    def fallback_share(self) -> float:
+        """Share of single lights' decisions that were the plan's, 0 to 1."""
+        return sum(self.reasons.values()) / max(self.light_decisions, 1)
+
+    def latency_ms(self, quantile: float) -> float:
+        """A quantile of the latencies; NaN before the first decision."""
+        if not self.latencies_ms:
+            return float("nan")
+        return float(np.quantile(self.latencies_ms, quantile))
+
+
+class FieldLoop:
+    """Drives the lights of a street by a policy, as long as that can be trusted.
+
+    Args:
+        site: The place, with the policy's observation.
+        policy: Who decides; it is asked in a thread of its own.
+        street: What is read and set.
+        limits: What is believed, and for how long.
+        log: Where decisions are written; None for nowhere.
+
+    Raises:
+        OptionError: The street lacks a light, or shows what none of its lights can show.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        policy: Policy,
+        street: Street,
+        limits: Limits | None = None,
+        log: DecisionLog | None = None,
+    ) -> None:
+        self._site, self._street, self._log = site, street, log
+        self._limits = limits = limits or Limits()
+        shown = street.shown()
+        if lacking := [light for light in site.lights if light not in shown]:
+            raise OptionError(f"the street has no traffic light {lacking[0]!r}; it has {[*shown]}")
+        self.lights = {
+            item.id: Light(item.phases, site.timing, shown[item.id])
+            for item in site.network.intersections
+        }
+        self._watchdog = Watchdog(site.capacity, site.halting, limits)
+        self._held: frozenset[str] = frozenset()
+        self._trust = Trust(site.lights, limits.return_after)
+        interval, clearance = site.decision_interval_s, site.timing.clearance_s
+        self._plan = fixed_time(site.network, interval, clearance, limits.green_s)
+        self.summary = Summary()
+        self._answer = _answer_of(policy, site)
+        self._asked = Answering()
+        self._warm_up(policy)
+
+    def run(self, seconds: float, on_decision: Callable[[Decision], None] | None = None) -> Summary:
+        """Drives the street for `seconds`, rounded up to whole decisions.
+
+        Raises:
+            SimulatorError: The street is gone; the lights cannot be set any more.
+        """
+        until = self._street.now_s() + seconds - 1e-6
+        try:
+            while self._street.now_s() < until:
+                decision, plans = self.decide()
+                self._act(decision, plans)
+                if on_decision is not None:
+                    on_decision(decision)
+        finally:
+            if self._log is not None:
+                self._log.write()
+        return self.summary
+
+    def decide(self) -> tuple[Decision, dict[str, list[Segment]]]:
+        """Reads, checks and decides; the street has not been touched yet.
+
+        Returns:
+            The decision, and what each light is to show in the coming interval.
+        """
+        begun = time.perf_counter()
+        now = self._street.now_s()
+        counts, faults = self._look(now)
+        read_ms = _ms_since(begun)
+        requested: list[int] = []
+        if len(faults) < len(self.lights):
+            requested, wrong = self._ask(counts, now, begun)
+            if wrong:
+                faults = dict.fromkeys(self.lights, wrong) | faults
+        fallback = self._trust.judge(faults)
+        phases = self._plan.act({}, {})
+        for light, phase in zip(self.lights, requested, strict=False):
+            if light not in fallback:
+                phases[light] = phase
+        interval = self._site.decision_interval_s
+        plans = {name: light.advance(phases[name], interval) for name, light in self.lights.items()}
+        decision = Decision(now, phases, fallback, read_ms, _ms_since(begun))
+        return decision, plans
+
+    def _act(self, decision: Decision, plans: Mapping[str, list[Segment]]) -> None:
+        """Shows the plans; no state is shown for less than its time, however late the street is."""
+        for index, (duration, states) in enumerate(merged(plans)):
+            self._street.show(states)
+            until = self._street.now_s() + duration
+            if index == 0:  # the lights do not wait for it
+                self._record(decision)
+                self._held = _without_green(self._site, plans)
+            self._street.wait(until)
+
+    def _record(self, decision: Decision) -> None:
+        self.summary.add(decision)
+        if self._log is not None:
+            self._log.add(decision)
+
+    def close(self) -> None:
+        """Lets the policy's thread end; lights stay as they are."""
+        self._asked.close()
+
+    def _look(self, now: float) -> tuple[dict[str, LaneCount], dict[str, str]]:
+        """Counts to believe, and the lights that see others or are not taken over yet."""
+        try:
+            counts = dict(self._street.read())
+            wrong = self._watchdog.faults(counts, now, self._held)
+        except Exception as error:  # noqa: BLE001 - whatever a detector's driver raises
+            reason = f"missing: no counts at all, {type(error).__name__}: {error}"
+            return {}, dict.fromkeys(self.lights, reason)
+        faults: dict[str, str] = {}
+        for name, light in self.lights.items():
+            reasons = [wrong[lane] for lane in self._site.sees[name] if lane in wrong]
+            if reasons:
+                faults[name] = reasons[0] + (f" (+{len(reasons) - 1})" if reasons[1:] else "")
+            elif not light.taken_over:
+                faults[name] = "beginning: it shows what is none of its phases"
+        return {lane: count for lane, count in counts.items() if lane not in wrong}, faults
+
+    def _ask(
+        self, counts: Mapping[str, LaneCount], now: float, begun: float
+    ) -> tuple[list[int], str]:
+        """The policy's phases in the order of the lights, or what is wrong with it."""
+        limits = self._limits
+        phases = [light.phase for light in self.lights.values()]
+        observations = self._site.observe(counts, now, phases)
+        within_ms = limits.answer_ms - limits.reserve_ms
+        left_ms = within_ms - _ms_since(begun)
+        if left_ms <= 0:
+            return [], f"late: {within_ms:g} ms were over before the policy could be asked"
+        try:
+            return self._asked.ask(
+                self._answer, observations, self._infos(), within_s=left_ms / 1e3
+            ), ""
+        except Late as late:
+            return [], f"late: {late}"
+        except NoAnswer as error:
+            return [], f"policy: {error}"
+
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        interval = self._site.decision_interval_s
+        lights = zip(self._site.observer.agents, self.lights.values(), strict=True)
+        return {
+            agent: {"action_mask": light.free(interval), "executed_action": light.phase}
+            for agent, light in lights
+        }
+
+    def _warm_up(self, policy: Policy) -> None:
+        """The first answer of a network takes longer than all others; it is not for the street."""
+        try:
+            nothing = self._site.observe({}, self._street.now_s(), [0] * len(self.lights))
+            for function, arguments in (
+                (policy.reset, (0,)),
+                (self._answer, (nothing, self._infos())),
+                (policy.reset, (0,)),
+            ):
+                self._asked.ask(function, *arguments, within_s=_WARM_UP_S)
+        except NoAnswer:
+            return  # it will fail again when it matters, and say so then
+
+
+def _answer_of(policy: Policy, site: Site) -> Callable[..., list[int]]:
+    """The policy, with the check of its answer, which takes time too."""
+    agents, spaces = site.observer.agents, site.spaces
+
+    def answer(observations: Any, infos: Any) -> list[int]:
+        return checked_phases(policy.act(observations, infos), agents, spaces)
+
+    return answer
+
+
+def _without_green(site: Site, plans: Mapping[str, list[Segment]]) -> frozenset[str]:
+    """Lanes in front of lights that have no green in these plans."""
+    held: set[str] = set()
+    for item in site.network.intersections:
+        states = [state for _, state in plans[item.id]]
+        green = {
+            link.from_lane
+            for link in item.links
+            if any(state[link.index] in GREEN for state in states)
+        }
+        held.update(lane for lane in item.incoming_lanes if lane not in green)
+    return frozenset(held)
+
+
+def _ms_since(begun: float) -> float:
+    return 1e3 * (time.perf_counter() - begun)

@@ -1,0 +1,152 @@
+"""What holds whatever a policy asks for: signal machines, the plan to fall back on, and trust.
+
+No input, no output, no clock of its own. The signal machine is that of the environments
+(`ugat_marl.signals`); here it also begins from whatever a light shows when it is taken over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl import signals
+from ugat_marl.controllers import FixedTime, Streets
+from ugat_marl.errors import OptionError
+from ugat_marl.network import Network
+from ugat_marl.signals import Segment, SignalState, SignalTiming
+
+_ENDING = frozenset("yYoO")
+"""Yellow, and off: traffic may be in the junction, so that yellow is shown (again) in full."""
+_NOT_GREEN = str.maketrans("yYoOu", "rrrrr")
+
+
+class Light:
+    """The signal machine of one traffic light.
+
+    Args:
+        phases: The green phases it may show.
+        timing: Minimum green and clearance.
+        shown: What it shows when it is taken over, any state of SUMO's. If that is none of the
+            phases it is held for the minimum green, as nobody knows since when it has been shown,
+            and cleared like one.
+
+    Raises:
+        OptionError: `shown` is of another light.
+    """
+
+    def __init__(self, phases: Sequence[str], timing: SignalTiming, shown: str) -> None:
+        if len(shown) != len(phases[0]) or not set(shown) <= signals.STATES:
+            raise OptionError(
+                f"the light shows {shown!r}, its phases are like {phases[0]!r}; the street must "
+                "be the scenario's own network"
+            )
+        self.phases = tuple(phases)
+        self._timing = timing
+        ends = "".join("y" if letter in _ENDING else letter for letter in shown)
+        self._ending_s = timing.yellow_s if set(shown) & _ENDING else 0.0
+        self._ending = ends.translate(str.maketrans("u", "r"))
+        held = shown.translate(_NOT_GREEN)
+        self._all = self.phases if held in self.phases else (*self.phases, held)
+        index = self._all.index(held)
+        self._state = SignalState(index, index, 0.0)
+
+    @property
+    def taken_over(self) -> bool:
+        """Whether it shows, or clears towards, a phase of its own."""
+        return self._state.phase < len(self.phases)
+
+    @property
+    def phase(self) -> int:
+        """The phase it shows or clears towards; 0 as long as it is not taken over."""
+        return self._state.phase if self.taken_over else 0
+
+    def free(self, within_s: float) -> NDArray[np.int8]:
+        """1 for every phase that would begin to be shown within `within_s`, ``(phases,)``."""
+        mask = np.ones(len(self.phases), dtype=np.int8)
+        left = within_s - self._ending_s
+        if self.taken_over and not signals.free_to_change(self._state, self._timing, left):
+            mask[:] = 0
+            mask[self.phase] = 1
+        return mask
+
+    def advance(self, requested: int, seconds: float) -> list[Segment]:
+        """What it shows in the next `seconds`, if from now on `requested` is asked for."""
+        shown: list[Segment] = []
+        if self._ending_s > 0:
+            part = min(self._ending_s, seconds)
+            shown, self._ending_s = [(part, self._ending)], self._ending_s - part
+            seconds -= part
+        if seconds > 0:
+            self._state, rest = signals.advance(
+                self._all, self._state, requested, seconds, self._timing
+            )
+            shown += rest
+        return shown
+
+
+class Trust:
+    """Who drives a light: the policy, until there is a fault, and again after some good decisions.
+
+    Args:
+        lights: The lights.
+        return_after: Good decisions in a row that a light spends on the plan after a fault.
+    """
+
+    def __init__(self, lights: Iterable[str], return_after: int) -> None:
+        self._return_after = return_after
+        self._good = dict.fromkeys(lights, math.inf)
+        self._last: dict[str, str] = {}
+
+    def judge(self, faults: Mapping[str, str]) -> dict[str, str]:
+        """Lights that follow the plan in this decision, and why.
+
+        Args:
+            faults: Light to what is wrong with its data or the policy, ``<kind>: <details>``.
+        """
+        found: dict[str, str] = {}
+        for light, good in self._good.items():
+            if light in faults:
+                self._good[light] = 0
+                self._last[light] = found[light] = faults[light]
+            elif good < self._return_after:
+                self._good[light] = good + 1
+                found[light] = (
+                    f"returning: {good + 1:g} of {self._return_after} good decisions after "
+                    f"{self._last[light]}"
+                )
+        return found
+
+
+def fixed_time(
+    network: Network, decision_interval_s: float, clearance_s: float, green_s: float
+) -> FixedTime:
+    """The plan to fall back on: a smallest set of phases that serves every link, in turn.
+
+    Its answers are by traffic light. It is a clock for all lights, so that it is the same whenever
+    a light joins.
+    """
+    streets = Streets(
+        {item.id: item for item in network.intersections},
+        {name: lane.capacity for name, lane in network.lanes.items()},
+        {name: lane.length_m / lane.speed_mps for name, lane in network.lanes.items()},
+        decision_interval_s,
+        clearance_s,
+    )
+    return FixedTime(streets, green_s)
+
+
+def merged(plans: Mapping[str, Sequence[Segment]]) -> list[tuple[float, dict[str, str]]]:
+    """The plans of all lights as one: durations in s, and the lights that change at their start."""
+    changes: dict[float, dict[str, str]] = {}
+    end = 0.0
+    for light, segments in plans.items():
+        offset = 0.0
+        for duration, state in segments:
+            changes.setdefault(round(offset, 6), {})[light] = state
+            offset += duration
+        end = max(end, offset)
+    times = [*sorted(changes), round(end, 6)]
+    return [(until - since, changes[since]) for since, until in zip(times, times[1:], strict=False)]

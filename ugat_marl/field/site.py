@@ -1,0 +1,133 @@
+"""What a controller has to know of the place it controls, and what a policy must see of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Discrete
+from numpy.typing import NDArray
+
+from ugat_marl.errors import OptionError
+from ugat_marl.field.street import LaneCount
+from ugat_marl.measurements import Snapshot
+from ugat_marl.network import Network, within
+from ugat_marl.observations import Observer
+from ugat_marl.scenario import Scenario
+from ugat_marl.signals import SignalTiming
+
+_INCOMING_ONLY = ("count", "queue", "density")
+_HALTING = ("queue", "movements")
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """The intersections, their timing, and the observation of one policy.
+
+    Attributes:
+        network: Static facts.
+        observer: Makes the policy's observations of counts.
+        timing: Minimum green and clearance of all lights.
+        decision_interval_s: Seconds from one decision to the next.
+        sees: Traffic light to the lanes its agent observes, those of neighbours included.
+        halting: Whether the observation needs the standing vehicles as well.
+    """
+
+    network: Network
+    observer: Observer
+    timing: SignalTiming
+    decision_interval_s: float
+    sees: Mapping[str, tuple[str, ...]]
+    halting: bool
+
+    @classmethod
+    def of(cls, scenario: Scenario, env_options: Mapping[str, Any]) -> Site:
+        """The site of a scenario, for a policy that relies on `env_options`.
+
+        Raises:
+            OptionError: The policy needs what no detector tells, or does not choose phases.
+        """
+        name, hops = env_options.get("observation", "count"), env_options.get("neighbours", 0)
+        if name == "waiting":
+            raise OptionError(
+                "the policy observes waiting times, which detectors do not count; in the field: "
+                "count, queue, density, pressure or movements"
+            )
+        if env_options.get("signals", "actions") != "actions":
+            raise OptionError(
+                "the policy leaves the signals to the network's own programme; there is nothing "
+                "to decide, so take another one"
+            )
+        network = Network.read(scenario)
+        control = scenario.control
+        items = network.intersections
+        own = {
+            item.id: item.incoming_lanes
+            if name in _INCOMING_ONLY
+            else (*item.incoming_lanes, *item.outgoing_lanes)
+            for item in items
+        }
+        near = within({item.id: item.neighbours for item in items}, hops)
+        return cls(
+            network,
+            Observer(network, name, hops),
+            SignalTiming(control.yellow_s, control.all_red_s, control.min_green_s),
+            control.decision_interval_s,
+            {
+                light: tuple(
+                    dict.fromkeys(lane for one in (light, *near[light]) for lane in own[one])
+                )
+                for light in own
+            },
+            name in _HALTING,
+        )
+
+    @cached_property
+    def lights(self) -> tuple[str, ...]:
+        """The traffic lights, in the order of the observer's agents."""
+        return tuple(item.id for item in self.network.intersections)
+
+    @cached_property
+    def capacity(self) -> dict[str, float]:
+        """Lane that must be counted to the vehicles that fit on it."""
+        lanes = dict.fromkeys(lane for own in self.sees.values() for lane in own)
+        return {lane: self.network.lanes[lane].capacity for lane in lanes}
+
+    @cached_property
+    def spaces(self) -> dict[str, Discrete]:
+        """Agent to its actions."""
+        items = zip(self.observer.agents, self.network.intersections, strict=True)
+        return {agent: Discrete(len(item.phases)) for agent, item in items}
+
+    def observe(
+        self, counts: Mapping[str, LaneCount], now_s: float, phases: list[int]
+    ) -> dict[str, NDArray[np.float32]]:
+        """The observations of all agents.
+
+        Args:
+            counts: Counts to believe; a lane without one is taken to be empty, so whoever sees it
+                must not be obeyed.
+            now_s: The street's clock.
+            phases: Phase each light shows or clears towards.
+        """
+        lanes = self._lanes.ids
+        nobody = LaneCount(now_s, 0.0, 0.0)
+        rows = [counts.get(lane, nobody) for lane in lanes]
+        snapshot = Snapshot(
+            time_s=now_s,
+            vehicles=np.array([row.vehicles for row in rows]),
+            halting=np.array([row.halting for row in rows]),
+            mean_speed_mps=np.full(len(lanes), np.nan),  # no observation reads it
+            waiting_s=np.empty(0),
+            departed=0,
+            backlog=0,
+        )
+        seen = self.observer.observe(snapshot, phases)
+        return dict(zip(self.observer.agents, seen, strict=True))
+
+    @cached_property
+    def _lanes(self) -> Any:
+        return self.network.lane_table()

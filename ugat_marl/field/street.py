@@ -1,0 +1,189 @@
+"""The street as a controller meets it: counts with their time, lights to set, a clock.
+
+`TraciStreet` lets a SUMO that runs elsewhere stand in for it; another street is a class with the
+five methods of `Street` (docs/field.md has one).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import subprocess
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, Protocol
+
+import traci
+import traci.constants as tc
+from traci.exceptions import FatalTraCIError, TraCIException
+
+from ugat_marl.errors import SimulatorError
+
+DetectorKind = Literal["lanes", "areas"]
+"""Where SUMO counts: on whole lanes, or on its lane-area detectors."""
+
+_RETRY_S = 0.05
+
+
+class LaneCount(NamedTuple):
+    """What is known of one lane.
+
+    Attributes:
+        time_s: When it was counted, on the street's clock.
+        vehicles: Vehicles on the lane; an estimate need not be whole.
+        halting: Of these, standing; NaN where nobody measures it.
+    """
+
+    time_s: float
+    vehicles: float
+    halting: float = math.nan
+
+
+class Street(Protocol):
+    """What the loop needs of a street. Only `read` may fail without ending the loop."""
+
+    def now_s(self) -> float:
+        """The street's clock, s."""
+        ...
+
+    def shown(self) -> Mapping[str, str]:
+        """Traffic light to the state it shows now, one letter of SUMO's per link."""
+        ...
+
+    def read(self) -> Mapping[str, LaneCount]:
+        """Lane to its last count, without waiting for a new one; lanes may be left out."""
+        ...
+
+    def show(self, states: Mapping[str, str]) -> None:
+        """Sets lights, which stay so until the next call; those left out are not touched."""
+        ...
+
+    def wait(self, until_s: float) -> None:
+        """Returns when the clock shows at least `until_s`."""
+        ...
+
+
+class TraciStreet:
+    """A running ``sumo --remote-port PORT`` in place of the street.
+
+    Counts are subscribed to, so that they come with every step, as detectors send them, and
+    `read` costs no round trip. The simulation goes on when the loop waits, and only then.
+
+    Args:
+        lanes: Lanes to count on.
+        port: Where SUMO listens.
+        host: The machine it runs on.
+        detectors: Whether to count on whole lanes, as the environments do, or on the simulation's
+            lane-area detectors (E2), several on a lane added up; lanes without one are not counted.
+        process: SUMO's process, if it is a child of this one, so that its end is noticed.
+        patience_s: How long to wait for SUMO to listen.
+
+    Raises:
+        SimulatorError: Nobody listens, or what runs there is another network.
+    """
+
+    def __init__(
+        self,
+        lanes: Sequence[str],
+        port: int,
+        host: str = "localhost",
+        *,
+        detectors: DetectorKind = "lanes",
+        process: subprocess.Popen[bytes] | None = None,
+        patience_s: float = 10.0,
+    ) -> None:
+        self._where = f"{host}:{port}"
+        self._connection = _connected(port, host, process, patience_s)
+        self._time_s = 0.0
+        try:
+            self._subscribe(lanes, detectors)
+        except SimulatorError:
+            self.close()
+            raise
+
+    def _subscribe(self, lanes: Sequence[str], detectors: DetectorKind) -> None:
+        with self._told("SUMO refuses to say what it counts"):
+            known = set(self._connection.lane.getIDList())
+            if strange := sorted(set(lanes) - known):
+                raise SimulatorError(
+                    f"the simulation at {self._where} has no lane {strange[0]!r} (and lacks "
+                    f"{len(strange)} of {len(lanes)}); it must run the scenario's own network"
+                )
+            self._lane_of = {lane: lane for lane in lanes}
+            self._counter: Any = self._connection.lane
+            if detectors == "areas":
+                self._counter = self._connection.lanearea
+                found = {name: self._counter.getLaneID(name) for name in self._counter.getIDList()}
+                self._lane_of = {name: lane for name, lane in found.items() if lane in set(lanes)}
+            for name in self._lane_of:
+                self._counter.subscribe(name, _COUNTED)
+            self._time_s = float(self._connection.simulation.getTime())
+
+    def now_s(self) -> float:
+        """The simulation's time, s."""
+        return self._time_s
+
+    def shown(self) -> dict[str, str]:
+        """State of every traffic light of the simulation."""
+        with self._told("SUMO does not say what its lights show"):
+            api = self._connection.trafficlight
+            return {name: api.getRedYellowGreenState(name) for name in api.getIDList()}
+
+    def read(self) -> dict[str, LaneCount]:
+        """Counts at the end of the last step."""
+        sums: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
+        for name, values in self._counter.getAllSubscriptionResults().items():
+            row = sums[self._lane_of[name]]
+            row[0] += values[_COUNTED[0]]
+            row[1] += values[_COUNTED[1]]
+        return {lane: LaneCount(self._time_s, *row) for lane, row in sums.items()}
+
+    def show(self, states: Mapping[str, str]) -> None:
+        """Sets the lights of the simulation."""
+        with self._told("SUMO does not set a light"):
+            for light, state in states.items():
+                self._connection.trafficlight.setRedYellowGreenState(light, state)
+
+    def wait(self, until_s: float) -> None:
+        """Simulates until then."""
+        if until_s > self._time_s:
+            with self._told(f"the street is gone after {self._time_s:g} s"):
+                self._connection.simulationStep(until_s)
+                self._time_s = float(self._connection.simulation.getTime())
+
+    def close(self) -> None:
+        """Hangs up, upon which SUMO ends; may be called again."""
+        with contextlib.suppress(TraCIException, FatalTraCIError, OSError):
+            self._connection.close(False)
+
+    @contextlib.contextmanager
+    def _told(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except (TraCIException, FatalTraCIError, OSError) as error:
+            self.close()
+            raise SimulatorError(f"{what} ({self._where}): {error}") from None
+
+
+_COUNTED = (tc.LAST_STEP_VEHICLE_NUMBER, tc.LAST_STEP_VEHICLE_HALTING_NUMBER)
+
+
+def _connected(
+    port: int, host: str, process: subprocess.Popen[bytes] | None, patience_s: float
+) -> Any:
+    """A connection of its own, outside of traci's pool, which belongs to the user."""
+    connect: Callable[..., Any] = traci.connect
+    until = time.monotonic() + patience_s
+    while True:
+        try:
+            return connect(port, 0, host)
+        except (TraCIException, FatalTraCIError, OSError) as error:
+            ended = process is not None and process.poll() is not None
+            if ended or time.monotonic() > until:
+                why = "it has ended" if ended else f"nobody listened for {patience_s:g} s"
+                raise SimulatorError(
+                    f"no connection to SUMO at {host}:{port}, {why} ({error}); start it with "
+                    f"--remote-port {port}, or let --start do so"
+                ) from None
+            time.sleep(_RETRY_S)

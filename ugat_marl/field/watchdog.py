@@ -1,0 +1,146 @@
+"""What counts must be like to be believed, and which are not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields
+
+from ugat_marl.errors import OptionError
+from ugat_marl.field.street import LaneCount
+
+_MAY_BE_ENDLESS = ("frozen_after_s", "silent_after_s", "over_capacity")
+_FULL = 0.8
+"""Share of its capacity from which a lane may be full: as many come as leave, or nobody can."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """From when on counts and policy are not believed, and for how long.
+
+    Attributes:
+        answer_ms: Within so many ms of reading the counts every light has its plan.
+        reserve_ms: Part of that kept for what follows the policy; the policy has the rest.
+        stale_after_s: Counts older than this are not used.
+        frozen_after_s: A lane whose count, not 0, stands still for so long while it has green; or
+            all counts, whatever the lights show. A queue at red is still, and so is a full lane.
+        silent_after_s: A lane that counts nobody for so long, after it has counted somebody and
+            while others move. Infinite where roads are empty for hours; so may the last one be.
+        over_capacity: So many times the vehicles that fit on the lane, and it is absurd. More than
+            1, since motorcycles are shorter than what the capacity is counted in.
+        return_after: Good decisions in a row before the policy drives a light again.
+        green_s: Time of a phase of the fixed-time plan, s, its clearance included.
+    """
+
+    answer_ms: float = 50.0
+    reserve_ms: float = 10.0
+    stale_after_s: float = 5.0
+    frozen_after_s: float = 180.0
+    silent_after_s: float = 1800.0
+    over_capacity: float = 2.0
+    return_after: int = 3
+    green_s: float = 30.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value, endless = getattr(self, item.name), item.name in _MAY_BE_ENDLESS
+            if not (value >= 0 and (endless or value < math.inf)):
+                raise OptionError(f"{item.name} = {value}: must be a number, 0 or more")
+        if self.reserve_ms >= self.answer_ms:
+            raise OptionError(
+                f"reserve_ms = {self.reserve_ms:g} leaves the policy nothing of the "
+                f"{self.answer_ms:g} ms; give less"
+            )
+
+
+class Watchdog:
+    """Looks at the counts of every decision.
+
+    Args:
+        capacity: Lane that must be counted to the vehicles that fit on it.
+        halting: Whether the number of standing vehicles must be known as well.
+        limits: What is believed.
+    """
+
+    def __init__(self, capacity: Mapping[str, float], halting: bool, limits: Limits) -> None:
+        self._capacity = capacity
+        self._halting = halting
+        self._limits = limits
+        self._value: dict[str, tuple[float, float]] = {}
+        self._still_s: dict[str, float] = {}
+        self._since_s: dict[str, float] = {}
+        self._looked_s = self._moved_s = 0.0
+        self._counted: set[str] = set()
+
+    def faults(
+        self, counts: Mapping[str, LaneCount], now_s: float, held: Collection[str] = ()
+    ) -> dict[str, str]:
+        """Lanes that are not to be believed, and why: ``<kind>: <details>``.
+
+        Args:
+            counts: What was read.
+            now_s: The street's clock.
+            held: Lanes that had no green since the last look: nobody could leave them.
+        """
+        found: dict[str, str] = {}
+        elapsed, self._looked_s = now_s - self._looked_s, now_s
+        for lane, capacity in self._capacity.items():
+            count = counts.get(lane)
+            if count is None:
+                found[lane] = f"missing: no count of lane {lane}"
+            elif wrong := self._absurd(count, capacity) or self._stale(count, now_s):
+                found[lane] = f"{wrong} on lane {lane}"
+            else:
+                waits = lane in held or count.vehicles >= _FULL * capacity
+                self._note(lane, count, now_s, 0.0 if waits else elapsed)
+                continue
+            self._value.pop(lane, None)  # what it will say next is new
+        return self._stuck(now_s) | found
+
+    def _absurd(self, count: LaneCount, capacity: float) -> str:
+        vehicles, halting = count.vehicles, count.halting
+        if not math.isfinite(vehicles) or vehicles < 0:
+            return f"absurd: {vehicles} vehicles"
+        if vehicles > self._limits.over_capacity * capacity:
+            return f"absurd: {vehicles:g} vehicles where {capacity:.1f} fit"
+        if self._halting and not 0 <= halting <= vehicles:
+            return f"absurd: {halting} of {vehicles:g} vehicles stand"
+        return ""
+
+    def _stale(self, count: LaneCount, now_s: float) -> str:
+        age = now_s - count.time_s
+        if not abs(age) <= self._limits.stale_after_s:  # NaN is stale; so is a clock that is ahead
+            return f"stale: a count {age:g} s old"
+        return ""
+
+    def _note(self, lane: str, count: LaneCount, now_s: float, elapsed: float) -> None:
+        value = (count.vehicles, count.halting if self._halting else 0.0)
+        if self._value.get(lane) == value:
+            self._still_s[lane] += elapsed
+        else:
+            self._value[lane], self._still_s[lane] = value, 0.0
+            self._since_s[lane] = self._moved_s = now_s
+        if count.vehicles > 0:
+            self._counted.add(lane)
+
+    def _stuck(self, now_s: float) -> dict[str, str]:
+        """Counts that do not move; an empty road at night is one of them, and no fault at first."""
+        limits, still = self._limits, now_s - self._moved_s
+        if still > limits.frozen_after_s and any(vehicles for vehicles, _ in self._value.values()):
+            return {
+                lane: f"frozen: no count has changed for {still:g} s, as on lane {lane}"
+                for lane in self._value
+            }
+        stuck: dict[str, str] = {}
+        for lane, (vehicles, _) in self._value.items():
+            moving, silent = self._still_s[lane], now_s - self._since_s[lane]
+            if vehicles > 0 and moving > limits.frozen_after_s:
+                stuck[lane] = f"frozen: {vehicles:g} vehicles for {moving:g} s of green on {lane}"
+            elif (
+                vehicles == 0
+                and silent > limits.silent_after_s
+                and still <= limits.frozen_after_s
+                and lane in self._counted
+            ):
+                stuck[lane] = f"silent: nobody for {silent:g} s on lane {lane}"
+        return stuck
