@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from ugat_marl.paper.runner import LOG, Planned, done, perform_all
 from ugat_marl.paper.settings import TABLES, Setting, settings_of
 from ugat_marl.paper.tables import PaperConfig, Planner
 from ugat_marl.progress import Silent
+from ugat_marl.training import locked
 from ugat_marl.transfer import DIRECT, TIMED
 from ugat_marl.ugat import UgatConfig
 
@@ -121,6 +124,25 @@ def test_a_failed_job_says_why_and_the_next_call_starts_it_again(tmp_path: Path)
         perform_all([planned], tmp_path, 1, Silent(), "test")
     assert "conut" in (tmp_path / "broken" / LOG).read_text()
     assert json.loads((tmp_path / "broken" / JOB).read_text())["kind"] == "direct"
+
+
+def test_two_tables_do_not_train_in_one_folder(tmp_path: Path) -> None:
+    lock = locked(tmp_path)
+    with pytest.raises(OptionError, match="another process"):
+        perform_all([], tmp_path, 1, Silent(), "test")
+    lock.close()
+    perform_all([], tmp_path, 1, Silent(), "test")
+
+
+def test_a_job_ends_with_whoever_started_it(tmp_path: Path) -> None:
+    endless = replace(planner().bases[0].job, episodes=10**6)
+    (tmp_path / JOB).write_text(json.dumps(asdict(endless)))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ugat_marl.paper.job", str(tmp_path)], stdin=subprocess.PIPE
+    )
+    assert process.stdin is not None
+    process.stdin.close()
+    assert process.wait(60) == 1
 
 
 @pytest.mark.parametrize("content", ["", "[{}]", '[{"domain": "sim"}]', '{"a": 1}', "[1]"])

@@ -91,7 +91,7 @@ class Run:
         identity = json.loads(json.dumps(identity, sort_keys=True))
         file = directory / "run.json"
         require_writable(file)
-        self._lock = _locked(directory)
+        self._lock = locked(directory)
         _remove_remains(directory)
         if file.exists() and self.resumable:
             if not resume:
@@ -177,8 +177,12 @@ class Run:
         return self._board
 
 
-def _locked(directory: Path) -> IO[str]:
-    """A file that stays locked as long as it is open, also by a process that is killed."""
+def locked(directory: Path) -> IO[str]:
+    """A file that stays locked as long as it is open, also by a process that is killed.
+
+    Raises:
+        OptionError: Another process has locked the folder.
+    """
     lock = (directory / ".lock").open("w")
     if importlib.util.find_spec("fcntl") is not None:  # not on Windows
         import fcntl

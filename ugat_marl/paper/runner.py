@@ -12,9 +12,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ugat_marl.errors import MeasurementError
-from ugat_marl.files import write_whole
+from ugat_marl.files import require_writable, write_whole
 from ugat_marl.paper.job import JOB, Job, Played, read_scores
 from ugat_marl.progress import Reporter
+from ugat_marl.training import locked
 
 LOG = "job.log"
 _TAIL = 400
@@ -74,10 +75,13 @@ def perform_all(
 
     Raises:
         MeasurementError: A job failed; its log says why. The others' results are kept.
+        OptionError: Another process performs jobs in that folder.
     """
     plan = list({planned.name: planned for planned in plan}.values())
     left = [planned for planned in plan if done(planned, folder) is None]
     running: dict[str, tuple[Planned, subprocess.Popen[bytes]]] = {}
+    require_writable(folder / LOG)
+    lock = locked(folder)
     with reporter.task(title, len(plan)) as advance:
         for _ in range(len(plan) - len(left)):
             advance()
@@ -99,6 +103,7 @@ def perform_all(
         finally:
             for _, process in running.values():
                 _end(process)
+            lock.close()
 
 
 def _begin(planned: Planned, folder: Path) -> subprocess.Popen[bytes]:
