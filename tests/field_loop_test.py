@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError, SimulatorError
 from ugat_marl.field import DecisionLog, FieldLoop, LaneCount, Limits, Site
+from ugat_marl.field.safety import fixed_time
 from ugat_marl.field.watchdog import Watchdog
 from ugat_marl.learners import DQN
 from ugat_marl.learners.agents import AgentSet
@@ -109,6 +110,9 @@ DATA_FAULTS: list[tuple[str, LaneCount | None]] = [
     ("absurd", LaneCount(NOW, math.nan, 0.0)),
     ("absurd", LaneCount(NOW, math.inf, 0.0)),
     ("absurd", LaneCount(NOW, -1.0, 0.0)),
+    ("absurd", LaneCount(NOW, None, 0.0)),  # type: ignore[arg-type]
+    ("absurd", LaneCount("now", 1.0, 0.0)),  # type: ignore[arg-type]
+    ("absurd", 3),  # type: ignore[list-item]
     ("absurd", LaneCount(NOW, 2.01 * SITE.capacity[LANE], 0.0)),
 ]
 
@@ -162,9 +166,7 @@ def failing(_counts: Counts) -> Counts:
     raise OSError("the cabinet does not answer")
 
 
-@pytest.mark.parametrize(
-    "spoil", [failing, lambda _: None, lambda _: {}, lambda c: dict.fromkeys(c, 3)]
-)
+@pytest.mark.parametrize("spoil", [failing, lambda _: None, lambda _: {}, lambda _: 3])
 def test_no_counts_send_every_light_to_the_plan(spoil: Callable[[Counts], Any]) -> None:
     street = MadeUpStreet()
     loop = FieldLoop(SITE, Scripted(), street, QUICK)
@@ -172,6 +174,34 @@ def test_no_counts_send_every_light_to_the_plan(spoil: Callable[[Counts], Any]) 
     (decision,) = decide(loop, street)
     assert decision.source == "fallback"
     assert all(reason.startswith("missing: ") for reason in decision.fallback.values())
+
+
+def test_lights_on_the_plan_ask_for_its_phases_and_the_others_for_the_policys() -> None:
+    street = MadeUpStreet()
+    loop = FieldLoop(SITE, Scripted(), street, QUICK)
+    street.spoil = replaced(None)
+    decisions = decide(loop, street, 12)
+    timing = SITE.timing
+    plan = fixed_time(SITE.network, 10.0, timing.clearance_s, QUICK.green_s)
+    planned = [plan.act({}, {})[LIGHT] for _ in decisions]
+    last = {item.id: len(item.phases) - 1 for item in SITE.network.intersections}
+    assert len(set(planned)) == 4
+    assert [decision.phases[LIGHT] for decision in decisions] == planned
+    for light in SITE.lights[1:]:
+        assert {decision.phases[light] for decision in decisions} == {last[light]}
+    shown = {states[LIGHT] for states in street.by_second}
+    assert {SITE.network.intersections[0].phases[phase] for phase in planned} <= shown
+
+
+def test_a_light_that_shows_a_foreign_state_is_the_plans_until_it_is_cleared() -> None:
+    street, policy = MadeUpStreet(), Scripted()
+    width = len(street.states[LIGHT])
+    street.states[LIGHT] = "r" * width
+    loop = FieldLoop(SITE, policy, street, QUICK)
+    decisions = decide(loop, street, 4)
+    kinds = [decision.fallback.get(LIGHT, "").partition(":")[0] for decision in decisions]
+    assert kinds == ["beginning", "returning", "returning", ""]
+    assert all(set(decision.fallback) <= {LIGHT} for decision in decisions)
 
 
 def test_neighbours_that_see_a_broken_detector_follow_the_plan_too() -> None:
@@ -271,6 +301,11 @@ def test_a_lane_that_fell_silent_is_found_but_not_one_that_never_counted() -> No
     )
     assert min(found) == 1910
     assert all(set(faults) == {"a"} for faults in found.values())
+
+
+def test_a_night_in_which_nobody_comes_any_more_is_no_fault() -> None:
+    watchdog = Watchdog(TWO, False, Limits(silent_after_s=600))
+    assert not held(watchdog, lambda now: {"a": now % 40 / 4 if now < 900 else 0.0, "b": 0.0})
 
 
 def raising(error: BaseException) -> Callable[[Any], Any]:
@@ -473,6 +508,27 @@ def test_a_log_that_ends_in_the_middle_of_a_line_is_not_added_to(tmp_path: Path)
     path.write_text('{"time_s": 0')
     with pytest.raises(OptionError, match="whole line"):
         DecisionLog(path)
+
+
+def test_a_log_that_cannot_be_written_for_a_while_does_not_stop_the_lights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ugat_marl.field.loop._WRITE_EVERY_S", 0.0)
+    folder = tmp_path / "logs"
+    log = DecisionLog(folder / "field.jsonl")
+    loop = FieldLoop(SITE, Scripted(), MadeUpStreet(), QUICK, log)
+
+    def disturb(decision: Any) -> None:
+        if decision.time_s == 10:
+            assert len(log.path.read_text().splitlines()) == 2
+            log.path.unlink()
+            folder.rmdir()
+            folder.touch()  # no folder any more
+        if decision.time_s == 40:
+            folder.unlink()
+
+    loop.run(60.0, disturb)
+    assert len(log.path.read_text().splitlines()) == 6
 
 
 def test_a_street_that_is_gone_ends_the_loop_with_its_log_written(tmp_path: Path) -> None:

@@ -134,6 +134,15 @@ def test_a_yellow_of_somebody_else_is_shown_in_full_by_hand() -> None:
     assert shown == [(3, "Gyrr"), (5, "Grrr"), (3, "yrrr"), (1, "rrrr")]
 
 
+def test_a_mask_reckons_with_the_yellow_of_somebody_else() -> None:
+    light = Light(PHASES, TIMING, "GGyy")
+    assert light.taken_over
+    assert light.phase == 0
+    assert light.free(8.0).tolist() == [1, 0]  # 3 s of yellow, 5 s of minimum green
+    assert light.free(9.0).tolist() == [1, 1]
+    assert light.advance(1, 10) == [(3, "GGyy"), (5, "GGrr"), (2, "yyrr")]
+
+
 def test_a_light_of_another_network_is_refused() -> None:
     with pytest.raises(OptionError, match="'GGrrr'.*'GGrr'"):
         Light(PHASES, TIMING, "GGrrr")

@@ -20,7 +20,7 @@ from ugat_marl.field.street import DetectorKind
 from ugat_marl.progress import Bars
 from ugat_marl.traffic_env import parallel_env
 
-Port = Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: a free one)")]
+Port = Annotated[int | None, arg(metavar="INT", help_behavior_hint="(with --start: a free one)")]
 Log = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: nowhere)")]
 
 

@@ -6,6 +6,7 @@ answers goes through the signal machines of `ugat_marl.field.safety`.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections import Counter
@@ -77,6 +78,7 @@ class DecisionLog:
 
     It is written anew beside its place and renamed, after a decision and at most once a second, so
     that a killed loop leaves all lines but those of its last second. Lines that are there stay.
+    Where it cannot be written for a while, the lights go on and it is tried again.
 
     Args:
         path: The file.
@@ -97,7 +99,8 @@ class DecisionLog:
         """Adds a line."""
         self._content += decision.line().encode() + b"\n"
         if time.monotonic() - self._written >= _WRITE_EVERY_S:
-            self.write()
+            with contextlib.suppress(OSError):  # a full disk does not stop the lights
+                self.write()
 
     def write(self) -> None:
         """Writes what there is."""
@@ -206,7 +209,7 @@ class FieldLoop:
             The decision, and what each light is to show in the coming interval.
         """
         begun = time.perf_counter()
-        now = self._street.now_s()
+        now = float(self._street.now_s())
         counts, faults = self._look(now)
         read_ms = _ms_since(begun)
         requested: list[int] = []

@@ -25,9 +25,9 @@ class Limits:
         frozen_after_s: A lane whose count, not 0, stands still for so long while it has green; or
             all counts, whatever the lights show. A queue at red is still, and so is a full lane.
         silent_after_s: A lane that counts nobody for so long, after it has counted somebody and
-            while others move. Infinite where roads are empty for hours; so may the last one be.
-        over_capacity: So many times the vehicles that fit on the lane, and it is absurd. More than
-            1, since motorcycles are shorter than what the capacity is counted in.
+            while others move; inf where roads are empty for hours.
+        over_capacity: More than so many times the vehicles that fit on the lane is absurd; not 1,
+            since motorcycles need less room than what the capacity is counted in.
         return_after: Good decisions in a row before the policy drives a light again.
         green_s: Time of a phase of the fixed-time plan, s, its clearance included.
     """
@@ -88,7 +88,7 @@ class Watchdog:
             count = counts.get(lane)
             if count is None:
                 found[lane] = f"missing: no count of lane {lane}"
-            elif wrong := self._absurd(count, capacity) or self._stale(count, now_s):
+            elif wrong := self._wrong(count, capacity, now_s):
                 found[lane] = f"{wrong} on lane {lane}"
             else:
                 waits = lane in held or count.vehicles >= _FULL * capacity
@@ -96,6 +96,12 @@ class Watchdog:
                 continue
             self._value.pop(lane, None)  # what it will say next is new
         return self._stuck(now_s) | found
+
+    def _wrong(self, count: LaneCount, capacity: float, now_s: float) -> str:
+        try:
+            return self._absurd(count, capacity) or self._stale(count, now_s)
+        except (TypeError, ValueError, AttributeError):  # a driver need not be typed
+            return f"absurd: {count!r} is no count"
 
     def _absurd(self, count: LaneCount, capacity: float) -> str:
         vehicles, halting = count.vehicles, count.halting
