@@ -22,7 +22,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "evaluate": ("commands.evaluate:Evaluate", "policies and rules in any domains: measures, gaps"),
     "tune": ("commands.tune:Tune", "the settings with which each rule does best in a domain"),
     "rollout": ("commands.rollout:Rollout", "record transitions as a Parquet log"),
-    "field": ("commands.field:Field", "drive the lights of a running SUMO as if it were the street"),
+    "field": (
+        "commands.field:Field",
+        "drive the lights of a running SUMO as if it were the street",
+    ),
     "record": ("commands.record:Record", "measure a domain as a street is measured"),
     "import-atspm": (
         "commands.import_atspm:ImportAtspm",
