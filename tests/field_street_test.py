@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -192,7 +193,10 @@ def test_late_greens_are_refused() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children with their parent")
-def test_sumo_does_not_outlive_the_process_that_started_it(python: list[str]) -> None:
+def test_sumo_does_not_outlive_the_process_that_started_it(
+    python: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # nobody is left to clear away
     code = (
         "import time\n"
         "from ugat_marl.effects import load\n"
@@ -228,6 +232,30 @@ def test_the_command_drives_and_sums_up(tmp_path: Path, capsys: pytest.CaptureFi
     assert "fixed time in 0.0%" in said
     assert re.search(r"ATT \d+\.\d s", said)
     assert len(log.read_text().splitlines()) == 6
+
+
+def test_an_interrupted_command_leaves_its_log_and_nothing_else(
+    python: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    log = tmp_path / "field.jsonl"
+    call = ["-m", "ugat_marl", "field", "single-v1", "--policy", "fixed-time:30", "--start"]
+    with subprocess.Popen(
+        [*python, *call, "--seconds", "1e7", "--log", str(log)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as command:
+        until = time.monotonic() + 60
+        while not log.exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        command.send_signal(signal.SIGINT)
+        _, said = command.communicate(timeout=30)
+    assert command.returncode == 130, said
+    assert said.strip().splitlines()[-1] == "ugat-marl: interrupted"
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [row["time_s"] for row in rows] == [10.0 * n for n in range(len(rows))]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["field.jsonl"]
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ class TraciStreet:
     ) -> None:
         self._where = f"{host}:{port}"
         self._connection = _connected(port, host, process, patience_s)
-        self._time_s = 0.0
+        self._time_s, self._amid = 0.0, False
         try:
             self._subscribe(lanes, detectors)
         except SimulatorError:
@@ -155,12 +155,17 @@ class TraciStreet:
     def close(self) -> None:
         """Hangs up, upon which SUMO ends; may be called again."""
         with contextlib.suppress(TraCIException, FatalTraCIError, OSError):
+            if self._amid and self._connection._socket is not None:
+                self._connection._socket.close()  # goodbye would be answered by what is under way
+                self._connection._socket = None
             self._connection.close(False)
 
     @contextlib.contextmanager
     def _told(self, what: str) -> Iterator[None]:
+        self._amid = True  # and stays so after Ctrl-C
         try:
             yield
+            self._amid = False
         except (TraCIException, FatalTraCIError, OSError) as error:
             self.close()
             raise SimulatorError(f"{what} ({self._where}): {error}") from None
