@@ -1,0 +1,350 @@
+"""IPPO and MAPPO on the suite's environments, in one file and with nothing but torch and numpy.
+
+Proximal policy optimisation (Schulman et al. 2017) by every intersection for itself (IPPO, de Witt
+et al. 2020), or with a critic that sees the whole network (MAPPO, Yu et al. 2022), and the details
+that matter (Huang et al. 2022, "The 37 implementation details of PPO").
+
+    python baselines/ippo.py --scenario grid2x2-v1 --episodes 100 --out runs/ippo
+    python baselines/ippo.py --scenario mixed-v1 --centralised
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor, nn
+
+import ugat_marl
+from ugat_marl.batched import BatchedMLP, one_thread
+from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
+from ugat_marl.errors import CheckpointError, EpisodeError, OptionError, UgatMarlError
+from ugat_marl.evaluation import evaluate, fixed_policy
+from ugat_marl.files import require_writable, write_whole
+from ugat_marl.learners.agents import AgentSet
+from ugat_marl.learners.dqn_policy import DQNPolicy, header
+from ugat_marl.learners.q_network import SharedMLP, flatten_parameters
+from ugat_marl.policy import AnyParallelEnv as Env
+from ugat_marl.policy import EpisodeCallback as Callback
+from ugat_marl.seeding import derive_seed, torch_generator
+from ugat_marl.transfer import EVALUATION_SEED
+
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
+
+
+@dataclass(frozen=True)
+class IPPOConfig:
+    """Settings of the learner."""
+
+    centralised: bool = False  # the critic sees env.state() (MAPPO), not an observation (IPPO)
+    shared: bool = True  # one actor and critic for all agents, told whose they are; or one for each
+    hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
+    learning_rate: float = 5e-4  # step size of Adam
+    anneal_episodes: int = 0  # the step size falls to 0 over so many episodes; 0 keeps it
+    discount: float = 0.95  # weight of the next decision's value (gamma)
+    gae_lambda: float = 0.95  # from one-step (0) to Monte Carlo (1) advantages
+    clip: float = 0.2  # share by which the probability of an action may move in an update
+    entropy_weight: float = 0.01  # weight of the entropy bonus
+    value_weight: float = 0.5  # weight of the critic's squared error
+    max_gradient: float = 0.5  # longer gradients are scaled down to this norm
+    update_every: int = 120  # decisions in a roll-out; the end of an episode ends one too
+    epochs: int = 8  # passes over each roll-out
+    minibatch: int = 30  # decisions (of all agents) in a gradient step
+    reward_scale: float | None = None  # factor on rewards; none: by their mean and deviation so far
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            whole = name in ("hidden", "update_every", "epochs", "minibatch")
+            most = 1 if name in ("discount", "gae_lambda") else math.inf
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None and not (1 if whole else 0) <= number <= most:
+                    raise OptionError(f"{name} = {value}: must be from {int(whole)} to {most}")
+        if self.discount == 1:
+            raise OptionError("discount = 1: must be below 1, since traffic has no end")
+
+
+def network(
+    agents: AgentSet, config: IPPOConfig, n_in: int, n_out: int, gain: float, rng: torch.Generator
+) -> nn.Module:
+    """Perceptrons from ``(agents, batch, n_in)`` to ``(agents, batch, n_out)``.
+
+    Weights are orthogonal, those of the last layer times `gain`, and biases zero. A shared one is
+    told whose input it computes, as by `ugat_marl.wrappers.agent_indicator`.
+    """
+    if config.shared:
+        made: nn.Module = SharedMLP(len(agents), n_in, config.hidden, n_out, rng)
+    else:
+        made = BatchedMLP([n_in] * len(agents), config.hidden, n_out, rng)
+    weights = [layer for name, layer in made.named_parameters() if name.endswith("weight")]
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.zero_()
+        for layer in weights:
+            for own in layer.view(-1, *layer.shape[-2:]):
+                nn.init.orthogonal_(own, gain if layer is weights[-1] else math.sqrt(2), rng)
+    return made
+
+
+def gae(rewards: Tensor, values: Tensor, discount: float, gae_lambda: float) -> Tensor:
+    """Generalised advantage estimates (Schulman et al. 2016, equation 16), ``(agents, decisions)``.
+
+    `rewards` has no end in between. `values` are those before each decision and the one after the
+    last, ``(agents, decisions + 1)``: it bootstraps the roll-out, be it cut off or truncated.
+    """
+    errors = rewards + discount * values[:, 1:] - values[:, :-1]
+    for i in reversed(range(errors.shape[1] - 1)):
+        errors[:, i] += discount * gae_lambda * errors[:, i + 1]
+    return errors
+
+
+class Decision(NamedTuple):
+    """What actor and critic saw, what was chosen, what came of it; all ``(agents, ...)``."""
+
+    observation: Tensor
+    viewed: Tensor
+    allowed: Tensor
+    action: Tensor
+    log_probability: Tensor
+    reward: Tensor
+
+
+class IPPO:
+    """Learns by PPO for all agents of `env`, equal or not; a `ugat_marl.policy.Learner`.
+
+    Roll-outs are bootstrapped with the critic's value where an episode is truncated; only where an
+    agent terminates, its future counts as zero reward.
+    """
+
+    def __init__(self, env: Env, config: IPPOConfig | None = None, seed: int = 0) -> None:
+        self.agents, self.config = agents, config = AgentSet.of(env), config or IPPOConfig()
+        self.env_options = dict(getattr(env.unwrapped, "env_options", {}))
+        self.episodes = 0
+        rng = torch_generator(seed, "ippo", "weights")
+        n_in, n_out = agents.widest_observation, agents.most_actions
+        self._actor = network(agents, config, n_in, n_out, 0.01, rng)  # at first nearly uniform
+        if config.centralised:
+            state: Any = getattr(env, "state_space", None)
+            if state is None:
+                raise OptionError("a centralised critic needs env.state_space and env.state()")
+            n_in = state.shape[0]
+        self._critic = network(agents, config, n_in, 1, 1.0, rng)
+        self._weights = flatten_parameters(nn.ModuleList([self._actor, self._critic]))
+        self._adam = torch.optim.Adam([self._weights], eps=1e-5)
+        # of each agent's rewards so far: their number, their sum, the sum of their squares
+        self._rewards = torch.zeros(3, len(agents), 1, dtype=torch.float64)
+
+    def learn(
+        self, env: Env, episodes: int, seed: int, on_episode: Callback | None = None
+    ) -> DQNPolicy:
+        """Trains for `episodes` more; what it draws depends on `seed` and their number so far."""
+        if AgentSet.of(env) != self.agents:
+            raise OptionError(f"agents are {AgentSet.of(env)}, this learner's {self.agents}")
+        with one_thread():
+            for _ in range(episodes):
+                numbers = self._episode(env, seed)
+                if on_episode is not None:
+                    on_episode(self.episodes - 1, numbers)
+        return self.policy()
+
+    def policy(self) -> DQNPolicy:
+        """The current policy, greedy; a snapshot.
+
+        It is of DQN's class, with logits in place of Q, so that all of `ugat-marl` reads its files.
+        """
+        parameters = nn.utils.parameters_to_vector(self._actor.parameters()).detach()
+        hidden, shared = self.config.hidden, self.config.shared
+        return DQNPolicy(self.agents, hidden, parameters, self.env_options, shared)
+
+    def save(self, path: Path) -> None:
+        """Writes the whole state, from which `load` goes on to the same numbers."""
+        write_checkpoint(path, "baselines.ippo", self._content())
+
+    def load(self, path: Path) -> None:
+        """Restores what `save` wrote; a `CheckpointError` if that is of another learner."""
+        content, own = read_checkpoint(path, "baselines.ippo"), self._content()
+        for name, value in own.items():
+            found = content.get(name)
+            if isinstance(value, Tensor) and isinstance(found, Tensor):
+                found, value = (found.shape, found.dtype), (value.shape, value.dtype)
+            if type(found) is not type(value) or (found != value and name != "episodes"):
+                raise CheckpointError(f"{path}: {name} is {found}, this learner's {value}")
+        self.episodes = content["episodes"]
+        self._weights.data.copy_(content["weights"])
+        self._rewards.copy_(content["rewards"])
+        self._adam.state[self._weights] = {name: content[name] for name in _MOMENTS}
+
+    def _content(self) -> dict[str, Any]:
+        weights = self._weights.detach().clone()
+        moments = dict(zip(_MOMENTS, (torch.tensor(0.0), 0 * weights, 0 * weights), strict=True))
+        return {
+            **header(self.agents, self.config.hidden, self.env_options, self.config.shared),
+            "centralised": self.config.centralised,
+            "episodes": self.episodes,
+            "weights": weights,
+            "rewards": self._rewards.clone(),
+            **(self._adam.state[self._weights] or moments),
+        }
+
+    def _episode(self, env: Env, seed: int) -> dict[str, float]:
+        acting = torch_generator(seed, "ippo", "act", self.episodes)
+        shuffling = torch_generator(seed, "ippo", "shuffle", self.episodes)
+        observations, infos = env.reset(seed=derive_seed(seed, "ippo", "episode", self.episodes))
+        rollout, losses, total = list[Decision](), list[list[float]](), 0.0
+        seen, viewed = self._look(env, observations)
+        while env.agents:
+            allowed = torch.from_numpy(self.agents.masks(infos))
+            action, log_probability = self._draw(seen, allowed, acting)
+            observations, rewards, ended, _, infos = env.step(self.agents.actions(action.numpy()))
+            if len(env.agents) not in (0, len(self.agents)):
+                raise EpisodeError(f"only {env.agents} are left; all agents have to stay")
+            reward = torch.from_numpy(self.agents.values(rewards))
+            if not reward.isfinite().all():
+                raise EpisodeError(f"a reward is not finite: {rewards}; correct the reward")
+            total += float(reward.mean())
+            rollout.append(Decision(seen, viewed, allowed, action, log_probability, reward))
+            seen, viewed = self._look(env, observations)
+            if len(rollout) == self.config.update_every or not env.agents:
+                over = torch.from_numpy(self.agents.values(ended)).bool()
+                losses += self._update(rollout, viewed, over, shuffling)
+                rollout.clear()
+        self.episodes += 1
+        policy_loss, value_loss, entropy = np.mean(losses, axis=0).tolist()
+        told = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
+        return {"return": total} | told
+
+    def _look(self, env: Env, observations: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+        """What the actors see, and what the critics see."""
+        seen = torch.from_numpy(self.agents.stack(observations))
+        if not self.config.centralised:
+            return seen, seen
+        return seen, torch.from_numpy(env.state()).expand(len(self.agents), -1)
+
+    def _log_probabilities(self, seen: Tensor, allowed: Tensor) -> Tensor:
+        """Of all actions; one that is not allowed has probability 0."""
+        return self._actor(seen).masked_fill(~allowed, -1e8).log_softmax(-1)
+
+    def _draw(self, seen: Tensor, allowed: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+        """An action drawn for each agent, by the Gumbel trick, and its logarithmic probability."""
+        with torch.no_grad():
+            logs = self._log_probabilities(seen[:, None], allowed[:, None]).squeeze(1)
+            uniform = torch.rand(logs.shape, generator=rng).clamp_min(1e-9)
+            action = (logs - (-uniform.log()).log()).argmax(-1)
+            return action, logs.gather(1, action[:, None]).squeeze(1)
+
+    def _update(
+        self, rollout: list[Decision], after: Tensor, over: Tensor, rng: torch.Generator
+    ) -> list[list[float]]:
+        batch = Decision(*(torch.stack(column, dim=1) for column in zip(*rollout, strict=True)))
+        config, (centre, scale) = self.config, self._reward_scale(batch.reward)
+        with torch.no_grad():
+            values = self._critic(torch.cat((batch.viewed, after[:, None]), dim=1)).squeeze(-1)
+            nothing = -centre * scale / (1 - config.discount)  # no reward for ever, in our unit
+            values[:, -1] = torch.where(over, nothing.squeeze(-1), values[:, -1])
+            rewards = (batch.reward - centre) * scale
+            returns = gae(rewards, values, config.discount, config.gae_lambda) + values[:, :-1]
+        left = 1 - self.episodes / config.anneal_episodes if config.anneal_episodes else 1.0
+        self._adam.param_groups[0]["lr"] = config.learning_rate * max(left, 0.0)
+        losses = list[list[float]]()
+        for _ in range(config.epochs):
+            for some in torch.randperm(len(rollout), generator=rng).split(config.minibatch):
+                part = Decision(*(column[:, some] for column in batch))
+                losses.append(self._descend(part, values[:, some], returns[:, some]))
+        return losses
+
+    def _reward_scale(self, rewards: Tensor) -> tuple[Tensor, Tensor]:
+        """Centre and scale of each agent's rewards, these ones included, ``(agents, 1)``."""
+        if self.config.reward_scale is not None:
+            return torch.zeros(len(rewards), 1), torch.tensor(self.config.reward_scale)
+        self._rewards += torch.stack([rewards.double() ** k for k in range(3)]).sum(2, keepdim=True)
+        _, mean, square = self._rewards / self._rewards[0]
+        deviation = (square - mean**2).clamp_min(0).sqrt()
+        return mean.float(), torch.where(deviation > 1e-6, 1 / deviation, 1.0).float()
+
+    def _descend(self, part: Decision, values: Tensor, returns: Tensor) -> list[float]:
+        logs = self._log_probabilities(part.observation, part.allowed)
+        chosen = logs.gather(-1, part.action[..., None]).squeeze(-1)
+        ratio = (chosen - part.log_probability).exp()
+        advantages = returns - values
+        gain = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+        clipped = ratio.clamp(1 - self.config.clip, 1 + self.config.clip)
+        policy_loss = -torch.minimum(ratio * gain, clipped * gain).mean()
+        value_loss = 0.5 * (self._critic(part.viewed).squeeze(-1) - returns).square().mean()
+        entropy = -(logs.exp() * logs).sum(-1).mean()
+        loss = policy_loss + self.config.value_weight * value_loss
+        (loss - self.config.entropy_weight * entropy).backward()
+        nn.utils.clip_grad_norm_([self._weights], self.config.max_gradient)
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=False)  # the networks' gradients are views of it
+        return [number.item() for number in (policy_loss, value_loss, entropy)]
+
+
+@dataclass(frozen=True)
+class Args:
+    """Trains IPPO, or with --centralised MAPPO, on one scenario."""
+
+    ppo: Annotated[IPPOConfig, tyro.conf.arg(name="")] = IPPOConfig()
+    scenario: str = "grid2x2-v1"  # id or path of the scenario
+    domain: str = "sim"  # the world to train and to be judged in
+    duration_s: float | None = None  # length of an episode; none: the scenario's own
+    episodes: int = 100  # episodes to train
+    seed: int = 0  # seed of all that is drawn
+    evaluate_every: int = 0  # episodes from one evaluation to the next; 0: only at the end
+    evaluation_seeds: int = 5  # episodes of an evaluation, always the same; 0: none
+    out: Path | None = None  # folder for policy.pt, learner.pt and result.json
+
+
+class Result(NamedTuple):
+    """The policy, the return of each episode, and by episodes trained the ATT of each seed, s."""
+
+    policy: DQNPolicy
+    returns: list[float]
+    att_s: dict[int, list[float]]
+
+
+def train(args: Args, on_episode: Callback | None = None) -> Result:
+    """Trains and evaluates; writes the results if `args.out` is given."""
+    scenario, length = ugat_marl.load_scenario(args.scenario), args.duration_s
+    env = ugat_marl.parallel_env(scenario, domain=args.domain, duration_s=length)
+    learner = IPPO(env, args.ppo, args.seed)
+    if args.out is not None:
+        require_writable(args.out / "policy.pt")
+    result = Result(learner.policy(), [], {})
+
+    def note(episode: int, numbers: Mapping[str, float]) -> None:
+        result.returns.append(numbers["return"])
+        if on_episode is not None:
+            on_episode(episode, numbers)
+
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + args.evaluation_seeds)
+    every = args.evaluate_every or max(1, args.episodes)
+    with contextlib.closing(env):
+        for until in (*range(every, args.episodes, every), args.episodes):
+            policy = fixed_policy(learner.learn(env, until - learner.episodes, args.seed, note))
+            if seeds:
+                found = evaluate(scenario, {"ppo": policy}, [args.domain], seeds, duration_s=length)
+                result.att_s[learner.episodes] = [item.scores.att_s for item in found.results]
+    result = result._replace(policy=learner.policy())
+    if args.out is not None:
+        result.policy.save(args.out / "policy.pt")
+        learner.save(args.out / "learner.pt")
+        told = {"args": asdict(args), "returns": result.returns, "att_s": result.att_s}
+        write_whole(args.out / "result.json", json.dumps(told, default=str) + "\n")
+    return result
+
+
+if __name__ == "__main__":
+    try:
+        trained = train(tyro.cli(Args), lambda n, told: print(n, f"return {told['return']:.1f}"))
+    except UgatMarlError as error:
+        sys.exit(f"ippo.py: error: {error}")
+    for episodes, att_s in trained.att_s.items():
+        print(f"{episodes} episodes: mean travel time {np.mean(att_s):.1f} s, by seed {att_s}")
