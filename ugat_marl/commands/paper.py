@@ -24,7 +24,14 @@ from ugat_marl.transfer import DIRECT
 
 @dataclass(frozen=True)
 class _Paper:
-    """What all tables have in common."""
+    """What all tables have in common.
+
+    Attributes:
+        config: What is trained, how often, and how it is judged.
+        out: Folder of the tables.
+        runs: Folder of the trainings.
+        jobs: Trainings at a time; default: one per core.
+    """
 
     config: Annotated[PaperConfig, arg(name="")]
     out: Path = Path("results")
@@ -64,12 +71,6 @@ class Main(_Paper):
     Examples:
         ugat-marl paper main
         ugat-marl paper main --scenario grid4x4-v1 --domains V3 V4 --seeds 3 --episodes 40
-
-    Attributes:
-        config: What is trained, how often, and how it is judged.
-        out: Folder of the tables.
-        runs: Folder of the trainings.
-        jobs: Trainings at a time; default: one per core.
     """
 
     table: ClassVar[str] = "main"
@@ -82,12 +83,6 @@ class Ablation(_Paper):
     Examples:
         ugat-marl paper ablation
         ugat-marl paper ablation --domains V1 V4 --groundings phase
-
-    Attributes:
-        config: What is trained, how often, and how it is judged.
-        out: Folder of the tables.
-        runs: Folder of the trainings.
-        jobs: Trainings at a time; default: one per core.
     """
 
     table: ClassVar[str] = "ablation"
@@ -99,12 +94,6 @@ class Alpha(_Paper):
 
     Examples:
         ugat-marl paper alpha
-
-    Attributes:
-        config: What is trained, how often, and how it is judged.
-        out: Folder of the tables.
-        runs: Folder of the trainings.
-        jobs: Trainings at a time; default: one per core.
     """
 
     table: ClassVar[str] = "alpha"
@@ -116,12 +105,6 @@ class Uncertainty(_Paper):
 
     Examples:
         ugat-marl paper uncertainty --domains V1 V2 V3 V4
-
-    Attributes:
-        config: What is trained, how often, and how it is judged.
-        out: Folder of the tables.
-        runs: Folder of the trainings.
-        jobs: Trainings at a time; default: one per core.
     """
 
     table: ClassVar[str] = "uncertainty"
@@ -133,12 +116,6 @@ class Gap(_Paper):
 
     Examples:
         ugat-marl paper gap --scenario single-v1 grid2x2-v1
-
-    Attributes:
-        config: What is trained, how often, and how it is judged.
-        out: Folder of the tables.
-        runs: Folder of the trainings.
-        jobs: Trainings at a time; default: one per core.
     """
 
     table: ClassVar[str] = "gap"
