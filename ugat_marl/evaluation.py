@@ -71,7 +71,7 @@ def evaluate(
     worlds = [parallel_env(scenario, domain, duration_s=duration_s) for domain in domains]
     for make in policies.values():
         make(worlds[0])  # so is a wrong policy
-    workers = workers or _usable_cores()
+    workers = workers or usable_cores()
     per_task = max(1, len(seeds) * len(policies) * len(domains) // (4 * workers))
     tasks = [
         _Task(name, make, world, tuple(seeds[start : start + per_task]))
@@ -212,7 +212,8 @@ def _controller_factory(spec: str) -> PolicyFactory:
     return lambda env: controller_for(spec, env)
 
 
-def _usable_cores() -> int:
+def usable_cores() -> int:
+    """Cores this process may run on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

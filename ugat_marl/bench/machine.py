@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from ugat_marl.evaluation import usable_cores
+
 _LIBRARIES = (
     "ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch", "gymnasium", "pettingzoo",
 )  # fmt: skip
@@ -44,13 +46,6 @@ def cpu_model() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
-
-
-def usable_cores() -> int:
-    """Cores this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def memory_gib() -> float | None:

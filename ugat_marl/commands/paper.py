@@ -10,9 +10,10 @@ from typing import Annotated, ClassVar
 from rich.console import Console
 from tyro.conf import arg
 
-from ugat_marl.bench.machine import machine_facts, usable_cores
+from ugat_marl.bench.machine import machine_facts
 from ugat_marl.comparison import Comparison
 from ugat_marl.errors import OptionError
+from ugat_marl.evaluation import usable_cores
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.paper.settings import GROUNDED_NAME
 from ugat_marl.paper.tables import PaperConfig, compare
