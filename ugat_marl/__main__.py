@@ -49,6 +49,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "paper gap": ("commands.paper:Gap", "what direct transfer loses, as radar charts"),
     "blind generate": ("commands.blind:BlindGenerate", "hide effects, measure, seal the labels"),
     "blind run": ("commands.blind:BlindRun", "diagnose the cases of a blind test"),
+    "blind visible": ("commands.blind:BlindVisible", "could the hidden effects be seen at all"),
     "blind grade": ("commands.blind:BlindGrade", "open the labels of diagnosed cases"),
     "blind table": ("commands.blind:BlindTable", "sum up graded blind tests"),
     "bench env": ("bench.speed:EnvBench", "speed against SUMO alone and sumo-rl"),

@@ -7,16 +7,16 @@ time, its diagnosis, and ``labels/<case>.json``, opened by the grading alone.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.effects import Effect
-from ugat_marl.errors import BlindTestError
+from ugat_marl.errors import BlindTestError, UnknownNameError
 from ugat_marl.files import write_whole
 
-PLAN, LABELS, GRADES = "plan.json", "labels", "grades.json"
+PLAN, LABELS, GRADES, VISIBLE = "plan.json", "labels", "grades.json", "visible.json"
 DIAGNOSIS, RUN = "diagnosis.json", "run.json"
 SCHEMA = "ugat-marl/blind/1"
 
@@ -157,6 +157,21 @@ def read_plan(directory: Path) -> tuple[Case, ...]:
             f"{directory / PLAN}: not the plan of a blind test ({error}); make one with "
             "ugat-marl blind generate"
         ) from None
+
+
+def chosen(directory: Path, only: Sequence[str]) -> tuple[Case, ...]:
+    """The cases with these ids; all of them without any.
+
+    Raises:
+        BlindTestError: Not a blind test.
+        UnknownNameError: No such case.
+    """
+    cases = read_plan(directory)
+    known = [case.case for case in cases]
+    for name in only:
+        if name not in known:
+            raise UnknownNameError("case", name, known)
+    return tuple(case for case in cases if not only or case.case in only)
 
 
 def label_path(directory: Path, case: str) -> Path:

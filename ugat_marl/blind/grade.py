@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -14,6 +14,7 @@ from ugat_marl.blind.cases import (
     GRADES,
     RUN,
     SCHEMA,
+    VISIBLE,
     Hidden,
     Label,
     read_json,
@@ -35,6 +36,9 @@ Verdict = Literal[
     "no_discrepancy", "explained", "not_identifiable", "partially_explained", "unknown", "failed"
 ]
 Outcome = Literal["right", "missed", "wrong", "abstained", "failed"]
+
+SEEN = 3.2
+"""Standard deviations: a level of 5 % shared by the 32 effects of the library, on two sides."""
 
 NAMING: frozenset[Verdict] = frozenset({"explained", "partially_explained"})
 """Verdicts that say: this is it."""
@@ -88,6 +92,8 @@ class Grade:
         shrink: Share of the held-out gap that is gone.
         policy_shrink: Share of the policy gap that is gone.
         wall_s: Time the diagnosis took.
+        visible: Whether a test that knows the effect sees it, or the log of the signals shows it;
+            None where that was not judged.
     """
 
     case: str
@@ -110,6 +116,7 @@ class Grade:
     shrink: float | None
     policy_shrink: float | None
     wall_s: float | None
+    visible: bool | None = None
 
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Grade:
@@ -129,6 +136,7 @@ def grade_cases(directory: Path) -> tuple[Grade, ...]:
         BlindTestError: Not a blind test, or a diagnosis that is none.
     """
     grades: list[Grade] = []
+    judged = read_json(directory / VISIBLE) if (directory / VISIBLE).exists() else {}
     for case in read_plan(directory):
         folder = directory / case.case
         run = read_json(folder / RUN) if (folder / RUN).exists() else {}
@@ -139,7 +147,11 @@ def grade_cases(directory: Path) -> tuple[Grade, ...]:
         else:
             continue
         try:
-            grades.append(grade(read_label(directory, case.case), diagnosis, run.get("wall_s")))
+            graded = grade(read_label(directory, case.case), diagnosis, run.get("wall_s"))
+            if case.case in judged:
+                found = _number(judged[case.case])
+                graded = replace(graded, visible=found is None or found >= SEEN)
+            grades.append(graded)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise BlindTestError(
                 f"{folder / DIAGNOSIS}: not a diagnosis ({type(error).__name__}: {error})"

@@ -10,8 +10,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ugat_marl.blind.cases import DIAGNOSIS, RUN, Case, read_json, read_plan
-from ugat_marl.errors import BlindTestError, UnknownNameError
+from ugat_marl.blind.cases import DIAGNOSIS, RUN, Case, chosen, read_json
+from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
 
@@ -45,15 +45,8 @@ def run_cases(
         BlindTestError: Not a blind test, or a case that has not been measured.
         UnknownNameError: No such case.
     """
-    cases = read_plan(directory)
-    known = [case.case for case in cases]
-    for name in only:
-        if name not in known:
-            raise UnknownNameError("case", name, known)
     left = [
-        case
-        for case in cases
-        if (not only or case.case in only) and not (directory / case.case / DIAGNOSIS).exists()
+        case for case in chosen(directory, only) if not (directory / case.case / DIAGNOSIS).exists()
     ]
     for case in left:
         if not (directory / case.case / "measured" / "periods.csv").exists():

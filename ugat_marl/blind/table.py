@@ -95,6 +95,7 @@ def _naming(grades: Sequence[Grade]) -> list[Row]:
     single = [x for x in grades if x.group == "single"]
     strong = [x for x in single if x.strength != "small"]
     rich = [x for x in strong if x.periods >= MANY and x.speeds]
+    seen = [x for x in rich if x.visible]
     one = [x for x in strong if x.periods == 1]
     blunt = [x for x in strong if x.periods >= MANY and not x.speeds]
     small = [x for x in single if x.strength == "small"]
@@ -108,6 +109,7 @@ def _naming(grades: Sequence[Grade]) -> list[Row]:
     trio_text = "acceleration, start-up delay, headway kept apart (medium or large)"
     return [
         _share("single effect, medium or large, named (5 periods, speeds)", rich, _right, 0.9),
+        _share("of these, those that a test which knows the effect sees", seen, _right),
         _share("the same from one period", one, _right, 0.8),
         _share("the same, 5 periods without speeds", blunt, _right),
         _share("single effect, small, named", small, _right),

@@ -17,6 +17,7 @@ from ugat_marl.blind.grade import grade_cases, read_grades
 from ugat_marl.blind.run import Diagnose, run_cases
 from ugat_marl.blind.strengths import STRENGTHS
 from ugat_marl.blind.table import markdown, write_table
+from ugat_marl.blind.visible import judge_visibility
 from ugat_marl.commands.arguments import LengthS
 from ugat_marl.effects import load
 from ugat_marl.errors import BlindTestError, OptionError
@@ -138,6 +139,38 @@ class BlindRun:
             workflow.diagnose(scenario, data, directory, config, Silent())
 
         return diagnose
+
+
+@dataclass(frozen=True)
+class BlindVisible:
+    """Asks of single effects whether a test that knows them would see them; opens their labels.
+
+    Only cases that have been diagnosed are judged. Grade them again afterwards.
+
+    Examples:
+        ugat-marl blind visible blind
+
+    Attributes:
+        directory: Directory of a blind test.
+        seed: Seed of the diagnoses, whose simulated days are used again.
+        only: Names of the cases to judge.
+    """
+
+    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    seed: int = 0
+    only: Annotated[
+        tuple[str, ...], arg(metavar="CASE ...", help_behavior_hint="(default: all)")
+    ] = ()
+
+    def run(self, console: Console) -> int:
+        """Judges."""
+        found = judge_visibility(
+            self.directory, only=self.only, seed=self.seed, reporter=Bars(console)
+        )
+        for case, deviations in sorted(found.items()):
+            said = "in the log of the signals" if deviations is None else f"{deviations:.1f} sd"
+            console.print(f"{case}  {said}", soft_wrap=True)
+        return 0
 
 
 @dataclass(frozen=True)
