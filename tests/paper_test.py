@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from ugat_marl.__main__ import main
-from ugat_marl.errors import MeasurementError, OptionError
+from ugat_marl.errors import MeasurementError, OptionError, UnknownNameError
 from ugat_marl.metrics import Scores
 from ugat_marl.paper.job import JOB, SCORES, read_scores
 from ugat_marl.paper.runner import LOG, Planned, done, perform_all
@@ -49,6 +49,13 @@ def test_rows_of_a_table_have_names_of_their_own_and_begin_with_direct_transfer(
     names = [setting.name for setting in SHORT.settings(table)]
     assert len(set(names)) == len(names)
     assert names[0] == DIRECT
+
+
+def test_rows_can_be_picked_and_keep_their_order() -> None:
+    some = replace(SHORT, rows=("trained in real", "UGAT, timed"))
+    assert [x.name for x in some.settings("main")] == [DIRECT, TIMED, "trained in real"]
+    with pytest.raises(UnknownNameError, match="trained in real"):
+        replace(SHORT, rows=("traned in real",)).settings("main")
 
 
 def test_what_does_not_know_the_domain_is_trained_once_for_all_of_them() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ugat_marl.comparison import Comparison, Trial
 from ugat_marl.effects import describe, in_domain, load
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.paper.job import Job
 from ugat_marl.paper.runner import Planned, done, perform_all
@@ -37,6 +37,7 @@ class PaperConfig:
         real_rollouts: Episodes added to D_real per iteration.
         groundings: Kinds of grounding: phase, timed, or both.
         constants: Constant delays in s that "main" sweeps.
+        rows: Names of the rows to train, and direct transfer with them; default: all of the table.
         evaluation_seeds: Episodes every policy is played for in each domain.
         rule_budget: Most episodes in which each rule is tuned in each domain.
         observation: What agents see.
@@ -58,6 +59,7 @@ class PaperConfig:
     real_rollouts: int = 3
     groundings: tuple[str, ...] = ("phase", "timed")
     constants: tuple[int, ...] = (1, 2, 3, 4, 5)
+    rows: tuple[str, ...] = ()
     evaluation_seeds: int = 5
     rule_budget: int = BUDGET
     observation: str = "count"
@@ -103,8 +105,17 @@ class PaperConfig:
         return [describe(domain) for domain in self.domains or default]
 
     def settings(self, table: str) -> list[Setting]:
-        """The rows of a table."""
-        return settings_of(table, self.ugat, self.sim, self.groundings, self.constants)
+        """The rows of a table.
+
+        Raises:
+            UnknownNameError: The table has no row of that name.
+        """
+        found = settings_of(table, self.ugat, self.sim, self.groundings, self.constants)
+        names = [setting.name for setting in found]
+        for row in self.rows:
+            if row not in names:
+                raise UnknownNameError(f"row of table {table!r}:", row, names)
+        return [item for item in found if not self.rows or item.name in (DIRECT, *self.rows)]
 
 
 def compare(
