@@ -66,7 +66,9 @@ def wanted(extras: Sequence[str]) -> Record:
     return Record(
         root=str(ROOT),
         requirements=digest([ROOT / "pyproject.toml", ROOT / "constraints.txt"]),
-        source=digest([ROOT / name for name in ("ugat_marl", "scenarios", "README.md")]),
+        source=digest(
+            [ROOT / name for name in ("ugat_marl", "scenarios", "baselines", "README.md")]
+        ),
         extras=sorted(extras),
     )
 

@@ -14,6 +14,7 @@ import ugat_marl
 
 PACKAGE = Path(ugat_marl.__file__).parent
 CHECKOUT = Path(__file__).resolve().parent.parent
+BASELINES = sorted(CHECKOUT.glob("baselines/*.py"))
 SCENARIOS = sorted(path.parent for path in CHECKOUT.glob("scenarios/*/scenario.toml"))
 
 pytestmark = pytest.mark.skipif(
@@ -41,6 +42,11 @@ def test_the_wheel_carries_what_a_scenario_needs(source: Path) -> None:
 def test_the_wheel_carries_no_build_sources() -> None:
     carried = {path.name for path in (PACKAGE / "_scenarios").rglob("*")}
     assert not {"source.toml", "vehicles.toml", "build.py"} & carried
+
+
+@pytest.mark.parametrize("source", BASELINES, ids=lambda path: path.name)
+def test_the_wheel_carries_the_baselines(source: Path) -> None:
+    assert (PACKAGE / "_baselines" / source.name).read_bytes() == source.read_bytes()
 
 
 def test_other_processes_import_the_wheel_too() -> None:

@@ -26,6 +26,7 @@ from ugat_marl.effects import in_domain, load
 from ugat_marl.errors import CheckpointError, LogError, OptionError, ScenarioError, UnknownNameError
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.uncertainty import MethodName
+from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.progress import Silent
@@ -334,13 +335,13 @@ def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
     late = "late_green=*,2"
     config = replace(SHORT, corrected=str(repaired), control=True, further=(late, "V4"))
     trained: list[tuple[str, int]] = []
-    learn = transfer_module.DQN.learn
+    learn = DQN.learn
 
     def counting(self: Any, env: Any, episodes: int, *rest: Any) -> Any:
         trained.append((getattr(env, "domain", "grounded"), episodes))
         return learn(self, env, episodes, *rest)
 
-    monkeypatch.setattr(transfer_module.DQN, "learn", counting)
+    monkeypatch.setattr(DQN, "learn", counting)
     found = transfer(config, tmp_path / "run")
     names = ["direct transfer", "UGAT", "more plain sim"]
     further = [f"further in {late}", "further in V4"]

@@ -54,7 +54,13 @@ EpisodeCallback = Callable[[int, Mapping[str, float]], None]
 
 @runtime_checkable
 class Learner(Protocol):
-    """Improves a policy by acting in an environment; keeps its state between calls."""
+    """Improves a policy by acting in an environment; keeps its state between calls.
+
+    Attributes:
+        episodes: Episodes it has been trained for in its life; saved with its state.
+    """
+
+    episodes: int
 
     def learn(
         self,

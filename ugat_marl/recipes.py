@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.effects import Domain
-from ugat_marl.learners.dqn import DQN
-from ugat_marl.learners.dqn_config import DQNConfig
-from ugat_marl.policy import AnyParallelEnv, Policy
+from ugat_marl.learners.registry import LearnerFactory
+from ugat_marl.policy import AnyParallelEnv, Learner, Policy
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
@@ -21,7 +20,7 @@ from ugat_marl.worlds import SimulatedWorld
 
 
 def train_until(
-    learner: DQN,
+    learner: Learner,
     env: AnyParallelEnv,
     episodes: int,
     seed: int,
@@ -104,17 +103,19 @@ class Control:
         return run.directory / (self.file or f"{file_name(self.name)}-learner.pt")
 
 
-def train_control(control: Control, config: DQNConfig, seed: int, run: Run, direct: Path) -> Policy:
+def train_control(
+    control: Control, make: LearnerFactory, seed: int, run: Run, direct: Path
+) -> Policy:
     """Trains until the learner has its episodes; where it was interrupted, it goes on.
 
     Args:
         control: What to train.
-        config: Settings of the learner.
+        make: Makes the learner.
         seed: Root of every random choice.
         run: Where it is saved.
         direct: The learner of direct transfer.
     """
-    learner = DQN.of(control.env, config, seed)
+    learner = make(control.env, seed)
     progress = control.learner_path(run)
     if progress.exists():
         learner.load(progress)

@@ -25,10 +25,10 @@ from ugat_marl.evaluation import (
 from ugat_marl.grounding.random_delays import RandomDelays
 from ugat_marl.grounding.view import neighbours_of
 from ugat_marl.learners.agents import AgentSet
-from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.placebo import PLACEBOS, Placebo, answer_with_noise
+from ugat_marl.learners.registry import DQN_NAME, learner_factory, require_known
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.randomised import randomised_env
@@ -93,12 +93,15 @@ class TransferConfig:
             late by random whole seconds up to this.
         fine_tuned: Also train direct transfer on in the real domain, for as many episodes as UGAT
             sees of it.
+        learner: What learns: dqn, the suite's own; or a baseline (docs/learner.md).
+        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; the
+            parts of a tuple are divided by commas.
         oracle: Also train from scratch in the real domain, for as many episodes as UGAT in all.
         placebo: A negative control, with which grounding must do nothing: "same-world" takes D_real
             from the simulation, "shuffled" deals out anew what followed in D_real, "noise" puts
             noise in the place of f.
         ugat: Settings of the algorithm.
-        dqn: Settings of the learner.
+        dqn: Settings of dqn.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -117,6 +120,8 @@ class TransferConfig:
     further: tuple[str, ...] = ()
     corrected: str | None = None
     randomised: bool = False
+    learner: str = DQN_NAME
+    learner_settings: tuple[str, ...] = ()
     random_delay_s: int | None = None
     fine_tuned: bool = False
     oracle: bool = False
@@ -143,6 +148,7 @@ class TransferConfig:
                 "`ugat-marl diagnose` wrote, or another domain"
             )
         if self.real == "none" and self.real_log is None:
+        require_known(self.learner)
             raise OptionError('real = "none" needs a real_log: something must be known of the real')
         self._refuse_impossible_controls()
 
@@ -194,6 +200,7 @@ def transfer(
         config: What to do.
         directory: Folder of the run; ``table.json``, ``metrics.parquet``, ``policies``,
             TensorBoard files and checkpoints go there.
+    make = learner_factory(config.learner, config.learner_settings, config.dqn)
         resume: Go on with the run in the folder.
         reporter: Shows progress.
     """
@@ -206,7 +213,7 @@ def transfer(
         recorded = RecordedWorld(log, env)  # refuses a misfit before anything is written
         _say_if_from_elsewhere(log, config, reporter)
     controls = _controls(config, scenario, env)
-    learner = DQN.of(env, config.dqn, config.seed)
+    learner = make(env, config.seed)
     transform = config.ugat.transform(env.layouts, config.seed, neighbours_of(env))
     if config.placebo == "noise":
         answer_with_noise(transform.forward, config.seed)
@@ -221,7 +228,7 @@ def transfer(
         policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
         direct = directory / DIRECT_LEARNER
         for control in controls:
-            trained = train_control(control, config.dqn, config.seed, run, direct)
+            trained = train_control(control, make, config.seed, run, direct)
             policies[control.name] = trained
     finally:
         for made in (env, *(control.env for control in controls)):
@@ -276,6 +283,7 @@ def judge(
             **{f"best rule in {domain}": rule for domain, rule in rules.items()},
             "rules searched": searched,
             "training seed": str(config.seed),
+            **({} if config.learner == DQN_NAME else {"learner": config.learner}),
             **({} if config.corrected is None else {CORRECTED: describe(config.corrected)}),
         },
     )
@@ -374,6 +382,9 @@ def _identity(
     if config.placebo == "none":  # runs from before there were any can be resumed
         settings.pop("placebo")
     settings.pop("corrected")  # a scenario is the same if its hash is, wherever it lies
+    if config.learner == DQN_NAME:  # the same
+        settings.pop("learner")
+        settings.pop("learner_settings")
     settings["real_log"] = _digest(config.real_log) if config.real_log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":

@@ -1,0 +1,149 @@
+"""Learners by name: the suite's own DQN, and the files of baselines/, loaded when they are used.
+
+A baseline is a file that offers a learner, called as ``Learner(env, config, seed)``, and a
+dataclass of its settings. Its policies are `DQNPolicy`, so that all of ``ugat-marl`` reads them.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from types import ModuleType
+from typing import Any, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.learners.dqn_config import DQNConfig
+from ugat_marl.policy import AnyParallelEnv, Learner
+
+LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
+"""Makes a fresh learner for the agents of an environment, its initial weights drawn from a seed."""
+
+DQN_NAME = "dqn"
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Where a learner is kept.
+
+    Attributes:
+        file: File of baselines/, without its suffix.
+        learner: Class in it.
+        config: Dataclass of its settings.
+        extra: Extra of the package that brings what it imports; "" for none.
+        settings: What its name says, in place of the defaults.
+    """
+
+    file: str
+    learner: str
+    config: str
+    extra: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+BASELINES: Mapping[str, Baseline] = {
+    "ippo": Baseline("ippo", "IPPO", "IPPOConfig"),
+    "mappo": Baseline("ippo", "IPPO", "IPPOConfig", settings={"centralised": True}),
+}
+
+
+def learner_factory(
+    name: str, settings: Sequence[str] = (), dqn: DQNConfig | None = None
+) -> LearnerFactory:
+    """What makes the learners a user names; its library is imported here.
+
+    Args:
+        name: "dqn", or one of `BASELINES`.
+        settings: Of a baseline, as ``NAME=VALUE``; the parts of a tuple are divided by commas.
+        dqn: Settings of "dqn".
+
+    Raises:
+        UnknownNameError: No such learner, or no such setting.
+        OptionError: A value is impossible, or the library is not installed.
+    """
+    require_known(name)
+    if name == DQN_NAME:
+        if settings:
+            raise OptionError(f"learner settings {' '.join(settings)}: those of dqn are --dqn.*")
+        from ugat_marl.learners.dqn import DQN
+
+        return lambda env, seed: DQN.of(env, dqn, seed)
+    baseline = BASELINES[name]
+    module = load_baseline(name)
+    config = _configured(getattr(module, baseline.config), baseline.settings, settings, name)
+    make = getattr(module, baseline.learner)
+    return lambda env, seed: make(env, config, seed)
+
+
+def require_known(name: str) -> None:
+    """Refuses the name of a learner that does not exist.
+
+    Raises:
+        UnknownNameError: It is neither "dqn" nor one of `BASELINES`.
+    """
+    if name != DQN_NAME and name not in BASELINES:
+        raise UnknownNameError("learner", name, (DQN_NAME, *BASELINES))
+
+
+def load_baseline(name: str) -> ModuleType:
+    """The module of a baseline; the same object at each call.
+
+    Raises:
+        OptionError: Its library is not installed.
+    """
+    baseline = BASELINES[name]
+    path = baselines_folder() / f"{baseline.file}.py"
+    module_name = f"ugat_marl_baseline_{baseline.file}"
+    if module_name in sys.modules:
+        return sys.modules[module_name]
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise OptionError(f"learner {name!r}: {path} is missing; install the package again")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[module_name]
+        missing = str(getattr(error, "name", "")).partition(".")[0]
+        if not isinstance(error, ModuleNotFoundError) or missing == "ugat_marl":
+            raise
+        raise OptionError(
+            f"learner {name!r} needs {missing}, which is not installed; run "
+            f"pip install 'ugat-marl[{baseline.extra}]', or in a checkout "
+            f"pip install -c constraints-baselines.txt -e '.[{baseline.extra}]'"
+        ) from None
+    return module
+
+
+def baselines_folder() -> Path:
+    """The baselines: beside the package in a checkout, inside it in a wheel."""
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "_baselines"
+    return inside if inside.is_dir() else package.parent / "baselines"
+
+
+def _configured(kind: Any, preset: Mapping[str, Any], given: Sequence[str], name: str) -> Any:
+    """The dataclass of settings with those of the name, then those of the user."""
+    hints = get_type_hints(kind)
+    names = [item.name for item in fields(kind) if item.name not in preset]
+    values = dict(preset)
+    for item in given:
+        key, equals, text = item.partition("=")
+        key = key.replace("-", "_")
+        if not equals or not text:
+            raise OptionError(f"learner setting {item!r}: must be NAME=VALUE")
+        if key not in names:
+            raise UnknownNameError(f"setting of {name}", key, names)
+        whole = text.split(",") if "tuple" in str(hints[key]) else text
+        value = None if text.lower() == "none" else whole
+        try:
+            values[key] = TypeAdapter(hints[key]).validate_python(value)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"]
+            raise OptionError(f"learner setting {item!r}: {reason}") from None
+    return kind(**values)
