@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from ugat_marl.effects import load as load_scenario
     from ugat_marl.traffic_env import TrafficEnv, env, parallel_env
     from ugat_marl.transitions import TransitionLog
+    from ugat_marl.vector import vector_env
 
 __version__ = "0.1.0"
 
@@ -21,9 +22,18 @@ _HOMES = {
     "env": ("ugat_marl.traffic_env", "env"),
     "load_scenario": ("ugat_marl.effects", "load"),
     "parallel_env": ("ugat_marl.traffic_env", "parallel_env"),
+    "vector_env": ("ugat_marl.vector", "vector_env"),
 }
 
-__all__ = ["TrafficEnv", "TransitionLog", "__version__", "env", "load_scenario", "parallel_env"]
+__all__ = [
+    "TrafficEnv",
+    "TransitionLog",
+    "__version__",
+    "env",
+    "load_scenario",
+    "parallel_env",
+    "vector_env",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -64,6 +64,10 @@ class SimulatorCrashed(SimulatorError):
     """The process that ran the simulation died; other simulations are not affected."""
 
 
+class WorkerError(UgatMarlError, RuntimeError):
+    """A reward or wrapper of the user raised an exception in the process of a simulation."""
+
+
 class EpisodeError(UgatMarlError, RuntimeError):
     """`step`, `state` or `scores` was called at a moment of the episode when it has no meaning."""
 

@@ -6,8 +6,12 @@ generator state having been saved.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import torch
+
+if TYPE_CHECKING:
+    import torch
 
 
 def derive_seed(seed: int, *path: int | str) -> int:
@@ -26,4 +30,6 @@ def numpy_generator(seed: int, *path: int | str) -> np.random.Generator:
 
 def torch_generator(seed: int, *path: int | str) -> torch.Generator:
     """A torch CPU generator for the stream `path` below `seed`."""
+    import torch  # most processes that need a seed simulate, and need no torch
+
     return torch.Generator().manual_seed(derive_seed(seed, *path))

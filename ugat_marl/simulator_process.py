@@ -20,8 +20,9 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any, ClassVar, Literal
+from typing import IO, Any, ClassVar, Literal, Self
 
 from ugat_marl.channel import Channel, ChannelClosed, Message
 from ugat_marl.errors import OptionError, SimulatorCrashed, SimulatorError
@@ -32,6 +33,7 @@ StartMethod = Literal["forkserver", "spawn"]
 
 _CAN_FORK = hasattr(os, "fork") and hasattr(socket, "send_fds")
 _PATIENCE_S = 10.0
+_PROGRAM = "ugat_marl.simulator_worker"
 
 
 class ProcessSimulator:
@@ -189,7 +191,7 @@ class _Worker:
         """A new interpreter that serves one simulation on its standard streams."""
         said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the worker
         process: subprocess.Popen[bytes] = subprocess.Popen(
-            _command("spawned", str(os.getpid())),
+            _command(_PROGRAM, "spawned", str(os.getpid())),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=said,
@@ -249,8 +251,9 @@ class _Worker:
 class _WarmParent:
     """The process that forks the workers; one for all simulators of a user's process."""
 
+    program: ClassVar[str] = _PROGRAM
     _lock: ClassVar[threading.RLock] = threading.RLock()
-    _current: ClassVar[_WarmParent | None] = None
+    _current: ClassVar[Any] = None
     _told_of_forks: ClassVar[bool] = False
 
     def __init__(self) -> None:
@@ -259,7 +262,7 @@ class _WarmParent:
         self._socket, its = socket.socketpair()
         with its:
             self._process = subprocess.Popen(
-                _command("parent", str(its.fileno()), str(self._owner)),
+                _command(self.program, "parent", str(its.fileno()), str(self._owner)),
                 stdin=subprocess.DEVNULL,
                 pass_fds=(its.fileno(),),
                 env=_environment(),
@@ -268,7 +271,7 @@ class _WarmParent:
         atexit.register(self.end)
 
     @classmethod
-    def acquire(cls) -> _WarmParent:
+    def acquire(cls) -> Self:
         """The parent of this process, started if need be."""
         if not cls._told_of_forks:
             os.register_at_fork(after_in_child=cls._forget)
@@ -297,14 +300,20 @@ class _WarmParent:
             if self._users == 0:
                 self.end()
 
-    def fork(self) -> _Worker | None:
-        """A fresh worker, or None if the parent is gone."""
+    def fork(self, descriptors: Sequence[int] = (), order: bytes = b"") -> _Worker | None:
+        """A fresh worker, or None if the parent is gone.
+
+        Args:
+            descriptors: Open files the worker gets beside its line and what it prints to.
+            order: What the parent reads before it forks.
+        """
         mine, its = socket.socketpair()
         said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the worker
         pid = b""
         with its, self._lock:
             try:
-                socket.send_fds(self._socket, [b"f"], [its.fileno(), said.fileno()])
+                socket.send_fds(self._socket, [b"f"], [its.fileno(), said.fileno(), *descriptors])
+                self._socket.sendall(order)
                 pid = self._socket.recv(8)
             except OSError:
                 pass
@@ -338,12 +347,12 @@ class _WarmParent:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-            if _WarmParent._current is self:
-                _WarmParent._current = None
+            if type(self)._current is self:
+                type(self)._current = None
 
 
-def _command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "ugat_marl.simulator_worker", *arguments]
+def _command(program: str, *arguments: str) -> list[str]:
+    return [sys.executable, "-m", program, *arguments]
 
 
 def _environment() -> dict[str, str]:

@@ -1,0 +1,17 @@
+"""Many simulations in worker processes, stepped together: `vector_env`."""
+
+from ugat_marl.vector.arrays import Arrays
+from ugat_marl.vector.environment import Autoreset, Batch, Ended, VectorEnv, vector_env
+from ugat_marl.vector.lane import Episode
+from ugat_marl.vector.spec import in_turn
+
+__all__ = [
+    "Arrays",
+    "Autoreset",
+    "Batch",
+    "Ended",
+    "Episode",
+    "VectorEnv",
+    "in_turn",
+    "vector_env",
+]

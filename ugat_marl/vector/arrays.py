@@ -1,0 +1,105 @@
+"""The memory that a user's process and its simulations have in common.
+
+The first axis is the environment, the second the agent, in the order of `possible_agents`. Unequal
+agents are padded at the end: zeros behind short observations, zeros in the masks of phases an agent
+does not have. The memory has no name, so that nothing is left of it however the processes end.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_ALIGNED = 64
+"""Bytes; no array begins in the middle of another one's cache line."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Sizes of the arrays.
+
+    Attributes:
+        environments: Number of environments.
+        agents: Number of agents of each.
+        width: Length of the longest observation.
+        actions: Number of phases of the agent with most of them.
+    """
+
+    environments: int
+    agents: int
+    width: int
+    actions: int
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """What is passed to and fro.
+
+    Attributes:
+        observations: float32 ``(environments, agents, width)``.
+        masks: int8 ``(environments, agents, actions)``; 1 where a phase may be chosen.
+        rewards: float64 ``(environments, agents)``.
+        actions: int64 ``(environments, agents)``; what the user asks for.
+        executed: int64 ``(environments, agents)``; the phases that were shown.
+    """
+
+    observations: NDArray[np.float32]
+    masks: NDArray[np.int8]
+    rewards: NDArray[np.float64]
+    actions: NDArray[np.int64]
+    executed: NDArray[np.int64]
+
+    @classmethod
+    def over(cls, descriptor: int, shape: Shape) -> Arrays:
+        """The arrays in an open file that `shared_memory` made; it may be closed afterwards."""
+        memory = mmap.mmap(descriptor, _size(shape))
+        found: dict[str, NDArray[Any]] = {}
+        offset = 0
+        for name, (kind, sizes) in _layout(shape).items():
+            count = int(np.prod(sizes))
+            flat = np.frombuffer(memory, dtype=kind, count=count, offset=offset)
+            found[name] = flat.reshape(sizes)
+            offset += _room(kind, sizes)
+        return cls(**found)
+
+    def part(self, where: slice | int) -> Arrays:
+        """Some of the environments, or one without the first axis, in the same memory."""
+        return Arrays(*(getattr(self, item.name)[where] for item in fields(self)))
+
+
+def shared_memory(shape: Shape) -> int:
+    """The descriptor of an open file without a name, of the size the arrays need."""
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("ugat_marl")
+    else:
+        with tempfile.TemporaryFile() as file:
+            descriptor = os.dup(file.fileno())
+    os.ftruncate(descriptor, _size(shape))
+    return descriptor
+
+
+def _layout(shape: Shape) -> dict[str, tuple[type[np.generic], tuple[int, ...]]]:
+    each = (shape.environments, shape.agents)
+    return {
+        "observations": (np.float32, (*each, shape.width)),
+        "masks": (np.int8, (*each, shape.actions)),
+        "rewards": (np.float64, each),
+        "actions": (np.int64, each),
+        "executed": (np.int64, each),
+    }
+
+
+def _room(kind: type[np.generic], sizes: tuple[int, ...]) -> int:
+    """Bytes up to the next array."""
+    size = np.dtype(kind).itemsize * int(np.prod(sizes))
+    return -(-size // _ALIGNED) * _ALIGNED
+
+
+def _size(shape: Shape) -> int:
+    return sum(_room(kind, sizes) for kind, sizes in _layout(shape).values())
