@@ -81,7 +81,7 @@ def test_triggered_departures_are_no_times(crossing: Crossing) -> None:
     ],
 )
 def test_what_cannot_be_driven_is_refused(vehicles: str, message: str, crossing: Crossing) -> None:
-    with pytest.raises(ScenarioError, match=rf"demand\.rou\.xml: {message}"):
+    with pytest.raises(ScenarioError, match=rf"demand\.rou\.xml(, line \d+)?: {message}"):
         check(crossing(vehicles=vehicles))
 
 

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from ugat_marl.effects import Acceleration, apply_effects, load
 from ugat_marl.errors import ScenarioError, UnknownNameError
-from ugat_marl.scenario import Document, Scenario, _toml, load_scenario, shipped_scenarios
+from ugat_marl.scenario import Document, Scenario, load_scenario, scenario_toml, shipped_scenarios
 from ugat_marl.scenario_settings import may_be_given, seconds_of, validated
 
 Crossing = Callable[..., Path]
@@ -190,7 +190,7 @@ def test_any_text_survives_the_way_through_toml(
     description: str, lights: dict[str, dict[str, list[str]]]
 ) -> None:
     settings = validated({**MINIMAL, "description": description, "intersections": lights}, "here")
-    text = _toml(settings.model_dump(mode="json"), ("acceleration=1",))
+    text = scenario_toml(settings.model_dump(mode="json"), ("acceleration=1",))
     assert validated(tomllib.loads(text), "again") == settings
 
 

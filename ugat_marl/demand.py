@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 
 from ugat_marl.errors import ScenarioError
+from ugat_marl.files import Tag
 from ugat_marl.network import Network
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.scenario_settings import seconds_of
@@ -41,18 +41,18 @@ def check_demand(scenario: Scenario, network: Network) -> Demand:
     vehicles = flows = 0
     for document in (*scenario.routes, *scenario.additional):
         latest = -math.inf
-        for item in document.parse().iter():
-            if item.tag in ("vehicle", "trip", "flow", "route"):
-                used = " ".join(item.get(key, "") for key in _ROUTED).split()
+        for item in document.scan():
+            if item.name in ("vehicle", "trip", "flow", "route"):
+                used = " ".join(item.attributes.get(key, "") for key in _ROUTED).split()
                 for edge in used:
                     if edge not in edges:
                         raise _unknown_edge(document, item, edge, scenario)
-            if item.tag in ("vehicle", "trip", "flow"):
+            if item.name in ("vehicle", "trip", "flow"):
                 depart = _depart_s(item, document, max(begin, latest))
                 if depart < latest and document in scenario.routes:
                     raise _unsorted(document, item, depart, latest)
                 latest = max(latest, depart)
-                if item.tag == "flow":
+                if item.name == "flow":
                     flows += depart < end and begin < _end_s(item, document)
                 else:
                     vehicles += begin <= depart < end
@@ -65,45 +65,47 @@ def check_demand(scenario: Scenario, network: Network) -> Demand:
     return Demand(vehicles, flows)
 
 
-def _who(item: ET.Element) -> str:
-    name = item.get("id", "")
-    return f"<{item.tag}" + (f" id={name!r}" if name else "") + ">"
+def _who(item: Tag) -> str:
+    name = item.attributes.get("id", "")
+    return f"<{item.name}" + (f" id={name!r}" if name else "") + ">"
 
 
-def _unknown_edge(
-    document: Document, item: ET.Element, edge: str, scenario: Scenario
-) -> ScenarioError:
+def _at(document: Document, item: Tag) -> str:
+    return f"{document.source}, line {item.line}"
+
+
+def _unknown_edge(document: Document, item: Tag, edge: str, scenario: Scenario) -> ScenarioError:
     return ScenarioError(
-        f"{document.source}: {_who(item)} uses the edge {edge!r}, which {scenario.network.source} "
-        "does not have; were the routes made for another network?"
+        f"{_at(document, item)}: {_who(item)} uses the edge {edge!r}, which "
+        f"{scenario.network.source} does not have; were the routes made for another network?"
     )
 
 
-def _unsorted(document: Document, item: ET.Element, depart: float, latest: float) -> ScenarioError:
+def _unsorted(document: Document, item: Tag, depart: float, latest: float) -> ScenarioError:
     return ScenarioError(
-        f"{document.source}: {_who(item)} departs at {depart:g} s but stands after one of "
+        f"{_at(document, item)}: {_who(item)} departs at {depart:g} s but stands after one of "
         f"{latest:g} s, and SUMO would leave it out; sort the file by departure (SUMO's "
         "tools/route/sort_routes.py does)"
     )
 
 
-def _depart_s(item: ET.Element, document: Document, triggered_s: float) -> float:
+def _depart_s(item: Tag, document: Document, triggered_s: float) -> float:
     """Seconds; of a departure that something else triggers, `triggered_s`."""
-    key, default = ("begin", "0") if item.tag == "flow" else ("depart", "")
-    text = item.get(key, default)
+    key, default = ("begin", "0") if item.name == "flow" else ("depart", "")
+    text = item.attributes.get(key, default)
     return triggered_s if text in _NO_TIME else _seconds(text, key, item, document)
 
 
-def _end_s(item: ET.Element, document: Document) -> float:
-    text = item.get("end")
+def _end_s(item: Tag, document: Document) -> float:
+    text = item.attributes.get("end")
     return math.inf if text is None else _seconds(text, "end", item, document)
 
 
-def _seconds(text: str, key: str, item: ET.Element, document: Document) -> float:
+def _seconds(text: str, key: str, item: Tag, document: Document) -> float:
     try:
         return seconds_of(text)
     except ValueError:
         raise ScenarioError(
-            f"{document.source}: {key}={text!r} of {_who(item)} is not a time; "
+            f"{_at(document, item)}: {key}={text!r} of {_who(item)} is not a time; "
             "give seconds or h:m:s"
         ) from None

@@ -13,11 +13,14 @@ import os
 import tempfile
 import xml.etree.ElementTree as ET
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 from xml.parsers import expat
 
 from ugat_marl.errors import OutputError, ScenarioError
+
+_PIECE = 1 << 20
 
 
 @contextlib.contextmanager
@@ -91,6 +94,65 @@ def read_bytes(path: Path) -> bytes:
         ) from None
 
 
+class Tag(NamedTuple):
+    """The start of an element of a long XML document.
+
+    Attributes:
+        name: Its tag.
+        attributes: Its attributes.
+        line: Where it stands, from 1.
+    """
+
+    name: str
+    attributes: dict[str, str]
+    line: int
+
+
+def chunks_of(path: Path) -> Iterator[bytes]:
+    """The content of `path` piece by piece, unpacked if its name ends in ``.gz``.
+
+    Raises:
+        ScenarioError: As for `read_bytes`.
+    """
+    try:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            while piece := file.read(_PIECE):
+                yield piece
+    except FileNotFoundError:
+        raise ScenarioError(f"{path}: no such file") from None
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise ScenarioError(
+            f"{path}: not a whole gzip archive ({error}); it may have been cut short"
+        ) from None
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def scan_xml(pieces: Iterable[bytes], name: str) -> Iterator[Tag]:
+    """The elements of a document of any length, each at its start, in little memory.
+
+    Args:
+        pieces: The document, cut anywhere.
+        name: What to call it in errors, usually its path.
+
+    Raises:
+        ScenarioError: As for `parse_xml`.
+    """
+    parser = _refusing_parser(name)
+    found: list[Tag] = []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        found.append(Tag(tag, attributes, parser.CurrentLineNumber))
+
+    parser.StartElementHandler = start
+    for piece in pieces:
+        _parse(parser, piece, False, name)
+        yield from found
+        found.clear()
+    _parse(parser, b"", True, name)
+    yield from found
+
+
 def parse_xml(content: bytes, name: str) -> ET.Element:
     """Parses XML without document types or entities.
 
@@ -102,11 +164,8 @@ def parse_xml(content: bytes, name: str) -> ET.Element:
         ScenarioError: Not well-formed (a truncated file, say), or declares a document type.
     """
     builder = ET.TreeBuilder()
-    parser = expat.ParserCreate()
+    parser = _refusing_parser(name)
     parser.buffer_text = True
-
-    def refuse(*_: object) -> None:
-        raise ScenarioError(f"{name}: document types and entities are not accepted; remove them")
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         builder.start(tag, attributes)
@@ -114,14 +173,30 @@ def parse_xml(content: bytes, name: str) -> ET.Element:
     def end(tag: str) -> None:
         builder.end(tag)
 
-    parser.StartDoctypeDeclHandler = refuse
-    parser.EntityDeclHandler = refuse
     parser.StartElementHandler = start
     parser.EndElementHandler = end
     parser.CharacterDataHandler = builder.data
+    _parse(parser, content, True, name)
+    return builder.close()
+
+
+def _refusing_parser(name: str) -> expat.XMLParserType:
+    parser = expat.ParserCreate()
+
+    def refuse(*_: object) -> None:
+        raise ScenarioError(
+            f"{name}: document types and entities are not accepted; remove them "
+            f"(line {parser.CurrentLineNumber})"
+        )
+
+    parser.StartDoctypeDeclHandler = refuse
+    parser.EntityDeclHandler = refuse
+    return parser
+
+
+def _parse(parser: expat.XMLParserType, content: bytes, last: bool, name: str) -> None:
     try:
-        parser.Parse(content, True)
-        return builder.close()
+        parser.Parse(content, last)
     except expat.ExpatError as error:
         raise ScenarioError(
             f"{name}: not well-formed XML ({error}); the file may have been cut short"

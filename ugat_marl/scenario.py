@@ -11,15 +11,24 @@ import functools
 import hashlib
 import importlib.util
 import json
+import re
 import tomllib
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError, UnknownNameError
-from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
+from ugat_marl.files import (
+    Tag,
+    chunks_of,
+    parse_xml,
+    read_bytes,
+    scan_xml,
+    write_whole,
+    xml_bytes,
+)
 from ugat_marl.scenario_settings import (
     ControlSettings,
     ScenarioFile,
@@ -54,6 +63,12 @@ class Document:
             return self.content
         assert self.path is not None
         return read_bytes(self.path)
+
+    def scan(self) -> Iterator[Tag]:
+        """The starts of its elements with their lines, in little memory."""
+        if self.path is not None and self.content is None:
+            return scan_xml(chunks_of(self.path), self.source)
+        return scan_xml([self.read()], self.source)
 
     def parse(self) -> ET.Element:
         """The document as an element tree, a fresh one at each call."""
@@ -144,7 +159,7 @@ class Scenario:
             "routes": [document.name for document in self.routes],
             "additional": [document.name for document in self.additional],
         }
-        write_whole(directory / "scenario.toml", _toml(settings, self.applied))
+        write_whole(directory / "scenario.toml", scenario_toml(settings, self.applied))
         return directory
 
 
@@ -328,7 +343,17 @@ def _quoted(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _toml(settings: Mapping[str, Any], applied: tuple[str, ...]) -> str:
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
+
+
+def scenario_toml(settings: Mapping[str, Any], applied: Sequence[str] = ()) -> str:
+    """The text of a ``scenario.toml``.
+
+    Args:
+        settings: Its keys and values; tables are nested.
+        applied: Descriptions of the effects that made the scenario, kept as comments.
+    """
     lines = [f"# made by applying {text}" for text in applied]
     tables: list[str] = []
     for key, value in settings.items():
@@ -348,8 +373,8 @@ def _toml(settings: Mapping[str, Any], applied: tuple[str, ...]) -> str:
 
 def _toml_table(name: str, table: Mapping[str, Any]) -> list[str]:
     plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
-    lines = ["", f"[{name}]", *(f"{_quoted(k)} = {_quoted(v)}" for k, v in plain.items())]
+    lines = ["", f"[{name}]", *(f"{_key(k)} = {_quoted(v)}" for k, v in plain.items())]
     for key, value in table.items():
         if isinstance(value, dict):
-            lines += _toml_table(f"{name}.{_quoted(key)}", value)
+            lines += _toml_table(f"{name}.{_key(key)}", value)
     return lines
