@@ -298,7 +298,7 @@ CASES = [
     Case(
         "an unknown source of phases",
         replaced(TOML, '"programme"', '"programm"'),
-        ("control.phases: give 'programme', 'conflict-free', or a list of SUMO states",),
+        ("control.phases: give 'programme', 'conflict-free', 'permitted', or a list",),
     ),
     Case(
         "a duration of nothing",

@@ -12,6 +12,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.phases import (
     MOST_PHASES,
     Link,
+    RightOfWay,
     are_foes,
     conflict_free_phases,
     conflicting_greens,
@@ -73,7 +74,7 @@ def test_phases_are_all_maximal_sets_without_conflict(junction: tuple[list[Link]
     links, foes = junction
     free = [s for s in all_sets(links) if free_of_conflict([links[i] for i in s], foes)]
     maximal = {s for s in free if not any(s < other for other in free)}
-    phases = conflict_free_phases(links, foes, len(links), "here")
+    phases = conflict_free_phases(links, RightOfWay(foes), len(links), "here")
     assert {greens(phase) for phase in phases} == maximal
     assert len(phases) == len(maximal)
     assert set("".join(phases)) <= {"G", "r"}
@@ -83,7 +84,7 @@ def test_phases_are_all_maximal_sets_without_conflict(junction: tuple[list[Link]
 @settings(max_examples=300)
 def test_right_turns_follow_without_conflict(junction: tuple[list[Link], Foes]) -> None:
     links, foes = junction
-    phases = conflict_free_phases(links, foes, len(links), "here")
+    phases = conflict_free_phases(links, RightOfWay(foes), len(links), "here")
     chosen = [greens(phase) for phase in phases]
     for green in chosen:
         assert free_of_conflict([links[i] for i in green], foes)
@@ -121,7 +122,7 @@ def four_arms() -> tuple[list[Link], Foes]:
 
 def test_the_eight_phases_of_four_arms() -> None:
     links, foes = four_arms()
-    phases = conflict_free_phases(links, foes, 12, "here")
+    phases = conflict_free_phases(links, RightOfWay(foes), 12, "here")
     n, e, s, w = (f"{arm}_" for arm in ARMS)
     leading = [
         frozenset(f"{item.from_edge}_{item.direction}" for item in links if phase[item.index] == "G"
@@ -148,20 +149,20 @@ def test_a_right_turn_with_its_own_lane_is_green_whenever_nothing_crosses_it() -
     # East's through movement merges with north's right turn, which has a lane to itself.
     links = [link(0, "n", "r", 0), link(1, "n", "s", 1), link(2, "e", "s"), link(3, "e", "l", 1)]
     foes = matrix(4, {(1, 2), (1, 3), (0, 2)})
-    assert set(conflict_free_phases(links, foes, 4, "here")) == {"GGrr", "rrGG"}
+    assert set(conflict_free_phases(links, RightOfWay(foes), 4, "here")) == {"GGrr", "rrGG"}
     foes = matrix(4, {(1, 2), (1, 3)})
-    assert set(conflict_free_phases(links, foes, 4, "here")) == {"GGrr", "GrGG"}
+    assert set(conflict_free_phases(links, RightOfWay(foes), 4, "here")) == {"GGrr", "GrGG"}
 
 
 def test_a_right_turn_that_never_could_follow_gets_a_phase() -> None:
     links = [link(0, "a", "r"), link(1, "b", "s"), link(2, "c", "s")]
     foes = matrix(3, {(0, 1), (0, 2), (1, 2)})
-    assert set(conflict_free_phases(links, foes, 3, "here")) == {"Grr", "rGr", "rrG"}
+    assert set(conflict_free_phases(links, RightOfWay(foes), 3, "here")) == {"Grr", "rGr", "rrG"}
 
 
 def test_right_turns_that_merge_into_each_other_are_not_green_together() -> None:
     links = [link(0, "a", "r"), link(1, "b", "r"), link(2, "c", "s")]
-    phases = conflict_free_phases(links, matrix(3, {(0, 1)}), 3, "here")
+    phases = conflict_free_phases(links, RightOfWay(matrix(3, {(0, 1)})), 3, "here")
     assert "GGG" not in phases
     assert {index for phase in phases for index in greens(phase)} == {0, 1, 2}
 
@@ -175,7 +176,7 @@ def test_movements_that_share_a_letter_are_green_together() -> None:
         Link(2, "c_0", "w_0", "s", "J", 3),
     ]
     foes = matrix(4, {(1, 2), (0, 3), (2, 3)})  # b crosses a's left turn only, c its through
-    phases = conflict_free_phases(links, foes, 3, "here")
+    phases = conflict_free_phases(links, RightOfWay(foes), 3, "here")
     assert set(phases) == {"Grr", "rGr", "rrG"}
 
 
@@ -184,12 +185,13 @@ def test_a_partial_turn_belongs_to_the_turn_it_resembles(partial: str, whole: st
     """Both are one movement: what crosses one of them stops both."""
     links = [link(0, "a", whole), link(1, "a", partial, 1), link(2, "b", "s"), link(3, "c", "s")]
     foes = matrix(4, {(1, 2), (0, 3), (2, 3)})
-    assert set(conflict_free_phases(links, foes, 4, "here")) == {"GGrr", "rrGr", "rrrG"}
+    assert set(conflict_free_phases(links, RightOfWay(foes), 4, "here")) == {"GGrr", "rrGr", "rrrG"}
 
 
 def test_letters_beyond_the_links_stay_red() -> None:
     links = [link(0, "a", "s"), link(1, "b", "s")]
-    assert conflict_free_phases(links, matrix(2, {(0, 1)}), 4, "here") == ("Grrr", "rGrr")
+    rules = RightOfWay(matrix(2, {(0, 1)}))
+    assert conflict_free_phases(links, rules, 4, "here") == ("Grrr", "rGrr")
 
 
 def test_too_many_phases_are_refused() -> None:
@@ -197,13 +199,13 @@ def test_too_many_phases_are_refused() -> None:
     links = [link(i, f"a{i}", "s") for i in range(2 * pairs)]
     foes = matrix(2 * pairs, {(2 * i, 2 * i + 1) for i in range(pairs)})
     with pytest.raises(ScenarioError, match=rf"here: more than {MOST_PHASES} conflict-free phases"):
-        conflict_free_phases(links, foes, 2 * pairs, "here")
+        conflict_free_phases(links, RightOfWay(foes), 2 * pairs, "here")
 
 
 def test_a_network_without_internal_lanes_says_what_to_do() -> None:
     links = [Link(0, "a_0", "b_0", "s")]
     with pytest.raises(ScenarioError, match='no internal lanes.*use phases = "programme"'):
-        conflict_free_phases(links, {}, 1, "here")
+        conflict_free_phases(links, RightOfWay({}), 1, "here")
 
 
 def test_programme_phases_are_its_greens_each_once() -> None:

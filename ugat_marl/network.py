@@ -11,8 +11,14 @@ import numpy as np
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml
+from ugat_marl.junctions import Link, crossings_of, foes_of, links_of, yields_of
 from ugat_marl.measurements import LaneTable
-from ugat_marl.phases import Link, conflict_free_phases, conflicting_greens, programme_phases
+from ugat_marl.phases import (
+    RightOfWay,
+    conflict_free_phases,
+    conflicting_greens,
+    programme_phases,
+)
 from ugat_marl.scenario import Scenario
 from ugat_marl.signals import STATES, check_phases
 
@@ -57,6 +63,7 @@ class Intersection:
         programme: The network's own programme, ``(duration_s, state)``.
         neighbours: Traffic lights one road away, in either direction.
         position: Mean of the junctions' coordinates, m.
+        crossings: Links for people on foot.
     """
 
     id: str
@@ -67,6 +74,7 @@ class Intersection:
     programme: tuple[tuple[float, str], ...]
     neighbours: tuple[str, ...]
     position: tuple[float, float]
+    crossings: tuple[Link, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,7 +117,7 @@ class Network:
     def _of(cls, root: ET.Element, scenario: Scenario) -> Network:
         document = scenario.network
         lanes = _lanes(root)
-        links = _links(root)
+        links = links_of(root)
         programmes = _programmes(root, scenario)
         if unknown := sorted(set(scenario.settings.intersections) - set(links)):
             raise ScenarioError(
@@ -117,7 +125,8 @@ class Network:
                 f"{document.source}; it has: {', '.join(sorted(links)) or 'none'}"
             )
         _check_lanes(links, lanes, document.source)
-        foes = _foes(root)
+        rules = RightOfWay(foes_of(root), yields_of(root), _right_on_red(root))
+        crossings = crossings_of(root)
         reachable = _neighbours(links, root)
         positions = _positions(root)
         found: list[Intersection] = []
@@ -125,7 +134,8 @@ class Network:
         for tls in sorted(links):
             own = tuple(sorted(links[tls], key=lambda link: (link.index, link.to_lane)))
             programme = programmes.get(tls, ())
-            phases = _phases_of(scenario, tls, own, programme, foes)
+            walks = tuple(crossings.get(tls, ()))
+            phases = _phases_of(scenario, tls, own, walks, programme, rules)
             if len(phases) < 2:
                 uncontrolled.append(tls)
                 continue
@@ -139,6 +149,7 @@ class Network:
                     programme=programme,
                     neighbours=reachable[tls],
                     position=_centre([positions[link.junction] for link in own]),
+                    crossings=walks,
                 )
             )
         if not found:
@@ -198,7 +209,7 @@ def signal_widths(scenario: Scenario) -> dict[str, int]:
         tls: len(programmes[tls][0][1])
         if tls in programmes
         else max(link.index for link in links) + 1
-        for tls, links in _links(root).items()
+        for tls, links in links_of(root).items()
     }
 
 
@@ -206,24 +217,27 @@ def _phases_of(
     scenario: Scenario,
     tls: str,
     links: tuple[Link, ...],
+    crossings: tuple[Link, ...],
     programme: tuple[tuple[float, str], ...],
-    foes: Mapping[str, Sequence[int]],
+    rules: RightOfWay,
 ) -> tuple[str, ...]:
     own = scenario.settings.intersections.get(tls)
     source = own.phases if own and own.phases is not None else scenario.control.phases
-    width = max(link.index for link in links) + 1
+    width = max(link.index for link in (*links, *crossings)) + 1
     where = f"scenario {scenario.id!r}, traffic light {tls!r}"
     if programme:
-        width = _check_programme(programme, width, links, foes, where)
-    if source == "conflict-free":
-        phases = conflict_free_phases(links, foes, width, where)
+        width = _check_programme(programme, width, links, rules.foes, where)
+    if source in ("conflict-free", "permitted"):
+        phases = conflict_free_phases(
+            links, rules, width, where, crossings=crossings, permitted=source == "permitted"
+        )
     elif source == "programme":
         phases = programme_phases(programme)
     else:
-        phases = source
+        phases = tuple(source)
     check_phases(phases, width, where)
     for phase in phases:
-        _check_greens(phase, links, foes, f"{where}: phase")
+        _check_greens(phase, links, rules.foes, f"{where}: phase")
     return phases
 
 
@@ -297,45 +311,6 @@ def _shape(text: str) -> tuple[tuple[float, float], ...]:
     return tuple((float(xyz[0]), float(xyz[1])) for xyz in points)
 
 
-def _links(root: ET.Element) -> dict[str, list[Link]]:
-    links: dict[str, list[Link]] = defaultdict(list)
-    for item in root.iter("connection"):
-        tls = item.get("tl")
-        if tls is None or item.get("from", ":").startswith(":"):
-            continue
-        junction, request = _request_of(item.get("via", ""))
-        links[tls].append(
-            Link(
-                index=int(item.get("linkIndex", "0")),
-                from_lane=f"{item.get('from')}_{item.get('fromLane')}",
-                to_lane=f"{item.get('to')}_{item.get('toLane')}",
-                direction=item.get("dir", "s"),
-                junction=junction,
-                request=request,
-            )
-        )
-    return links
-
-
-def _request_of(via: str) -> tuple[str, int]:
-    """Junction and matrix row of an internal lane ``:<junction>_<first row>_<lane>``."""
-    if not via:
-        return "", -1
-    junction, first, lane = via[1:].rsplit("_", 2)
-    return junction, int(first) + int(lane)
-
-
-def _foes(root: ET.Element) -> dict[str, list[int]]:
-    """Per junction, a bit mask of conflicting rows for each row of the right-of-way matrix."""
-    foes: dict[str, list[int]] = {}
-    for junction in root.iter("junction"):
-        rows = {
-            int(r.get("index", "0")): int(r.get("foes", "0"), 2) for r in junction.iter("request")
-        }
-        foes[junction.get("id", "")] = [rows.get(i, 0) for i in range(max(rows, default=-1) + 1)]
-    return foes
-
-
 def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[float, str], ...]]:
     """The programme SUMO runs: the last one defined, additional files after the network."""
     programmes: dict[str, tuple[tuple[float, str], ...]] = {}
@@ -371,6 +346,14 @@ def _neighbours(links: Mapping[str, list[Link]], root: ET.Element) -> dict[str, 
                 adjacent[tls].add(other)
                 adjacent[other].add(tls)
     return {tls: tuple(sorted(found)) for tls, found in adjacent.items()}
+
+
+def _right_on_red(root: ET.Element) -> frozenset[str]:
+    return frozenset(
+        item.get("id", "")
+        for item in root.iter("junction")
+        if item.get("type") == "traffic_light_right_on_red"
+    )
 
 
 def _positions(root: ET.Element) -> dict[str, tuple[float, float]]:

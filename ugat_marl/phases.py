@@ -5,10 +5,12 @@ The conflicts are those of the junction's own right-of-way matrix (``<request fo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from functools import partial
 
 from ugat_marl.errors import ScenarioError
+from ugat_marl.junctions import Link, Matrix, has_bit
 from ugat_marl.signals import GREEN, YELLOW
 
 MOST_PHASES = 64
@@ -18,31 +20,8 @@ MOST_PHASES = 64
 Movement = tuple[str, str]
 """Approach (edge) and direction."""
 
-
-@dataclass(frozen=True)
-class Link:
-    """A way across an intersection, controlled by one letter of the signal state.
-
-    Attributes:
-        index: Position of its letter; several links may share one.
-        from_lane: Incoming lane.
-        to_lane: Outgoing lane.
-        direction: SUMO's letter: s straight, l/L left, r/R right, t turn-around.
-        junction: Junction it crosses.
-        request: Its row in that junction's right-of-way matrix, or -1 if the network has none.
-    """
-
-    index: int
-    from_lane: str
-    to_lane: str
-    direction: str
-    junction: str = ""
-    request: int = -1
-
-    @property
-    def from_edge(self) -> str:
-        """Edge of the incoming lane."""
-        return self.from_lane.rsplit("_", 1)[0]
+Clash = Callable[[Link, Link], bool]
+"""Whether two links must not be green together."""
 
 
 def programme_phases(programme: Sequence[tuple[float, str]]) -> tuple[str, ...]:
@@ -54,17 +33,12 @@ def programme_phases(programme: Sequence[tuple[float, str]]) -> tuple[str, ...]:
     )
 
 
-def are_foes(a: Link, b: Link, foes: Mapping[str, Sequence[int]]) -> bool:
+def are_foes(a: Link, b: Link, foes: Matrix) -> bool:
     """Whether the paths of two links cross or merge, by their junction's matrix."""
-    if a.junction != b.junction or a.request < 0 or b.request < 0:
-        return False
-    rows = foes[a.junction]
-    return bool(rows[a.request] >> b.request & 1 or rows[b.request] >> a.request & 1)
+    return has_bit(a, b, foes) or has_bit(b, a, foes)
 
 
-def conflicting_greens(
-    phase: str, links: Sequence[Link], foes: Mapping[str, Sequence[int]]
-) -> tuple[int, int] | None:
+def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple[int, int] | None:
     """Two links that both have protected green though their paths cross, or None.
 
     Only crossings that involve a through movement count: many networks draw opposing left turns so
@@ -83,11 +57,33 @@ def conflicting_greens(
     return None
 
 
+@dataclass(frozen=True)
+class RightOfWay:
+    """Who is in whose way at the junctions of a network, and who waits.
+
+    Attributes:
+        foes: Rows that cross or merge.
+        yields: Rows that each row gives way to; empty where nobody asks who waits.
+        right_on_red: Junctions where right turns may go on red after a stop.
+    """
+
+    foes: Matrix
+    yields: Matrix = field(default_factory=dict[str, Sequence[int]])
+    right_on_red: frozenset[str] = frozenset()
+
+    def waits(self, a: Link, b: Link) -> bool:
+        """Whether `a` must let `b` go first."""
+        return bool(self.yields) and has_bit(a, b, self.yields)
+
+
 def conflict_free_phases(
     links: Sequence[Link],
-    foes: Mapping[str, Sequence[int]],
+    rules: RightOfWay,
     width: int,
     source: str,
+    *,
+    crossings: Sequence[Link] = (),
+    permitted: bool = False,
 ) -> tuple[str, ...]:
     """All maximal sets of compatible movements, as SUMO states.
 
@@ -96,11 +92,18 @@ def conflict_free_phases(
     green to a lane they share or that they do not conflict with.
     On a 4-arm junction with left lanes this gives the eight phases of the UGAT paper.
 
+    A crossing goes with every phase in which only turning vehicles cross it, who wait (``g``):
+    right turns if there is such a phase, left turns too if not. One that no phase can serve gets
+    green in a phase for people on foot alone.
+
     Args:
         links: Links of one traffic light.
-        foes: Right-of-way matrices by junction.
+        rules: Right of way at its junctions.
         width: Letters of a state.
         source: What to call the traffic light in errors.
+        crossings: Links for people on foot.
+        permitted: Whether left turns may go together with the traffic opposite, which they let pass
+            (``g``).
 
     Returns:
         Distinct states, through movements before left turns, in a fixed order.
@@ -113,34 +116,92 @@ def conflict_free_phases(
             f"{source}: the network has no internal lanes, so conflicts are unknown; "
             'use phases = "programme" or list the phases'
         )
+    clash = _permitted_clash(links, rules) if permitted else partial(are_foes, foes=rules.foes)
     groups = _movements(links)
     following = {name for name in groups if name[1] == "r"}
     while True:
-        phases = _maximal_phases(groups, following, foes, source)
+        phases = _maximal_phases(groups, following, clash, source)
         never = [name for name in sorted(following) if not any(name in chosen for chosen in phases)]
         if not never:
             break
         following -= set(never)
-    states = (
-        "".join(
-            "G" if index in {link.index for name in chosen for link in groups[name]} else "r"
-            for index in range(width)
+    chosen = [[link for name in phase for link in groups[name]] for phase in phases]
+    letters = {link.index for link in links}
+    walks = [crossing for crossing in crossings if crossing.index not in letters]
+    together = _with_crossings(chosen, walks, rules.foes)
+    return tuple(dict.fromkeys(state_of(green, links, rules, width) for green in together))
+
+
+def _permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
+    """Conflicts but those of left turns that wait for the approach opposite."""
+    through = [link for link in links if link.direction == "s"]
+    crossing = {
+        (a.from_edge, b.from_edge) for a in through for b in through if are_foes(a, b, rules.foes)
+    }
+    straight = {link.from_edge for link in through}
+
+    def clash(a: Link, b: Link) -> bool:
+        if not are_foes(a, b, rules.foes):
+            return False
+        opposite = {a.from_edge, b.from_edge} <= straight and not (
+            {(a.from_edge, b.from_edge), (b.from_edge, a.from_edge)} & crossing
         )
-        for chosen in phases
-    )
-    return tuple(dict.fromkeys(states))
+        return not opposite or not any(
+            turn_of(x) == "l" and rules.waits(x, y) for x, y in ((a, b), (b, a))
+        )
+
+    return clash
+
+
+def _with_crossings(
+    phases: list[list[Link]], crossings: Sequence[Link], foes: Matrix
+) -> list[list[Link]]:
+    """The phases with the crossings that may be used in them, and one for those left over."""
+    alone: list[Link] = []
+    found = [list(phase) for phase in phases]
+    for crossing in crossings:
+        possible: list[int] = []
+        for turning in ("r", "rl"):
+            possible = [
+                number
+                for number, phase in enumerate(phases)
+                if all(turn_of(link) in turning for link in phase if are_foes(link, crossing, foes))
+            ]
+            if possible:
+                break
+        for number in possible:
+            found[number].append(crossing)
+        if not possible:
+            alone.append(crossing)
+    return [*found, alone] if alone else found
+
+
+def state_of(
+    green: Sequence[Link], links: Sequence[Link], rules: RightOfWay, width: int
+) -> str:
+    """The state that shows green: protected, or permitted where somebody else goes first."""
+    letters = ["r"] * width
+    for link in links:
+        if link.junction in rules.right_on_red and turn_of(link) == "r":
+            letters[link.index] = "s"
+    for link in green:
+        letters[link.index] = "G"
+    for link in green:
+        if any(link.from_edge != b.from_edge and rules.waits(link, b) for b in green):
+            letters[link.index] = "g"
+    return "".join(letters)
 
 
 def _maximal_phases(
     groups: Mapping[Movement, Sequence[Link]],
     following: set[Movement],
-    foes: Mapping[str, Sequence[int]],
+    clash: Clash,
     source: str,
 ) -> list[set[Movement]]:
     """Maximal sets of the movements that lead, each with the right turns that may follow it."""
     main = [name for name in groups if name not in following]
     compatible = {
-        a: {b for b in main if b != a and not _groups_conflict(groups[a], groups[b], foes)}
+        a: {b for b in main if b != a and not _groups_conflict(groups[a], groups[b], clash)}
         for a in main
     }
 
@@ -151,7 +212,7 @@ def _maximal_phases(
     for leading in sorted(_maximal_cliques(compatible, source), key=through_first):
         chosen = set(leading)
         for name in groups:
-            if name in following and _right_may_go(name, chosen, groups, foes):
+            if name in following and _right_may_go(name, chosen, groups, clash):
                 chosen.add(name)
         phases.append(chosen)
     return phases
@@ -181,19 +242,22 @@ def _turn(direction: str) -> str:
     return {"L": "l", "t": "l", "T": "l", "R": "r"}.get(direction, direction)
 
 
-def _groups_conflict(
-    a: Sequence[Link], b: Sequence[Link], foes: Mapping[str, Sequence[int]]
-) -> bool:
-    return any(x.from_edge != y.from_edge and are_foes(x, y, foes) for x in a for y in b)
+def turn_of(link: Link) -> str:
+    """Through, left or right; partial turns and turn-arounds count as the turn they resemble."""
+    return _turn(link.direction)
+
+
+def _groups_conflict(a: Sequence[Link], b: Sequence[Link], clash: Clash) -> bool:
+    return any(x.from_edge != y.from_edge and clash(x, y) for x in a for y in b)
 
 
 def _right_may_go(
     name: Movement,
     chosen: Set[Movement],
     groups: Mapping[Movement, Sequence[Link]],
-    foes: Mapping[str, Sequence[int]],
+    clash: Clash,
 ) -> bool:
-    if any(_groups_conflict(groups[name], groups[other], foes) for other in chosen):
+    if any(_groups_conflict(groups[name], groups[other], clash) for other in chosen):
         return False
     lanes = {link.from_lane for link in groups[name]}
     sharing = [

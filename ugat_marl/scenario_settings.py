@@ -11,9 +11,10 @@ from pydantic import Field
 
 from ugat_marl.errors import ScenarioError, nearest
 
-PhaseSource = Literal["programme", "conflict-free"] | tuple[str, ...]
+PhaseSource = Literal["programme", "conflict-free", "permitted"] | tuple[str, ...]
 """Where an intersection's green phases come from: the network's own signal programme, all maximal
-conflict-free sets of movements, or an explicit list of SUMO states."""
+conflict-free sets of movements, the same with left turns that let the traffic opposite pass, or an
+explicit list of SUMO states."""
 
 _SET_BY_THE_SUITE = frozenset(
     {
@@ -140,7 +141,8 @@ def _explain(item: Any) -> str:
         key = ".".join(names[: names.index("phases") + 1])
         if item["type"] == "missing":
             return f"key {key!r} is missing"
-        return f"{key}: give 'programme', 'conflict-free', or a list of SUMO states in quotes"
+        allowed = "'programme', 'conflict-free', 'permitted', or a list of SUMO states in quotes"
+        return f"{key}: give {allowed}"
     key = ".".join(names)
     if item["type"] == "extra_forbidden":
         known = _known_keys(names[:-1])
