@@ -7,9 +7,12 @@ import tomllib
 from dataclasses import fields
 from pathlib import Path
 
-from ugat_marl.effects import effect_from, known_effects
+from ugat_marl.effects import Incident, effect_from, effects_on_controllers, known_effects
+from ugat_marl.effects.acting import PHASE_ORDERS
+from ugat_marl.effects.judging import OBJECTIVES
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.uncertainty import METHODS
+from ugat_marl.judging import HIDDEN
 from ugat_marl.scenario_settings import (
     ControlSettings,
     IntersectionSettings,
@@ -67,6 +70,28 @@ def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
             assert parameter.unit.replace("^2", "²") in cell
         for text in kind.texts.values():
             assert ("`*`" in cell) == text.everywhere or len(kind.texts) > 1
+    example = re.search(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    assert example is not None
+    (record,) = tomllib.loads(example[1])["effects"]
+    effect_from(record)
+
+
+def test_every_effect_on_controllers_is_documented_with_its_fields_and_ranges() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "gaps.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
+    for name, kind in {**effects_on_controllers(), Incident.name: Incident}.items():
+        cell = rows[name]
+        assert re.findall(r"`(\w+)`", cell) == [item.name for item in fields(kind)], name
+        for parameter in kind.ranges.values():
+            if parameter.high < 1e6:
+                assert f"{parameter.low:g}–{parameter.high:g}" in cell, (name, parameter)
+            assert parameter.unit in cell
+    for rule in PHASE_ORDERS:
+        assert f"`{rule}`" in page
+    for name in HIDDEN:
+        assert f"| `{name}` |" in page
+    for name in OBJECTIVES:
+        assert name in rows["objective"]
     example = re.search(r"```toml\n(.*?)```", page, flags=re.DOTALL)
     assert example is not None
     (record,) = tomllib.loads(example[1])["effects"]

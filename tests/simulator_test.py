@@ -16,7 +16,8 @@ from ugat_marl import parallel_env
 from ugat_marl.effects import Acceleration, StartupDelay, apply_effects, load
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.signals import GREEN
-from ugat_marl.simulator import LibsumoSimulator, launch_of, read_trips
+from ugat_marl.simulator import LibsumoSimulator, launch_of
+from ugat_marl.trips import read_trips
 
 Crossing = Callable[..., Path]
 LANES = ("S_C_0", "W_C_0", "C_N_0", "C_E_0")

@@ -49,6 +49,8 @@ class Snapshot:
         mean_left: Vehicles that had left the lane's road, from this lane, averaged over the seconds
             since the last snapshot, ``(lanes,)``: how many, and how early. Empty unless the
             simulator was started with `crossings`, and in the first snapshot.
+        near: Vehicles, halting ones and waiting time as above of those in the last metres of the
+            lane, ``(3, lanes)``. Empty unless the simulator was started with `zone_m`.
     """
 
     time_s: float
@@ -59,6 +61,7 @@ class Snapshot:
     departed: int
     backlog: int
     mean_left: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    near: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def less(self, left: NDArray[np.float64]) -> Snapshot:
         """This snapshot without the vehicles that have `left`, ``(lanes,)``; nobody arrives."""
@@ -76,9 +79,16 @@ class Trips:
         delay_s: Time loss inside the network plus departure delay, ``(vehicles,)``.
         finished: Whether the vehicle arrived, bool ``(vehicles,)``.
         entered: Whether the vehicle got into the network, bool ``(vehicles,)``.
+        co2_g: What the vehicle emitted, in g, ``(vehicles,)``. This and what follows is empty
+            unless the simulator was started with `persons`.
+        persons: Persons in the vehicle, ``(vehicles,)``.
+        dangers: Collisions and hard brakings in the episode, ``(2,)``.
     """
 
     travel_time_s: NDArray[np.float64]
     delay_s: NDArray[np.float64]
     finished: NDArray[np.bool_]
     entered: NDArray[np.bool_]
+    co2_g: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    persons: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    dangers: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))

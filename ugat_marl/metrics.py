@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ class Scores:
         due: Vehicles scheduled to depart before the end.
         departed: Vehicles that entered the network.
         backlog: Vehicles due at the end that never entered.
+        hidden: What only a domain with an objective measures; see `ugat_marl.judging.HIDDEN`.
     """
 
     att_s: float
@@ -39,6 +41,7 @@ class Scores:
     due: float
     departed: float
     backlog: float
+    hidden: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 MEASURES: dict[str, str] = {

@@ -167,6 +167,13 @@ class Observer:
         return Box(lows, np.ones_like(lows), dtype=np.float32)
 
 
+def joint_space(spaces: Sequence[Box]) -> Box:
+    """The space of vectors one after the other."""
+    low = np.concatenate([space.low for space in spaces])
+    high = np.concatenate([space.high for space in spaces])
+    return Box(low, high, dtype=np.float32)
+
+
 def _gather(network: Network, name: str) -> tuple[NDArray[np.int64], list[int]]:
     """Positions in (halting | vehicles) for `movements`, and the number of features of each."""
     lanes = network.lane_table()

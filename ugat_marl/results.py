@@ -86,7 +86,7 @@ class Evaluation:
         """One value per seed, in the order of the seeds."""
         found = [r for r in self.results if r.policy == policy and r.domain == domain]
         found.sort(key=lambda result: result.seed)
-        return np.array([getattr(result.scores, measure) for result in found])
+        return np.array([_measured(result.scores, measure) for result in found])
 
     def estimate(self, policy: str, domain: str, measure: str) -> Estimate:
         """Mean and interval of a measure."""
@@ -103,6 +103,11 @@ class Evaluation:
         mine = self.values(policy, domain, "att_s")
         return Estimate.of(mine - self.values(best, domain, "att_s"))
 
+    def _hidden(self, domain: str) -> list[str]:
+        """What only a domain with an objective measures."""
+        played = (result.scores for result in self.results if result.domain == domain)
+        return list(dict.fromkeys(name for scores in played for name in scores.hidden))
+
     def as_dict(self) -> dict[str, Any]:
         """Everything, for JSON: the summary and every episode."""
         summary: list[dict[str, Any]] = []
@@ -113,6 +118,8 @@ class Evaluation:
                     row[measure] = asdict(self.estimate(policy, domain, measure))
                     if domain != self.domains[0]:
                         row[f"{measure}_gap"] = asdict(self.gap(policy, domain, measure))
+                for measure in self._hidden(domain):
+                    row[measure] = asdict(self.estimate(policy, domain, measure))
                 row["regret_s"] = asdict(self.regret(policy, domain))
                 summary.append(row)
         return {
@@ -170,6 +177,13 @@ class Tuned:
     def episodes(self) -> int:
         """Episodes played for it."""
         return sum(trial.episodes for trial in self.trials)
+
+
+def _measured(scores: Scores, measure: str) -> float:
+    """A measure, also a hidden one; nan where that was not measured."""
+    if hasattr(scores, measure):
+        return getattr(scores, measure)
+    return scores.hidden.get(measure, math.nan)
 
 
 def _without_nan(value: Any) -> Any:

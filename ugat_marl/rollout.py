@@ -107,7 +107,7 @@ class _Recording:
         self._recorder = TransitionRecorder(provenance_of(env, observer, seed))
         self._names = dict(zip(self._base.possible_agents, observer.agents, strict=True))
         self._seen = self._look()
-        self._before: Snapshot = self._base.snapshot
+        self._before: Snapshot = self._base.seen
         self._step = 0
 
     def add(self, actions: Actions, rewards: Mapping[str, float], infos: Infos) -> None:
@@ -125,7 +125,7 @@ class _Recording:
 
     def _served(self) -> dict[str, NDArray[np.float32]] | None:
         """The features at the last decision without the vehicles that left since, on average."""
-        before, self._before = self._before, self._base.snapshot
+        before, self._before = self._before, self._base.seen
         left = self._before.mean_left
         if not len(left) or self._observer.needs_waiting:  # who has left says nothing of waiting
             return None
@@ -134,7 +134,7 @@ class _Recording:
         return {agent: vector[: layout.features] for agent, vector, layout in own}
 
     def _look(self) -> dict[str, NDArray[np.float32]]:
-        vectors = self._observer.observe(self._base.snapshot, self._base.phases)
+        vectors = self._observer.observe(self._base.seen, self._base.phases)
         return dict(zip(self._observer.agents, vectors, strict=True))
 
     def _renamed(self, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,7 +7,6 @@ it is refused. `ugat_marl.simulator_process` gives the same interface in a proce
 from __future__ import annotations
 
 import os
-import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,9 +19,10 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.files import write_whole
-from ugat_marl.measurements import Snapshot, Trips
+from ugat_marl.measurements import HALTING_MPS, Snapshot, Trips
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.signals import Segment
+from ugat_marl.trips import measuring_options, read_trips
 
 Plans = Mapping[str, Sequence[Segment]]
 """Traffic light to what it shows in the coming seconds; lights left out go on as before."""
@@ -43,6 +43,8 @@ class Launch:
         crossings: Whether to look every second for vehicles that leave a lane's road.
         gui: Whether to open a window.
         files: Names and content of the scenario's edited files.
+        zone_m: Length of what is measured apart at the end of each lane, or 0 for nothing.
+        persons: Vehicle types with the persons in each vehicle; what is hidden is then measured.
     """
 
     arguments: tuple[str, ...]
@@ -53,6 +55,8 @@ class Launch:
     crossings: bool = False
     gui: bool = False
     files: tuple[tuple[str, bytes], ...] = ()
+    zone_m: float = 0.0
+    persons: tuple[tuple[str, float], ...] = ()
 
     def write(self) -> None:
         """Makes the folder and puts the files into it."""
@@ -119,6 +123,8 @@ def launch_of(
     waiting: bool = False,
     crossings: bool = False,
     gui: bool = False,
+    zone_m: float = 0.0,
+    persons: Mapping[str, float] | None = None,
 ) -> Launch:
     """Lists SUMO's options, and the files that have to be written for it; writes nothing.
 
@@ -130,6 +136,9 @@ def launch_of(
         waiting: Whether to measure waiting times.
         crossings: Whether to look every second for vehicles that leave a lane's road.
         gui: Whether to open a window.
+        zone_m: Length of what is to be measured apart at the end of each lane, or 0 for nothing.
+        persons: Vehicle type to the persons in each vehicle, "" for all others, if emissions,
+            persons and dangers are to be measured.
     """
     settings = scenario.settings
     files = {
@@ -158,6 +167,8 @@ def launch_of(
         "--duration-log.disable", "true",
         "--no-warnings", "true",
     ]  # fmt: skip
+    if persons is not None:
+        arguments += measuring_options(directory)
     if gui:
         arguments += ["--start", "true", "--quit-on-end", "true"]
     return Launch(
@@ -169,6 +180,8 @@ def launch_of(
         crossings,
         gui,
         tuple(written.items()),
+        zone_m,
+        tuple((persons or {}).items()),
     )
 
 
@@ -284,9 +297,9 @@ class LibsumoSimulator:
     def finish(self) -> Trips:
         """Ends the simulation; SUMO then writes what became of every vehicle due."""
         assert self._launch is not None, "finish before start"
-        directory = Path(self._launch.directory)
+        directory, persons = Path(self._launch.directory), dict(self._launch.persons)
         self.close()
-        return read_trips(directory / _TRIPS)
+        return read_trips(directory / _TRIPS, persons)
 
     def close(self) -> None:
         """Ends the simulation of this object, if there is one."""
@@ -334,7 +347,21 @@ class LibsumoSimulator:
             waiting_s=measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0),
             departed=int(statistic("", "stats.vehicles.inserted")),
             backlog=int(statistic("", "stats.vehicles.waiting")),
+            near=self._near(names, taken) if self._launch.zone_m else np.empty(0),
         )
+
+    def _near(self, names: Sequence[str], places: NDArray[np.int64]) -> NDArray[np.float64]:
+        """What stands in `Snapshot.near`; looks at every vehicle on the lanes `names`."""
+        assert self._launch is not None
+        near = np.zeros((3, len(self._launch.lanes)))
+        api = libsumo.vehicle
+        for lane, place in zip(names, places.tolist(), strict=True):
+            begins = libsumo.lane.getLength(lane) - self._launch.zone_m
+            for name in libsumo.lane.getLastStepVehicleIDs(lane):
+                if api.getLanePosition(name) >= begins:
+                    halts = api.getSpeed(name) < HALTING_MPS
+                    near[:, place] += (1.0, float(halts), api.getWaitingTime(name))
+        return near
 
     def _fail(self, what: str, error: Exception) -> None:
         assert self._launch is not None
@@ -353,36 +380,6 @@ def one_line(text: str) -> str:
     """What SUMO printed as one line, without its formulas."""
     lines = [line.strip().removeprefix("Error: ") for line in text.splitlines()]
     return " ".join(line for line in lines if line and line != "Quitting (on error).")
-
-
-def read_trips(path: Path) -> Trips:
-    """Reads SUMO's tripinfo file, unfinished and undeparted vehicles included.
-
-    Raises:
-        SimulatorError: SUMO did not write it, or not all of it.
-    """
-    try:
-        return _trips_in(path)
-    except (OSError, ET.ParseError) as error:
-        raise SimulatorError(
-            f"SUMO's report on its vehicles cannot be read ({error}); is there room left in "
-            f"{path.parent.parent}?"
-        ) from None
-
-
-def _trips_in(path: Path) -> Trips:
-    rows: list[tuple[float, float, bool, bool]] = []
-    for _, item in ET.iterparse(path):
-        if item.tag == "tripinfo":
-            entered = float(item.get("depart", "-1")) >= 0
-            finished = float(item.get("arrival", "-1")) >= 0
-            waited = float(item.get("departDelay", "0"))
-            inside = float(item.get("duration", "0"))
-            lost = float(item.get("timeLoss", "0"))
-            rows.append((waited + inside, waited + lost, finished, entered))
-        item.clear()
-    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    return Trips(table[:, 0], table[:, 1], table[:, 2] > 0, table[:, 3] > 0)
 
 
 def simulates_here() -> bool:

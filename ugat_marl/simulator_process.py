@@ -27,7 +27,14 @@ from typing import IO, Any, ClassVar, Literal, Self
 from ugat_marl.channel import Channel, ChannelClosed, Message
 from ugat_marl.errors import OptionError, SimulatorCrashed, SimulatorError
 from ugat_marl.measurements import Snapshot, Trips
-from ugat_marl.simulator import Launch, Plans, VehiclePicture, one_line
+from ugat_marl.simulator import (
+    Launch,
+    LibsumoSimulator,
+    Plans,
+    Simulator,
+    VehiclePicture,
+    one_line,
+)
 
 StartMethod = Literal["forkserver", "spawn"]
 
@@ -90,9 +97,9 @@ class ProcessSimulator:
 
     def finish(self) -> Trips:
         """Ends the simulation and its process; returns what became of every vehicle due."""
-        (table,) = self._ask("finish").arrays
+        table, *hidden = self._ask("finish").arrays
         self._end_worker()
-        return Trips(table[0], table[1], table[2] > 0, table[3] > 0)
+        return Trips(table[0], table[1], table[2] > 0, table[3] > 0, *hidden)
 
     def close(self) -> None:
         """Ends the simulation and its process; the warm parent goes with the last simulator."""
@@ -156,6 +163,13 @@ class ProcessSimulator:
             self._end_worker()
             raise SimulatorError(error)
         return reply
+
+
+def simulator_of(option: str) -> Simulator:
+    """A simulator by the name that `EnvOptions` has for its kind."""
+    if option == "inprocess":
+        return LibsumoSimulator()
+    return ProcessSimulator("spawn" if option == "spawn" else None)
 
 
 class _Worker:
@@ -362,7 +376,7 @@ def _environment() -> dict[str, str]:
 
 
 def _snapshot(reply: Message) -> Snapshot:
-    lanes, waiting, mean_left = reply.arrays
+    lanes, waiting, mean_left, *near = reply.arrays
     header = reply.header
     return Snapshot(
         header["time_s"],
@@ -373,4 +387,5 @@ def _snapshot(reply: Message) -> Snapshot:
         header["departed"],
         header["backlog"],
         mean_left,
+        *near,
     )

@@ -46,7 +46,9 @@ def _answer(simulator: Simulator, header: dict[str, Any]) -> Message:
     assert what == "finish", what
     trips = simulator.finish()
     rows = [trips.travel_time_s, trips.delay_s, trips.finished, trips.entered]
-    return Message({}, [np.array(rows, dtype=np.float64)])
+    told = [np.array(rows, dtype=np.float64)]
+    hidden = [trips.co2_g, trips.persons, trips.dangers] if len(trips.dangers) else []
+    return Message({}, told + hidden)
 
 
 def _message(snapshot: Snapshot) -> Message:
@@ -56,7 +58,8 @@ def _message(snapshot: Snapshot) -> Message:
         "backlog": snapshot.backlog,
     }
     lanes = np.array([snapshot.vehicles, snapshot.halting, snapshot.mean_speed_mps])
-    return Message(header, [lanes, snapshot.waiting_s, snapshot.mean_left])
+    measured = [lanes, snapshot.waiting_s, snapshot.mean_left]
+    return Message(header, [*measured, snapshot.near] if len(snapshot.near) else measured)
 
 
 class _Worker:

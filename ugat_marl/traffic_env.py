@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import secrets
-import shutil
-import tempfile
 import warnings
-import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,20 +14,24 @@ from pettingzoo import ParallelEnv
 
 from ugat_marl import signals
 from ugat_marl.actions import checked_delays, checked_phases
+from ugat_marl.cabinet import Cabinet
 from ugat_marl.demand import check_demand
-from ugat_marl.effects import Domain, describe, in_domain, load
+from ugat_marl.effects import Domain, controller_effects, describe, in_domain, load
 from ugat_marl.effects.signals import late_greens, with_late_programmes
 from ugat_marl.errors import EpisodeError, OptionError
+from ugat_marl.judging import Judge
 from ugat_marl.measurements import Snapshot
 from ugat_marl.metrics import EpisodeRecorder, Scores
 from ugat_marl.network import Network
-from ugat_marl.observations import Observer
+from ugat_marl.observations import Observer, joint_space
 from ugat_marl.options import EnvOptions
+from ugat_marl.own_directory import OwnDirectory
 from ugat_marl.rendering import Picture
 from ugat_marl.rewards import Rewarder
 from ugat_marl.scenario import Scenario
-from ugat_marl.simulator import LibsumoSimulator, Simulator, launch_of
-from ugat_marl.simulator_process import ProcessSimulator
+from ugat_marl.sensing import Sensing
+from ugat_marl.simulator import Simulator, launch_of
+from ugat_marl.simulator_process import simulator_of
 from ugat_marl.transitions import AgentLayout
 
 
@@ -85,10 +84,14 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._lanes = self.network.lane_table()
         self._observer = Observer(self.network, options.observation, options.neighbours)
         self._rewarder = Rewarder(self.network, options.reward)
+        effects = controller_effects(self.scenario)
+        self._sensing = Sensing.of(effects, self.network, self.decision_interval_s)
+        self._cabinet = Cabinet.of(effects, self.network, self._timing, self.decision_interval_s)
+        self._judge = Judge.of(effects, self.scenario)
         self._name_agents()
-        self._state_space = self._joint_space()
+        self._state_space = joint_space(list(self.observation_spaces.values()))
         self._simulator: Simulator | None = None
-        self._remove: weakref.finalize[..., TrafficEnv] | None = None
+        self._directory = OwnDirectory()
         self.np_random = np.random.default_rng()
         self.agents: list[str] = []
         self._scores: Scores | None = None
@@ -118,6 +121,11 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     def snapshot(self) -> Snapshot:
         """What was measured after the last decision (or the reset)."""
         return self._snapshot
+
+    @property
+    def seen(self) -> Snapshot:
+        """What controllers see of `snapshot`: all of it, but for effects on observations."""
+        return self._seen
 
     @property
     def phases(self) -> list[int]:
@@ -183,6 +191,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if not self.agents:
             raise EpisodeError("step() needs a running episode; call reset() first")
         requested = checked_phases(actions, self.agents, self.action_spaces)
+        if self._cabinet is not None:
+            requested = self._cabinet.obey(requested, self._states)
         before = self._snapshot
         self._advance(requested)
         rewards = self._rewarder.rewards(before, self._snapshot)
@@ -225,7 +235,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """All observations, one after the other; also after the last step."""
         if not hasattr(self, "_states"):
             raise EpisodeError("state() has no meaning before the first reset()")
-        return np.concatenate(self._observer.observe(self._snapshot, self.phases))
+        return np.concatenate(self._observer.observe(self._seen, self.phases))
 
     def scores(self) -> Scores:
         """The measures of the episode that has ended.
@@ -248,7 +258,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if self.render_mode != "rgb_array":
             return None
         if self._picture is None:
-            self._picture = Picture(self.network)
+            self._picture = Picture(self.network, self.intersection_of)
         if self._simulator is not None and self.agents:
             self._picture.draw(self._simulator.vehicles(), self._simulator.signals())
         return self._picture.pixels()
@@ -259,7 +269,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.agents = []
         if simulator is not None:
             simulator.close()
-        self._remove_directory()
+        self._directory.remove()
 
     def __del__(self) -> None:
         if getattr(self, "_simulator", None) is not None:
@@ -282,20 +292,10 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.action_spaces = {a: actions[count] for a, count in zip(agents, phases, strict=True)}
         self._all_free = [np.ones(count, dtype=np.int8) for count in phases]
 
-    def _joint_space(self) -> Box:
-        spaces = list(self.observation_spaces.values())
-        return Box(
-            np.concatenate([space.low for space in spaces]),
-            np.concatenate([space.high for space in spaces]),
-            dtype=np.float32,
-        )
-
     def _start(self, seed: int) -> None:
-        self._remove_directory()
+        directory = self._directory.fresh()
         if self._simulator is None:
-            self._simulator = _simulator(self.options.simulator)
-        directory = Path(tempfile.gettempdir()) / f"ugat_marl-{secrets.token_hex(8)}"
-        self._remove = weakref.finalize(self, _remove_tree, directory, os.getpid())
+            self._simulator = simulator_of(self.options.simulator)
         launch = launch_of(
             with_late_programmes(self.scenario),
             seed,
@@ -304,9 +304,14 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             waiting=self._observer.needs_waiting or self._rewarder.needs_waiting,
             crossings=self.options.crossings,
             gui=self.render_mode == "human",
+            zone_m=self._sensing.zone_m if self._sensing else 0.0,
+            persons=self._judge.persons if self._judge else None,
         )
         self.agents = []
-        self._snapshot = self._simulator.start(launch)
+        for part in (self._sensing, self._cabinet):
+            if part is not None:
+                part.reset(seed)
+        self._look(self._simulator.start(launch))
 
     def _advance(self, requested: list[int]) -> None:
         assert self._simulator is not None
@@ -323,15 +328,25 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             plans, states = {}, self._states
         plans = self._delays.hold(plans)
         agents, self.agents = self.agents, []  # the episode is over if SUMO fails
-        self._snapshot: Snapshot = self._simulator.advance(self.decision_interval_s, plans)
+        self._look(self._simulator.advance(self.decision_interval_s, plans))
         self.agents, self._states = agents, states
 
+    def _look(self, snapshot: Snapshot) -> None:
+        self._snapshot = snapshot
+        self._seen = snapshot if self._sensing is None else self._sensing.see(snapshot)
+
     def _observe(self) -> dict[str, NDArray[np.float32]]:
-        seen = self._observer.observe(self._snapshot, self.phases)
+        seen = self._observer.observe(self._seen, self.phases)
         return dict(zip(self.agents, seen, strict=True))
 
     def _infos(self) -> dict[str, dict[str, Any]]:
         infos: dict[str, dict[str, Any]] = {}
+        if self._cabinet is not None:
+            masks = self._cabinet.masks(self._states)
+            return {
+                agent: {"action_mask": mask, "executed_action": state.phase}
+                for agent, mask, state in zip(self.agents, masks, self._states, strict=True)
+            }
         for agent, state, free in zip(self.agents, self._states, self._all_free, strict=True):
             mask = free.copy()
             if not signals.free_to_change(state, self._timing, self.decision_interval_s):
@@ -354,12 +369,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if self.render_mode == "rgb_array":
             self.render()
         self.agents = []
-        self._scores = self._recorder.scores(self._simulator.finish())
-
-    def _remove_directory(self) -> None:
-        remove, self._remove = self._remove, None
-        if remove is not None:
-            remove()
+        trips = self._simulator.finish()
+        scores = self._recorder.scores(trips)
+        self._scores = self._judge.judged(scores, trips) if self._judge else scores
 
 
 def parallel_env(
@@ -386,15 +398,3 @@ def env(scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any)
     from pettingzoo.utils import parallel_to_aec
 
     return parallel_to_aec(parallel_env(scenario, domain, **options))
-
-
-def _simulator(name: str) -> Simulator:
-    if name == "inprocess":
-        return LibsumoSimulator()
-    return ProcessSimulator("spawn" if name == "spawn" else None)
-
-
-def _remove_tree(directory: Path, owner: int) -> None:
-    """Removes a folder, though nobody closed its environment; not in a forked child, however."""
-    if os.getpid() == owner:
-        shutil.rmtree(directory, ignore_errors=True)

@@ -31,7 +31,8 @@ from ugat_marl.redraw import explicit, redrawn, sumo_program
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.seeding import derive_seed
 from ugat_marl.signals import delayed_log
-from ugat_marl.simulator import launch_of, one_line, read_trips
+from ugat_marl.simulator import launch_of, one_line
+from ugat_marl.trips import read_trips
 
 WARM_UP_S = 600.0
 """Simulated before a period that does not begin with the scenario, under its own first signals."""

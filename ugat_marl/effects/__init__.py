@@ -4,7 +4,14 @@ The same value makes a "real" domain different from the simulation, is what a di
 is what repairs a model.
 """
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text
+from ugat_marl.effects.acting import (
+    ExecutionDelay,
+    LostCommands,
+    MaxGreen,
+    MinGreen,
+    PhaseOrder,
+)
+from ugat_marl.effects.base import EVERYWHERE, ControllerEffect, Effect, Parameter, Text
 from ugat_marl.effects.demand import DemandLevel, DemandSurge, DemandTiming
 from ugat_marl.effects.detectors import (
     ClockDrift,
@@ -17,16 +24,35 @@ from ugat_marl.effects.detectors import (
     observed,
     owners,
 )
+from ugat_marl.effects.domains import GAPS, NAMED, NamedDomain, spelled_out
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
-from ugat_marl.effects.roads import LaneClosure, LocalSpeed, Parking, parked_at_other_times
+from ugat_marl.effects.judging import Objective
+from ugat_marl.effects.observing import (
+    CountingError,
+    CountingNoise,
+    DetectionZone,
+    DetectorFailure,
+    LostReadings,
+    ObservationDelay,
+    QuantisedCounts,
+)
+from ugat_marl.effects.roads import (
+    Incident,
+    LaneClosure,
+    LocalSpeed,
+    Parking,
+    parked_at_other_times,
+)
 from ugat_marl.effects.settings import (
     ALIASES,
     SETTINGS,
     Domain,
     apply_effects,
+    controller_effects,
     describe,
     detector_effects,
     effect_from,
+    effects_on_controllers,
     in_domain,
     known_effects,
     load,
@@ -55,32 +81,50 @@ from ugat_marl.effects.vehicles import (
 __all__ = [
     "ALIASES",
     "EVERYWHERE",
+    "GAPS",
+    "NAMED",
     "SETTINGS",
     "Acceleration",
     "AllRedTime",
     "ClockDrift",
+    "ControllerEffect",
+    "CountingError",
+    "CountingNoise",
     "Deceleration",
     "DemandLevel",
     "DemandSurge",
     "DemandTiming",
     "DesiredSpeed",
+    "DetectionZone",
     "DetectorEffect",
+    "DetectorFailure",
     "Domain",
     "DriverModel",
     "Dropout",
     "Effect",
     "EmergencyDeceleration",
+    "ExecutionDelay",
     "GapAcceptance",
     "Headway",
     "HeavyShare",
     "Imperfection",
+    "Incident",
     "LaneClosure",
     "LaneDiscipline",
     "LateGreen",
     "LocalSpeed",
+    "LostCommands",
+    "LostReadings",
+    "MaxGreen",
     "MinGap",
+    "MinGreen",
+    "NamedDomain",
+    "Objective",
+    "ObservationDelay",
     "Parameter",
     "Parking",
+    "PhaseOrder",
+    "QuantisedCounts",
     "ReactionStep",
     "RedRunning",
     "SignalClock",
@@ -95,9 +139,11 @@ __all__ = [
     "YellowRunning",
     "YellowTime",
     "apply_effects",
+    "controller_effects",
     "describe",
     "detector_effects",
     "effect_from",
+    "effects_on_controllers",
     "in_domain",
     "known_effects",
     "load",
@@ -106,4 +152,5 @@ __all__ = [
     "parked_at_other_times",
     "parse_domain",
     "scenario_of",
+    "spelled_out",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, ClassVar, Literal
 
@@ -15,7 +15,7 @@ from ugat_marl.scenario import Scenario
 EVERYWHERE = "*"
 """As a place: all of them."""
 
-TextKind = Literal["lane", "edge", "traffic light", "detector", "model"]
+TextKind = Literal["lane", "edge", "traffic light", "detector", "model", "phase order", "objective"]
 
 _FORBIDDEN = frozenset(" \t\n\r|\\'\";,<>&")
 """Characters that ids in SUMO cannot have; a comma ends a value in the text form."""
@@ -123,6 +123,23 @@ class Effect:
                 raise UnknownNameError(f"{text.kind} of effect {self.name!r}:", value, text.allowed)
             return same[0]
         return value
+
+
+@dataclass(frozen=True)
+class ControllerEffect(Effect):
+    """An effect on what controllers see, do or are judged by; traffic and detectors stay alone.
+
+    The environment keeps it, so the scenario goes on listing it in its own `effects`: there it is
+    hashed, written and read again. No files change.
+    """
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Lists the effect in the scenario; the last of two of the same name counts."""
+        others = [item for item in scenario.settings.effects if item.get("name") != self.name]
+        listed = sorted([*others, self.record()], key=lambda item: str(item.get("name")))
+        settings = scenario.settings.model_copy(update={"effects": tuple(listed)})
+        known = () if str(self) in scenario.applied else (str(self),)  # a scenario is loaded twice
+        return replace(scenario, settings=settings, applied=(*scenario.applied, *known))
 
 
 def draw(salt: str, *names: str) -> float:

@@ -16,7 +16,7 @@ from typing import ClassVar
 from ugat_marl.effects.base import Effect, Parameter, Text, draw
 from ugat_marl.effects.documents import seconds_text, sort_departures
 from ugat_marl.effects.places import places_of
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import xml_bytes
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.seeding import numpy_generator
@@ -51,6 +51,43 @@ class LaneClosure(Effect):
             return replace(scenario, applied=(*scenario.applied, str(self)))
         stand = {"until": seconds_text(self.end_s)}
         return _with_blockers(scenario, self, self.lane, [begin], stand)
+
+
+@dataclass(frozen=True)
+class Incident(Effect):
+    """A lane before a signal is closed for a while; a hash of the network's lanes says which.
+
+    A diagnosis looks for the `LaneClosure` it is.
+    """
+
+    name: ClassVar[str] = "incident"
+    ranges: ClassVar[dict[str, Parameter]] = {"after_s": _TIME, "lasts_s": Parameter("s", 1.0, 1e7)}
+    after_s: float
+    lasts_s: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Closes one of the lanes that lead to a signal, if possible one with another beside it.
+
+        Times count from the beginning of the scenario, not from midnight.
+
+        Raises:
+            ScenarioError: No lane that leads to a signal is long enough.
+        """
+        places = places_of(scenario)
+        lanes = [
+            lane
+            for lane in places.ends
+            if places.lanes[lane].cars and places.lanes[lane].length_m >= _LAST_M
+        ]
+        if not lanes:
+            raise ScenarioError(
+                f"effect {self.name!r}: scenario {scenario.id!r} has no lane of {_LAST_M:g} m that "
+                "leads to a signal; name one with lane_closure"
+            )
+        wide = [lane for lane in lanes if len(places.edges[places.lanes[lane].edge]) > 1]
+        lane = min(wide or lanes, key=lambda lane: draw(self.name, lane))
+        begin = scenario.settings.begin_s + self.after_s
+        return LaneClosure(lane, begin, begin + self.lasts_s).apply(scenario)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.effects.base import Effect
+from ugat_marl.effects.acting import ACTING
+from ugat_marl.effects.base import ControllerEffect, Effect
 from ugat_marl.effects.demand import DemandLevel, DemandSurge, DemandTiming
 from ugat_marl.effects.detectors import (
     ClockDrift,
@@ -18,8 +19,11 @@ from ugat_marl.effects.detectors import (
     Swapped,
     Undercount,
 )
+from ugat_marl.effects.domains import NAMED
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
-from ugat_marl.effects.roads import LaneClosure, LocalSpeed, Parking
+from ugat_marl.effects.judging import JUDGING
+from ugat_marl.effects.observing import OBSERVING
+from ugat_marl.effects.roads import Incident, LaneClosure, LocalSpeed, Parking
 from ugat_marl.effects.signals import AllRedTime, LateGreen, YellowTime
 from ugat_marl.effects.turning import Turning
 from ugat_marl.effects.vehicles import (
@@ -37,11 +41,11 @@ from ugat_marl.effects.vehicles import (
     StartupDelay,
     YellowRunning,
 )
-from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
+from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
 from ugat_marl.scenario import Scenario, load_scenario
 
 Domain = str | Sequence[Effect]
-"""``"sim"``, a setting or its alias, ``"effect=value+effect=value"``, a scenario directory or
+"""``"sim"``, a named domain or its alias, ``"effect=value+effect=value"``, a scenario directory or
 ``.sumocfg`` on the same road network, or effects."""
 
 
@@ -84,9 +88,21 @@ _EFFECTS: dict[str, type[Effect]] = {
 }  # fmt: skip
 
 
+_ON_CONTROLLERS: dict[str, type[Effect]] = {
+    kind.name: kind for kind in (*OBSERVING, *ACTING, *JUDGING)
+}
+
+_ALL: dict[str, type[Effect]] = {**_EFFECTS, **_ON_CONTROLLERS, Incident.name: Incident}
+
+
 def known_effects() -> Mapping[str, type[Effect]]:
-    """All effects by name."""
+    """The effects on traffic, signals and detectors by name: what measured data may show."""
     return dict(_EFFECTS)
+
+
+def effects_on_controllers() -> Mapping[str, type[Effect]]:
+    """The effects on what controllers see, do and are judged by; no diagnosis looks for them."""
+    return dict(_ON_CONTROLLERS)
 
 
 def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
@@ -102,9 +118,9 @@ def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
     """
     values = dict(record)
     name = str(values.pop("name", ""))
-    if name not in _EFFECTS:
-        raise UnknownNameError("effect", name, _EFFECTS, where and f"It stands{where}.")
-    kind = _EFFECTS[name]
+    if name not in _ALL:
+        raise UnknownNameError("effect", name, _ALL, where and f"It stands{where}.")
+    kind = _ALL[name]
     parameters = [item.name for item in fields(kind)]
     for key in values:
         if key not in parameters:
@@ -139,21 +155,23 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
     if name == "sim":
         return ()
     if name in _names():
-        return SETTINGS[_names()[name]]
+        found = _names()[name]
+        return SETTINGS[found] if found in SETTINGS else parse_domain(NAMED[found].effects)
     if "=" in name:
         return (_effect_from_text(parts[0]),)
+    near = nearest(name, ("sim", *NAMED, *ALIASES))
     raise UnknownNameError(
         "domain",
         domain,
-        ("sim", *SETTINGS, *ALIASES),
-        "Effects (startup_delay=0.5+acceleration=1.0) and the directory of another scenario on the "
-        "same network work as well.",
+        ("sim", *SETTINGS, *ALIASES, *([near] if near else [])),
+        "ugat-marl domains lists all names. Effects (startup_delay=0.5+acceleration=1.0) and the "
+        "directory of another scenario on the same network work as well.",
     )
 
 
 def _names() -> dict[str, str]:
-    """Settings by all the names they have, in small letters."""
-    return {setting.lower(): setting for setting in SETTINGS} | ALIASES
+    """Domains by all the names they have, in small letters."""
+    return {name.lower(): name for name in NAMED} | ALIASES
 
 
 def _parts(domain: str) -> list[str]:
@@ -161,7 +179,7 @@ def _parts(domain: str) -> list[str]:
     parts: list[str] = []
     for part in domain.split("+"):
         name = parts[-1].partition("=")[0].strip().lower() if parts else ""
-        kind = _EFFECTS.get(name)
+        kind = _ALL.get(name)
         new = "=" in part or part.strip().lower() in {"", "sim", *_names()}
         if kind is not None and kind.texts and not new:
             parts[-1] += f"+{part}"
@@ -173,9 +191,9 @@ def _parts(domain: str) -> list[str]:
 def _effect_from_text(text: str) -> Effect:
     name, _, values = (part.strip() for part in text.partition("="))
     name = name.lower()
-    if name not in _EFFECTS:
-        raise UnknownNameError("effect", name, _EFFECTS)
-    kind = _EFFECTS[name]
+    if name not in _ALL:
+        raise UnknownNameError("effect", name, _ALL)
+    kind = _ALL[name]
     parameters = [item.name for item in fields(kind)]
     parts = [part.strip() for part in values.split(",")]
     if len(parts) != len(parameters):
@@ -195,8 +213,7 @@ def _effect_from_text(text: str) -> Effect:
 def describe(domain: Domain) -> str:
     """A short name for a domain, as tables show it."""
     if isinstance(domain, str):
-        lower = domain.lower()
-        return ALIASES.get(lower, domain.upper() if lower.upper() in SETTINGS else domain)
+        return _names().get(domain.strip().lower(), domain)
     return "+".join(map(str, domain)) or "sim"
 
 
@@ -208,7 +225,10 @@ def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
 
 
 def load(name: str | Path | Scenario) -> Scenario:
-    """Loads a scenario and applies the effects its own file lists (see `load_scenario`)."""
+    """Loads a scenario and applies the effects its own file lists (see `load_scenario`).
+
+    Those on controllers stay listed in its settings, for the environment to keep.
+    """
     scenario = name if isinstance(name, Scenario) else load_scenario(name)
     where = f" in scenario {scenario.id!r}"
     effects = [effect_from(record, where) for record in scenario.settings.effects]
@@ -229,6 +249,12 @@ def detector_effects(scenario: Scenario) -> tuple[DetectorEffect, ...]:
             assert isinstance(effect, DetectorEffect)
             found.append(effect)
     return tuple(found)
+
+
+def controller_effects(scenario: Scenario) -> tuple[ControllerEffect, ...]:
+    """The effects on controllers that were applied to a scenario."""
+    found = map(effect_from, scenario.settings.effects)
+    return tuple(effect for effect in found if isinstance(effect, ControllerEffect))
 
 
 def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
