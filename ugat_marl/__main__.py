@@ -129,7 +129,7 @@ def _parse(name: str, rest: list[str]) -> Any:
         with contextlib.redirect_stderr(said):
             command, unknown = tyro.cli(
                 kind,
-                args=rest,
+                args=_with_address(rest),
                 prog=f"ugat-marl {name}",
                 description=_description(kind),
                 return_unknown_args=True,
@@ -149,6 +149,17 @@ def _parse(name: str, rest: list[str]) -> Any:
             )
         raise UgatMarlError(f"{name}: unexpected {first!r}; see ugat-marl {name} --help")
     return command
+
+
+def _with_address(rest: list[str]) -> list[str]:
+    """A bare ``--ray`` means the Ray of this machine."""
+    followed = zip(rest, [*rest[1:], "--"], strict=False)
+    bare = [word == "--ray" and after.startswith("-") for word, after in followed]
+    return [
+        part
+        for word, b in zip(rest, bare, strict=True)
+        for part in ((word, "local") if b else (word,))
+    ]
 
 
 def _description(kind: Any) -> str:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import math
-import os
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +12,18 @@ import numpy as np
 from ugat_marl.controllers import STANDARD_RULES, controller_for, parse_spec
 from ugat_marl.effects import Domain, describe
 from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.executors import (
+    Stop,
+    Workers,
+    as_done,
+    parts_at_a_time,
+)
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.policy import Policy
-from ugat_marl.progress import Advance, Reporter, Silent
+from ugat_marl.progress import Reporter, Silent
 from ugat_marl.results import Evaluation, Result, Trial
-from ugat_marl.rollout import roll_out, until
+from ugat_marl.rollout import persistently, roll_out, until
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
@@ -46,7 +49,7 @@ def evaluate(
     seeds: Sequence[int],
     *,
     duration_s: float | None = None,
-    workers: int | None = None,
+    workers: Workers = None,
     reporter: Reporter | None = None,
     title: str = "evaluating",
     notes: Mapping[str, str] | None = None,
@@ -59,7 +62,7 @@ def evaluate(
         domains: Domains; gaps are taken against the first, usually ``"sim"``.
         seeds: Seeds of the episodes, the same for all.
         duration_s: Length of an episode; None for the scenario's own.
-        workers: Simulations at a time; None for the number of cores.
+        workers: Simulations at a time; None for the number of cores; or an executor.
         reporter: Shows progress.
         title: What to call the work there.
         notes: Kept with the result.
@@ -71,16 +74,20 @@ def evaluate(
     worlds = [parallel_env(scenario, domain, duration_s=duration_s) for domain in domains]
     for make in policies.values():
         make(worlds[0])  # so is a wrong policy
-    workers = workers or usable_cores()
-    per_task = max(1, len(seeds) * len(policies) * len(domains) // (4 * workers))
+    episodes = len(seeds) * len(policies) * len(domains)
+    per_task = max(1, episodes // (4 * parts_at_a_time(workers)))
     tasks = [
         _Task(name, make, world, tuple(seeds[start : start + per_task]))
         for world in worlds
         for name, make in policies.items()
         for start in range(0, len(seeds), per_task)
     ]
-    with (reporter or Silent()).task(title, len(seeds) * len(policies) * len(domains)) as advance:
-        results = _play_all(tasks, workers, advance)
+    stop, results = Stop(), list[Result]()
+    with (reporter or Silent()).task(title, episodes) as advance:
+        for _, played in as_done(workers, _play, [(task, stop) for task in tasks], stop):
+            results += played
+            for _ in played:
+                advance()
     order = {
         (name, describe(domain)): i for i, (name, domain) in enumerate(_pairs(policies, domains))
     }
@@ -95,7 +102,7 @@ def best_rules(
     rules: Sequence[str] = STANDARD_RULES,
     seeds: Sequence[int] = (TUNING_SEED, TUNING_SEED + 1),
     duration_s: float | None = None,
-    workers: int | None = None,
+    workers: Workers = None,
     reporter: Reporter | None = None,
 ) -> dict[str, str]:
     """For each domain the rule with the smallest mean ATT on the tuning seeds.
@@ -128,7 +135,7 @@ def race(
     seeds: Sequence[Sequence[int]],
     *,
     duration_s: float | None = None,
-    workers: int | None = None,
+    workers: Workers = None,
     reporter: Reporter | None = None,
     title: str = "racing",
 ) -> tuple[Trial, ...]:
@@ -140,7 +147,7 @@ def race(
         specs: Spellings of the rules.
         seeds: The seeds of each rung.
         duration_s: Length of an episode; None for the scenario's own.
-        workers: Simulations at a time; None for the number of cores.
+        workers: Simulations at a time; None for the number of cores; or an executor.
         reporter: Shows progress.
         title: What to call the work there.
 
@@ -152,7 +159,7 @@ def race(
     for rung, own in enumerate(seeds):
         found = evaluate(
             scenario,
-            {spec: _controller_factory(spec) for spec in running},
+            {spec: RuleFactory(spec) for spec in running},
             [domain],
             own,
             duration_s=duration_s,
@@ -171,15 +178,61 @@ def race(
     )
 
 
+@dataclass(frozen=True)
+class RuleFactory:
+    """Makes a controller by its spelling, such as ``"largest-queue:30"``."""
+
+    spec: str
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        """The controller for an environment."""
+        return controller_for(self.spec, env)
+
+
+@dataclass(frozen=True)
+class FixedPolicy:
+    """Always gives the same, stateless, policy."""
+
+    policy: Policy
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        """The policy."""
+        return self.policy
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """Gives a policy that was trained for the agents of an environment.
+
+    Attributes:
+        policy: It.
+        path: Where it was read, for the error.
+    """
+
+    policy: DQNPolicy
+    path: str
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        """The policy, if it fits."""
+        fitting = parallel_env(env.scenario, **self.policy.env_options)
+        if AgentSet.of(fitting) != self.policy.agents:
+            raise CheckpointError(
+                f"{self.path} was trained for other intersections than those of scenario "
+                f"{env.scenario.id!r}: its agents are {self.policy.agents}, here "
+                f"{AgentSet.of(fitting)}"
+            )
+        return self.policy
+
+
 def rule_factory(spec: str) -> PolicyFactory:
     """A factory for a controller such as ``"largest-queue:30"``; the spelling is checked now."""
     parse_spec(spec)
-    return _controller_factory(spec)
+    return RuleFactory(spec)
 
 
 def fixed_policy(policy: Policy) -> PolicyFactory:
     """A factory that always gives the same, stateless, policy."""
-    return lambda _env: policy
+    return FixedPolicy(policy)
 
 
 def policy_factory(spec: str) -> PolicyFactory:
@@ -194,29 +247,7 @@ def policy_factory(spec: str) -> PolicyFactory:
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
     if path.suffix != ".pt" and not path.is_file():
         return rule_factory(spec)
-    policy = DQNPolicy.load(path)
-
-    def make(env: TrafficEnv) -> Policy:
-        fitting = parallel_env(env.scenario, **policy.env_options)
-        if AgentSet.of(fitting) != policy.agents:
-            raise CheckpointError(
-                f"{path} was trained for other intersections than those of scenario "
-                f"{env.scenario.id!r}: its agents are {policy.agents}, here {AgentSet.of(fitting)}"
-            )
-        return policy
-
-    return make
-
-
-def _controller_factory(spec: str) -> PolicyFactory:
-    return lambda env: controller_for(spec, env)
-
-
-def usable_cores() -> int:
-    """Cores this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return TrainedPolicy(DQNPolicy.load(path), str(path))
 
 
 def _pairs(
@@ -225,40 +256,14 @@ def _pairs(
     return [(name, domain) for name in policies for domain in domains]
 
 
-def _play_all(tasks: Sequence[_Task], workers: int, advance: Advance) -> list[Result]:
-    """Threads suffice: the simulations run in processes of their own."""
-    stop = threading.Event()
-    lock = threading.Lock()
-    results: list[Result] = []
-
-    def done() -> None:
-        with lock:
-            advance()
-
-    pool = concurrent.futures.ThreadPoolExecutor(workers)
-    try:
-        running = {pool.submit(_play, t, stop, done) for t in tasks}
-        while running:  # wakes up now and then, so that Ctrl-C is heard
-            finished, running = concurrent.futures.wait(
-                running, timeout=0.2, return_when=concurrent.futures.FIRST_COMPLETED
-            )
-            for future in finished:
-                results += future.result()
-    finally:
-        stop.set()
-        pool.shutdown(cancel_futures=True)
-    return results
-
-
-def _play(task: _Task, stop: threading.Event, done: Callable[[], None]) -> list[Result]:
+def _play(task: _Task, stop: Stop) -> list[Result]:
     policy = task.make(task.world)
     env = parallel_env(task.world.scenario, **policy.env_options)  # its domain is in its files
     results: list[Result] = []
     try:
         for seed in task.seeds:
-            roll_out(env, policy, seed, on_step=until(stop))
+            persistently(lambda seed=seed: roll_out(env, policy, seed, on_step=until(stop)))
             results.append(Result(task.name, task.world.domain, seed, env.scores()))
-            done()
     finally:
         env.close()
     return results

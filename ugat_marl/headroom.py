@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from ugat_marl.effects import Domain
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import evaluate, rule_factory
+from ugat_marl.executors import Workers
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Scenario
 
@@ -50,7 +51,7 @@ def headroom(
     holds_s: Sequence[int] = HOLDS_S,
     seeds: Sequence[int] = SEEDS,
     *,
-    workers: int | None = None,
+    workers: Workers = None,
     reporter: Reporter | None = None,
 ) -> list[Row]:
     """ATT of the largest-queue rule in every domain for every hold.
@@ -60,7 +61,7 @@ def headroom(
         domains: The first one is the domain the others are compared with.
         holds_s: Shortest times a phase is kept, in s.
         seeds: Seeds of the episodes.
-        workers: Simulations at a time; None for the number of cores.
+        workers: Simulations at a time; None for the number of cores; or an executor.
         reporter: Shows progress.
 
     Returns:

@@ -22,6 +22,7 @@ from ugat_marl.controllers import NAMES, RULES, spell
 from ugat_marl.effects import Domain, describe, in_domain
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.evaluation import TUNING_SEED, best_rules, race
+from ugat_marl.executors import Workers
 from ugat_marl.files import user_cache, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.results import Trial, Tuned
@@ -50,7 +51,7 @@ def tune(
     budget: int = BUDGET,
     *,
     duration_s: float | None = None,
-    workers: int | None = None,
+    workers: Workers = None,
     reporter: Reporter | None = None,
     fresh: bool = False,
 ) -> Tuned:
@@ -66,7 +67,7 @@ def tune(
         domain: The domain to tune it in.
         budget: Most episodes to play.
         duration_s: Length of an episode; None for the scenario's own.
-        workers: Simulations at a time; None for the number of cores.
+        workers: Simulations at a time; None for the number of cores; or an executor.
         reporter: Shows progress.
         fresh: Play again though the result is remembered. It is kept in the user's cache folder
             for the same scenario, domain, rule, values, budget and versions.
@@ -105,7 +106,7 @@ def tuned_rules(
     names: Sequence[str] = TUNED_RULES,
     seeds: Sequence[int] = (TUNING_SEED, TUNING_SEED + 1),
     duration_s: float | None = None,
-    workers: int | None = None,
+    workers: Workers = None,
     reporter: Reporter | None = None,
 ) -> dict[str, str]:
     """For each domain the best rule, each rule with the settings that are best there.

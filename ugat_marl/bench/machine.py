@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.evaluation import usable_cores
+from ugat_marl.executors import usable_cores
 
 _LIBRARIES = (
     "ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch", "gymnasium", "pettingzoo",

@@ -10,6 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
+from ugat_marl.commands.arguments import Ray, workers_of
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import evaluate, policy_factory
@@ -35,6 +36,7 @@ class Evaluate:
         first_seed: Seed of the first of them.
         duration_s: Length of an episode in s; default: the scenario's own.
         workers: Simulations at a time; default: one per core.
+        ray: Play on Ray instead.
         out: JSON file for the table and every episode.
     """
 
@@ -45,6 +47,7 @@ class Evaluate:
     first_seed: int = 1000
     duration_s: float | None = None
     workers: int | None = None
+    ray: Ray = None
     out: Path | None = None
 
     def run(self, console: Console) -> int:
@@ -60,15 +63,16 @@ class Evaluate:
             raise OptionError("--first-seed must not be negative")
         if self.seeds < 1 or (self.workers is not None and self.workers < 1):
             raise OptionError("--seeds and --workers must be at least 1")
-        found = evaluate(
-            load(self.scenario),
-            dict(zip(names_of(self.policies), map(policy_factory, self.policies), strict=True)),
-            self.domains,
-            range(self.first_seed, self.first_seed + self.seeds),
-            duration_s=self.duration_s,
-            workers=self.workers,
-            reporter=Bars(console),
-        )
+        with workers_of(self.workers, self.ray) as workers:
+            found = evaluate(
+                load(self.scenario),
+                dict(zip(names_of(self.policies), map(policy_factory, self.policies), strict=True)),
+                self.domains,
+                range(self.first_seed, self.first_seed + self.seeds),
+                duration_s=self.duration_s,
+                workers=workers,
+                reporter=Bars(console),
+            )
         console.print(measures_table(found))
         if self.out is not None:
             found.write(self.out)

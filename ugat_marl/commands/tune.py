@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.commands.arguments import LengthS, Workers
+from ugat_marl.commands.arguments import LengthS, Ray, Workers, workers_of
 from ugat_marl.controllers import NAMES, RULES
 from ugat_marl.effects import describe, load
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -35,6 +35,7 @@ class Tune:
         budget: Most episodes for each rule.
         duration_s: Length of an episode in s.
         workers: Simulations at a time.
+        ray: Play on Ray instead.
         fresh: Play anew what is remembered from an earlier call.
         out: JSON file for every setting tried.
     """
@@ -45,6 +46,7 @@ class Tune:
     budget: int = BUDGET
     duration_s: LengthS = None
     workers: Workers = None
+    ray: Ray = None
     fresh: bool = False
     out: Path | None = None
 
@@ -64,19 +66,20 @@ class Tune:
         if self.out is not None:
             require_writable(self.out)
         scenario, reporter = load(self.scenario), Bars(console)
-        found = [
-            tune(
-                name,
-                scenario,
-                self.domain,
-                self.budget,
-                duration_s=self.duration_s,
-                workers=self.workers,
-                reporter=reporter,
-                fresh=self.fresh,
-            )
-            for name in self.rules
-        ]
+        with workers_of(self.workers, self.ray) as workers:
+            found = [
+                tune(
+                    name,
+                    scenario,
+                    self.domain,
+                    self.budget,
+                    duration_s=self.duration_s,
+                    workers=workers,
+                    reporter=reporter,
+                    fresh=self.fresh,
+                )
+                for name in self.rules
+            ]
         console.print(tuning_table(f"{scenario.id} in {describe(self.domain)}", found))
         if self.out is not None:
             write_whole(self.out, json.dumps([asdict(each) for each in found], indent=1) + "\n")

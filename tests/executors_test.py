@@ -1,0 +1,230 @@
+"""Work in parts: on threads, processes and Ray, with the same results, whatever dies."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ugat_marl.commands.arguments import workers_of
+from ugat_marl.effects import load
+from ugat_marl.errors import OptionError, SimulatorCrashed
+from ugat_marl.evaluation import evaluate, rule_factory
+from ugat_marl.executors import (
+    RayExecutor,
+    Stop,
+    as_done,
+    executor_of,
+    local_processes,
+    parts_at_a_time,
+    usable_cores,
+)
+from ugat_marl.policy import Policy
+from ugat_marl.rollout import ATTEMPTS, persistently
+from ugat_marl.traffic_env import TrafficEnv
+
+LENGTH_S = 100.0
+
+
+def halved(number: int, stop: Stop) -> float:
+    if number < 0:
+        raise ValueError(f"{number} is negative")
+    return number / 2
+
+
+def test_parts_are_numbered_in_whatever_order_they_are_done() -> None:
+    found = dict(as_done(3, halved, [(n, Stop()) for n in range(20)], Stop()))
+    assert found == {n: n / 2 for n in range(20)}
+
+
+def test_the_first_failure_stops_what_was_not_begun() -> None:
+    begun: list[int] = []
+    stop = Stop()
+
+    def work(number: int) -> None:
+        begun.append(number)
+        if number == 1:
+            raise ValueError("one")
+        stop.wait(10)
+
+    with pytest.raises(ValueError, match="one"):
+        list(as_done(2, work, [(n,) for n in range(50)], stop))
+    assert stop.is_set()
+    assert len(begun) < 10
+
+
+def test_an_executor_that_was_given_stays_open() -> None:
+    with ThreadPoolExecutor(2) as pool:
+        assert parts_at_a_time(pool) == 2
+        list(as_done(pool, halved, [(1, Stop())], Stop()))
+        assert pool.submit(int, "3").result() == 3
+    with executor_of(3) as own:
+        assert isinstance(own, ThreadPoolExecutor)
+    with pytest.raises(RuntimeError, match="shutdown"):
+        own.submit(int, "3")
+    assert parts_at_a_time(None) == usable_cores()
+    assert parts_at_a_time(5) == 5
+
+
+def test_a_stop_is_heard_where_it_was_made() -> None:
+    stop = Stop()
+    stop.set()
+    elsewhere = copy.copy(stop)  # by the way that pickles go
+    assert isinstance(elsewhere, threading.Event)
+    assert not elsewhere.is_set()
+
+
+def results(workers: Any, policies: Any = None) -> Any:
+    policies = policies or {rule: rule_factory(rule) for rule in ("largest-queue:20", "random")}
+    scenario = load("single-v1")
+    return evaluate(
+        scenario, policies, ["sim", "V4"], [5, 6], duration_s=LENGTH_S, workers=workers
+    ).results
+
+
+@pytest.mark.slow
+def test_processes_give_what_threads_give() -> None:
+    with local_processes(2) as processes:
+        assert results(processes) == results(2)
+
+
+# --- simulators that die
+
+
+@dataclass(frozen=True)
+class Killed:
+    """A rule whose simulator is killed at the third decision, the first times it is played."""
+
+    folder: Path
+    times: int
+    rule: str = "largest-queue:20"
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        return KillingPolicy(rule_factory(self.rule)(env), self)
+
+
+class KillingPolicy:
+    def __init__(self, policy: Policy, how: Killed) -> None:
+        self.env_options = policy.env_options
+        self._policy = policy
+        self._how = how
+        self._decision = 0
+
+    def reset(self, seed: int) -> None:
+        self._policy.reset(seed)
+        self._decision = 0
+
+    def act(self, observations: Any, infos: Any) -> Any:
+        self._decision += 1
+        marks = len(list(self._how.folder.iterdir()))
+        if self._decision == 3 and marks < self._how.times:
+            (self._how.folder / str(marks)).touch()
+            for child in simulators():
+                os.kill(child, signal.SIGKILL)
+        return self._policy.act(observations, infos)
+
+
+def simulators() -> Iterator[int]:
+    """The workers below this process."""
+    tables = {}
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            with contextlib.suppress(OSError):
+                parent = (folder / "stat").read_text().rpartition(")")[2].split()[1]
+                tables[int(folder.name)] = int(parent)
+    warm = [pid for pid, parent in tables.items() if parent == os.getpid()]
+    for pid, parent in tables.items():
+        if parent in warm and b"simulator_worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            yield pid
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_an_episode_whose_simulator_dies_is_played_again(tmp_path: Path) -> None:
+    folder = tmp_path / "marks"
+    folder.mkdir()
+    expected = results(1, {"rule": rule_factory("largest-queue:20")})
+    assert results(1, {"rule": Killed(folder, 2)}) == expected
+    assert len(list(folder.iterdir())) == 2
+    with pytest.raises(SimulatorCrashed, match="died"):
+        results(1, {"rule": Killed(folder, 100)})
+    assert len(list(folder.iterdir())) == 2 + ATTEMPTS
+
+
+def test_other_errors_are_not_tried_again() -> None:
+    tried: list[int] = []
+
+    def play() -> None:
+        tried.append(1)
+        raise OptionError("no")
+
+    with pytest.raises(OptionError, match="no"):
+        persistently(play)
+    assert tried == [1]
+
+
+# --- Ray
+
+
+def test_a_missing_ray_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(OptionError, match=r"pip install 'ugat-marl\[ray\]'"):
+        RayExecutor()
+
+
+def test_ray_and_workers_exclude_each_other() -> None:
+    with (
+        pytest.raises(OptionError, match="--jobs is for this machine"),
+        workers_of(2, "auto", "--jobs"),
+    ):
+        pass
+    with workers_of(2, None) as workers:
+        assert workers == 2
+
+
+@pytest.fixture(scope="module")
+def ray() -> Iterator[Executor]:
+    pytest.importorskip("ray")
+    with RayExecutor() as executor:
+        yield executor
+
+
+def test_ray_gives_what_threads_give(ray: Executor) -> None:
+    assert results(ray) == results(2)
+
+
+def test_ray_s_errors_are_the_parts_own(ray: Executor) -> None:
+    with pytest.raises(ValueError, match="^invalid literal for int"):
+        list(as_done(ray, int, [("one",)], Stop()))
+
+
+DIES_TWICE = """
+import os, pathlib
+folder = pathlib.Path({folder!r})
+marks = len(list(folder.iterdir()))
+(folder / str(marks)).touch()
+if marks < 2:
+    os.kill(os.getpid(), 9)
+"""
+
+
+def test_ray_replaces_a_worker_that_dies(ray: Executor, tmp_path: Path) -> None:
+    list(as_done(ray, exec, [(DIES_TWICE.format(folder=str(tmp_path)),)], Stop()))
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_what_is_watched_is_played_here(ray: Executor) -> None:
+    with pytest.raises(OptionError, match="must be played here"):
+        evaluate(
+            load("single-v1"), {"r": rule_factory("random")}, ["sim"], [1],
+            workers=ray, watch=lambda name, env: lambda step: None,
+        )  # fmt: skip

@@ -1,0 +1,217 @@
+"""Who does work that can be done in parts: this machine's cores, or any standard executor.
+
+Everything that plays many episodes takes ``workers``: a number, None for one per usable core, or a
+`concurrent.futures.Executor` that the caller made and closes. With a number the parts are threads,
+each of which drives simulations in processes of their own. What a part is given and gives back can
+be pickled by whoever does that, so that pools of processes and clusters work as well; Ray is made
+an executor here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ugat_marl.errors import OptionError
+
+Workers = int | Executor | None
+"""Parts at a time, None for the number of usable cores; or an executor."""
+
+Done = TypeVar("Done")
+
+RETRIES = 3
+"""So often Ray takes up a part whose process died."""
+
+
+class Stop(threading.Event):
+    """Set when nobody waits for the work any more; a copy in another process is never set."""
+
+    def __reduce__(self) -> tuple[type[Stop], tuple[()]]:
+        return Stop, ()
+
+
+def usable_cores() -> int:
+    """Cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def parts_at_a_time(workers: Workers) -> int:
+    """How many parts are done at once; a guess for executors that do not say."""
+    if isinstance(workers, Executor):
+        return getattr(workers, "parts_at_a_time", None) or getattr(
+            workers, "_max_workers", usable_cores()
+        )
+    return workers or usable_cores()
+
+
+def in_this_process(workers: Workers) -> bool:
+    """Whether the parts can call back what made them."""
+    return not isinstance(workers, Executor) or isinstance(workers, ThreadPoolExecutor)
+
+
+@contextlib.contextmanager
+def executor_of(workers: Workers) -> Iterator[Executor]:
+    """The executor; one that is made here is closed, one that was given is not."""
+    if isinstance(workers, Executor):
+        yield workers
+        return
+    with ThreadPoolExecutor(parts_at_a_time(workers)) as pool:
+        yield pool
+
+
+def as_done(
+    workers: Workers,
+    work: Callable[..., Done],
+    parts: Iterable[tuple[Any, ...]],
+    stop: Stop,
+) -> Iterator[tuple[int, Done]]:
+    """Does all parts; yields the number of each with what came of it, in the order they are done.
+
+    The first failure is raised. What was not begun then is given up, and `stop` is set, as it is
+    when the loop is left early or interrupted.
+
+    Args:
+        workers: Who does it.
+        work: Does one, called with the part's values.
+        parts: Values.
+        stop: What the parts look at now and then.
+    """
+    with executor_of(workers) as pool:
+        numbers: dict[Future[Done], int] = {}
+        try:
+            for number, part in enumerate(parts):
+                numbers[pool.submit(work, *part)] = number
+            left = set(numbers)
+            while left:  # wakes up now and then, so that Ctrl-C is heard
+                done, left = wait(left, timeout=0.2, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield numbers[future], future.result()
+        finally:
+            stop.set()
+            for future in numbers:
+                future.cancel()
+
+
+def local_processes(workers: int | None = None) -> ProcessPoolExecutor:
+    """Interpreters of their own instead of threads: for many cores, where one would be too slow.
+
+    Each takes seconds to start and as much memory as the suite with torch. As with every pool of
+    processes, a script that makes one guards its code by ``if __name__ == "__main__":``.
+    """
+    import multiprocessing
+
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(parts_at_a_time(workers), mp_context=context)
+
+
+class RayExecutor(Executor):
+    """Ray as a standard executor; every part is a task that needs one core.
+
+    Ray takes up a task whose process or machine died; what it computes depends on what it is given
+    alone. The suite must be installed on all machines.
+
+    Args:
+        address: ``"local"`` starts Ray on this machine; ``"auto"``, ``"host:port"`` or
+            ``"ray://host:port"`` joins a cluster. A Ray that this process has joined is used as is.
+
+    Raises:
+        OptionError: Ray is not installed, or there is none at the address.
+    """
+
+    def __init__(self, address: str = "local") -> None:
+        try:
+            import ray  # pyright: ignore[reportMissingImports]
+        except ImportError:
+            raise OptionError(
+                "--ray needs Ray, which is not installed: pip install 'ugat-marl[ray]'"
+            ) from None
+        self._ray: Any = ray
+        self._owns = not ray.is_initialized()
+        if self._owns:
+            variables = {"OMP_NUM_THREADS": "1", "PYTHONPATH": _import_path()}
+            known: dict[str, Any] = {} if address != "local" else {"include_dashboard": False}
+            try:
+                ray.init(
+                    address=address,
+                    runtime_env={"env_vars": variables},
+                    log_to_driver=False,
+                    logging_level="error",
+                    **known,
+                )
+            except (ConnectionError, ValueError, RuntimeError) as error:
+                raise OptionError(
+                    f"--ray {address}: cannot be reached ({' '.join(str(error).split())}); give "
+                    "local, auto, host:port or ray://host:port"
+                ) from None
+        self._task: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
+        self._running: dict[Future[Any], Any] = {}
+        self._lock = threading.Lock()
+
+    @property
+    def parts_at_a_time(self) -> int:
+        """Cores of the cluster."""
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Hands a part to the cluster."""
+        future: Future[Any] = Future()
+        reference = self._task.remote(fn, args, kwargs)
+        with self._lock:
+            self._running[future] = reference
+        reference.future().add_done_callback(lambda found: self._settle(future, found))
+        future.add_done_callback(self._withdraw)
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Waits for what was submitted, unless told not to; ends the Ray that was started here."""
+        with self._lock:
+            running = list(self._running)
+        for future in running:
+            if cancel_futures:
+                future.cancel()
+            elif wait:
+                future.exception()
+        if self._owns and self._ray.is_initialized():
+            self._ray.shutdown()
+
+    def _settle(self, future: Future[Any], found: Future[Any]) -> None:
+        """Passes a result on; Ray's error is the part's own with Ray's words around it."""
+        with self._lock:
+            self._running.pop(future, None)
+        if not future.set_running_or_notify_cancel():
+            return
+        error = found.exception()
+        if error is not None:
+            future.set_exception(getattr(error, "cause", None) or error)
+        else:
+            future.set_result(found.result())
+
+    def _withdraw(self, future: Future[Any]) -> None:
+        with self._lock:
+            reference = self._running.pop(future, None)
+        if reference is not None and future.cancelled():
+            self._ray.cancel(reference, force=True)
+
+
+def _call(fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    return fn(*args, **kwargs)
+
+
+def _import_path() -> str:
+    """This process's import path, for the workers: they import what their user imports."""
+    return os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
