@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.commands.arguments import Workers
+from ugat_marl.commands.arguments import Ray, Workers, workers_of
 from ugat_marl.discrepancy.workflow import CORRECTED, FILE, DiagnosisConfig, diagnose
 from ugat_marl.effects import DetectorEffect, known_effects, load
 from ugat_marl.errors import OptionError
@@ -47,6 +47,7 @@ class Diagnose:
         leave_out: Names of effects (docs/effects.md) that are not examined.
         cache: Folder of remembered simulations.
         workers: Simulations at a time.
+        ray: Simulate on Ray instead.
         report: Write the page report.html.
     """
 
@@ -63,6 +64,7 @@ class Diagnose:
         Path | None, arg(metavar="PATH", help_behavior_hint="(default: the user's cache folder)")
     ] = None
     workers: Workers = None
+    ray: Ray = None
     report: bool = True
 
     def run(self, console: Console) -> int:
@@ -75,7 +77,9 @@ class Diagnose:
         require_writable(self.out / FILE)
         _say_what_cannot_be_seen(measured, console)
         try:
-            record = diagnose(scenario, measured, self.out, config, Bars(console))
+            with workers_of(self.workers, self.ray) as workers:
+                config = replace(config, workers=workers)
+                record = diagnose(scenario, measured, self.out, config, Bars(console))
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command goes on where it stopped") from None
         console.print(diagnosis_summary(record))
@@ -93,7 +97,6 @@ class Diagnose:
             seed=self.seed,
             leave_out=self.leave_out,
             cache=self.cache,
-            workers=self.workers,
         )
 
     def _check_out(self) -> None:

@@ -11,9 +11,9 @@ from rich.console import Console
 from tyro.conf import arg
 
 from ugat_marl.bench.machine import machine_facts
+from ugat_marl.commands.arguments import Ray, workers_of
 from ugat_marl.comparison import Comparison
 from ugat_marl.errors import OptionError
-from ugat_marl.evaluation import usable_cores
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.paper.settings import GROUNDED_NAME
 from ugat_marl.paper.tables import PaperConfig, compare
@@ -32,12 +32,14 @@ class _Paper:
         out: Folder of the tables.
         runs: Folder of the trainings.
         jobs: Trainings at a time; default: one per core.
+        ray: Train on Ray instead, on machines that share the folder of the trainings.
     """
 
     config: Annotated[PaperConfig, arg(name="")]
     out: Path = Path("results")
     runs: Path = Path("runs/paper")
     jobs: int | None = None
+    ray: Ray = None
 
     table: ClassVar[str]
 
@@ -48,8 +50,10 @@ class _Paper:
         for scenario in self.config.scenario:
             folder = self.out / self._folder(scenario)
             require_writable(folder / "table.md")
-            jobs = self.jobs or usable_cores()
-            found = compare(self.table, scenario, self.config, self.runs, jobs, Bars(console))
+            with workers_of(self.jobs, self.ray, "--jobs") as workers:
+                found = compare(
+                    self.table, scenario, self.config, self.runs, workers, Bars(console)
+                )
             _write(found, folder)
             console.print(terminal_tables(found, DIRECT))
             console.print(f"table and pictures: {folder}\ntrainings: {self.runs}", soft_wrap=True)

@@ -7,13 +7,12 @@ import hashlib
 import importlib.metadata
 import io
 import itertools
-import os
 import time
 import zipfile
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -26,6 +25,7 @@ from ugat_marl.discrepancy.site import Greens, Site
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
+from ugat_marl.executors import Workers, parts_at_a_time
 from ugat_marl.files import user_cache, write_whole
 from ugat_marl.measured.data import Period
 from ugat_marl.scenario import Scenario
@@ -69,7 +69,7 @@ class Engine:
         seed: Root of the days.
         cache: Folder of remembered tallies, or None.
         deadline: ``time.monotonic()`` at which new simulations are refused, or None.
-        workers: Simulations at a time; default: one per core.
+        workers: Simulations at a time, None for one per core; or an executor that simulates days.
     """
 
     set_aside: frozenset[int] = frozenset()
@@ -85,7 +85,7 @@ class Engine:
         *,
         cache: Path | None = None,
         deadline: float | None = None,
-        workers: int | None = None,
+        workers: Workers = None,
     ) -> None:
         self.site = site
         self.periods = tuple(periods)
@@ -94,7 +94,7 @@ class Engine:
         self._replay = replay
         self._seed = seed
         self._cache = cache
-        self._workers = workers or os.cpu_count() or 1
+        self._workers = workers
         self._greens: list[tuple[Greens, ...]] = [site.greens(period) for period in periods]
         self._days: OrderedDict[str, Day] = OrderedDict()
         self._known: dict[str, Replicate] = {}
@@ -180,7 +180,7 @@ class Engine:
             groups: Jobs.
             advance: Called after each group.
         """
-        with ThreadPoolExecutor(self._workers) as pool:
+        with ThreadPoolExecutor(parts_at_a_time(self._workers)) as pool:
             futures = [[pool.submit(work, job) for job in group] for group in groups]
             done: list[list[Done]] = []
             try:
@@ -218,7 +218,7 @@ class Engine:
                 raise OutOfTime("the budget of time is spent")
             period = self.periods[number % len(self.periods)]
             seed = derive_seed(self._seed, "replicate", number)
-            day = self._replay.simulate(physics, period, seed)
+            day = self._simulated(physics, period, seed)
             self.simulated += 1
             self._days[key] = day
             while len(self._days) > _KEPT_DAYS:
@@ -229,6 +229,12 @@ class Engine:
         if not faults:
             return day
         return Day(self._replay.observed(faults, day.period), day.travel_time_s)
+
+    def _simulated(self, effects: tuple[Effect, ...], period: Period, seed: int) -> Day:
+        if not isinstance(self._workers, Executor):
+            return self._replay.simulate(effects, period, seed)
+        # Here a thread waits for it and does what follows, which is little.
+        return self._workers.submit(self._replay.simulate, effects, period, seed).result()
 
     def _key(self, effects: Sequence[Effect], number: int) -> str:
         signals = self._signals[number % len(self.periods)]

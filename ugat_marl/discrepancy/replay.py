@@ -14,6 +14,7 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -70,6 +71,7 @@ class Replay:
         detectors: Sequence[Detector],
         owner: Mapping[str, str],
     ) -> None:
+        self._given = scenario, network, detectors, owner
         self._scenario = explicit(scenario)
         self._network = network
         self._detectors = tuple(detectors)
@@ -77,6 +79,10 @@ class Replay:
         self._own = detector_effects(scenario)
         self._days: OrderedDict[int, Scenario] = OrderedDict()
         self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[type[Replay], tuple[Any, ...]]:
+        """For executors elsewhere: the days it remembers stay here."""
+        return Replay, self._given
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
         """Simulates one day.

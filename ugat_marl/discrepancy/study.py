@@ -24,6 +24,7 @@ from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Distance, Pools, Reference, added, locked_up
 from ugat_marl.discrepancy.volume import Routes
 from ugat_marl.errors import MeasuredDataError, OptionError
+from ugat_marl.executors import Workers
 from ugat_marl.measured.data import Detector, Measured, Period
 from ugat_marl.network import Network
 from ugat_marl.progress import Reporter
@@ -47,7 +48,7 @@ class DiagnosisConfig:
         seed: Root of the simulated days.
         leave_out: Effects that are not examined.
         cache: Folder of remembered days; None for the user's cache folder.
-        workers: Simulations at a time; None for the number of cores.
+        workers: Simulations at a time, None for the number of cores; or an executor.
         effort: Numbers of simulated days; None for what suits the size of the network.
     """
 
@@ -56,7 +57,7 @@ class DiagnosisConfig:
     seed: int = 0
     leave_out: tuple[str, ...] = ()
     cache: Path | None = None
-    workers: int | None = None
+    workers: Workers = None
     effort: Effort | None = None
 
     def __post_init__(self) -> None:

@@ -1,4 +1,8 @@
-"""Performs the jobs of a table: several at a time, each in a process of its own, resumable."""
+"""Performs the jobs of a table: several at a time, each in a process of its own, resumable.
+
+A job is described in its folder and leaves its results there, so that an executor whose workers are
+elsewhere needs a file system they have in common.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +10,13 @@ import json
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ugat_marl.errors import MeasurementError
+from ugat_marl.executors import Stop, Workers, executor_of
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.paper.job import JOB, Job, Played, read_scores
 from ugat_marl.progress import Reporter
@@ -62,14 +67,14 @@ def done(planned: Planned, folder: Path) -> Played | None:
 
 
 def perform_all(
-    plan: Sequence[Planned], folder: Path, processes: int, reporter: Reporter, title: str
+    plan: Sequence[Planned], folder: Path, workers: Workers, reporter: Reporter, title: str
 ) -> None:
     """Performs what is not done yet; a job waits for the one it starts from.
 
     Args:
         plan: Jobs; one that several rows share is performed once.
         folder: Where their folders lie.
-        processes: Jobs at a time.
+        workers: Jobs at a time, or an executor.
         reporter: Shows progress.
         title: What to call the work there.
 
@@ -79,45 +84,50 @@ def perform_all(
     """
     plan = list({planned.name: planned for planned in plan}.values())
     left = [planned for planned in plan if done(planned, folder) is None]
-    running: dict[str, tuple[Planned, subprocess.Popen[bytes]]] = {}
+    running: dict[Future[None], Planned] = {}
     require_writable(folder / LOG)
-    lock = locked(folder)
-    with reporter.task(title, len(plan)) as advance:
+    lock, stop = locked(folder), Stop()
+    with reporter.task(title, len(plan)) as advance, executor_of(workers) as pool:
         for _ in range(len(plan) - len(left)):
             advance()
         try:
             while left or running:
-                waited_for = {planned.name for planned in left} | set(running)
-                free = [planned for planned in left if planned.job.start not in waited_for]
-                for planned in free[: processes - len(running)]:
+                waited_for = {planned.name for planned in (*left, *running.values())}
+                for planned in [one for one in left if one.job.start not in waited_for]:
                     left.remove(planned)
-                    running[planned.name] = planned, _begin(planned, folder)
-                time.sleep(0.1)
-                for name in [
-                    n for n, (_, process) in running.items() if process.poll() is not None
-                ]:
-                    planned, _ = running.pop(name)
+                    own = folder.resolve() / planned.name
+                    write_whole(own / JOB, json.dumps(asdict(planned.job), indent=1) + "\n")
+                    running[pool.submit(_perform, str(own), stop)] = planned
+                # Wakes up now and then, so that Ctrl-C is heard.
+                finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    planned = running.pop(future)
+                    future.result()
                     if done(planned, folder) is None:
-                        raise MeasurementError(_failure(folder / name))
+                        raise MeasurementError(_failure(folder / planned.name))
                     advance(note=planned.short)
         finally:
-            for _, process in running.values():
-                _end(process)
+            stop.set()
+            for future in running:
+                future.cancel()
             lock.close()
 
 
-def _begin(planned: Planned, folder: Path) -> subprocess.Popen[bytes]:
-    own = folder / planned.name
-    own.mkdir(parents=True, exist_ok=True)
-    write_whole(own / JOB, json.dumps(asdict(planned.job), indent=1) + "\n")
-    with (own / LOG).open("wb") as log:
-        return subprocess.Popen(
-            [sys.executable, "-m", "ugat_marl.paper.job", str(own)],
+def _perform(folder: str, stop: Stop) -> None:
+    """Performs the job in a folder, or its beginning, if nobody waits for it any more."""
+    with Path(folder, LOG).open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "ugat_marl.paper.job", folder],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C is for this process; it ends the others itself
         )
+    try:
+        while process.poll() is None and not stop.wait(0.1):
+            pass
+    finally:
+        _end(process)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

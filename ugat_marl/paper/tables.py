@@ -9,6 +9,7 @@ from pathlib import Path
 from ugat_marl.comparison import Comparison, Trial
 from ugat_marl.effects import describe, in_domain, load
 from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.executors import Workers
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.paper.job import Job
 from ugat_marl.paper.runner import Planned, done, perform_all
@@ -123,7 +124,7 @@ def compare(
     scenario: str,
     config: PaperConfig,
     folder: Path,
-    processes: int,
+    workers: Workers,
     reporter: Reporter,
 ) -> Comparison:
     """Trains and plays whatever a table still lacks, and puts it together.
@@ -133,7 +134,7 @@ def compare(
         scenario: One of the scenarios.
         config: What is trained.
         folder: Where the folders of the jobs lie; finished ones are used again.
-        processes: Jobs at a time.
+        workers: Jobs at a time, or an executor.
         reporter: Shows progress.
     """
     loaded = load(scenario)
@@ -141,7 +142,7 @@ def compare(
         in_domain(loaded, target)  # a wrong name is an error now, not in an hour
     planner = Planner(table, scenario, config)
     plan = [job for row in config.settings(table) for job in planner.jobs(row)]
-    perform_all(planner.bases + plan, folder, processes, reporter, f"paper {table}")
+    perform_all(planner.bases + plan, folder, workers, reporter, f"paper {table}")
     trials = [trial for row in config.settings(table) for trial in planner.trials(row, folder)]
     return Comparison(loaded.id, loaded.hash, describe(config.sim), tuple(trials), {"table": table})
 
