@@ -75,6 +75,15 @@ def masked_observation(env: AnyParallelEnv) -> Wrapper:
     return _MaskedObservation(env)
 
 
+def appended_mask(env: AnyParallelEnv) -> Wrapper:
+    """Appends to each observation the agent's action mask, for learners that know no other way.
+
+    Whoever reads it gives the actions with a 0 no probability, or a value below all others. It is
+    all ones where the infos have no mask.
+    """
+    return _AppendedMask(env)
+
+
 class Wrapper(BaseParallelWrapper[str, Any, Any]):
     """What the wrappers have in common: spaces of their own, all else of the environment within.
 
@@ -278,12 +287,40 @@ class _FrameStack(Wrapper):
         return {agent: np.concatenate(self._frames[agent]) for agent in observations}
 
 
-class _MaskedObservation(Wrapper):
+class _Masking(Wrapper):
+    """What shows masks in observations."""
+
     def __init__(self, env: AnyParallelEnv) -> None:
         super().__init__(env)
-        sizes = {agent: _size(_discrete(env, agent)) for agent in self.action_spaces}
+        self._sizes = {agent: _size(_discrete(env, agent)) for agent in self.action_spaces}
+
+    def _mask(self, agent: str, infos: Infos) -> NDArray[np.int8]:
+        given = infos.get(agent, {}).get("action_mask")
+        return np.ones(self._sizes[agent], np.int8) if given is None else np.array(given, np.int8)
+
+
+class _AppendedMask(_Masking):
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        masks = {size: spaces.Box(0.0, 1.0, (size,)) for size in self._sizes.values()}
+        made: dict[tuple[int, int], spaces.Box] = {}  # agents that shared a box still do
+        for agent, box in self.observation_spaces.items():
+            key = id(box), self._sizes[agent]
+            made[key] = made.get(key) or _joined([box, masks[key[1]]])
+            self.observation_spaces[agent] = made[key]
+
+    def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
+        return {
+            agent: np.concatenate((vector, self._mask(agent, infos)), dtype=vector.dtype)
+            for agent, vector in observations.items()
+        }
+
+
+class _MaskedObservation(_Masking):
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        sizes = self._sizes
         masks = {size: spaces.Box(0, 1, (size,), np.int8) for size in sizes.values()}
-        self._sizes = sizes
         self.observation_spaces = {
             agent: spaces.Dict({"observations": box, "action_mask": masks[sizes[agent]]})
             for agent, box in self.observation_spaces.items()
@@ -294,10 +331,6 @@ class _MaskedObservation(Wrapper):
             agent: {"observations": vector, "action_mask": self._mask(agent, infos)}
             for agent, vector in observations.items()
         }
-
-    def _mask(self, agent: str, infos: Infos) -> NDArray[np.int8]:
-        given = infos.get(agent, {}).get("action_mask")
-        return np.ones(self._sizes[agent], np.int8) if given is None else np.array(given, np.int8)
 
 
 def _box(env: AnyParallelEnv, agent: str) -> spaces.Box:

@@ -48,6 +48,10 @@ class Baseline:
 BASELINES: Mapping[str, Baseline] = {
     "ippo": Baseline("ippo", "IPPO", "IPPOConfig"),
     "mappo": Baseline("ippo", "IPPO", "IPPOConfig", settings={"centralised": True}),
+    "sb3-ppo": Baseline("sb3", "SB3", "SB3Config", "sb3", {"algorithm": "ppo"}),
+    "sb3-dqn": Baseline("sb3", "SB3", "SB3Config", "sb3", {"algorithm": "dqn"}),
+    "maskable-ppo": Baseline("sb3", "SB3", "SB3Config", "sb3", {"algorithm": "maskable-ppo"}),
+    "supersuit-ppo": Baseline("supersuit_ppo", "SuperSuitPPO", "SuperSuitConfig", "sb3"),
 }
 
 
@@ -115,7 +119,7 @@ def load_baseline(name: str) -> ModuleType:
         raise OptionError(
             f"learner {name!r} needs {missing}, which is not installed; run "
             f"pip install 'ugat-marl[{baseline.extra}]', or in a checkout "
-            f"pip install -c constraints-baselines.txt -e '.[{baseline.extra}]'"
+            f"pip install -e '.[{baseline.extra}]'"
         ) from None
     return module
 

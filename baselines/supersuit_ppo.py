@@ -1,0 +1,71 @@
+"""Stable-Baselines3's PPO through SuperSuit, as many pages on PettingZoo show it.
+
+It works, and it is here because it is so common; `sb3.py` is the same learner without these faults
+of SuperSuit 3.11:
+
+- Its vector environment never says that an end is a truncation: PPO takes the end of an episode,
+  where traffic goes on, for the end of all, and learns that nothing is worth anything there.
+- It has no `seed`: `PPO(seed=...)` fails. Here every episode is seeded by `TrainingEnv` within.
+- `concat_vec_envs_v1` copies the environment and never closes the copies, and with worker processes
+  loses what they learn of rewards; so it is left out here.
+- `pad_action_space_v0` turns an action that does not exist into action 0, in silence. Here
+  `ugat_marl.wrappers.pad` pads, which refuses it, and masks see to it that it is never chosen.
+- `agent_indicator_v0` takes every step through PettingZoo's other interface and back, and steps a
+  `GroundedEnv` whose episode is over; `ugat_marl.wrappers.agent_indicator` does not.
+- It carries no masks; here they are a part of the observation.
+
+    python baselines/supersuit_ppo.py --scenario grid2x2-v1 --episodes 100 --out runs/supersuit
+"""
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import tyro
+from supersuit.vector import MarkovVectorEnv
+from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
+
+from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.learners.registry import load_baseline
+from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
+from ugat_marl.wrappers import agent_indicator, appended_mask, pad
+
+_sb3: Any = load_baseline("sb3-ppo")
+
+
+@dataclass(frozen=True)
+class SuperSuitConfig(_sb3.SB3Config):
+    """Settings of the learner; those of PPO in `sb3.py`."""
+
+    algorithm: Literal["ppo"] = "ppo"
+
+
+class SuperSuitPPO(_sb3.SB3):
+    """Learns by PPO in SuperSuit's vector environment; a `ugat_marl.policy.Learner`."""
+
+    def __init__(
+        self, env: AnyParallelEnv, config: SuperSuitConfig | None = None, seed: int = 0
+    ) -> None:
+        super().__init__(env, config or SuperSuitConfig(), seed)
+        self._kind = "baselines.supersuit.ppo"
+
+    def _wrapped(self, env: AnyParallelEnv) -> Any:
+        return SB3VecEnvWrapper(MarkovVectorEnv(appended_mask(agent_indicator(pad(env)))))
+
+
+@dataclass(frozen=True)
+class Args(BaselineArgs):
+    """Trains PPO of Stable-Baselines3 through SuperSuit on one scenario."""
+
+    sb3: Annotated[SuperSuitConfig, tyro.conf.arg(name="")] = SuperSuitConfig()
+
+
+def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
+    """Trains and evaluates; writes the results if `args.out` is given."""
+    return train_baseline(args, lambda env: SuperSuitPPO(env, args.sb3, args.seed), on_episode)
+
+
+if __name__ == "__main__":
+    baseline_command(Args, train)

@@ -1,0 +1,356 @@
+"""The learners of other libraries: each against tasks whose optimum is known, and itself.
+
+A learner whose library is not installed is skipped; `make compat` installs them all.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
+from ugat_marl.evaluation import policy_factory
+from ugat_marl.grounding.gate import GateConfig
+from ugat_marl.grounding.transform import GroundedActionTransform
+from ugat_marl.grounding.wrapper import GroundedEnv
+from ugat_marl.learners import DQNPolicy
+from ugat_marl.learners.registry import (
+    BASELINES,
+    baselines_folder,
+    learner_factory,
+    load_baseline,
+)
+from ugat_marl.policy import Learner, Policy
+from ugat_marl.testing import ToyTraffic, check_policy, failures
+from ugat_marl.traffic_env import parallel_env
+
+if not baselines_folder().is_dir():
+    pytest.skip("baselines/ is neither here nor in the package", allow_module_level=True)
+
+LIBRARIES = {
+    "sb3": "sb3_contrib",
+    "torchrl": "torchrl",
+    "skrl": "skrl",
+    "benchmarl": "benchmarl",
+    "rllib": "ray",
+}
+PPO = ("hidden=32,32", "learning_rate=3e-3", "epochs=4")
+VALUES = ("hidden=32,32", "learning_rate=3e-3", "replay=2000", "explore=400", "target_rate=0.05")
+SETTINGS = {
+    "sb3-ppo": (*PPO, "update_every=20", "minibatch=10"),
+    "maskable-ppo": (*PPO, "update_every=20", "minibatch=10"),
+    "sb3-dqn": (*VALUES, "warmup=40", "batch=64"),
+    "supersuit-ppo": (*PPO, "update_every=20", "minibatch=10"),
+    "torchrl-mappo": (*PPO, "update_every=20", "minibatch=10"),
+    "skrl-ippo": (*PPO, "update_every=20", "minibatches=2"),
+    "skrl-mappo": (*PPO, "update_every=20", "minibatches=2"),
+    "qmix": (*VALUES, "update_every=10", "updates=10", "batch=32"),
+    "vdn": (*VALUES, "update_every=10", "updates=10", "batch=32"),
+    "rllib-ppo": (*PPO, "minibatches=4"),
+}
+NAMES = [
+    pytest.param(
+        name,
+        marks=pytest.mark.skipif(
+            importlib.util.find_spec(LIBRARIES[BASELINES[name].extra]) is None,
+            reason=f"{LIBRARIES[BASELINES[name].extra]} is not installed",
+        ),
+    )
+    for name in SETTINGS
+    if name in BASELINES
+]
+CHANCE = np.random.default_rng(3)
+every = pytest.mark.parametrize("name", NAMES)
+
+
+class EqualToy(ToyTraffic):
+    """The two equal intersections of the toy environment."""
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__(**given)
+        del self.layouts["tee_0"], self.observation_spaces["tee_0"], self.action_spaces["tee_0"]
+        self.possible_agents = list(self.layouts)
+        self.agent_groups = {"cross": self.possible_agents}
+        size = sum(layout.size for layout in self.layouts.values())
+        self.state_space = spaces.Box(0.0, 1.0, (size,), np.float32)
+
+
+class MaskedToy(ToyTraffic):
+    """Forbids phases at random and counts what was asked for all the same."""
+
+    violations = steps_done = 0
+
+    def step(self, actions: Any) -> Any:
+        """Counts actions that were forbidden."""
+        self.steps_done += 1
+        self.violations += sum(not self.masks[a][action] for a, action in actions.items())
+        return super().step(actions)
+
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        infos = super()._infos()
+        for info in infos.values():
+            mask = info["action_mask"]
+            mask[self._traffic.permutation(len(mask))[: self._traffic.integers(len(mask))]] = 0
+        self.masks = {agent: info["action_mask"].copy() for agent, info in infos.items()}
+        return infos
+
+
+class PaidEnv(ParallelEnv[str, Any, Any]):
+    """Four decisions, each paid 1; the agent sees which is next, in a circle."""
+
+    metadata: ClassVar = {"name": "paid", "is_parallelizable": True, "render_modes": []}
+    render_mode = None
+    state_space = spaces.Box(0, 1, (4,), np.float32)
+
+    def __init__(self, reward: float = 1.0) -> None:
+        self.possible_agents, self.agents = ["signal_0"], list[str]()
+        self.reward = reward
+        self.observation_spaces = {"signal_0": spaces.Box(0, 1, (4,), np.float32)}
+        self.action_spaces = {"signal_0": spaces.Discrete(2)}
+
+    def observation_space(self, agent: str) -> Any:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.agents, self.time = ["signal_0"], 0
+        return self._observe(), {"signal_0": {}}
+
+    def step(self, actions: dict[str, int]) -> Any:
+        self.time += 1
+        over, one = self.time == 4, "signal_0"
+        if over:
+            self.agents = []
+        ends = {one: False}, {one: over}
+        return self._observe(), {one: self.reward}, *ends, {one: {}}
+
+    def state(self) -> Any:
+        return self._observe()["signal_0"]
+
+    def _observe(self) -> dict[str, Any]:
+        return {"signal_0": np.eye(4, dtype=np.float32)[self.time % 4]}
+
+
+def made(name: str, env: Any, *settings: str, seed: int = 0) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return learner_factory(name, (*SETTINGS[name], *settings))(env, seed)
+
+
+def play(env: ToyTraffic, act: Callable[[Any, Any], dict[str, int]], episodes: int = 10) -> float:
+    """Mean over episodes of the sum of rewards, mean over agents."""
+    total = 0.0
+    for seed in range(1000, 1000 + episodes):
+        observations, infos = env.reset(seed=seed)
+        while env.agents:
+            observations, rewards, _, _, infos = env.step(act(observations, infos))
+            total += sum(rewards.values()) / len(rewards)
+    return total / episodes
+
+
+def greedily(observations: Any, infos: Any) -> dict[str, int]:
+    """The phase that lets most vehicles go, the longer queues where that is equal."""
+    chosen: dict[str, int] = {}
+    for agent, vector in observations.items():
+        count = len(infos[agent]["action_mask"])
+        queues = vector[: vector.size - count] * 20
+        pairs = [queues[phase : phase + 2] for phase in range(count)]
+        gains = [np.minimum(pair, 3).sum() + 1e-3 * pair.sum() for pair in pairs]
+        chosen[agent] = int(np.argmax(gains))
+    return chosen
+
+
+def at_random(observations: Any, infos: Any) -> dict[str, int]:
+    """Any phase."""
+    return {agent: int(CHANCE.integers(len(infos[agent]["action_mask"]))) for agent in observations}
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two states are the same, to the bit."""
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    return bool(one == other)
+
+
+def state_of(learner: Any) -> dict[str, Any]:
+    return {"networks": dict(learner._networks()), "rest": learner._rest()}
+
+
+@every
+@pytest.mark.parametrize("make", [EqualToy, ToyTraffic], ids=["equal", "unequal"])
+def test_it_learns(name: str, make: type[ToyTraffic]) -> None:
+    env = make(steps=40, arrivals=0.7)
+    policy = made(name, env).learn(env, 30, 1)
+    random, greedy = play(env, at_random), play(env, greedily)
+    assert play(env, policy.act) > greedy + 0.3 * (random - greedy)
+
+
+@every
+def test_masks_are_kept(name: str) -> None:
+    env = MaskedToy(steps=30)
+    policy = made(name, env).learn(env, 3, 1)
+    assert env.steps_done >= 90
+    assert env.violations == 0
+    play(env, policy.act, 2)
+    assert env.violations == 0
+    play(env, at_random, 1)
+    assert env.violations > 0
+
+
+@every
+def test_two_calls_are_one_call_also_over_a_file(name: str, tmp_path: Path) -> None:
+    env = MaskedToy(steps=20)
+    whole, parts = (made(name, env) for _ in range(2))
+    first: list[float] = []
+    whole.learn(env, 4, 5, lambda _, told: first.append(told["return"]))
+    second: list[tuple[int, float]] = []
+    parts.learn(env, 2, 5, lambda number, told: second.append((number, told["return"])))
+    parts.save(tmp_path / "learner.pt")
+    resumed = made(name, env, seed=9)
+    assert not np.array_equal(resumed.policy().parameters, parts.policy().parameters)
+    resumed.load(tmp_path / "learner.pt")
+    assert same(state_of(resumed), state_of(parts))
+    torch.rand(3)  # what others draw does not matter
+    resumed.learn(env, 2, 5, lambda number, told: second.append((number, told["return"])))
+    assert second == list(enumerate(first))
+    assert np.array_equal(whole.policy().parameters, resumed.policy().parameters)
+    assert resumed.episodes == whole.episodes == 4
+    assert np.array_equal(resumed.rewards.sums, whole.rewards.sums)
+    other = made(name, env)
+    other.learn(env, 4, 6)
+    assert not np.array_equal(whole.policy().parameters, other.policy().parameters)
+
+
+@every
+def test_what_others_draw_is_left_as_it_was(name: str) -> None:
+    env = ToyTraffic()
+    torch.manual_seed(3)
+    expected = torch.rand(2)
+    torch.manual_seed(3)
+    made(name, env).learn(env, 1, 1)
+    assert torch.equal(torch.rand(2), expected)
+
+
+@every
+def test_it_keeps_the_protocols_and_its_policies_conform(name: str, tmp_path: Path) -> None:
+    env = ToyTraffic()
+    learner = made(name, env)
+    policy = learner.learn(env, 1, 1)
+    assert isinstance(learner, Learner) and isinstance(policy, Policy)
+    assert not failures(check_policy(policy, ToyTraffic))
+    before = policy.parameters
+    learner.learn(env, 6, 1)
+    assert np.array_equal(policy.parameters, before)
+    assert not np.array_equal(learner.policy().parameters, before)
+    policy.save(tmp_path / "policy.pt")
+    assert np.array_equal(DQNPolicy.load(tmp_path / "policy.pt").parameters, before)
+
+
+@every
+def test_it_trains_in_a_grounded_environment(name: str) -> None:
+    env = ToyTraffic()
+    transform = GroundedActionTransform(env.layouts, 0, gate=GateConfig(mode="infinite"))
+    transform.forward.fitted.fill_(True)
+    transform.inverse.fitted.fill_(True)
+    learner = made(name, env)
+    returns: list[float] = []
+    learner.learn(env, 1, 1)
+    learner.learn(GroundedEnv(env, transform), 2, 1, lambda _, told: returns.append(told["return"]))
+    learner.learn(env, 1, 1)
+    assert len(returns) == 2 and learner.episodes == 4 and np.isfinite(returns).all()
+
+
+@every
+def test_what_it_cannot_learn_in_is_refused(name: str, tmp_path: Path) -> None:
+    learner = made(name, ToyTraffic())
+    with pytest.raises(OptionError, match="this learner's"):
+        learner.learn(EqualToy(), 1, 1)
+    broken = PaidEnv(reward=float("nan"))
+    with pytest.raises(EpisodeError, match="not finite"):
+        made(name, broken).learn(broken, 1, 1)
+    learner.save(tmp_path / "learner.pt")
+    for changed in (made(name, EqualToy()), made(name, ToyTraffic(), "hidden=8")):
+        before = state_of(changed)
+        with pytest.raises(CheckpointError, match=r"learner\.pt"):
+            changed.load(tmp_path / "learner.pt")
+        assert same(state_of(changed), before)
+    with pytest.raises(OptionError, match="discount"):
+        made(name, ToyTraffic(), "discount=1")
+
+
+def value_of(name: str, learner: Any) -> list[float]:
+    """What the learner holds the four observations of `PaidEnv` to be worth."""
+    eye, agent, mask = torch.eye(4), torch.ones(4, 1), torch.ones(4, 2)
+    if name in ("sb3-ppo", "maskable-ppo", "supersuit-ppo"):
+        seen = [eye, agent] if name == "maskable-ppo" else [eye, agent, mask]
+        values = learner._model.policy.predict_values(torch.cat(seen, 1))
+    elif name == "sb3-dqn":
+        values = learner._model.q_net(torch.cat([eye, agent, mask], 1)).max(1).values
+    elif name == "torchrl-mappo":
+        values = learner._critic(eye)
+    elif name.startswith("skrl"):
+        critic = learner._models["signal_0"]["value"]
+        seen = eye if name == "skrl-mappo" else torch.cat([eye, mask], 1)
+        values = critic.network(seen)
+    elif name == "rllib-ppo":
+        module = learner._learner.module["signal"].unwrapped()
+        batch = {"obs": {"observations": torch.cat([eye, agent], 1), "action_mask": mask}}
+        values = module.compute_values(batch)
+    else:  # VDN's sum of one agent's values is its own
+        ((first, *rest),) = learner._actors()
+        values = first(torch.cat([eye, agent], 1))
+        for layer in rest:
+            values = layer(values.relu())
+        values = values.max(1).values
+    return values.flatten().tolist()
+
+
+@pytest.mark.parametrize("name", [item for item in NAMES if item.values[0] != "qmix"])
+def test_values_bootstrap_where_an_episode_is_cut_off(name: str) -> None:
+    env = PaidEnv()
+    learner = made(
+        name,
+        env,
+        "discount=0.5",
+        *(["least_exploration=1"] if "explore=400" in SETTINGS[name] else []),
+    )
+    learner.rewards = lambda paid: paid.astype(float)  # as they are
+    learner.learn(env, 150, 1)
+    # paid for ever: 1 / (1 - 0.5); SuperSuit says that the end is the end
+    wanted = [1.875, 1.75, 1.5, 1.0] if name == "supersuit-ppo" else [2.0, 2.0, 2.0, 2.0]
+    assert value_of(name, learner) == pytest.approx(wanted, abs=0.2)
+
+
+@every
+@pytest.mark.parametrize("scenario", ["grid2x2-v1", "mixed-v1"])
+def test_it_trains_on_roads(name: str, scenario: str, tmp_path: Path) -> None:
+    module: Any = load_baseline(name)
+    settings = made(name, ToyTraffic()).config
+    (field,) = {item.name for item in module.Args.__dataclass_fields__.values()} - set(
+        module.BaselineArgs.__dataclass_fields__
+    )
+    args = module.Args(
+        scenario=scenario, duration_s=60, episodes=2, evaluation_seeds=1, out=tmp_path,
+        **{field: settings},
+    )  # fmt: skip
+    result = module.train(args)
+    assert len(result.returns) == 2
+    assert list(result.att_s) == [2] and np.isfinite(result.att_s[2]).all()
+    assert {path.name for path in tmp_path.iterdir()} == {"policy.pt", "learner.pt", "result.json"}
+    env = parallel_env(scenario)
+    assert policy_factory(str(tmp_path / "policy.pt"))(env)

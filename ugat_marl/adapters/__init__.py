@@ -1,0 +1,1 @@
+"""Environments in the form a library wants; each module imports one library."""
