@@ -19,6 +19,7 @@ from ugat_marl.errors import UgatMarlError, UnknownNameError, nearest
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("commands.train:Train", "train by UGAT across the gap, print what was won"),
+    "report": ("commands.report:Report", "trainings as one page: tables, curves, maps"),
     "evaluate": ("commands.evaluate:Evaluate", "policies and rules in any domains: measures, gaps"),
     "tune": ("commands.tune:Tune", "the settings with which each rule does best in a domain"),
     "rollout": ("commands.rollout:Rollout", "record transitions as a Parquet log"),

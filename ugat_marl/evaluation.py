@@ -16,6 +16,7 @@ from ugat_marl.executors import (
     Stop,
     Workers,
     as_done,
+    in_this_process,
     parts_at_a_time,
 )
 from ugat_marl.learners.agents import AgentSet
@@ -23,12 +24,16 @@ from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.results import Evaluation, Result, Trial
-from ugat_marl.rollout import persistently, roll_out, until
+from ugat_marl.rollout import StepCallback, persistently, roll_out, until
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
 PolicyFactory = Callable[[TrafficEnv], Policy]
 """Makes a policy for an environment; controllers read the network from it."""
+
+Watch = Callable[[str, str, TrafficEnv], StepCallback]
+"""Called with the names of policy and domain and the environment; what it returns is called after
+each decision, in several threads at a time."""
 
 TUNING_SEED = 9001
 """First of the seeds the best rule is searched on; never those a result is reported on."""
@@ -40,6 +45,7 @@ class _Task:
     make: PolicyFactory
     world: TrafficEnv
     seeds: tuple[int, ...]
+    watch: Watch | None
 
 
 def evaluate(
@@ -53,6 +59,7 @@ def evaluate(
     reporter: Reporter | None = None,
     title: str = "evaluating",
     notes: Mapping[str, str] | None = None,
+    watch: Watch | None = None,
 ) -> Evaluation:
     """Plays every policy in every domain with every seed, spread over the cores.
 
@@ -66,6 +73,7 @@ def evaluate(
         reporter: Shows progress.
         title: What to call the work there.
         notes: Kept with the result.
+        watch: Looks at the environments while they are played.
     """
     names = [describe(domain) for domain in domains]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -74,10 +82,12 @@ def evaluate(
     worlds = [parallel_env(scenario, domain, duration_s=duration_s) for domain in domains]
     for make in policies.values():
         make(worlds[0])  # so is a wrong policy
+    if watch is not None and not in_this_process(workers):
+        raise OptionError("what is watched must be played here; give a number of workers")
     episodes = len(seeds) * len(policies) * len(domains)
     per_task = max(1, episodes // (4 * parts_at_a_time(workers)))
     tasks = [
-        _Task(name, make, world, tuple(seeds[start : start + per_task]))
+        _Task(name, make, world, tuple(seeds[start : start + per_task]), watch)
         for world in worlds
         for name, make in policies.items()
         for start in range(0, len(seeds), per_task)
@@ -260,9 +270,16 @@ def _play(task: _Task, stop: Stop) -> list[Result]:
     policy = task.make(task.world)
     env = parallel_env(task.world.scenario, **policy.env_options)  # its domain is in its files
     results: list[Result] = []
+    check = until(stop)
+    look = task.watch(task.name, task.world.domain, env) if task.watch is not None else check
+
+    def on_step(step: int) -> None:
+        check(step)
+        look(step)
+
     try:
         for seed in task.seeds:
-            persistently(lambda seed=seed: roll_out(env, policy, seed, on_step=until(stop)))
+            persistently(lambda seed=seed: roll_out(env, policy, seed, on_step=on_step))
             results.append(Result(task.name, task.world.domain, seed, env.scores()))
     finally:
         env.close()

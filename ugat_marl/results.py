@@ -11,13 +11,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.errors import CheckpointError
 from ugat_marl.files import write_whole
 from ugat_marl.metrics import MEASURES, Scores, bootstrap_interval
 from ugat_marl.seeding import numpy_generator
@@ -138,6 +139,25 @@ class Evaluation:
         content = json.dumps(_without_nan(self.as_dict()), indent=1, allow_nan=False)
         write_whole(path, content + "\n")
 
+    @classmethod
+    def read(cls, path: Path) -> Evaluation:
+        """Reads what `write` wrote; what is null there, or left out, has no value (nan).
+
+        Raises:
+            CheckpointError: The file is missing, cut short or of another form.
+        """
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            results = tuple(result_of(row) for row in content["episodes"])
+            notes = {str(key): str(text) for key, text in content["notes"].items()}
+            return cls(str(content["scenario"]), str(content["scenario_hash"]), results, notes)
+        except OSError as error:
+            raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from None
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            raise CheckpointError(
+                f"{path}: not the table of a run ({error!r}); it may have been cut short"
+            ) from None
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -177,6 +197,21 @@ class Tuned:
     def episodes(self) -> int:
         """Episodes played for it."""
         return sum(trial.episodes for trial in self.trials)
+
+
+def result_of(row: Mapping[str, Any]) -> Result:
+    """An episode from its row in a record; what is null or left out has no value (nan)."""
+    numbers = {
+        item.name: _number(row.get(item.name)) for item in fields(Scores) if item.name != "hidden"
+    }
+    hidden = {str(name): _number(value) for name, value in (row.get("hidden") or {}).items()}
+    scores = Scores(**numbers)
+    scores = replace(scores, hidden=hidden) if hidden else scores
+    return Result(str(row["policy"]), str(row["domain"]), int(row["seed"]), scores)
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
 
 
 def _measured(scores: Scores, measure: str) -> float:

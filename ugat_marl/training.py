@@ -7,6 +7,8 @@ stage it repeats and ends with the same file as an unbroken one.
 
 from __future__ import annotations
 
+import contextlib
+import importlib.metadata
 import importlib.util
 import json
 import math
@@ -24,6 +26,8 @@ from ugat_marl.progress import Reporter
 
 CHECKPOINT = "checkpoint"
 METRICS = "metrics.parquet"
+SETTINGS = "settings.json"
+_VERSIONS = ("ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch")
 _SCHEMA = {"stage": pl.String, "step": pl.Int64, "name": pl.String, "value": pl.Float64}
 
 
@@ -175,6 +179,19 @@ class Run:
             again = step if folder.exists() else None  # hides what a killed run logged from here on
             self._board = SummaryWriter(str(folder), purge_step=again)
         return self._board
+
+
+def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
+    """Keeps all options of a run, and the versions it is made with, for readers.
+
+    ``run.json`` holds only what must be the same for `--resume`.
+    """
+    versions: dict[str, str] = {}
+    for name in _VERSIONS:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    content = {"settings": settings, "versions": versions}
+    write_whole(directory / SETTINGS, json.dumps(content, indent=1, default=str) + "\n")
 
 
 def locked(directory: Path) -> IO[str]:

@@ -17,6 +17,7 @@ from ugat_marl.evaluation import (
     TUNING_SEED,
     Evaluation,
     PolicyFactory,
+    Watch,
     best_rules,
     evaluate,
     fixed_policy,
@@ -27,24 +28,19 @@ from ugat_marl.grounding.view import neighbours_of
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
-from ugat_marl.placebo import PLACEBOS, Placebo, answer_with_noise
 from ugat_marl.learners.registry import DQN_NAME, learner_factory, require_known
+from ugat_marl.placebo import PLACEBOS, Placebo, answer_with_noise
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Reporter, Silent
+from ugat_marl.queues import QUEUES, QueueRecord
 from ugat_marl.randomised import randomised_env
 from ugat_marl.recipes import Control, file_name, simulated_worlds, train_control
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
-from ugat_marl.training import Run
+from ugat_marl.training import Run, write_settings
 from ugat_marl.transitions import TransitionLog
 from ugat_marl.tuning import LEAST_BUDGET, TUNED_RULES, tuned_rules
-from ugat_marl.ugat import (
-    DIRECT_LEARNER,
-    State,
-    UgatConfig,
-    restore,
-    train_ugat,
-)
+from ugat_marl.ugat import DIRECT_LEARNER, State, UgatConfig, restore, train_ugat
 from ugat_marl.worlds import RecordedWorld, ShuffledWorld, World
 
 EVALUATION_SEED = 1000
@@ -93,13 +89,13 @@ class TransferConfig:
             late by random whole seconds up to this.
         fine_tuned: Also train direct transfer on in the real domain, for as many episodes as UGAT
             sees of it.
-        learner: What learns: dqn, the suite's own; or a baseline (docs/learner.md).
-        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; the
-            parts of a tuple are divided by commas.
         oracle: Also train from scratch in the real domain, for as many episodes as UGAT in all.
         placebo: A negative control, with which grounding must do nothing: "same-world" takes D_real
             from the simulation, "shuffled" deals out anew what followed in D_real, "noise" puts
             noise in the place of f.
+        learner: What learns: dqn, the suite's own; or a baseline (docs/learner.md).
+        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; the
+            parts of a tuple are divided by commas.
         ugat: Settings of the algorithm.
         dqn: Settings of dqn.
     """
@@ -120,12 +116,12 @@ class TransferConfig:
     further: tuple[str, ...] = ()
     corrected: str | None = None
     randomised: bool = False
-    learner: str = DQN_NAME
-    learner_settings: tuple[str, ...] = ()
     random_delay_s: int | None = None
     fine_tuned: bool = False
     oracle: bool = False
     placebo: Placebo = "none"
+    learner: str = DQN_NAME
+    learner_settings: tuple[str, ...] = ()
     ugat: Annotated[UgatConfig, arg(name="")] = field(default_factory=UgatConfig)
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
@@ -148,11 +144,11 @@ class TransferConfig:
                 "`ugat-marl diagnose` wrote, or another domain"
             )
         if self.real == "none" and self.real_log is None:
-        require_known(self.learner)
             raise OptionError('real = "none" needs a real_log: something must be known of the real')
         self._refuse_impossible_controls()
 
     def _refuse_impossible_controls(self) -> None:
+        require_known(self.learner)
         if self.placebo not in PLACEBOS:
             raise UnknownNameError("placebo", self.placebo, PLACEBOS)
         if self.placebo == "same-world" and self.real_log is not None:
@@ -199,12 +195,12 @@ def transfer(
     Args:
         config: What to do.
         directory: Folder of the run; ``table.json``, ``metrics.parquet``, ``policies``,
-            TensorBoard files and checkpoints go there.
-    make = learner_factory(config.learner, config.learner_settings, config.dqn)
+            TensorBoard files, checkpoints and what `ugat-marl report` shows go there.
         resume: Go on with the run in the folder.
         reporter: Shows progress.
     """
     reporter = reporter or Silent()
+    make = learner_factory(config.learner, config.learner_settings, config.dqn)
     scenario = load(config.scenario)
     env = parallel_env(scenario, config.sim, **config.env_options)
     recorded: RecordedWorld | None = None
@@ -218,6 +214,7 @@ def transfer(
     if config.placebo == "noise":
         answer_with_noise(transform.forward, config.seed)
     run = Run(directory, _identity(config, scenario, env, controls), resume, reporter)
+    write_settings(directory, asdict(config))
     try:
         state = State(learner, transform)
         restore(state, run, DQNPolicy.load)
@@ -237,7 +234,9 @@ def transfer(
     for name, trained in policies.items():
         if isinstance(trained, DQNPolicy):
             trained.save(directory / "policies" / f"{file_name(name)}.pt")
-    table = judge(config, scenario, policies, reporter)
+    queues = QueueRecord()
+    table = judge(config, scenario, policies, reporter, queues.watch)
+    queues.write(directory / QUEUES)
     table.write(directory / "table.json")
     return table
 
@@ -256,6 +255,7 @@ def judge(
     scenario: Scenario,
     policies: Mapping[str, Policy],
     reporter: Reporter,
+    watch: Watch | None = None,
 ) -> Evaluation:
     """Evaluates policies beside the rules that are best in each domain."""
     seeds = [TUNING_SEED + k for k in range(config.tuning_seeds)]
@@ -286,6 +286,7 @@ def judge(
             **({} if config.learner == DQN_NAME else {"learner": config.learner}),
             **({} if config.corrected is None else {CORRECTED: describe(config.corrected)}),
         },
+        watch=watch,
     )
 
 
@@ -381,10 +382,10 @@ def _identity(
         settings.pop(other)
     if config.placebo == "none":  # runs from before there were any can be resumed
         settings.pop("placebo")
-    settings.pop("corrected")  # a scenario is the same if its hash is, wherever it lies
     if config.learner == DQN_NAME:  # the same
         settings.pop("learner")
         settings.pop("learner_settings")
+    settings.pop("corrected")  # a scenario is the same if its hash is, wherever it lies
     settings["real_log"] = _digest(config.real_log) if config.real_log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":

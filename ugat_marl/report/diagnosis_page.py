@@ -25,13 +25,13 @@ from ugat_marl.report.diagnosis_sections import (
     provenance,
     ranking,
 )
-from ugat_marl.report.diagnosis_style import ABOVE, LEVELS, STYLE
+from ugat_marl.report.diagnosis_style import ABOVE, LEVELS
 from ugat_marl.report.diagnosis_words import Record
+from ugat_marl.report.page import document
 
 _LOUD, _QUIET = 16, 6
 """Strips that are shown at once, of statistics outside of their noise and, if none is, inside."""
 _COMMANDS = re.compile(r"<h2>Run it again</h2><pre><code>(.*?)</code></pre>", re.DOTALL)
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 
 
 def write_diagnosis_page(
@@ -63,14 +63,8 @@ def diagnosis_page(record: Record, network: Network, commands: Sequence[str] = (
         provenance(record, commands),
     )
     title = f"Diagnosis of {record['scenario']}: {words.VERDICTS.get(record['verdict'], '')}"
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"{_head(record)}\n<main>\n" + "\n".join(filter(None, sections)) + "\n</main>\n"
-        "</body>\n</html>\n"
-    )
+    main = "\n".join(filter(None, sections))
+    return document(title, f"{_head(record)}\n<main>\n{main}\n</main>")
 
 
 def commands_on_page(path: Path) -> list[str]:

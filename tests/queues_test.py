@@ -1,0 +1,85 @@
+"""Where and when vehicles stand: counted by hand, and in episodes that are played."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ugat_marl.effects import load
+from ugat_marl.errors import CheckpointError
+from ugat_marl.evaluation import evaluate, rule_factory
+from ugat_marl.network import Network
+from ugat_marl.queues import QueueRecord, read_queues
+
+
+def stub(decisions: int, interval_s: float) -> Any:
+    """An environment of grid2x2-v1 whose snapshot the test writes."""
+    network = Network.read(load("grid2x2-v1"))
+    env = SimpleNamespace(
+        network=network, decision_interval_s=interval_s,
+        scenario=SimpleNamespace(decisions=decisions), snapshot=None,
+    )  # fmt: skip
+    env.unwrapped = env
+    return env
+
+
+def test_queues_are_means_by_minute_and_intersection() -> None:
+    env = stub(decisions=9, interval_s=10.0)
+    lanes = env.network.lane_table()
+    record = QueueRecord()
+    look = record.watch("rule", "V4", env)
+    first, second = env.network.intersections[:2]
+    for step in range(1, 10):
+        halting = np.zeros(len(lanes.ids))
+        halting[lanes.indices(first.incoming_lanes[:2])] = step, 1.0
+        halting[lanes.indices(first.outgoing_lanes[:1])] += 0.0
+        halting[lanes.indices(second.incoming_lanes[:1])] = 2.0
+        env.snapshot = SimpleNamespace(halting=halting)
+        look(step)
+    rows = {(m, tls): queue for _, _, m, tls, queue in record.frame().rows()}
+    # 6 decisions in the first minute, 3 in the second
+    assert rows[0, first.id] == np.mean([1, 2, 3, 4, 5, 6]) + 1
+    assert rows[1, first.id] == np.mean([7, 8, 9]) + 1
+    assert rows[0, second.id] == rows[1, second.id] == 2.0
+    assert {m for m, _ in rows} == {0, 1} and len(rows) == 8
+
+
+def test_long_intervals_leave_minutes_out() -> None:
+    env = stub(decisions=2, interval_s=90.0)
+    look = (record := QueueRecord()).watch("rule", "V4", env)
+    env.snapshot = SimpleNamespace(halting=np.ones(len(env.network.lane_table().ids)))
+    look(1)
+    look(2)
+    assert set(record.frame()["minute"]) == {1, 2}
+
+
+def test_an_evaluation_fills_it(tmp_path: Path) -> None:
+    record = QueueRecord()
+    rules = {name: rule_factory(name) for name in ("fixed-time:30", "max-pressure:20")}
+    found = evaluate(
+        load("single-v1"), rules, ["sim", "V4"], [1, 2], duration_s=300, watch=record.watch
+    )
+    record.write(tmp_path / "queues.parquet")
+    frame = read_queues(tmp_path / "queues.parquet")
+    assert len(frame) == 2 * 2 * 5
+    for policy in rules:
+        for domain in ("sim", "V4"):
+            own = frame.filter(policy=policy, domain=domain)
+            # 6 decisions in each of 5 minutes: the mean of the means is that of the scores
+            mean = found.values(policy, domain, "queue").mean()
+            assert own["queue"].mean() == pytest.approx(mean)
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1 no more"])
+def test_a_damaged_file_is_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "q.parquet").write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"q\.parquet: cannot be read"):
+        read_queues(tmp_path / "q.parquet")
+    pl.DataFrame({"a": [1]}).write_parquet(tmp_path / "q.parquet")
+    with pytest.raises(CheckpointError, match="not the queues of a run"):
+        read_queues(tmp_path / "q.parquet")
