@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -205,8 +205,7 @@ def result_of(row: Mapping[str, Any]) -> Result:
         item.name: _number(row.get(item.name)) for item in fields(Scores) if item.name != "hidden"
     }
     hidden = {str(name): _number(value) for name, value in (row.get("hidden") or {}).items()}
-    scores = Scores(**numbers)
-    scores = replace(scores, hidden=hidden) if hidden else scores
+    scores = Scores(**numbers, hidden=hidden)
     return Result(str(row["policy"]), str(row["domain"]), int(row["seed"]), scores)
 
 
