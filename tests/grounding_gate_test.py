@@ -36,6 +36,31 @@ def test_pooled_alpha_is_one_mean_over_all_intersections() -> None:
     assert gate.alpha.tolist() == pytest.approx([0.5, 0.5])
 
 
+def test_a_fitted_start_expects_the_mean_u_of_the_first_fit_until_there_are_logged_ones() -> None:
+    gate = Gate(AGENTS, GateConfig(start="fitted"))
+    gate.begin(np.array([0.4, 0.0]))  # without any uncertainty there is nothing to gate by
+    assert gate.alpha.tolist() == [0.4, np.inf]
+    assert run(gate, (0.5, 0.9), (0.3, 0.9)) == [[False, True], [True, True]]
+    gate.update()
+    assert gate.alpha.tolist() == pytest.approx([0.4, 0.9])
+    gate.begin(np.array([0.1, 0.1]))  # the second fit
+    assert gate.alpha.tolist() == pytest.approx([0.4, 0.9])
+
+
+@pytest.mark.parametrize("config", [GateConfig(), GateConfig("static", 0.3, start="fitted")])
+def test_only_a_dynamic_gate_starts_fitted_and_only_if_asked_to(config: GateConfig) -> None:
+    gate = Gate(AGENTS, config)
+    before = gate.alpha.tolist()
+    gate.begin(np.array([0.1, 0.2]))
+    assert gate.alpha.tolist() == before
+
+
+def test_a_fitted_start_is_pooled_like_all_else() -> None:
+    gate = Gate(AGENTS, GateConfig(scope="pooled", start="fitted"))
+    gate.begin(np.array([0.1, 0.3]))
+    assert gate.alpha.tolist() == pytest.approx([0.2, 0.2])
+
+
 def test_refused_actions_are_logged_like_taken_ones() -> None:
     gate = Gate(AGENTS, GateConfig())
     run(gate, (0.4, 0.4))

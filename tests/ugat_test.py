@@ -25,6 +25,7 @@ from ugat_marl.controllers import controller_for
 from ugat_marl.effects import in_domain, load
 from ugat_marl.errors import CheckpointError, LogError, OptionError, ScenarioError, UnknownNameError
 from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.uncertainty import MethodName
 from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
@@ -127,6 +128,17 @@ def test_alpha_starts_infinite_and_then_is_the_mean_of_u(unbroken: Path) -> None
     assert rows[1, "gate/alpha"] == np.inf
     assert rows[1, "gate/acceptance"] == 1.0
     assert rows[2, "gate/alpha"] == pytest.approx(rows[1, "gate/mean_u"])
+
+
+def test_alpha_can_start_at_what_the_first_fit_expects(tmp_path: Path) -> None:
+    few = replace(
+        SMALL.ugat, pretrain_episodes=2, iterations=1, grounded_episodes=1,
+        gate=GateConfig(start="fitted"),
+    )  # fmt: skip
+    transfer(replace(SMALL, ugat=few), tmp_path / "run")
+    rows = {name: value for *_, name, value in Metrics.read(tmp_path / "run/metrics.parquet").rows}
+    assert rows["gate/alpha"] == pytest.approx(rows["mean_u_on_predictions"])
+    assert rows["gate/acceptance"] < 1.0
 
 
 @pytest.mark.parametrize(

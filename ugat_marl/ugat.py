@@ -185,6 +185,7 @@ def train_ugat(
         report = _fit(state, config, derive_seed(seed, "fit", i), run, i)
         if config.least_accuracy is not None:
             state.transform.gate.trust(report.trusted(config.least_accuracy))
+        state.transform.gate.begin(report.expected_u)
         _learn(state, grounded, config.grounded_episodes, seed, run, f"grounded, round {i + 1}")
         gate = _update_alpha(state, run)
         run.log("iteration", i + 1, _numbers(report, gate, state, probe))

@@ -211,6 +211,12 @@ class FitReport:
             )
         return tuple(sentence for sentence in found if sentence)
 
+    @property
+    def expected_u(self) -> Floats:
+        """Mean u to expect at the gate, per agent; of all agents where one has no held-out rows."""
+        known = self.mean_u_on_predictions
+        return np.where(np.isnan(known), np.nanmean(known), known)
+
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
         """Agents whose models may be obeyed, for `Gate.trust`; ``(agents,)``.
 

@@ -2,8 +2,9 @@
 
 A grounded action is taken where the inverse model's uncertainty u is below the threshold alpha. In
 UGAT alpha starts at infinity (everything is taken) and is then the mean of the u that were logged;
-a fixed alpha and an infinite one (GAT, no gate) are the paper's ablations. Where every u was 0,
-there is no uncertainty to gate by, and alpha stays infinite.
+it can start at the mean that the first fit leads to expect. A fixed alpha and an infinite one (GAT,
+no gate) are the paper's ablations. Where every u was 0, there is no uncertainty to gate by, and
+alpha stays infinite.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ugat_marl.errors import CheckpointError, OptionError
 
 MODES = ("infinite", "static", "dynamic")
 SCOPES = ("intersection", "pooled")
+STARTS = ("open", "fitted")
 
 
 @dataclass(frozen=True)
@@ -34,18 +36,23 @@ class GateConfig:
         static_alpha: Threshold in (0, 1], for mode "static".
         scope: One alpha per intersection, or one pooled over all.
         window_epochs: E, the number of epochs whose u enter the mean.
+        start: Alpha of "dynamic" before any u is logged: "open" is infinite, as in the paper;
+            "fitted" is the mean u of the first fit, of h's answers to what f predicts.
     """
 
     mode: Literal["infinite", "static", "dynamic"] = "dynamic"
     static_alpha: float = 0.5
     scope: Literal["intersection", "pooled"] = "intersection"
     window_epochs: int = 20
+    start: Literal["open", "fitted"] = "open"
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
             raise OptionError(f"gate mode is {self.mode!r}; allowed: {', '.join(MODES)}")
         if self.scope not in SCOPES:
             raise OptionError(f"gate scope is {self.scope!r}; allowed: {', '.join(SCOPES)}")
+        if self.start not in STARTS:
+            raise OptionError(f"gate start is {self.start!r}; allowed: {', '.join(STARTS)}")
         if not 0.0 < self.static_alpha <= 1.0:
             raise OptionError(f"gate static_alpha is {self.static_alpha}; allowed: in (0, 1]")
         if self.window_epochs < 1:
@@ -115,6 +122,21 @@ class Gate:
         """
         self.trusted = np.asarray(agents, bool).copy()
 
+    def begin(self, mean_u: NDArray[np.float64]) -> None:
+        """Tells a gate that starts "fitted" what u to expect; later iterations have logged theirs.
+
+        Args:
+            mean_u: ``(agents,)`` means; where one is 0 there is nothing to gate by.
+        """
+        if self.config.mode != "dynamic" or self.config.start != "fitted" or self.iteration:
+            return
+        expected = np.full_like(mean_u, mean_u.mean()) if self._pooled else mean_u
+        self.alpha = np.where(expected > 0, expected, np.inf)
+
+    @property
+    def _pooled(self) -> bool:
+        return self.config.scope == "pooled"
+
     def accepts(
         self, u: NDArray[np.floating[Any]], permitted: NDArray[np.bool_] | None = None
     ) -> NDArray[np.bool_]:
@@ -167,7 +189,7 @@ class Gate:
             warnings.warn(report.warning, stacklevel=2)
         if self.config.mode == "dynamic" and self._epochs:
             total = np.sum(self._epochs, axis=0)
-            if self.config.scope == "pooled":
+            if self._pooled:
                 total = np.broadcast_to(total.sum(1, keepdims=True), total.shape)
             self.alpha = np.divide(total[0], total[1], out=self.alpha.copy(), where=total[0] > 0)
         self._counts = np.zeros_like(self._counts)

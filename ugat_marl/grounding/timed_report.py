@@ -83,6 +83,11 @@ class TimedReport:
             found.append(f"u does not rise off the data (AUROC {self.inverse.auroc_off_data:.2f})")
         return tuple(sentence for sentence in found if sentence)
 
+    @property
+    def expected_u(self) -> Floats:
+        """Mean u to expect at the gate, per agent: that of h on its held-out states."""
+        return np.full(len(self.agents), self.inverse.mean_u)
+
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
         """Agents whose h may be obeyed, for `Gate.trust`; the others take the best constant.
 

@@ -126,11 +126,13 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
     full = GROUNDED_NAME[name]
     static = replace(base, gate=replace(base.gate, mode="static", static_alpha=0.5))
     ungated = replace(base, gate=replace(base.gate, mode="infinite"))
+    fitted = replace(base, gate=replace(base.gate, start="fitted"))
     plain = replace(ungated, fit=replace(base.fit, uncertainty="none"))
     proven = replace(base, least_accuracy=0.0)
     return [
         Setting(full, "grounded", ugat=base),
         Setting(f"{full}: α = 0.5", "grounded", ugat=static),
+        Setting(f"{full}: α from the first fit on", "grounded", ugat=fitted),
         Setting(f"{full}: no gate", "grounded", ugat=ungated),
         Setting(f"{full}: no uncertainty (GAT)", "grounded", ugat=plain),
         *(
