@@ -43,6 +43,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("commands.export:Export", "a trained policy as TorchScript, ONNX or matrices"),
     "check": ("commands.check:Check", "is a scenario sound, its environment conformant?"),
     "scenarios": ("commands.scenarios:Scenarios", "the networks and domains that can be named"),
+    "domains": ("commands.domains:Domains", "the named domains: gap, effects, counterpart"),
     "paper main": ("commands.paper:Main", "UGAT and every control, with intervals over seeds"),
     "paper ablation": ("commands.paper:Ablation", "UGAT without its parts"),
     "paper alpha": ("commands.paper:Alpha", "static thresholds against the dynamic one"),

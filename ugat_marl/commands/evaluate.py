@@ -11,12 +11,19 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.commands.arguments import Ray, workers_of
-from ugat_marl.effects import load
-from ugat_marl.errors import OptionError
+from ugat_marl.effects import NAMED, load, spelled_out
+from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.evaluation import evaluate, policy_factory
 from ugat_marl.files import require_writable
+from ugat_marl.gap_matrix import gaps_of
 from ugat_marl.progress import Bars
+from ugat_marl.report.gap_tables import hidden_tables, matrix_table
 from ugat_marl.report.tables import measures_table
+from ugat_marl.scenario import Scenario
+from ugat_marl.traffic_env import parallel_env
+
+MOST_IN_DETAIL = 8
+"""More domains than these, named ones among them, are shown as a matrix of controllers and gaps."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +33,14 @@ class Evaluate:
     Examples:
         ugat-marl evaluate single-v1 --policies largest-queue:20 max-pressure programme
         ugat-marl evaluate grid2x2-v1 --policies runs/demo/policies/ugat.pt --domains sim V4
+        ugat-marl evaluate single-v1 --domains all --seeds 1 --duration-s 900
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         policies: Rules (such as fixed-time:30, actuated:40, largest-queue:20, max-pressure:10,
             programme; docs/controllers.md has them all) and files of trained policies.
-        domains: Domains; gaps are taken against the first.
+        domains: Domains; gaps are taken against the first. "all" is sim and every named domain,
+            observation, action, transition or reward all of that gap: see ugat-marl domains.
         seeds: Number of episodes of each policy in each domain.
         first_seed: Seed of the first of them.
         duration_s: Length of an episode in s; default: the scenario's own.
@@ -63,21 +72,46 @@ class Evaluate:
             raise OptionError("--first-seed must not be negative")
         if self.seeds < 1 or (self.workers is not None and self.workers < 1):
             raise OptionError("--seeds and --workers must be at least 1")
+        scenario = load(self.scenario)
+        domains = self._domains(scenario, console)
         with workers_of(self.workers, self.ray) as workers:
             found = evaluate(
-                load(self.scenario),
+                scenario,
                 dict(zip(names_of(self.policies), map(policy_factory, self.policies), strict=True)),
-                self.domains,
+                domains,
                 range(self.first_seed, self.first_seed + self.seeds),
                 duration_s=self.duration_s,
                 workers=workers,
                 reporter=Bars(console),
             )
-        console.print(measures_table(found))
+        if len(domains) > MOST_IN_DETAIL and gaps_of(found):
+            console.print(matrix_table(found))
+        else:
+            console.print(measures_table(found))
+        for table in hidden_tables(found):
+            console.print(table)
         if self.out is not None:
             found.write(self.out)
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
+
+    def _domains(self, scenario: Scenario, console: Console) -> list[str]:
+        """The domains spelled out, without those of a list that the network does not allow."""
+        found: list[str] = []
+        for name in spelled_out(self.domains):
+            if name in NAMED and name not in self.domains and _may_not_fit(name):
+                try:
+                    parallel_env(scenario, name, duration_s=self.duration_s)
+                except ScenarioError as error:
+                    console.print(f"{name} is left out: {error}", style="dim", markup=False)
+                    continue
+            found.append(name)
+        return found
+
+
+def _may_not_fit(name: str) -> bool:
+    """Whether a named domain asks for something not every network has: a barrier, a long lane."""
+    return any(word in NAMED[name].effects for word in ("phase_order=barrier", "incident="))
 
 
 def names_of(policies: Sequence[str]) -> list[str]:

@@ -1,0 +1,96 @@
+"""``ugat-marl domains``: the worlds that have a name, by the gap they open."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Annotated
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+from tyro.conf import Positional, arg
+
+from ugat_marl.effects import ALIASES, GAPS, NAMED, NamedDomain
+from ugat_marl.errors import UnknownNameError
+
+_TITLES = {
+    "observation": "observation gap: controllers see something else",
+    "action": "action gap: something else becomes of commands",
+    "transition": "transition gap: traffic does something else",
+    "reward": "reward gap: something else is wanted",
+}
+
+
+@dataclass(frozen=True)
+class Domains:
+    """Lists the domains that have a name: their gap, effects, and counterpart in Sim2Signal.
+
+    Any of them, and any effect, goes together with others: V4+zone-50+counting_noise=0.1.
+
+    Examples:
+        ugat-marl domains
+        ugat-marl domains action
+        ugat-marl evaluate single-v1 --domains sim action --seeds 2
+
+    Attributes:
+        gap: observation, action, transition or reward.
+        json: Prints JSON instead of tables.
+    """
+
+    gap: Annotated[
+        Positional[str | None], arg(metavar="[GAP]", help_behavior_hint="(default: all four)")
+    ] = None
+    json: bool = False
+
+    def run(self, console: Console) -> int:
+        """Prints the lists."""
+        if self.gap is not None and self.gap not in GAPS:
+            raise UnknownNameError("gap", self.gap, GAPS)
+        listed = [item for item in NAMED.values() if self.gap in (None, item.gap)]
+        if self.json:
+            console.print_json(json.dumps([asdict(item) for item in listed]))
+            return 0
+        for gap in GAPS:
+            own = [item for item in listed if item.gap == gap]
+            if own:
+                console.print(_table(_TITLES[gap], own))
+                for line in _notes(own):
+                    console.print(Text(line, style="dim"))
+                console.print()
+        theirs = sum(bool(item.counterpart) for item in listed)
+        console.print(
+            f"{len(listed)} domains, {theirs} with a counterpart in Sim2Signal (arXiv:2609.01676). "
+            "Effects and their units: docs/effects.md, docs/gaps.md",
+            markup=False,
+        )
+        return 0
+
+
+def _table(title: str, domains: list[NamedDomain]) -> Table:
+    table = Table(
+        box=box.SIMPLE_HEAD, title=Text(title), title_justify="left", pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )  # fmt: skip
+    table.add_column("domain", no_wrap=True)
+    table.add_column("effects", overflow="fold")
+    table.add_column("Sim2Signal", max_width=21, overflow="fold")
+    aliases = {name: alias for alias, name in ALIASES.items()}
+    for item in domains:
+        alias = f" ({aliases[item.name]})" if item.name in aliases else ""
+        effects = item.effects.replace("+", " + ")
+        table.add_row(Text(item.name + alias), Text(effects), Text(item.counterpart))
+    return table
+
+
+def _notes(domains: list[NamedDomain]) -> list[str]:
+    """What there is to say of some of them, each thing once."""
+    said: dict[str, list[str]] = {}
+    for item in domains:
+        if item.note:
+            said.setdefault(item.note, []).append(item.name)
+    return [
+        f"{names[0]}{f' to {names[-1]}' if len(names) > 1 else ''}: {note}"
+        for note, names in said.items()
+    ]
