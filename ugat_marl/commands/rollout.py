@@ -1,31 +1,61 @@
-"""``ugat-marl rollout``: record transitions of any policy in any domain."""
+"""``ugat-marl rollout``: record transitions of any policy in any domain, or film it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 from rich.console import Console
 from tyro.conf import Positional, arg
 
+from ugat_marl.commands.evaluate import names_of
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import policy_factory
 from ugat_marl.files import require_writable
+from ugat_marl.filming import Film, Frame, film, frames, require_video, write_video
 from ugat_marl.progress import Bars
 from ugat_marl.rollout import Exploring, observer_of, roll_out
+from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
 from ugat_marl.traffic_env import parallel_env
 from ugat_marl.transitions import TransitionLog
 
 
 @dataclass(frozen=True)
+class VideoConfig:
+    """What of an episode is filmed.
+
+    Attributes:
+        from_s: Where it begins, in s from the beginning of the episode.
+        length_s: How long it is, in s of traffic.
+        speed: Seconds of traffic per second of video; one frame is one second of traffic.
+        size: Longer side of the picture of a network, in pixels.
+    """
+
+    from_s: float = 600.0
+    length_s: float = 300.0
+    speed: int = 10
+    size: int = 800
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.speed <= 100:
+            raise OptionError(f"film.speed = {self.speed}: must be from 1 to 100")
+        if not 200 <= self.size <= 4000:
+            raise OptionError(f"film.size = {self.size}: must be from 200 to 4000")
+
+
+@dataclass(frozen=True)
 class Rollout:
-    """Records transitions, for `train --real-log` or for study.
+    """Records transitions, for `train --real-log` or for study, or films an episode.
 
     Examples:
         ugat-marl rollout single-v1 --domain V4 --policy largest-queue:20 --out v4.parquet
+        ugat-marl rollout grid4x4-v1 --domain V4 --policy max-pressure:20 --video out.mp4
+        ugat-marl rollout grid2x2-v1 --domain V4 --policy runs/first/policies/direct-transfer.pt
+        --beside runs/first/policies/ugat.pt --video before-after.gif
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
@@ -39,10 +69,14 @@ class Rollout:
         neighbours: How many roads away intersections are recorded too.
         duration_s: Length of an episode in s; default: the scenario's own.
         crossings: Also record when vehicles cross the stop lines: timed grounding reads it.
+        video: Video to write: .mp4 (needs ffmpeg: pip install 'ugat-marl[video]'), .webp or .gif
+            (need nothing). It is of an episode of its own, without random phases.
+        beside: A second policy, filmed beside the first in the same episode.
+        film: What of the episode is filmed.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
-    out: Path
+    out: Path | None = None
     policy: str = "largest-queue:20"
     domain: str = "sim"
     episodes: int = 3
@@ -52,13 +86,31 @@ class Rollout:
     neighbours: int = 0
     duration_s: float | None = None
     crossings: bool = False
+    video: Path | None = None
+    beside: str | None = None
+    film: VideoConfig = field(default_factory=VideoConfig)
 
     def run(self, console: Console) -> int:
-        """Records and writes."""
+        """Records, films and writes."""
         if self.episodes < 1 or not 0 <= self.epsilon <= 1:
             raise OptionError("--episodes must be at least 1 and --epsilon from 0 to 1")
-        require_writable(self.out)
+        if self.out is None and self.video is None:
+            raise OptionError("nothing to write: give --out FILE.parquet, --video FILE, or both")
+        if self.beside is not None and self.video is None:
+            raise OptionError("--beside needs --video, which shows both policies")
+        for path in (self.out, self.video):
+            if path is not None:
+                require_writable(path)
+        if self.video is not None:
+            require_video(self.video)
         scenario = load(self.scenario)
+        if self.out is not None:
+            self._record(scenario, self.out, console)
+        if self.video is not None:
+            self._film(scenario, self.video, console)
+        return 0
+
+    def _record(self, scenario: Scenario, out: Path, console: Console) -> None:
         probe = parallel_env(scenario, self.domain, duration_s=self.duration_s)
         policy = policy_factory(self.policy)(probe)
         observer = observer_of(probe, self.observation, self.neighbours)
@@ -76,6 +128,38 @@ class Rollout:
         finally:
             env.close()
         log = TransitionLog.concatenate(logs)
-        log.write(self.out)
-        console.print(f"{len(log)} transitions: {self.out}", soft_wrap=True)
-        return 0
+        log.write(out)
+        console.print(f"{len(log)} transitions: {out}", soft_wrap=True)
+
+    def _film(self, scenario: Scenario, video: Path, console: Console) -> None:
+        specs = [self.policy, *([self.beside] if self.beside is not None else [])]
+        names = names_of(specs) if len(set(specs)) > 1 else specs
+        films: list[Film] = []
+        with Bars(console).task(f"filming in {self.domain}", len(specs)) as advance:
+            for spec, name in zip(specs, names, strict=True):
+                films.append(self._filmed(scenario, spec, name))
+                advance()
+        count = len(films[0].scenes)
+        with Bars(console).task(f"writing {video.name}", count) as advance:
+
+            def counted() -> Iterator[Frame]:
+                for picture in frames(films, self.film.size):
+                    yield picture
+                    advance()
+
+            write_video(counted(), video, self.film.speed)
+        console.print(
+            f"{count} s of traffic in {count / self.film.speed:.0f} s of video: {video}",
+            soft_wrap=True,
+        )
+
+    def _filmed(self, scenario: Scenario, spec: str, name: str) -> Film:
+        probe = parallel_env(scenario, self.domain, duration_s=self.duration_s)
+        policy = policy_factory(spec)(probe)
+        options = {"duration_s": self.duration_s, **policy.env_options}
+        env = parallel_env(scenario, self.domain, **options)
+        seed = derive_seed(self.seed, "rollout", 0)
+        try:
+            return film(env, policy, seed, self.film.from_s, self.film.length_s, name)
+        finally:
+            env.close()
