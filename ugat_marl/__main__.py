@@ -65,7 +65,16 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "is the learner as good as the best rule where it was trained?",
     ),
     "bench memory": ("bench.memory:MemoryBench", "memory over many resets"),
-    "bench all": ("bench.everything:AllBench", "all but strength"),
+    "bench scale": (
+        "bench.scale:ScaleBench",
+        "many simulations, large networks, processes that die",
+    ),
+    "bench all": ("bench.everything:AllBench", "all but strength and scale"),
+}
+
+SHORT: dict[str, tuple[str, ...]] = {
+    "scenarios": ("scenario", "list"),
+    "check": ("scenario", "check", "--conformance"),
 }
 
 USAGE_ERROR = 2

@@ -10,6 +10,7 @@ from ugat_marl.bench.fitting import FittingBench
 from ugat_marl.bench.learning import LearningBench
 from ugat_marl.bench.memory import MemoryBench
 from ugat_marl.bench.report import Report, Spread, Target
+from ugat_marl.bench.scale import ScaleBench
 from ugat_marl.bench.speed import EnvBench
 from ugat_marl.bench.strength import StrengthBench
 
@@ -20,6 +21,7 @@ __all__ = [
     "LearningBench",
     "MemoryBench",
     "Report",
+    "ScaleBench",
     "Spread",
     "StrengthBench",
     "Target",
