@@ -14,9 +14,6 @@ from ugat_marl.bench.measured import in_fresh_process
 from ugat_marl.bench.memory import growth_of
 from ugat_marl.bench.report import Report, Spread, Target, require_positive
 from ugat_marl.errors import MeasurementError, OptionError
-from ugat_marl.networks.making import make_scenario
-from ugat_marl.networks.regular import rectangle
-from ugat_marl.networks.walks import turning
 from ugat_marl.progress import Reporter, Silent
 
 _PROGRAM = ["-m", "ugat_marl.bench.scale_work"]
@@ -276,6 +273,11 @@ class ScaleBench:
         return in_fresh_process(_PROGRAM, told)
 
     def _grid(self, folder: Path, side: int, reporter: Reporter) -> Path:
+        # Only two parts need grids, and all that makes networks takes a while to load.
+        from ugat_marl.networks.making import make_scenario
+        from ugat_marl.networks.regular import rectangle
+        from ugat_marl.networks.walks import turning
+
         target = folder / f"grid{side}x{side}"
         length_s = 10.0 * (self.settled + self.decisions + 1)
         make_scenario(
