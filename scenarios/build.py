@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from demand import draw_demand
-from roads import convert, plain_xml, read_plan
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
+from ugat_marl.networks.plan import convert, plain_xml, read_plan
 
 HERE = Path(__file__).resolve().parent
 BEGIN, END = "<!-- headroom: begin -->\n", "<!-- headroom: end -->\n"

@@ -7,15 +7,15 @@ a walk that would pass a junction twice is drawn again.
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from roads import Plan, Road
 
 from ugat_marl.files import xml_bytes
+from ugat_marl.networks.plan import Plan, Road
+from ugat_marl.networks.walks import arrivals, pick
 from ugat_marl.seeding import numpy_generator
 
 
@@ -42,9 +42,9 @@ def draw_demand(
         first = next(road for road in plan.roads.values() if road.start == entry)
         number = 0
         for part, factor in enumerate(profile):
-            for moment in _arrivals(random, flow["vph"] * factor / 3600, bin_s):
+            for moment in arrivals(random, flow["vph"] * factor / 3600, bin_s):
                 route = _walk(plan, first, demand["turns"], random)
-                kind = _pick(demand["types"], random)
+                kind = pick(demand["types"], random)
                 trips.append((part * bin_s + moment, f"{entry}_{number}", route, kind))
                 number += 1
     root = ET.Element("routes")
@@ -59,18 +59,6 @@ def draw_demand(
     return xml_bytes(root)
 
 
-def _arrivals(random: np.random.Generator, rate_per_s: float, length_s: float) -> list[float]:
-    """Poisson arrivals in [0, length_s)."""
-    found: list[float] = []
-    moment = 0.0
-    while rate_per_s > 0:
-        moment -= math.log(1.0 - float(random.random())) / rate_per_s
-        if moment >= length_s:
-            break
-        found.append(moment)
-    return found
-
-
 def _walk(
     plan: Plan, first: Road, turns: Mapping[str, Any], random: np.random.Generator
 ) -> list[str]:
@@ -82,21 +70,11 @@ def _walk(
             served = {turn for lane in road.lanes for turn in lane}
             shares = turns.get(road.id, turns["default"])
             exits = plan.exits(road)
-            turn = _pick({t: shares[t] for t in ("l", "s", "r") if t in served}, random)
+            turn = pick({t: shares[t] for t in ("l", "s", "r") if t in served}, random)
             road = exits[turn]
             route.append(road.id)
         if road.end not in passed:
             return route
-
-
-def _pick(shares: Mapping[str, float], random: np.random.Generator) -> str:
-    """A key of `shares`, with probability proportional to its value."""
-    mark = float(random.random()) * sum(shares.values())
-    for name, share in shares.items():
-        mark -= share
-        if mark < 0:
-            return name
-    return next(reversed(list(shares)))
 
 
 def _vehicle_types(demand: Mapping[str, Any], vehicles: Mapping[str, Any]) -> list[ET.Element]:

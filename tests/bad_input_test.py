@@ -258,7 +258,7 @@ CASES = [
     Case(
         "a route over an edge that does not exist",
         replaced(ROUTES, "W_C C_E", "W_C C_Q"),
-        (r"demand\.rou\.xml: <route id='east'>", "'C_Q'", "made for another network"),
+        (r"demand\.rou\.xml, line \d+: <route id='east'>", "'C_Q'", "made for another network"),
     ),
     Case(
         "no vehicles",

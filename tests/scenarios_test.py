@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.metadata
 import math
 import os
@@ -20,6 +19,7 @@ import pytest
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.headroom import Row, headroom, markdown
 from ugat_marl.network import Network
+from ugat_marl.networks.plan import Plan, convert, plain_xml, read_plan
 from ugat_marl.scenario import load_scenario, shipped_scenarios
 
 FOLDER = Path(__file__).resolve().parent.parent / "scenarios"
@@ -290,10 +290,8 @@ def test_headroom_of_nothing_is_refused() -> None:
         headroom(load_scenario("single-v1"), ["sim"], (), [0])
 
 
-def plan(monkeypatch: pytest.MonkeyPatch, there: list[str], beyond: list[str]) -> tuple[Any, Any]:
-    """The module `roads` and a plan of two roads in a row, ``A_j`` and ``j_B``, and one south."""
-    monkeypatch.syspath_prepend(str(FOLDER))
-    roads = importlib.import_module("roads")
+def plan(there: list[str], beyond: list[str]) -> Plan:
+    """Two roads in a row, ``A_j`` and ``j_B``, and one south."""
     table = {
         "junctions": {"j": [0, 0]},
         "ends": {"A": [-100, 0], "B": [100, 0], "C": [0, -100]},
@@ -303,11 +301,11 @@ def plan(monkeypatch: pytest.MonkeyPatch, there: list[str], beyond: list[str]) -
             {"between": ["C", "j"], "there": ["rl"], "back": [""]},
         ],
     }
-    return roads, roads.read_plan(table)
+    return read_plan(table)
 
 
-def test_builder_connects_lanes_by_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, found = plan(monkeypatch, ["r", "s"], ["", "", ""])
+def test_builder_connects_lanes_by_turn() -> None:
+    found = plan(["r", "s"], ["", "", ""])
     links = [(a, road.id, b) for a, road, b in found.connections(found.roads["A_j"])]
     assert links == [(0, "j_C", 0), (1, "j_B", 0), (1, "j_B", 1), (1, "j_B", 2)]
     links = [(a, road.id, b) for a, road, b in found.connections(found.roads["C_j"])]
@@ -322,14 +320,14 @@ def test_builder_connects_lanes_by_turn(monkeypatch: pytest.MonkeyPatch) -> None
     ],
 )
 def test_builder_refuses_impossible_lanes(
-    monkeypatch: pytest.MonkeyPatch, there: list[str], beyond: list[str], message: str
+    there: list[str], beyond: list[str], message: str
 ) -> None:
-    _, found = plan(monkeypatch, there, beyond)
+    found = plan(there, beyond)
     with pytest.raises(ScenarioError, match=message):
         found.connections(found.roads["A_j"])
 
 
-def test_builder_passes_on_what_netconvert_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    roads, found = plan(monkeypatch, ["sr"], [""])
+def test_builder_passes_on_what_netconvert_says() -> None:
+    found = plan(["sr"], [""])
     with pytest.raises(ScenarioError, match="no-such-option"):
-        roads.convert(roads.plain_xml(found, 13.9), {"no-such-option": 1})
+        convert(plain_xml(found, 13.9), {"no-such-option": 1})

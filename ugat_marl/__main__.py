@@ -41,8 +41,22 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "where a simulation and measured data disagree, and why",
     ),
     "export": ("commands.export:Export", "a trained policy as TorchScript, ONNX or matrices"),
-    "check": ("commands.check:Check", "is a scenario sound, its environment conformant?"),
-    "scenarios": ("commands.scenarios:Scenarios", "the networks and domains that can be named"),
+    "scenario list": (
+        "commands.scenario_list:ScenarioList",
+        "the networks and domains that can be named",
+    ),
+    "scenario new": (
+        "commands.scenario_new:ScenarioNew",
+        "a scenario from any road network and demand",
+    ),
+    "scenario check": (
+        "commands.scenario_check:ScenarioCheck",
+        "what a controller will face; is it sound?",
+    ),
+    "scenario draw": (
+        "commands.scenario_draw:ScenarioDraw",
+        "every intersection with its phases, as pictures",
+    ),
     "domains": ("commands.domains:Domains", "the named domains: gap, effects, counterpart"),
     "paper main": ("commands.paper:Main", "UGAT and every control, with intervals over seeds"),
     "paper ablation": ("commands.paper:Ablation", "UGAT without its parts"),
@@ -76,6 +90,7 @@ SHORT: dict[str, tuple[str, ...]] = {
     "scenarios": ("scenario", "list"),
     "check": ("scenario", "check", "--conformance"),
 }
+"""Short names of commands, and what they stand for."""
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
@@ -112,6 +127,7 @@ def _run(given: list[str], console: Console) -> int:
 
         console.print(f"ugat-marl {__version__}")
         return 0
+    given = [*SHORT.get(given[0], (given[0],)), *given[1:]]
     name, rest = given[0], given[1:]
     if parts := {key.split()[1] for key in COMMANDS if key.startswith(f"{name} ")}:
         if not rest or rest[0] in ("-h", "--help"):
@@ -121,7 +137,7 @@ def _run(given: list[str], console: Console) -> int:
             raise UnknownNameError(name, rest[0], parts)
         name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in COMMANDS:
-        names = {key.split()[0] for key in COMMANDS}
+        names = {*(key.split()[0] for key in COMMANDS), *SHORT}
         raise UnknownNameError("command", name, names, "ugat-marl --help explains them.")
     command = _parse(name, rest)
     if name.startswith("bench "):
@@ -223,9 +239,11 @@ def _print_help(console: Console, prefix: str = "") -> None:
             console.print(f"  {name.removeprefix(prefix):<15} {text}")
     console.print(f"\nugat-marl {prefix}COMMAND --help shows options and examples of a command.")
     if not prefix:
+        short = ", ".join(f"{name} = {' '.join(words)}" for name, words in SHORT.items())
+        console.print(f"Short: {short}.\n")
         console.print(
             "A first try:\n\n"
-            "  ugat-marl scenarios\n"
+            "  ugat-marl scenario list\n"
             "  ugat-marl evaluate single-v1 --domains sim V4 --seeds 2\n"
             "  ugat-marl train grid2x2-v1 --real V4"
         )

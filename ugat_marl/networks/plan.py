@@ -1,15 +1,13 @@
-"""A road network described in a few lines of TOML, and the SUMO network made from it.
+"""A road network described in a few lines, and the SUMO network made from it.
 
-`source.toml` of a scenario names either a grid or single junctions and roads. The lanes of an
-approach are listed from the kerb to the middle of the road, each with the turns it serves at the
-junction ahead: ``["sr", "l"]`` is a lane for straight on and right beside a lane for left.
+The `source.toml` of a shipped scenario names either a grid or single junctions and roads. The lanes
+of an approach are listed from the kerb to the middle of the road, each with the turns it serves at
+the junction ahead: ``["sr", "l"]`` is a lane for straight on and right beside a lane for left.
 """
 
 from __future__ import annotations
 
 import math
-import re
-import subprocess
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
@@ -17,10 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import sumo
-
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import xml_bytes
+from ugat_marl.networks.programs import netconvert
 
 TURNS = {"l": "left", "s": "straight", "r": "right"}
 STRAIGHT_WITHIN_DEG = 45.0
@@ -105,7 +102,7 @@ class Plan:
 def read_plan(source: Mapping[str, Any]) -> Plan:
     """The plan in a parsed `source.toml`, from its table ``grid`` or ``junctions``/``roads``."""
     if "grid" in source:
-        return _grid(**source["grid"])
+        return grid(**source["grid"])
     nodes = {
         id_: Node(id_, *map(float, place), signal=kind == "junctions")
         for kind in ("junctions", "ends")
@@ -122,7 +119,7 @@ def read_plan(source: Mapping[str, Any]) -> Plan:
     return Plan(nodes, roads)
 
 
-def _grid(
+def grid(
     columns: int,
     rows: int,
     spacing_m: float,
@@ -130,8 +127,17 @@ def _grid(
     east_west: Sequence[str],
     north_south: Sequence[str],
 ) -> Plan:
-    """Junctions A1 (south-west), B1, ... A2, ...; ends west1, east1, ..., southA, northA, ..."""
-    letters = [chr(ord("A") + column) for column in range(columns)]
+    """Junctions A1 (south-west), B1, ... A2, ...; ends west1, east1, ..., southA, northA, ...
+
+    Args:
+        columns: Junctions from west to east.
+        rows: Junctions from south to north.
+        spacing_m: Between neighbours.
+        entry_m: Length of the roads into the network.
+        east_west: Lanes of the roads along the rows, kerb first, each with its turns.
+        north_south: Those of the roads along the columns.
+    """
+    letters = [_column(number) for number in range(columns)]
     nodes: dict[str, Node] = {}
     roads: dict[str, Road] = {}
 
@@ -156,6 +162,12 @@ def _grid(
         north = Node(f"north{letter}", x, height + entry_m, False)
         add([south, *inner, north], tuple(north_south))
     return Plan(nodes, roads)
+
+
+def _column(number: int) -> str:
+    """A to Z, then AA, AB, ..., as in a spreadsheet."""
+    rest, last = divmod(number, 26)
+    return (_column(rest - 1) if rest else "") + chr(ord("A") + last)
 
 
 def plain_xml(plan: Plan, speed_mps: float) -> dict[str, bytes]:
@@ -192,19 +204,18 @@ def convert(documents: Mapping[str, bytes], options: Mapping[str, Any]) -> bytes
         ScenarioError: netconvert refused or warned; holds its words.
     """
     with tempfile.TemporaryDirectory() as folder:
-        output = Path(folder) / "network.net.xml"
-        command = [str(Path(sumo.SUMO_HOME) / "bin" / "netconvert")]
+        arguments: list[str] = []
         for option, document in documents.items():
             file = Path(folder) / f"{option.strip('-')}.xml"
             file.write_bytes(document)
-            command += [option, str(file)]
-        command += ["--output-file", str(output), "--no-turnarounds", "true"]
-        command += ["--offset.disable-normalization", "true"]
+            arguments += [option, str(file)]
+        arguments += ["--no-turnarounds", "true", "--offset.disable-normalization", "true"]
         for name, value in options.items():
-            command += [f"--{name}", str(value).lower() if isinstance(value, bool) else str(value)]
-        environment = {"SUMO_HOME": str(sumo.SUMO_HOME)}
-        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-        if done.returncode or "Warning" in done.stderr:
-            raise ScenarioError(f"netconvert: {done.stderr.strip()}")
-        text = output.read_text(encoding="utf-8")
-    return re.sub(r"<!--.*?-->\s*", "", text, count=1, flags=re.DOTALL).encode()
+            arguments += [
+                f"--{name}",
+                str(value).lower() if isinstance(value, bool) else str(value),
+            ]
+        output = Path(folder) / "network.net.xml"
+        if warnings := netconvert(arguments, output):
+            raise ScenarioError(f"netconvert: {warnings}")
+        return output.read_bytes()

@@ -1,4 +1,4 @@
-"""``ugat-marl scenarios``: what networks there are."""
+"""``ugat-marl scenario list``: what networks there are."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ugat_marl.scenario import resco_maps, shipped_scenarios
 
 
 @dataclass(frozen=True)
-class Scenarios:
+class ScenarioList:
     """Lists the scenarios and domains that can be named.
 
     Examples:
-        ugat-marl scenarios
+        ugat-marl scenario list
     """
 
     def run(self, console: Console) -> int:

@@ -1,0 +1,252 @@
+"""OpenStreetMap extracts: a town written by hand, as XML, packed, and as protocol buffers."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.__main__ import main
+from ugat_marl.files import parse_xml
+from ugat_marl.network import Network
+from ugat_marl.networks.osm_pbf import pbf_to_xml
+from ugat_marl.networks.survey import survey
+from ugat_marl.progress import Silent
+from ugat_marl.scenario import Scenario, load_scenario
+
+TOWN = Path(__file__).parent / "data" / "town.osm"
+
+
+def made(target: Path, osm: Path, *words: str) -> int:
+    call = ["scenario", "new", str(target), "--osm", str(osm), "--vph", "200", *words]
+    return main([*call, "--duration-s", "600"])
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
+    target = tmp_path_factory.mktemp("osm") / "town"
+    assert made(target, TOWN) == 0
+    return load_scenario(target)
+
+
+def test_the_dual_carriageway_has_one_light(town: Scenario) -> None:
+    """Its crossroads is mapped as two signalled nodes, 16 m apart."""
+    network = Network.read(town)
+    assert [item.id for item in network.intersections] == ["9", "cluster_2_5"]
+    cluster = network.intersection("cluster_2_5")
+    assert {link.junction for link in cluster.links} == {"cluster_2_5"}
+    assert len({link.from_edge for link in cluster.links}) == 4
+    assert len(cluster.incoming_lanes) == 6
+
+
+def test_a_light_at_a_crossing_is_no_agent(town: Scenario) -> None:
+    assert Network.read(town).uncontrolled == ("8",)
+
+
+def test_the_roundabout_is_one(town: Scenario) -> None:
+    roundabouts = list(town.network.parse().iter("roundabout"))
+    assert len(roundabouts) == 1
+    assert len(roundabouts[0].get("edges", "").split()) == 5
+
+
+def test_a_footbridge_is_no_junction(town: Scenario) -> None:
+    root = town.network.parse()
+    west = [edge for edge in root.iter("edge") if (edge.get("id") or "").startswith("1001#")]
+    assert len(west) == 2  # the carriageway is cut at the crossroads alone
+    kinds = {edge.get("type") for edge in root.iter("edge")} - {None}
+    assert kinds == {"highway.primary", "highway.secondary"}
+
+
+def test_phases_serve_everybody(town: Scenario) -> None:
+    facts = survey(town)
+    assert all(not item.unserved_links for item in facts.intersections)
+    assert all(len(item.phases) >= 4 for item in facts.intersections)
+
+
+def test_the_licence_is_named(town: Scenario) -> None:
+    assert town.network.path is not None
+    text = (town.network.path.parent / "README.md").read_text()
+    assert "OpenStreetMap contributors" in text
+    assert "4 lights in the extract make 3 in the network" in text
+
+
+def test_packed_extracts_make_the_same_network(town: Scenario, tmp_path: Path) -> None:
+    packed = tmp_path / "Stadt, süd.osm.gz"
+    packed.write_bytes(gzip.compress(TOWN.read_bytes()))
+    assert made(tmp_path / "a", packed) == 0
+    assert load_scenario(tmp_path / "a").network.read() == town.network.read()
+
+
+# --- protocol buffers -----------------------------------------------------------------------------
+
+
+def varint(value: int) -> bytes:
+    value &= (1 << 64) - 1
+    out = b""
+    while value > 127:
+        out += bytes([value & 127 | 128])
+        value >>= 7
+    return out + bytes([value])
+
+
+def field(number: int, value: int | bytes) -> bytes:
+    if isinstance(value, int):
+        return varint(number << 3) + varint(value)
+    return varint(number << 3 | 2) + varint(len(value)) + value
+
+
+def zigzag(value: int) -> int:
+    return value << 1 if value >= 0 else (-value << 1) - 1
+
+
+def steps(values: list[int]) -> bytes:
+    return b"".join(varint(zigzag(b - a)) for a, b in zip([0, *values], values, strict=False))
+
+
+def blob(kind: bytes, content: bytes) -> bytes:
+    packed = field(2, len(content)) + field(3, zlib.compress(content))
+    header = field(1, kind) + field(3, len(packed))
+    return struct.pack(">I", len(header)) + header + packed
+
+
+def as_pbf(osm: Path, *, dense: bool) -> bytes:
+    """An extract packed as the wiki describes the format."""
+    root = parse_xml(osm.read_bytes(), "osm")
+    texts: list[str] = [""]
+
+    def number(text: str) -> int:
+        if text not in texts:
+            texts.append(text)
+        return texts.index(text)
+
+    def tags(item: object) -> list[tuple[int, int]]:
+        return [(number(tag.get("k")), number(tag.get("v"))) for tag in item.iter("tag")]  # type: ignore[attr-defined]
+
+    def place(text: str | None) -> int:
+        return round(float(text or 0) * 1e7)
+
+    nodes = list(root.iter("node"))
+    if dense:
+        keys = b"".join(
+            b"".join(varint(k) + varint(v) for k, v in tags(node)) + b"\0" for node in nodes
+        )
+        columns = [steps([int(node.get("id", "")) for node in nodes])]
+        columns += [steps([place(node.get(key)) for node in nodes]) for key in ("lat", "lon")]
+        fields = zip((1, 8, 9, 10), [*columns, keys], strict=True)
+        group = field(2, b"".join(field(n, content) for n, content in fields))
+    else:
+        group = b""
+        for node in nodes:
+            pairs = tags(node)
+            content = field(1, zigzag(int(node.get("id", ""))))
+            content += field(2, b"".join(varint(k) for k, _ in pairs))
+            content += field(3, b"".join(varint(v) for _, v in pairs))
+            content += field(8, zigzag(place(node.get("lat"))))
+            group += field(1, content + field(9, zigzag(place(node.get("lon")))))
+    ways = b""
+    for way in root.iter("way"):
+        pairs = tags(way)
+        content = field(1, int(way.get("id", ""))) + field(2, b"".join(varint(k) for k, _ in pairs))
+        content += field(3, b"".join(varint(v) for _, v in pairs))
+        ways += field(
+            3, content + field(8, steps([int(nd.get("ref", "")) for nd in way.iter("nd")]))
+        )
+    table = b"".join(field(1, text.encode()) for text in texts)
+    block = field(1, table) + field(2, group) + field(2, ways)
+    return blob(b"OSMHeader", field(4, b"OsmSchema-V0.6")) + blob(b"OSMData", block)
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_protocol_buffers_make_the_same_network(
+    dense: bool, town: Scenario, tmp_path: Path
+) -> None:
+    (tmp_path / "town.osm.pbf").write_bytes(as_pbf(TOWN, dense=dense))
+    assert made(tmp_path / "a", tmp_path / "town.osm.pbf") == 0
+    assert load_scenario(tmp_path / "a").network.read() == town.network.read()
+
+
+def test_relations_are_unpacked(tmp_path: Path) -> None:
+    table = b"".join(field(1, text) for text in (b"", b"via", b"type", b"restriction <&>"))
+    content = field(1, 5) + field(2, varint(2)) + field(3, varint(3)) + field(8, varint(1) * 2)
+    content += field(9, steps([7, 4])) + field(10, varint(0) + varint(1))
+    block = field(1, table) + field(2, field(4, content))
+    (tmp_path / "x.pbf").write_bytes(blob(b"OSMData", block))
+    pbf_to_xml(tmp_path / "x.pbf", tmp_path / "x.osm", Silent())
+    (relation,) = parse_xml((tmp_path / "x.osm").read_bytes(), "x").iter("relation")
+    assert [dict(item.attrib) for item in relation] == [
+        {"type": "node", "ref": "7", "role": "via"},
+        {"type": "way", "ref": "4", "role": "via"},
+        {"k": "type", "v": "restriction <&>"},
+    ]
+
+
+def other_packing() -> bytes:
+    packed = field(2, 4) + field(4, b"lzma")
+    header = field(1, b"OSMData") + field(3, len(packed))
+    return struct.pack(">I", len(header)) + header + packed
+
+
+def bomb() -> bytes:
+    return blob(b"OSMData", bytes(40 << 20))
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (as_pbf(TOWN, dense=True)[:-30], "damaged (cut short)"),
+        (b"<osm/>" * 9, "not an OpenStreetMap .pbf"),
+        (other_packing(), "osmium cat bad.pbf -o extract.osm.gz"),
+        (bomb(), "unpacks to more than the format allows"),
+    ],
+    ids=["cut", "no pbf", "other packing", "bomb"],
+)
+def test_protocol_buffers_that_are_wrong(
+    content: bytes, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.pbf").write_bytes(content)
+    assert made(tmp_path / "a", tmp_path / "bad.pbf") == 2
+    assert says in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.pbf"]
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+NO_LIGHTS = TOWN.read_text().replace("traffic_signals", "none")
+NO_ROADS = TOWN.read_text().replace('k="highway" v="primary"', 'k="x" v="y"').replace(
+    'k="highway" v="secondary"', 'k="x" v="y"'
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (NO_LIGHTS, "bad.osm: no traffic light in it (no node with highway=traffic_signals)"),
+        (NO_ROADS, "bad.osm: no road for cars in it"),
+        ("<net>\n</net>", "line 1: an OpenStreetMap extract begins with <osm>, this with <net>"),
+        (TOWN.read_text()[:900], "bad.osm: not well-formed XML"),
+        ('<!DOCTYPE osm [<!ENTITY a "b">]><osm>&a;</osm>', "document types and entities"),
+        ('<!DOCTYPE osm SYSTEM "http://localhost/x"><osm/>', "document types and entities"),
+    ],
+    ids=["no lights", "no roads", "net", "cut", "entity", "external"],
+)
+def test_extracts_that_are_wrong(
+    content: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.osm").write_text(content)
+    assert made(tmp_path / "a", tmp_path / "bad.osm") == 2
+    assert says in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.osm"]
+
+
+def test_lights_can_be_guessed(tmp_path: Path) -> None:
+    (tmp_path / "dark.osm").write_text(NO_LIGHTS)
+    assert made(tmp_path / "a", tmp_path / "dark.osm", "--guess-signals") == 0
+    assert Network.read(load_scenario(tmp_path / "a")).intersections
+
+
+def test_other_files_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert made(tmp_path / "a", tmp_path / "city.shp") == 2
+    assert "give a file that ends in .osm" in capsys.readouterr().err

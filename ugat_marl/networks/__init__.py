@@ -1,0 +1,1 @@
+"""Road networks from anywhere: made, imported, looked at and drawn."""

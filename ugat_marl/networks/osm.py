@@ -1,0 +1,182 @@
+"""Streets from an OpenStreetMap extract the user has; nothing is downloaded.
+
+netconvert does the work, with the options that give signals a controller can use: junctions that
+are mapped as several nodes become one, signals mapped before a junction belong to it, and lights
+close to each other share one controller.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.files import Tag, chunks_of, parse_xml, read_bytes, write_whole
+from ugat_marl.junctions import foes_of, links_of
+from ugat_marl.networks.making import NETWORK, Draft, Roads
+from ugat_marl.networks.osm_pbf import pbf_to_xml
+from ugat_marl.networks.programs import netconvert
+from ugat_marl.networks.reading import scan
+from ugat_marl.phases import are_foes
+from ugat_marl.progress import Reporter
+from ugat_marl.redraw import sumo_program
+
+_ENDINGS = (".osm", ".osm.xml", ".osm.gz", ".osm.xml.gz", ".pbf")
+_FOR_CARS = frozenset(
+    {
+        "motorway", "motorway_link", "trunk", "trunk_link", "primary", "primary_link", "secondary",
+        "secondary_link", "tertiary", "tertiary_link", "unclassified", "residential",
+        "living_street", "service", "road",
+    }
+)  # fmt: skip
+_OPTIONS = (
+    "--geometry.remove", "--ramps.guess", "--roundabouts.guess",
+    "--junctions.join", "--junctions.join-dist", "15",
+    "--tls.guess-signals", "--tls.guess-signals.dist", "30",
+    "--tls.join", "--tls.join-dist", "30",
+    "--tls.default-type", "static", "--tls.yellow.time", "3", "--tls.allred.time", "2",
+    "--remove-edges.isolated", "--keep-edges.by-vclass", "passenger",
+    "--no-turnarounds", "--junctions.corner-detail", "5", "--output.street-names",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Extract:
+    """What an extract holds for us.
+
+    Attributes:
+        roads: Ways for cars.
+        signals: Nodes with a traffic light.
+        walks: Those of them that are a crossing for people on foot, by their ids.
+    """
+
+    roads: int
+    signals: int
+    walks: frozenset[str]
+
+
+def from_osm(path: Path, *, guess: bool) -> Roads:
+    """The streets of an extract.
+
+    Args:
+        path: ``.osm``, ``.osm.gz`` or ``.pbf``.
+        guess: Whether netconvert may put lights at large junctions that have none in the extract.
+
+    Raises:
+        OptionError: Another kind of file, by its name.
+    """
+    if not path.name.lower().endswith(_ENDINGS):
+        raise OptionError(f"--osm {str(path)!r}: give a file that ends in {', '.join(_ENDINGS)}")
+
+    def roads(folder: Path, reporter: Reporter) -> Draft:
+        with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+            source = _as_xml(path, Path(name), reporter)
+            extract = _look(source, path, reporter)
+            if not extract.roads:
+                raise ScenarioError(
+                    f"{path}: no road for cars in it (no way with a highway=... tag)"
+                )
+            if not extract.signals and not guess:
+                raise ScenarioError(
+                    f"{path}: no traffic light in it (no node with highway=traffic_signals); "
+                    "--guess-signals puts some at large junctions"
+                )
+            notes = _convert(source, extract, folder / NETWORK, Path(name), guess=guess)
+        return Draft(
+            f"OpenStreetMap extract {path.name}",
+            f"Converted from `{path.name}` by SUMO's netconvert. © OpenStreetMap contributors; the "
+            "data are available under the Open Database Licence (openstreetmap.org/copyright).",
+            settings={"control": {"phases": "conflict-free"}},
+            notes=tuple(notes),
+        )
+
+    return roads
+
+
+def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
+    """The extract as XML that any program may read: unpacked, and under a plain name."""
+    plain = work / "extract.osm"
+    if path.name.lower().endswith(".pbf"):
+        pbf_to_xml(path, plain, reporter)
+        return plain
+    if path.suffix != ".gz":
+        return path
+    with plain.open("wb") as file:
+        for piece in chunks_of(path):
+            file.write(piece)
+    return plain
+
+
+def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
+    """Counts roads and lights; refuses entities before any other program sees the file."""
+    roads = signals = 0
+    walks: set[str] = set()
+    item: Tag | None = None
+    crossing = light = False
+    try:
+        for tag in scan(source, reporter):
+            if item is None and tag.name != "osm":
+                raise ScenarioError(
+                    f"{path}, line {tag.line}: an OpenStreetMap extract begins with <osm>, this "
+                    f"with <{tag.name}>"
+                )
+            if tag.name in ("osm", "node", "way", "relation"):
+                item, crossing, light = tag, False, False
+            elif tag.name == "tag" and item is not None:
+                key, value = tag.attributes.get("k"), tag.attributes.get("v")
+                roads += item.name == "way" and key == "highway" and value in _FOR_CARS
+                if item.name == "node" and key in ("highway", "crossing"):
+                    crossing |= key == "crossing" or value == "crossing"
+                    signals += value == "traffic_signals" and not light
+                    light |= value == "traffic_signals"
+                    if crossing and light:
+                        walks.add(item.attributes.get("id", ""))
+    except ScenarioError as error:
+        raise ScenarioError(str(error).replace(str(source), str(path))) from None
+    return _Extract(roads, signals, frozenset(walks))
+
+
+def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: bool) -> list[str]:
+    types = sumo_program("netconvert").parent.parent / "data/typemap/osmNetconvert.typ.xml"
+    arguments = ["--osm-files", str(source), "--type-files", str(types), *_OPTIONS]
+    if guess:
+        arguments.append("--tls.guess")
+    made = work / "made.net.xml"
+    netconvert(arguments, made)
+    # What is left of lights on plain roads, far from the junction they belong to, stops nobody's
+    # foes; those at crossings do stop the traffic for people on foot.
+    if idle := _idle_lights(made, extract.walks):
+        netconvert([*arguments, "--tls.unset", ",".join(idle)], made)
+    write_whole(out, made.read_bytes())
+    root = parse_xml(read_bytes(out), str(out))
+    lights = len(links_of(root))
+    notes = [
+        f"{extract.signals} lights in the extract make {lights} in the network, since those of one "
+        "junction share a controller"
+    ]
+    if idle:
+        notes.append(f"{len(idle)} lights on plain roads were left out")
+    if not lights:
+        raise ScenarioError(
+            f"{source}: none of its lights is at a road for cars; --guess-signals puts some at "
+            "large junctions"
+        )
+    return notes
+
+
+def _idle_lights(network: Path, walks: Iterable[str]) -> list[str]:
+    """Junctions of lights that no two streams contend for, without those at crossings."""
+    root = parse_xml(read_bytes(network), str(network))
+    foes = foes_of(root)
+    kept = set(walks)
+    found: list[str] = []
+    for links in links_of(root).values():
+        junctions = {link.junction for link in links}
+        contended = any(
+            are_foes(a, b, foes) and a.from_edge != b.from_edge for a in links for b in links
+        )
+        if not contended and not junctions & kept:
+            found += sorted(junctions)
+    return found

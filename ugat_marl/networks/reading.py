@@ -1,0 +1,117 @@
+"""Long files read piece by piece, with progress, and errors that name the line."""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import json
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import Tag, chunks_of, read_bytes, scan_xml
+from ugat_marl.progress import Reporter
+
+_LONG = 8 << 20
+"""Bytes from which reading a file is worth a bar."""
+_MOST = 32 << 20
+"""Characters of a single object; more are a file that is broken in the middle."""
+
+Pieces = Iterable[bytes]
+
+
+def scan(path: Path, reporter: Reporter) -> Iterator[Tag]:
+    """The elements of an XML file of any length.
+
+    Raises:
+        ScenarioError: As for `ugat_marl.files.scan_xml`.
+    """
+    with _progress(path, reporter) as counted:
+        yield from scan_xml(counted(chunks_of(path)), str(path))
+
+
+def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], int]]:
+    """The objects of a JSON file that holds one list of them, each with its line.
+
+    Raises:
+        ScenarioError: Not JSON, or not a list of objects.
+    """
+    decoder = json.JSONDecoder()
+    text, line, opened = "", 1, False
+    with _progress(path, reporter) as counted:
+        pieces = _texts(counted(chunks_of(path)), path)
+        while True:
+            rest = text.lstrip(" \t\r\n" if not opened else " \t\r\n,")
+            line += text[: len(text) - len(rest)].count("\n")
+            text = rest
+            if text and not opened:
+                if text[0] != "[":
+                    raise ScenarioError(f"{path}, line {line}: a list of vehicles begins with [")
+                text, opened = text[1:], True
+                continue
+            if text.startswith("]"):
+                return
+            try:
+                found, end = decoder.raw_decode(text)
+            except json.JSONDecodeError as error:
+                piece = next(pieces, "")
+                if not piece or len(text) > _MOST:
+                    raise ScenarioError(
+                        f"{path}, line {line + text.count(chr(10), 0, error.pos)}: not valid JSON "
+                        f"({error.msg}); the file may have been cut short"
+                    ) from None
+                text += piece
+                continue
+            if not isinstance(found, dict):
+                raise ScenarioError(f"{path}, line {line}: an object in braces was expected here")
+            yield cast("dict[str, Any]", found), line
+            line += text.count("\n", 0, end)
+            text = text[end:]
+
+
+def read_json(path: Path) -> tuple[Any, str]:
+    """A JSON file as a whole, and its text.
+
+    Raises:
+        ScenarioError: Not JSON.
+    """
+    try:
+        text = read_bytes(path).decode()
+        return json.loads(text), text
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path}: is not UTF-8: {error}") from None
+    except json.JSONDecodeError as error:
+        raise ScenarioError(
+            f"{path}, line {error.lineno}: not valid JSON ({error.msg}); the file may have been "
+            "cut short"
+        ) from None
+    except RecursionError:
+        raise ScenarioError(f"{path}: nested too deeply for a road network") from None
+
+
+def _texts(pieces: Pieces, path: Path) -> Iterator[str]:
+    decoder = codecs.getincrementaldecoder("utf-8-sig")()
+    try:
+        for piece in pieces:
+            yield decoder.decode(piece)
+        yield decoder.decode(b"", final=True)
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path}: is not UTF-8: {error}") from None
+
+
+@contextlib.contextmanager
+def _progress(path: Path, reporter: Reporter) -> Iterator[Callable[[Pieces], Pieces]]:
+    """A bar over the pieces of a long file; nothing for a short one."""
+    size = path.stat().st_size if path.is_file() else 0
+    if size < _LONG or path.suffix == ".gz":  # how long a packed file is shows only at its end
+        yield lambda pieces: pieces
+        return
+    with reporter.task(f"reading {path.name}, MiB", size >> 20) as advance:
+
+        def counted(pieces: Pieces) -> Pieces:
+            for piece in pieces:
+                yield piece
+                advance()
+
+        yield counted

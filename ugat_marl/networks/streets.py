@@ -1,0 +1,70 @@
+"""Where cars may drive: entries, exits, and the way on from every road of a network."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+TURNS = {"L": "l", "R": "r", "T": "t"}
+"""SUMO's letters for partial turns, as the turns they resemble."""
+
+
+@dataclass(frozen=True)
+class Streets:
+    """The roads for cars.
+
+    Attributes:
+        start: Junction at the beginning of every road (SUMO's edges).
+        end: Junction at its end.
+        ahead: Roads ahead of every road by turn: ``s``, ``l``, ``r`` or ``t`` (back).
+        entries: Roads that no other road leads to, but perhaps their own opposite direction.
+        exits: Roads that lead to no other.
+    """
+
+    start: Mapping[str, str]
+    end: Mapping[str, str]
+    ahead: Mapping[str, Mapping[str, tuple[str, ...]]]
+    entries: tuple[str, ...]
+    exits: frozenset[str]
+
+    @classmethod
+    def of(cls, root: ET.Element) -> Streets:
+        """Those of a ``<net>``."""
+        start: dict[str, str] = {}
+        end: dict[str, str] = {}
+        for edge in root.iter("edge"):
+            if edge.get("function") is None and any(map(_for_cars, edge.iter("lane"))):
+                start[edge.get("id", "")] = edge.get("from", "")
+                end[edge.get("id", "")] = edge.get("to", "")
+        ahead: dict[str, dict[str, dict[str, None]]] = defaultdict(lambda: defaultdict(dict))
+        for item in root.iter("connection"):
+            here, there = item.get("from", ""), item.get("to", "")
+            if here in start and there in start:
+                letter = item.get("dir", "s")
+                ahead[here][TURNS.get(letter, letter)][there] = None
+        reached: set[str] = set()
+        left: set[str] = set()
+        for here, turns in ahead.items():
+            for there in (road for roads in turns.values() for road in roads):
+                if (end[there], start[there]) != (start[here], end[here]):
+                    reached.add(there)
+                    left.add(here)
+        return cls(
+            start,
+            end,
+            {
+                road: {t: tuple(roads) for t, roads in turns.items()}
+                for road, turns in ahead.items()
+            },
+            tuple(road for road in start if road not in reached and road in left),
+            frozenset(road for road in start if road not in left),
+        )
+
+
+def _for_cars(lane: ET.Element) -> bool:
+    allow, disallow = lane.get("allow"), lane.get("disallow")
+    if allow is not None:
+        return bool({"all", "passenger"} & set(allow.split()))
+    return not {"all", "passenger"} & set((disallow or "").split())

@@ -1,0 +1,131 @@
+"""A network, or a whole configuration, that SUMO reads already: copied, or used where it lies."""
+
+from __future__ import annotations
+
+import shutil
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.files import parse_xml, read_bytes, write_whole
+from ugat_marl.networks.making import Draft, Fleet, Roads, Vehicles
+from ugat_marl.networks.reading import scan
+from ugat_marl.progress import Reporter
+from ugat_marl.scenario import Document, load_scenario
+
+_CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
+
+
+def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
+    """Roads, and perhaps vehicles, of SUMO's own files.
+
+    Args:
+        path: A ``.sumocfg`` or a ``.net.xml``, packed or not.
+        link: Whether files stay where they are and are named by their absolute paths.
+        own_vehicles: Whether the vehicles of a configuration are wanted.
+
+    Raises:
+        OptionError: Neither a configuration nor a network, by its name.
+    """
+    configuration = path.name.endswith(_CONFIGURATIONS)
+    if not configuration and not path.name.removesuffix(".gz").endswith(".xml"):
+        raise OptionError(f"--sumo {str(path)!r}: give a .sumocfg or a .net.xml")
+
+    def roads(folder: Path, reporter: Reporter) -> Draft:
+        if not configuration:
+            _require_root(path, ("net",), "SUMO network", reporter)
+            name = _placed(path, folder, link)
+            return Draft(f"SUMO network {path.name}", _origin([path], link), network=name)
+        return _configured(path, folder, link, own_vehicles, reporter)
+
+    return roads
+
+
+def given_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
+    """Route files the user has."""
+
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+        del network
+        for path in paths:
+            _require_root(path, ("routes", "additional"), "route file", reporter)
+        return Fleet(tuple(_placed(path, folder, link) for path in paths))
+
+    return vehicles
+
+
+def _configured(
+    path: Path, folder: Path, link: bool, own_vehicles: bool, reporter: Reporter
+) -> Draft:
+    if own_vehicles:
+        scenario = load_scenario(path)
+        network, routes, additional = scenario.network, scenario.routes, scenario.additional
+        settings = scenario.settings.model_dump(mode="json", exclude_defaults=True)
+    else:
+        network, settings = _network_of(path), {}
+        routes = additional = ()
+    times = ("begin_s", "duration_s", "step_length_s", "sumo")
+    kept = {key: settings[key] for key in times if settings.get(key)}
+
+    def placed(documents: Sequence[Document]) -> tuple[str, ...]:
+        return tuple(_put(item, folder, link) for item in documents)
+
+    return Draft(
+        f"SUMO configuration {path.name}",
+        _origin([path], link),
+        network=placed([network])[0],
+        routes=placed(routes),
+        additional=placed(additional),
+        settings=kept,
+    )
+
+
+def _network_of(path: Path) -> Document:
+    root: ET.Element = parse_xml(read_bytes(path), str(path))
+    for item in root.iter():
+        if item.tag in ("net-file", "net", "n"):
+            file = path.parent / item.get("value", item.get("v", ""))
+            if not file.is_file():
+                raise ScenarioError(f"{path}: <{item.tag}> names {file}, which does not exist")
+            return Document(file.name, file)
+    raise ScenarioError(f"{path}: no <net-file value=...>; a scenario needs a network")
+
+
+def _put(document: Document, folder: Path, link: bool) -> str:
+    if document.path is not None:
+        return _placed(document.path, folder, link)
+    write_whole(folder / document.name, document.read())  # read without the files it would write
+    return document.name
+
+
+def _placed(path: Path, folder: Path, link: bool) -> str:
+    """The name under which the scenario finds the file: in its folder, or where it is."""
+    if link:
+        return str(path.resolve())
+    if (folder / path.name).exists():
+        raise ScenarioError(
+            f"two files are called {path.name!r}, which one directory cannot hold; rename one"
+        )
+    shutil.copyfile(path, folder / path.name)
+    return path.name
+
+
+def _require_root(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> None:
+    first: Any = None
+    for tag in scan(path, reporter):
+        if first is None and tag.name not in tags:
+            raise ScenarioError(
+                f"{path}, line {tag.line}: a {what} begins with "
+                f"{' or '.join(f'<{name}>' for name in tags)}, this with <{tag.name}>"
+            )
+        first = tag
+
+
+def _origin(paths: Sequence[Path], link: bool) -> str:
+    names = ", ".join(f"`{path.name}`" for path in paths)
+    kept = "left where it lies and named by its path" if link else "copied as it was"
+    return (
+        f"{names}, {kept}. Who made it decides what may be done with it; keep its licence beside "
+        "it when you pass it on."
+    )
