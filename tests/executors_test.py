@@ -32,6 +32,8 @@ from ugat_marl.executors import (
 from ugat_marl.policy import Policy
 from ugat_marl.rollout import ATTEMPTS, persistently
 from ugat_marl.traffic_env import TrafficEnv
+from ugat_marl.transitions import TransitionLog
+from ugat_marl.worlds import RollOut, roll_outs
 
 LENGTH_S = 100.0
 
@@ -96,6 +98,18 @@ def results(workers: Any, policies: Any = None) -> Any:
 def test_processes_give_what_threads_give() -> None:
     with local_processes(2) as processes:
         assert results(processes) == results(2)
+
+
+def test_roll_outs_are_in_the_order_of_their_seeds_whoever_plays_them() -> None:
+    scenario = load("single-v1")
+    rule = rule_factory("largest-queue:20")
+    each = RollOut(scenario, "V4", {"duration_s": LENGTH_S}, rule, 0.3, "count")
+    alone = [each.play(seed, Stop())[0] for seed in (3, 1, 2)]
+    log, scores = roll_outs(each, (3, 1, 2), workers=2)
+    assert log.frame.equals(TransitionLog.concatenate(alone).frame)
+    assert log.provenance.domain == "V4"
+    assert log.provenance.seeds == (3, 1, 2)
+    assert len({score.att_s for score in scores}) == 3
 
 
 # --- simulators that die

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
 
 import polars as pl
 
+from ugat_marl.effects import Domain
 from ugat_marl.errors import LogError
+from ugat_marl.evaluation import PolicyFactory
+from ugat_marl.executors import Stop, Workers, as_done
 from ugat_marl.grounding.random_delays import RandomDelays
+from ugat_marl.metrics import Scores
+from ugat_marl.observations import Observer
 from ugat_marl.policy import AnyParallelEnv, Policy
-from ugat_marl.rollout import Exploring, observer_of, roll_out, until
+from ugat_marl.progress import Reporter, Silent
+from ugat_marl.rollout import Exploring, observer_of, persistently, roll_out, until
+from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed, numpy_generator
-from ugat_marl.traffic_env import TrafficEnv
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.transitions import TransitionLog
 
 
@@ -70,12 +79,15 @@ class SimulatedWorld:
         logs: list[TransitionLog] = []
         for episode in range(self._episodes):
             episode_seed = derive_seed(seed, "roll-out", self._name, iteration, episode)
-            log = roll_out(
-                self._env, exploring, episode_seed, record=observer, on_step=until(self._stop)
-            ).log
+            log = persistently(partial(self._played, self._env, exploring, episode_seed, observer))
             assert log is not None
             logs.append(log)
         return TransitionLog.concatenate(logs)
+
+    def _played(
+        self, env: AnyParallelEnv, policy: Policy, seed: int, observer: Observer
+    ) -> TransitionLog | None:
+        return roll_out(env, policy, seed, record=observer, on_step=until(self._stop)).log
 
     def stop(self) -> None:
         """Ends the roll-out that is under way."""
@@ -86,6 +98,77 @@ class SimulatedWorld:
         if self._env is not None:
             self._env.close()
             self._env = None
+
+
+@dataclass(frozen=True)
+class RollOut:
+    """What roll-outs have in common: all that whoever plays one has to be sent.
+
+    Attributes:
+        scenario: Where.
+        domain: In which domain.
+        options: Of the environment; those the policy relies on are added.
+        make: Makes who acts; rules remember their episode, so that each has its own.
+        epsilon: Chance of a random phase.
+        observation: What is recorded.
+        neighbours: How many roads away intersections are recorded too.
+    """
+
+    scenario: Scenario
+    domain: Domain
+    options: Mapping[str, Any]
+    make: PolicyFactory
+    epsilon: float
+    observation: str
+    neighbours: int = 0
+
+    def play(self, seed: int, stop: Stop) -> tuple[TransitionLog, Scores]:
+        """Plays one episode in an environment of its own."""
+        probe = parallel_env(self.scenario, self.domain, **self.options)
+        policy = self.make(probe)
+        options = {**self.options, **policy.env_options}
+        env = parallel_env(self.scenario, self.domain, **options)
+        observer = observer_of(env, self.observation, self.neighbours)
+        exploring = Exploring(policy, self.epsilon)
+        try:
+            played = persistently(
+                lambda: roll_out(env, exploring, seed, record=observer, on_step=until(stop))
+            )
+            assert played.log is not None
+            return played.log, env.scores()
+        finally:
+            env.close()
+
+
+def roll_outs(
+    each: RollOut,
+    seeds: Sequence[int],
+    *,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+    title: str = "rolling out",
+) -> tuple[TransitionLog, tuple[Scores, ...]]:
+    """Plays episodes, several at a time, and records them in the order of their seeds.
+
+    Args:
+        each: What they have in common.
+        seeds: One for each.
+        workers: Simulations at a time; None for the number of cores; or an executor.
+        reporter: Shows progress.
+        title: What to call the work there.
+
+    Returns:
+        All transitions, and the scores of every episode.
+    """
+    stop = Stop()
+    found: dict[int, tuple[TransitionLog, Scores]] = {}
+    with (reporter or Silent()).task(title, len(seeds)) as advance:
+        parts = [(seed, stop) for seed in seeds]
+        for number, (log, scores) in as_done(workers, each.play, parts, stop):
+            found[number] = log, scores
+            advance(note=f"ATT {scores.att_s:.0f} s")
+    logs, scores = zip(*(found[number] for number in range(len(seeds))), strict=True)
+    return TransitionLog.concatenate(list(logs)), tuple(scores)
 
 
 class RecordedWorld:

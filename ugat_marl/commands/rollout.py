@@ -10,18 +10,18 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
+from ugat_marl.commands.arguments import Ray, Workers, workers_of
 from ugat_marl.commands.evaluate import names_of
-from ugat_marl.effects import load
+from ugat_marl.effects import describe, load
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.filming import Film, Frame, film, frames, require_video, write_video
 from ugat_marl.progress import Bars
-from ugat_marl.rollout import Exploring, observer_of, roll_out
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
 from ugat_marl.traffic_env import parallel_env
-from ugat_marl.transitions import TransitionLog
+from ugat_marl.worlds import RollOut, roll_outs
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,8 @@ class Rollout:
         neighbours: How many roads away intersections are recorded too.
         duration_s: Length of an episode in s; default: the scenario's own.
         crossings: Also record when vehicles cross the stop lines: timed grounding reads it.
+        workers: Simulations at a time.
+        ray: Record on Ray instead.
         video: Video to write: .mp4 (needs ffmpeg: pip install 'ugat-marl[video]'), .webp or .gif
             (need nothing). It is of an episode of its own, without random phases.
         beside: A second policy, filmed beside the first in the same episode.
@@ -86,6 +88,8 @@ class Rollout:
     neighbours: int = 0
     duration_s: float | None = None
     crossings: bool = False
+    workers: Workers = None
+    ray: Ray = None
     video: Path | None = None
     beside: str | None = None
     film: VideoConfig = field(default_factory=VideoConfig)
@@ -94,6 +98,8 @@ class Rollout:
         """Records, films and writes."""
         if self.episodes < 1 or not 0 <= self.epsilon <= 1:
             raise OptionError("--episodes must be at least 1 and --epsilon from 0 to 1")
+        if self.workers is not None and self.workers < 1:
+            raise OptionError("--workers must be at least 1")
         if self.out is None and self.video is None:
             raise OptionError("nothing to write: give --out FILE.parquet, --video FILE, or both")
         if self.beside is not None and self.video is None:
@@ -111,23 +117,15 @@ class Rollout:
         return 0
 
     def _record(self, scenario: Scenario, out: Path, console: Console) -> None:
-        probe = parallel_env(scenario, self.domain, duration_s=self.duration_s)
-        policy = policy_factory(self.policy)(probe)
-        observer = observer_of(probe, self.observation, self.neighbours)
         options = {"duration_s": self.duration_s, "crossings": self.crossings}
-        env = parallel_env(scenario, self.domain, **options, **policy.env_options)
-        logs: list[TransitionLog] = []
-        try:
-            with Bars(console).task(f"{self.policy} in {env.domain}", self.episodes) as advance:
-                for episode in range(self.episodes):
-                    seed = derive_seed(self.seed, "rollout", episode)
-                    played = roll_out(env, Exploring(policy, self.epsilon), seed, record=observer)
-                    assert played.log is not None
-                    logs.append(played.log)
-                    advance(note=f"ATT {env.scores().att_s:.0f} s")
-        finally:
-            env.close()
-        log = TransitionLog.concatenate(logs)
+        make = policy_factory(self.policy)
+        each = RollOut(
+            scenario, self.domain, options, make, self.epsilon, self.observation, self.neighbours
+        )
+        seeds = [derive_seed(self.seed, "rollout", episode) for episode in range(self.episodes)]
+        title = f"{self.policy} in {describe(self.domain)}"
+        with workers_of(self.workers, self.ray) as workers:
+            log, _ = roll_outs(each, seeds, workers=workers, reporter=Bars(console), title=title)
         log.write(out)
         console.print(f"{len(log)} transitions: {out}", soft_wrap=True)
 
