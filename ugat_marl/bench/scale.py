@@ -150,6 +150,8 @@ class ScaleBench:
             Figure("2 simulations together / 1, steps per s", ratio, 1.7, 1.9, True),
             _told("steps per s of 1 simulation", Spread.of(_speeds(runs[1]))),
             _told("steps per s of 2 simulations", Spread.of(_speeds(runs[2]))),
+            _told("CPU of a simulation per step [ms]", _milliseconds(runs[2], "simulation_cpu_s")),
+            _told("CPU of its user per step [ms]", _milliseconds(runs[2], "user_cpu_s")),
             _told("memory of 1 simulation and its user [MiB]", runs[1][-1]["memory_mib"]),
             _told(
                 "memory of a further simulation [MiB]",
@@ -192,6 +194,7 @@ class ScaleBench:
             agents = own[-1]["agents"]
             figures += [
                 _told(f"{side}x{side}: ms per agent and step", Spread.of(costs[side])),
+                _told(f"{side}x{side}: the same, CPU alone", _cpu_cost(own)),
                 _told(f"{side}x{side}: vehicles on lanes per agent", own[-1]["vehicles"] / agents),
                 _told(f"{side}x{side}: memory of all processes [MiB]", own[-1]["memory_mib"]),
             ]
@@ -301,6 +304,17 @@ _METHOD = (
 def _told(name: str, value: Spread | float) -> Figure:
     """A figure that has nothing to reach."""
     return Figure(name, value, float("nan"), float("nan"), True)
+
+
+def _milliseconds(runs: list[Run], what: str) -> Spread:
+    return Spread.of([1e3 * run[what] / run["steps"] for run in runs])
+
+
+def _cpu_cost(runs: list[Run]) -> Spread:
+    """Milliseconds of CPU per agent and step, of the simulation and of its user."""
+    spent = [run["simulation_cpu_s"] + run["user_cpu_s"] for run in runs]
+    each = zip(spent, runs, strict=True)
+    return Spread.of([1e3 * cpu_s / (run["steps"] * run["agents"]) for cpu_s, run in each])
 
 
 def _speeds(runs: list[Run]) -> list[float]:

@@ -42,12 +42,15 @@ def steps(request: Request) -> dict[str, Any]:
         batch = env.reset(request["seed"])
         for decision in range(request["settled"]):
             batch = env.step(cycle(batch.masks, decision))
+        computed, simulated = time.process_time(), _cpu_s(env)
         began = time.perf_counter()
         for decision in range(request["settled"], request["settled"] + request["decisions"]):
             batch = env.step(cycle(batch.masks, decision))
         seconds = time.perf_counter() - began
         return {
             "seconds": seconds,
+            "user_cpu_s": time.process_time() - computed,
+            "simulation_cpu_s": _cpu_s(env) - simulated,
             "steps": env.n * request["decisions"],
             "agents": len(env.agents),
             "memory_mib": _memory_mib(),
@@ -190,6 +193,18 @@ def ray(request: Request) -> dict[str, Any]:
     finally:
         cluster.shutdown()
     return {"seconds": seconds, "digest": hashlib.sha256(results.encode()).hexdigest()}
+
+
+def _cpu_s(env: VectorEnv) -> float:
+    """Seconds of CPU the simulations have used; nan where the system does not say."""
+    total = 0.0
+    for lane in env._lanes:
+        stat = Path(f"/proc/{lane._worker._pid if lane._worker else 0}/stat")
+        if not stat.exists():
+            return float("nan")
+        user, system = stat.read_text().rpartition(")")[2].split()[11:13]
+        total += (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+    return total
 
 
 def _memory_mib() -> float:
