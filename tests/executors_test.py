@@ -17,7 +17,10 @@ from typing import Any
 import pytest
 
 from ugat_marl.commands.arguments import workers_of
-from ugat_marl.effects import load
+from ugat_marl.discrepancy.engine import Engine
+from ugat_marl.discrepancy.replay import Replay
+from ugat_marl.discrepancy.site import Site
+from ugat_marl.effects import StartupDelay, load
 from ugat_marl.errors import OptionError, SimulatorCrashed
 from ugat_marl.evaluation import evaluate, rule_factory
 from ugat_marl.executors import (
@@ -29,6 +32,9 @@ from ugat_marl.executors import (
     parts_at_a_time,
     usable_cores,
 )
+from ugat_marl.loops import standard_detectors
+from ugat_marl.measured.data import Period
+from ugat_marl.network import Network
 from ugat_marl.policy import Policy
 from ugat_marl.rollout import ATTEMPTS, persistently
 from ugat_marl.traffic_env import TrafficEnv
@@ -110,6 +116,25 @@ def test_roll_outs_are_in_the_order_of_their_seeds_whoever_plays_them() -> None:
     assert log.provenance.domain == "V4"
     assert log.provenance.seeds == (3, 1, 2)
     assert len({score.att_s for score in scores}) == 3
+
+
+@pytest.mark.slow
+def test_days_of_a_diagnosis_are_the_same_in_processes(data: Path) -> None:
+    scenario = load(data / "crossing")
+    network = Network.read(scenario)
+    detectors = standard_detectors(network)
+    site = Site.of(network, detectors)
+    shown = ((0.0, "Gr"), (30.0, "rG"), (60.0, "Gr"), (90.0, "rG"))
+    periods = [Period("day1", 0.0, 120.0, "fit", {"C": shown}, {})]
+    replay = Replay(scenario, network, detectors, site.owner)
+    found: list[Any] = []
+    with local_processes(1) as processes:
+        for workers in (2, processes):
+            engine = Engine(scenario, site, replay, periods, 3, workers=workers)
+            days = engine.replicates([StartupDelay(1.0)], [0, 1])
+            found.append([(day.tally.sums.tolist(), day.travel_time_s) for day in days])
+    assert found[0] == found[1]
+    assert found[0][0] != found[0][1]
 
 
 # --- simulators that die

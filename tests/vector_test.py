@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import vector as gymnasium_vector
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from ugat_marl import parallel_env, vector_env
 from ugat_marl.effects import StartupDelay, load
@@ -490,6 +491,19 @@ def test_gymnasium_s_vector_env() -> None:
     env.close()
     env.close()
     assert pids(vector) == []
+
+
+def test_gymnasium_s_own_wrappers_take_it() -> None:
+    vector = GymnasiumVectorEnv(vector_env("grid2x2-v1", 1, duration_s=20))
+    env = RecordEpisodeStatistics(vector)
+    _, infos = env.reset(seed=1)
+    paid = np.zeros(env.num_envs)
+    for step in range(2):
+        _, rewards, _, _, infos = env.step(chosen(infos["action_mask"], 1, step))
+        paid += rewards
+    np.testing.assert_allclose(infos["episode"]["r"], paid)
+    assert infos["episode"]["l"].tolist() == [2] * env.num_envs
+    env.close()
 
 
 # --- wrong calls
