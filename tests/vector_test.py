@@ -432,6 +432,19 @@ def test_an_unused_one_starts_and_leaves_nothing(crossing: Crossing, temporary: 
         env.reset(1)
 
 
+def test_halves_outlive_the_name_of_the_whole(crossing: Crossing, temporary: Path) -> None:
+    first, second = vector_env(crossing(), 2, duration_s=20).halves()
+    gc.collect()
+    for half in (first, second):
+        half.reset(1)
+        half.step([[0]])
+    first.close()
+    second.step([[0]])
+    del first, second, half
+    gc.collect()
+    assert list(temporary.iterdir()) == []
+
+
 # --- ends of episodes
 
 

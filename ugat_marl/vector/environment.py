@@ -90,7 +90,7 @@ class VectorEnv:
         plain: An environment with the same spaces, which is never started.
         domains: The domain of an episode.
         autoreset: What happens when one ends.
-        home: What is closed with them; None for a half of other ones.
+        home: What is closed with them; or what they are a half of, which is kept alive.
 
     Attributes:
         n: Number of environments.
@@ -109,7 +109,7 @@ class VectorEnv:
         plain: AnyParallelEnv,
         domains: DomainOf,
         autoreset: Autoreset,
-        home: Home | None,
+        home: Home | VectorEnv,
     ) -> None:
         self.n = len(lanes)
         self.agent_set = AgentSet.of(plain)
@@ -121,7 +121,8 @@ class VectorEnv:
         self._lanes = list(lanes)
         self._arrays: Arrays | None = arrays
         self._domains = domains
-        self._home = home
+        self._whole = home if isinstance(home, VectorEnv) else None
+        self._home = None if isinstance(home, VectorEnv) else home
         self._counts = np.array(self.agent_set.action_counts)
         self._begun: list[int] = []
         self._stepped: list[int] = []
@@ -133,6 +134,8 @@ class VectorEnv:
 
     def halves(self) -> tuple[VectorEnv, VectorEnv]:
         """Two vectors of these environments: one is stepped while the other one's answer is used.
+
+        Closing the whole closes both, closing a half ends its simulations only.
 
         Raises:
             OptionError: There is one environment only.
@@ -148,7 +151,7 @@ class VectorEnv:
                 self.plain,
                 self._domains,
                 self.autoreset,
-                None,
+                self,
             )
             for part in parts
         )
