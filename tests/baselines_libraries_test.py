@@ -191,6 +191,7 @@ def state_of(learner: Any) -> dict[str, Any]:
     return {"networks": dict(learner._networks()), "rest": learner._rest()}
 
 
+@pytest.mark.slow
 @every
 @pytest.mark.parametrize("make", [EqualToy, ToyTraffic], ids=["equal", "unequal"])
 def test_it_learns(name: str, make: type[ToyTraffic]) -> None:
@@ -320,6 +321,7 @@ def value_of(name: str, learner: Any) -> list[float]:
     return values.flatten().tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [item for item in NAMES if item.values[0] != "qmix"])
 def test_values_bootstrap_where_an_episode_is_cut_off(name: str) -> None:
     env = PaidEnv()

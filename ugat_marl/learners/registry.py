@@ -52,6 +52,16 @@ BASELINES: Mapping[str, Baseline] = {
     "sb3-dqn": Baseline("sb3", "SB3", "SB3Config", "sb3", {"algorithm": "dqn"}),
     "maskable-ppo": Baseline("sb3", "SB3", "SB3Config", "sb3", {"algorithm": "maskable-ppo"}),
     "supersuit-ppo": Baseline("supersuit_ppo", "SuperSuitPPO", "SuperSuitConfig", "sb3"),
+    "torchrl-mappo": Baseline("torchrl_mappo", "TorchRLMAPPO", "TorchRLConfig", "torchrl"),
+    "skrl-ippo": Baseline("skrl_ippo", "Skrl", "SkrlConfig", "skrl"),
+    "skrl-mappo": Baseline("skrl_ippo", "Skrl", "SkrlConfig", "skrl", {"centralised": True}),
+    "qmix": Baseline(
+        "benchmarl_task", "BenchMARL", "BenchMARLConfig", "benchmarl", {"algorithm": "qmix"}
+    ),
+    "vdn": Baseline(
+        "benchmarl_task", "BenchMARL", "BenchMARLConfig", "benchmarl", {"algorithm": "vdn"}
+    ),
+    "rllib-ppo": Baseline("rllib_ppo", "RLlib", "RLlibConfig", "rllib"),
 }
 
 
@@ -119,7 +129,7 @@ def load_baseline(name: str) -> ModuleType:
         raise OptionError(
             f"learner {name!r} needs {missing}, which is not installed; run "
             f"pip install 'ugat-marl[{baseline.extra}]', or in a checkout "
-            f"pip install -e '.[{baseline.extra}]'"
+            f"pip install -c constraints-baselines.txt -e '.[{baseline.extra}]'"
         ) from None
     return module
 

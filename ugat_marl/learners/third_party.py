@@ -276,6 +276,14 @@ def perceptron(n_in: int, hidden: Sequence[int], n_out: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
+def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
+    """A layer with copies of these weights ``(n_out, n_in)``; no random number is drawn."""
+    layer: Any = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
+    layer.weight.data.copy_(weight.detach())
+    layer.bias.data.copy_(bias.detach())
+    return layer
+
+
 def linear_layers(network: nn.Module) -> list[nn.Linear]:
     """The affine layers of a network, in their order."""
     return [layer for layer in network.modules() if isinstance(layer, nn.Linear)]

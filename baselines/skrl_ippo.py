@@ -1,0 +1,217 @@
+"""IPPO and MAPPO of skrl: PPO with networks of its own for every intersection.
+
+skrl's wrapper, trainer and memories. It knows no masks: here they stand at the end of the
+observation, where the policy below takes them off and gives actions that are not allowed no
+probability. Critics see the same observation (IPPO) or `env.state()` (MAPPO).
+
+    python baselines/skrl_ippo.py --scenario grid2x2-v1 --episodes 100 --out runs/skrl
+    python baselines/skrl_ippo.py --scenario mixed-v1 --centralised
+    ugat-marl train grid2x2-v1 --learner skrl-ippo
+"""
+# pyright: reportMissingImports=false, reportMissingSuperCall=false
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+from skrl.envs.wrappers.torch import wrap_env
+from skrl.memories.torch import RandomMemory
+from skrl.models.torch import CategoricalMixin, DeterministicMixin, Model
+from skrl.multi_agents.torch.ippo import IPPO, IPPO_CFG
+from skrl.multi_agents.torch.mappo import MAPPO, MAPPO_CFG
+from skrl.trainers.torch import SequentialTrainer
+from torch import Tensor, nn
+
+from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.errors import OptionError
+from ugat_marl.learners.third_party import (
+    LibraryLearner,
+    TrainingEnv,
+    check_settings,
+    decisions_of,
+    kept_generators,
+    linear_layers,
+    perceptron,
+    roll_out_length,
+    seed_generators,
+)
+from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
+from ugat_marl.wrappers import appended_mask
+
+_PREPROCESSED = ("observation", "state", "value")
+_FORBIDDEN = -1e8  # in the place of logits; not infinite, or the entropy is not a number
+
+
+@dataclass(frozen=True)
+class SkrlConfig:
+    """Settings of the learner."""
+
+    centralised: bool = False  # the critics see env.state() (MAPPO), not an observation (IPPO)
+    hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
+    learning_rate: float = 5e-4  # step size of Adam
+    discount: float = 0.95  # weight of the next decision's value (gamma)
+    gae_lambda: float = 0.95  # from one-step (0) to Monte Carlo (1) advantages
+    clip: float = 0.2  # share by which the probability of an action may move in an update
+    entropy_weight: float = 0.01  # weight of the entropy bonus
+    value_weight: float = 0.5  # weight of the critic's squared error
+    max_gradient: float = 0.5  # longer gradients are scaled down to this norm
+    update_every: int = 120  # decisions in a roll-out, or a few more: it has to divide an episode
+    epochs: int = 8  # passes over each roll-out
+    minibatches: int = 4  # parts of a roll-out, one for each gradient step
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+
+class Actor(CategoricalMixin, Model):
+    """Logits of one agent's actions, out of its observation without the mask behind it."""
+
+    def __init__(self, spaces: Mapping[str, Any], hidden: Sequence[int]) -> None:
+        Model.__init__(self, **spaces, device="cpu")
+        CategoricalMixin.__init__(self)
+        self.network = perceptron(
+            self.num_observations - self.num_actions, hidden, self.num_actions
+        )
+
+    def compute(self, inputs: Mapping[str, Any], role: str) -> tuple[Tensor, dict[str, Any]]:
+        """Skrl asks for logits and makes the distribution."""
+        seen = inputs["observations"]
+        allowed = seen[:, -self.num_actions :] > 0.5
+        logits = self.network(seen[:, : -self.num_actions])
+        return logits.masked_fill(~allowed, _FORBIDDEN), {}
+
+
+class Critic(DeterministicMixin, Model):
+    """The value of an observation, or of the state of the whole network."""
+
+    def __init__(self, spaces: Mapping[str, Any], hidden: Sequence[int], centralised: bool) -> None:
+        Model.__init__(self, **spaces, device="cpu")
+        DeterministicMixin.__init__(self)
+        self._key = "states" if centralised else "observations"
+        size = self.num_states if centralised else self.num_observations
+        self.network = perceptron(size, hidden, 1)
+
+    def compute(self, inputs: Mapping[str, Any], role: str) -> tuple[Tensor, dict[str, Any]]:
+        """Skrl asks for values."""
+        return self.network(inputs[self._key]), {}
+
+
+class Skrl(LibraryLearner):
+    """Learns by skrl's IPPO or MAPPO; a `ugat_marl.policy.Learner`."""
+
+    def __init__(
+        self, env: AnyParallelEnv, config: SkrlConfig | None = None, seed: int = 0
+    ) -> None:
+        self.config = config = config or SkrlConfig()
+        super().__init__(env, f"baselines.skrl.{'mappo' if config.centralised else 'ippo'}")
+        if getattr(env, "state_space", None) is None:
+            raise OptionError("skrl asks environments for their state; this one has none")
+        self._decisions = decisions_of(env)
+        masked = appended_mask(env)
+        state: Any = getattr(env, "state_space")  # noqa: B009 - not every environment has one
+        spaces = {
+            agent: {
+                "observation_space": masked.observation_space(agent),
+                "state_space": state,
+                "action_space": masked.action_space(agent),
+            }
+            for agent in self.agents.names
+        }
+        self._models: dict[str, dict[str, Any]] = {}
+        with kept_generators():
+            seed_generators(seed, "skrl", "weights")
+            for agent, own in spaces.items():
+                critic = Critic(own, config.hidden, config.centralised)
+                self._models[agent] = {"policy": Actor(own, config.hidden), "value": critic}
+            self._learning = self._made(spaces)
+
+    def _made(self, spaces: Mapping[str, Mapping[str, Any]]) -> Any:
+        config = self.config
+        steps = roll_out_length(self._decisions, config.update_every)
+        names = list(self.agents.names)
+        settings: dict[str, Any] = {
+            "rollouts": steps,
+            "learning_epochs": config.epochs,
+            "mini_batches": min(config.minibatches, steps),
+            "discount_factor": config.discount,
+            "gae_lambda": config.gae_lambda,
+            "learning_rate": config.learning_rate,
+            "grad_norm_clip": config.max_gradient,
+            "ratio_clip": config.clip,
+            "value_clip": 0.0,
+            "entropy_loss_scale": config.entropy_weight,
+            "value_loss_scale": config.value_weight,
+            "time_limit_bootstrap": True,
+            "experiment": {"write_interval": 0, "checkpoint_interval": 0},
+        }
+        unused = ("learning_rate_scheduler", *(f"{x}_preprocessor" for x in _PREPROCESSED))
+        settings |= {f"{name}_kwargs": {agent: {} for agent in names} for name in unused}
+        kind, kind_of_settings = (MAPPO, MAPPO_CFG) if config.centralised else (IPPO, IPPO_CFG)
+        return kind(
+            possible_agents=names,
+            models=self._models,
+            memories={name: RandomMemory(memory_size=steps, device="cpu") for name in names},
+            cfg=kind_of_settings(**settings),
+            device="cpu",
+            **{
+                f"{key}s": {name: spaces[name][key] for name in names}
+                for key in ("observation_space", "state_space", "action_space")
+            },
+        )
+
+    def _train(self, env: TrainingEnv, episodes: int, seed: int) -> None:
+        world = wrap_env(appended_mask(env), wrapper="pettingzoo", verbose=False)
+        for _ in range(episodes):  # one by one: skrl would go on drawing from one stream
+            seed_generators(seed, "skrl", "episode", self.episodes)
+            trainer = SequentialTrainer(
+                env=world,
+                agents=self._learning,
+                cfg={
+                    "timesteps": self._decisions,
+                    "headless": True,
+                    "disable_progressbar": True,
+                    "close_environment_at_exit": False,
+                },
+            )
+            trainer.train()
+            self._learning.tracking_data.clear()  # skrl keeps all it tracks until it is written
+
+    def _actors(self) -> Sequence[Sequence[nn.Linear]]:
+        return [linear_layers(self._models[agent]["policy"].network) for agent in self.agents.names]
+
+    def _networks(self) -> Mapping[str, Tensor]:
+        return {
+            f"{agent}.{role}.{name}": tensor
+            for agent, models in self._models.items()
+            for role, model in models.items()
+            for name, tensor in model.state_dict().items()
+        }
+
+    def _rest(self) -> dict[str, Any]:
+        made = self._learning.optimizers
+        return {"adam": {agent: made[agent].state_dict() for agent in self.agents.names}}
+
+    def _restore(self, networks: Mapping[str, Tensor], rest: Mapping[str, Any]) -> None:
+        for name, tensor in self._networks().items():
+            tensor.copy_(networks[name])
+        for agent, state in rest["adam"].items():
+            self._learning.optimizers[agent].load_state_dict(state)
+
+
+@dataclass(frozen=True)
+class Args(BaselineArgs):
+    """Trains IPPO, or with --centralised MAPPO, of skrl on one scenario."""
+
+    ppo: Annotated[SkrlConfig, tyro.conf.arg(name="")] = SkrlConfig()
+
+
+def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
+    """Trains and evaluates; writes the results if `args.out` is given."""
+    return train_baseline(args, lambda env: Skrl(env, args.ppo, args.seed), on_episode)
+
+
+if __name__ == "__main__":
+    baseline_command(Args, train)
