@@ -42,7 +42,7 @@ def node_map(
     drawing.text((8, 20), shortened(title, TITLE), 14, bold=True)
     for lane in network.lanes.values():
         for piece in _inside([place(point) for point in lane.shape], 34 + high):
-            drawing.line(piece, "road", 2)
+            drawing.line(piece, "road", max(2.0, 2.6 * place.scale))
     points = {tls: place(centre) for tls, centre in centres.items()}
     radius = _radius(list(points.values()))
     for tls, at in points.items():
@@ -116,15 +116,20 @@ def _placed(points: Sequence[Point]) -> tuple[Placing, float]:
 
 
 class Placing:
-    """Metres of a network to units of a drawing."""
+    """Metres of a network to units of a drawing.
+
+    Attributes:
+        scale: Units per metre.
+    """
 
     def __init__(self, west: float, north: float, scale: float, left: float, top: float) -> None:
-        self._from, self._scale, self._to = (west, north), scale, (left, top)
+        self.scale = scale
+        self._from, self._to = (west, north), (left, top)
 
     def __call__(self, point: Point) -> Point:
         """Where a point of the network lies in the drawing."""
         x, y = point[0] - self._from[0], self._from[1] - point[1]
-        return self._to[0] + x * self._scale, self._to[1] + y * self._scale
+        return self._to[0] + x * self.scale, self._to[1] + y * self.scale
 
 
 def _inside(points: Sequence[Point], bottom: float) -> list[list[Point]]:

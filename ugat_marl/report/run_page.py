@@ -296,8 +296,8 @@ def _gate(page: RunPage, record: RunRecord, found: Places | str, places: Places 
     if places is not None:
         for key, what, unit in (
             ("gate/acceptance", "accepted grounded actions", "% of decisions"),
-            ("gate/mean_u", "mean uncertainty u", "(u, from 0 to 1)"),
-            ("gate/alpha", "threshold α", "(as u; ∞ takes everything)"),
+            ("gate/mean_u", "mean uncertainty u", "from 0 to 1"),
+            ("gate/alpha", "threshold α", "as u; ∞ takes everything"),
         ):
             figures += _map(page, record, places, key, what, unit)
     note = places.note if places is not None else str(found)
@@ -317,12 +317,12 @@ def _map(page: RunPage, record: RunRecord, places: Places, key: str, what: str, 
         value = dict(series.get(agent, [])).get(last, math.nan) * scale
         text = "∞" if math.isinf(value) else f"{value:.0f}" if scale > 1 else f"{value:.2f}"
         values[tls] = (value, "" if math.isnan(value) else text)
-    if not any(text for _, text in values.values()):
-        return ""
+    if len(values) < 2 or not any(text for _, text in values.values()):
+        return ""  # a single intersection needs no map
     title = f"{what}, iteration {last}"
     name = file_name(record.name, "map", key.rpartition("/")[2])
     drawing = node_map(name, title, places.network, values, (0.0, scale), unit)
-    return page.figure(drawing, f"{what[0].upper()}{what[1:]} at each intersection, {unit}.")
+    return page.figure(drawing, f"{what[0].upper()}{what[1:]} at each intersection ({unit}).")
 
 
 def _worst(page: RunPage, record: RunRecord, places: Places | None) -> str:
@@ -354,7 +354,7 @@ def _worst(page: RunPage, record: RunRecord, places: Places | None) -> str:
         title = f"mean queue, {first} in {domain}"
         name = file_name(record.name, "map-queue")
         unit = "vehicles standing"
-        if values.keys() & set(places.intersection_of.values()):
+        if len(values.keys() & set(places.intersection_of.values())) > 1:
             ends = (0.0, max(means.values()) or 1.0)
             drawing = node_map(name, title, places.network, values, ends, unit)
             figures += page.figure(drawing, "Halting vehicles before each intersection.")

@@ -101,7 +101,7 @@ def gate_picture(records: Sequence[RunRecord], name: str) -> Drawing | None:
     names = {
         "gate/acceptance": "acceptance (share of decisions)",
         "gate/mean_u": "mean u",
-        "gate/alpha": "threshold α after it (none: ∞)",
+        "gate/alpha": "threshold α (none: ∞)",
     }
     curves = {
         key: joined([one for record in records if (one := record.series("iteration", key))])

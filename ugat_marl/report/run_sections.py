@@ -217,7 +217,7 @@ def _cell(row: Mapping[str, Any], key: str, *, sign: bool) -> str:
 def gate_table(record: RunRecord, places: Places | None) -> str:
     """The gate by intersection, in the last iteration."""
     columns = {
-        "gate/acceptance": "accepted", "gate/mean_u": "mean u", "gate/alpha": "α after it",
+        "gate/acceptance": "accepted", "gate/mean_u": "mean u", "gate/alpha": "α",
         "gate/change_rate": "changed", "gate/trusted": "f and h are proven",
         "lost_time/best_s": "lost time, s",
     }  # fmt: skip
@@ -232,9 +232,7 @@ def gate_table(record: RunRecord, places: Places | None) -> str:
         cells = [_of_gate(key, last[key].get(agent, math.nan)) for key in shown]
         rows.append([agent, tls or "–", *cells])
     headings = ["agent", "traffic light", *shown.values()]
-    return folded(
-        f"The gate at each of {len(agents)} intersections", grid(headings, rows, headings[2:])
-    )
+    return folded("The gate, intersection by intersection", grid(headings, rows, headings[2:]))
 
 
 def _of_gate(key: str, value: float) -> str:

@@ -22,7 +22,7 @@ figure.missing {{ color: var(--soft); font-size: .9rem; }}
 article {{ border-top: 3px solid var(--line); margin-top: 2.4rem; }}
 article > h2 {{ border: 0; margin-top: .8rem; font-size: 1.3rem; }}
 ul.plain {{ padding-left: 1.1rem; margin: .4rem 0; }}
-td.n {{ white-space: normal; }}
+.n {{ white-space: normal; }}
 .many {{ font-size: .86rem; }}
 .many th, .many td {{ padding-right: .5rem; }}
 .many td:not(.n, [data-label=rank]) {{ min-width: 3.2rem; }}
