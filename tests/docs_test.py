@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 import re
+import shlex
 import tomllib
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from ugat_marl.effects import Incident, effect_from, effects_on_controllers, known_effects
+import numpy as np
+import pytest
+import supersuit
+from gymnasium.spaces import Box
+
+import ugat_marl
+from ugat_marl.__main__ import main
+from ugat_marl.effects import (
+    Incident,
+    QueueModel,
+    effect_from,
+    effects_on_controllers,
+    known_effects,
+)
 from ugat_marl.effects.acting import PHASE_ORDERS
 from ugat_marl.effects.judging import OBJECTIVES
+from ugat_marl.files import xml_bytes
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.uncertainty import METHODS
 from ugat_marl.judging import HIDDEN
@@ -20,7 +35,7 @@ from ugat_marl.scenario_settings import (
     validated,
 )
 
-PAGE = (Path(__file__).parent.parent / "docs" / "scenario-file.md").read_text()
+PAGE = (Path(__file__).parent.parent / "docs" / "scenarios.md").read_text()
 
 
 def test_every_key_of_a_scenario_file_is_documented() -> None:
@@ -43,10 +58,46 @@ def test_the_defaults_on_the_page_are_those_of_the_code() -> None:
 def test_the_example_is_a_scenario_file() -> None:
     example = re.search(r"```toml\n(.*?)```", PAGE, flags=re.DOTALL)
     assert example is not None
-    settings = validated(tomllib.loads(example[1]), "docs/scenario-file.md")
+    settings = validated(tomllib.loads(example[1]), "docs/scenarios.md")
     assert settings.intersections["C1"].phases == ("GGrr", "rrGG")
     for record in settings.effects:
         effect_from(record)
+
+
+def test_what_is_added_in_ten_lines_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    section = PAGE.partition("## Adding something")[2]
+    blocks = re.findall(r"```(\w+)\n(.*?)```", section, flags=re.DOTALL)
+    assert [kind for kind, _ in blocks] == ["sh", "python", "python", "python"]
+    assert all(len(text.splitlines()) <= 10 for _, text in blocks)
+    for line in blocks[0][1].splitlines():
+        program, *words = shlex.split(line)
+        assert program == "ugat-marl"
+        assert main(words) == 0
+    given = {"np": np, "replace": replace, "supersuit": supersuit, "Box": Box} | {
+        "dataclass": dataclass, "ugat_marl": ugat_marl, "xml_bytes": xml_bytes,
+    }  # fmt: skip
+    made = [dict(given) for _ in blocks[1:]]
+    for names, (_, text) in zip(made, blocks[1:], strict=True):
+        exec(text, names)  # the page's own words, in a namespace of their own
+    effect, observation, reward = made
+    whole = reward["env"].demand.vehicles
+    assert effect["env"].demand.vehicles == pytest.approx(0.75 * whole, abs=1)
+    observations, _ = observation["seen"].reset(seed=1)
+    for agent, vector in observations.items():
+        assert vector[-1] == 0.0
+        assert observation["seen"].observation_space(agent).contains(vector)
+        assert len(vector) == observation["env"].observation_space(agent).shape[0] + 1
+    env = reward["env"]
+    env.reset(seed=1)
+    for _ in range(6):
+        _, rewards, *_ = env.step(dict.fromkeys(env.agents, 0))
+        lanes = env.network.lane_table()
+        for agent, value in rewards.items():
+            own = env.network.intersection(env.intersection_of[agent]).incoming_lanes
+            assert value == -env.snapshot.halting[lanes.indices(own)].max()
+    for names in made:
+        names["env"].close()
 
 
 def test_every_uncertainty_is_documented() -> None:
@@ -79,7 +130,8 @@ def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
 def test_every_effect_on_controllers_is_documented_with_its_fields_and_ranges() -> None:
     page = (Path(__file__).parent.parent / "docs" / "gaps.md").read_text()
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
-    for name, kind in {**effects_on_controllers(), Incident.name: Incident}.items():
+    others = {kind.name: kind for kind in (Incident, QueueModel)}
+    for name, kind in {**effects_on_controllers(), **others}.items():
         cell = rows[name]
         assert re.findall(r"`(\w+)`", cell) == [item.name for item in fields(kind)], name
         for parameter in kind.ranges.values():

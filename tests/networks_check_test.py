@@ -74,6 +74,16 @@ def test_flows_are_counted_too(single: Scenario) -> None:
     assert road.vph == pytest.approx(180, abs=2)
 
 
+def test_lanes_that_a_phase_serves_in_part_are_counted() -> None:
+    """RESCO's arterial has left turns and straight on in one lane; single-v1 has lanes for each."""
+    (item,) = survey(load("single-v1")).intersections
+    assert item.partly_served == ()
+    facts = survey(load("mixed-v1").with_control(phases="conflict-free"))
+    shared = {item.id: len(item.partly_served) for item in facts.intersections}
+    assert shared["P"] == 0
+    assert shared["S"] == 4  # one lane for everything on each of its four arms
+
+
 def spoilt(single: Scenario, phases: list[str]) -> Scenario:
     settings = single.settings.model_dump() | {"intersections": {"A1": {"phases": phases}}}
     return replace(single, settings=type(single.settings).model_validate(settings))

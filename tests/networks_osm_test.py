@@ -13,9 +13,10 @@ from ugat_marl.__main__ import main
 from ugat_marl.files import parse_xml
 from ugat_marl.network import Network
 from ugat_marl.networks.osm_pbf import pbf_to_xml
+from ugat_marl.networks.phasing import suited
 from ugat_marl.networks.survey import survey
 from ugat_marl.progress import Silent
-from ugat_marl.scenario import Scenario, load_scenario
+from ugat_marl.scenario import Scenario, load_scenario, shipped_scenarios
 
 TOWN = Path(__file__).parent / "data" / "town.osm"
 
@@ -63,7 +64,33 @@ def test_a_footbridge_is_no_junction(town: Scenario) -> None:
 def test_phases_serve_everybody(town: Scenario) -> None:
     facts = survey(town)
     assert all(not item.unserved_links for item in facts.intersections)
-    assert all(len(item.phases) >= 4 for item in facts.intersections)
+
+
+def test_left_turns_from_shared_lanes_are_permitted(town: Scenario, tmp_path: Path) -> None:
+    """Waiting for a phase of their own they block the lane: 273 s of travel in place of 79."""
+    sources = {tls: own.phases for tls, own in town.settings.intersections.items()}
+    assert sources == {"9": "permitted", "cluster_2_5": "permitted"}
+    for item in Network.read(town).intersections:
+        assert len(item.phases) == 2
+        assert all("g" in state for state in item.phases)
+    assert made(tmp_path / "a", TOWN, "--phases", "conflict-free") == 0
+    network = Network.read(load_scenario(tmp_path / "a"))
+    assert [len(item.phases) for item in network.intersections] == [6, 8]
+
+
+def test_lights_without_phases_to_derive_keep_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ugat_marl.phases.MOST_PHASES", 1)
+    assert made(tmp_path / "a", TOWN) == 0
+    scenario = load_scenario(tmp_path / "a")
+    assert {own.phases for own in scenario.settings.intersections.values()} == {"programme"}
+    assert "2 lights have no phases that can be derived" in (tmp_path / "a/README.md").read_text()
+
+
+def test_lanes_for_one_turn_need_no_permission() -> None:
+    folder = dict(shipped_scenarios())["grid2x2-v1"]
+    assert suited(folder / "network.net.xml") == ({}, [])
 
 
 def test_the_licence_is_named(town: Scenario) -> None:

@@ -176,9 +176,7 @@ def _with_crossings(
     return [*found, alone] if alone else found
 
 
-def state_of(
-    green: Sequence[Link], links: Sequence[Link], rules: RightOfWay, width: int
-) -> str:
+def state_of(green: Sequence[Link], links: Sequence[Link], rules: RightOfWay, width: int) -> str:
     """The state that shows green: protected, or permitted where somebody else goes first."""
     letters = ["r"] * width
     for link in links:

@@ -189,6 +189,7 @@ def _row(item: IntersectionFacts) -> tuple[str, ...]:
         "crossings": item.crossings,
         "links without a light": item.uncontrolled,
         "links never green": len(item.unserved_links),
+        "lanes served in part": len(item.partly_served),
     }
     counts = (item.lanes, item.links, item.movements, item.conflicts, len(item.phases))
     return (*map(str, counts), "; ".join(f"{n} {what}" for what, n in remarks.items() if n))

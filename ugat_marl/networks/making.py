@@ -11,6 +11,7 @@ from ugat_marl.demand import Demand, check_demand
 from ugat_marl.files import write_whole
 from ugat_marl.network import Network
 from ugat_marl.networks.folder import new_folder
+from ugat_marl.networks.phasing import suited
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Scenario, load_scenario, scenario_toml
 
@@ -28,6 +29,7 @@ class Draft:
         routes: Its route files, likewise; empty if the source has no vehicles.
         additional: Its additional files, likewise.
         settings: Further values of its ``scenario.toml``.
+        derive: Whether the phases of each light are derived as its lanes allow.
         notes: What was noticed on the way, for the README and for whoever waits.
     """
 
@@ -37,6 +39,7 @@ class Draft:
     routes: tuple[str, ...] = ()
     additional: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    derive: bool = False
     notes: tuple[str, ...] = ()
 
 
@@ -109,6 +112,11 @@ def make_scenario(
         if vehicles:
             fleet = vehicles(folder, folder / draft.network, reporter)
         own = dict(draft.settings)
+        notes = (*draft.notes, *fleet.notes)
+        if draft.derive and "phases" not in settings.get("control", {}):
+            kinds, more = suited(folder / draft.network)
+            notes += tuple(more)
+            own["intersections"] = {tls: {"phases": kind} for tls, kind in kinds.items()}
         control = {**own.pop("control", {}), **settings.get("control", {})}
         content: dict[str, Any] = {
             "description": draft.description,
@@ -124,7 +132,7 @@ def make_scenario(
         scenario = load_scenario(folder)
         network = Network.read(scenario)
         demand = check_demand(scenario, network)
-        made = Made(scenario, network, demand, (*draft.notes, *fleet.notes))
+        made = Made(scenario, network, demand, notes)
         write_whole(folder / "README.md", _readme(made, draft, command))
     return Made(load_scenario(target), network, demand, made.notes)
 

@@ -89,6 +89,7 @@ def from_osm(path: Path, *, guess: bool) -> Roads:
             f"Converted from `{path.name}` by SUMO's netconvert. © OpenStreetMap contributors; the "
             "data are available under the Open Database Licence (openstreetmap.org/copyright).",
             settings={"control": {"phases": "conflict-free"}},
+            derive=True,
             notes=tuple(notes),
         )
 

@@ -74,6 +74,8 @@ class IntersectionFacts:
         phases: What it chooses from.
         unserved_lanes: Lanes to which no phase gives green.
         unserved_links: Links that are green in no phase, as ``lane -> lane``.
+        partly_served: Lanes that some phase serves in one direction only: who waits for the other
+            blocks them.
         always_green: Links that are green in every phase: the signal never stops them.
         right_on_red: Links that may go on red after a stop.
         u_turns: Links that turn around.
@@ -91,6 +93,7 @@ class IntersectionFacts:
     phases: tuple[PhaseFacts, ...]
     unserved_lanes: tuple[str, ...]
     unserved_links: tuple[str, ...]
+    partly_served: tuple[str, ...]
     always_green: int
     right_on_red: int
     u_turns: int
@@ -150,7 +153,7 @@ def survey(scenario: Scenario) -> Survey:
         scenario.decisions,
         demand.vehicles,
         demand.flows,
-        traffic.first_s,
+        round(traffic.first_s, 2),
         round(traffic.fill_s, 1),
         shortest,
         tuple(_facts(item, network, rules, free, traffic) for item in network.intersections),
@@ -186,6 +189,7 @@ def _facts(
         unserved_links=tuple(
             f"{link.from_lane} -> {link.to_lane}" for link in item.links if link.index not in may_go
         ),
+        partly_served=tuple(lane for lane in item.incoming_lanes if _in_part(lane, item)),
         always_green=sum(all(link.index in green for green in served) for link in item.links),
         right_on_red=sum(link.index in stop_and_go for link in item.links),
         u_turns=sum(link.direction in "tT" for link in item.links),
@@ -193,6 +197,12 @@ def _facts(
         uncontrolled=sum(free.get(junction, 0) for junction in junctions),
         approaches=tuple(_approaches(item, network, traffic)),
     )
+
+
+def _in_part(lane: str, item: Intersection) -> bool:
+    indices = {link.index for link in item.links if link.from_lane == lane}
+    shown = ({state[index] in GREEN for index in indices} for state in item.phases)
+    return any(len(letters) > 1 for letters in shown)
 
 
 def _movement(link: Link) -> str:
