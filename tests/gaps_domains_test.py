@@ -99,6 +99,9 @@ def test_a_gap_that_does_not_exist(capsys: pytest.CaptureFixture[str]) -> None:
 # --- read back
 
 
+LANES = "laneChangeModel.lcStrategic"
+
+
 class Trace:
     """What one episode of a domain showed; the simulation runs in this process."""
 
@@ -118,6 +121,8 @@ class Trace:
         self.near: list[list[int]] = []
         self.vehicles: dict[str, dict[str, Any]] = {}
         self.first_s: float | None = None
+        self.positions: set[float] = set()
+        self.queues = "mesosim" in env.scenario.settings.sumo  # there are no lanes to change
         generator = np.random.default_rng(1)
         _, infos = env.reset(seed=1)
         simulator: Any = env._simulator
@@ -152,6 +157,7 @@ class Trace:
         if self.plan and self.plan[-1] in self.item.phases:
             assert libsumo.trafficlight.getRedYellowGreenState("A1") == self.plan[-1]
         for name in api.getIDList():
+            self.positions.add(round(api.getLanePosition(name), 3))
             if name not in self.vehicles:
                 self.first_s = self.first_s or env.snapshot.time_s
                 self.vehicles[name] = {
@@ -162,7 +168,7 @@ class Trace:
                     "headway": api.getTau(name),
                     "imperfection": api.getImperfection(name),
                     "speed": api.getSpeedFactor(name),
-                    "strategic": api.getParameter(name, "laneChangeModel.lcStrategic"),
+                    "strategic": None if self.queues else api.getParameter(name, LANES),
                 }
         zone = next((e.metres for e in self.effects if e.name == "detection_zone"), None)
         self.near.append(
@@ -352,6 +358,11 @@ def check_incident(trace: Trace, after_s: float, lasts_s: float) -> None:
     assert text.endswith(f",{after_s:g},{after_s + lasts_s:g}")
 
 
+def check_queue_model(trace: Trace, metres: float) -> None:
+    assert trace.env.scenario.settings.sumo.get("meso-edgelength") == f"{metres:g}"
+    assert 2 < len(trace.positions) < 20, "vehicles are where segments begin, and nowhere else"
+
+
 def check_objective(trace: Trace, wanted: str) -> None:
     assert set(trace.scores.hidden) == set(HIDDEN), wanted
     assert trace.scores.hidden["cost"] > 0
@@ -385,6 +396,7 @@ CHECKS: dict[str, Callable[..., Any]] = {
     "demand_level": check_demand,
     "demand_timing": check_later,
     "incident": check_incident,
+    "queue_model": check_queue_model,
     "objective": check_objective,
 }
 

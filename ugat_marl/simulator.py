@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.files import write_whole
-from ugat_marl.measurements import HALTING_MPS, Snapshot, Trips
+from ugat_marl.looks import QueueLook, near_the_end, refuse_in_queues
+from ugat_marl.measurements import Snapshot, Trips
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.signals import Segment
 from ugat_marl.trips import measuring_options, read_trips
@@ -57,6 +58,13 @@ class Launch:
     files: tuple[tuple[str, bytes], ...] = ()
     zone_m: float = 0.0
     persons: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def segment_m(self) -> float:
+        """Length of a segment of the mesoscopic model; 0 with car following."""
+        if "--mesosim" not in self.arguments:
+            return 0.0
+        return float(self.arguments[self.arguments.index("--meso-edgelength") + 1])
 
     def write(self) -> None:
         """Makes the folder and puts the files into it."""
@@ -141,6 +149,8 @@ def launch_of(
             persons and dangers are to be measured.
     """
     settings = scenario.settings
+    if "mesosim" in settings.sumo:
+        refuse_in_queues(scenario.id, crossings=crossings, zone=bool(zone_m), gui=gui)
     files = {
         "--net-file": [scenario.network],
         "--route-files": list(scenario.routes),
@@ -208,6 +218,7 @@ class LibsumoSimulator:
         self._shown: dict[str, str] = {}
         self._time_s = 0.0
         self._limits = np.empty(0)
+        self._queues: QueueLook | None = None
         self._on: dict[str, tuple[int, str]] = {}
         self._owner = 0
 
@@ -241,6 +252,9 @@ class LibsumoSimulator:
         self._time_s = launch.begin_s
         limits = map(libsumo.lane.getMaxSpeed, launch.lanes)
         self._limits = np.fromiter(limits, np.float64, len(launch.lanes))
+        self._queues = None
+        if launch.segment_m:
+            self._queues = QueueLook(libsumo, launch.lanes, launch.segment_m)
         return self._snapshot()
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
@@ -324,6 +338,14 @@ class LibsumoSimulator:
 
     def _snapshot(self) -> Snapshot:
         assert self._launch is not None
+        statistic = libsumo.simulation.getParameter
+        departed = int(statistic("", "stats.vehicles.inserted"))
+        backlog = int(statistic("", "stats.vehicles.waiting"))
+        if self._queues is not None:
+            rows = self._queues.look(self._time_s, self._limits)
+            waiting = rows[3] if self._launch.waiting else np.empty(0)
+            measured = rows[0], rows[1], rows[2], waiting
+            return Snapshot(self._time_s, *measured, departed, backlog)
         lanes, api = self._launch.lanes, libsumo.lane
         vehicles = np.fromiter(map(api.getLastStepVehicleNumber, lanes), np.float64, len(lanes))
         taken = np.flatnonzero(vehicles)
@@ -337,7 +359,6 @@ class LibsumoSimulator:
             values[taken] = np.fromiter(map(what, names), np.float64, len(names))
             return values
 
-        statistic = libsumo.simulation.getParameter
         none = np.zeros(len(lanes))
         return Snapshot(
             time_s=self._time_s,
@@ -345,23 +366,10 @@ class LibsumoSimulator:
             halting=measure(api.getLastStepHaltingNumber, none),
             mean_speed_mps=measure(api.getLastStepMeanSpeed, self._limits),
             waiting_s=measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0),
-            departed=int(statistic("", "stats.vehicles.inserted")),
-            backlog=int(statistic("", "stats.vehicles.waiting")),
-            near=self._near(names, taken) if self._launch.zone_m else np.empty(0),
+            departed=departed,
+            backlog=backlog,
+            near=near_the_end(libsumo, lanes, names, self._launch.zone_m),
         )
-
-    def _near(self, names: Sequence[str], places: NDArray[np.int64]) -> NDArray[np.float64]:
-        """What stands in `Snapshot.near`; looks at every vehicle on the lanes `names`."""
-        assert self._launch is not None
-        near = np.zeros((3, len(self._launch.lanes)))
-        api = libsumo.vehicle
-        for lane, place in zip(names, places.tolist(), strict=True):
-            begins = libsumo.lane.getLength(lane) - self._launch.zone_m
-            for name in libsumo.lane.getLastStepVehicleIDs(lane):
-                if api.getLanePosition(name) >= begins:
-                    halts = api.getSpeed(name) < HALTING_MPS
-                    near[:, place] += (1.0, float(halts), api.getWaitingTime(name))
-        return near
 
     def _fail(self, what: str, error: Exception) -> None:
         assert self._launch is not None

@@ -25,6 +25,7 @@ from ugat_marl.effects.detectors import (
     owners,
 )
 from ugat_marl.effects.domains import GAPS, NAMED, NamedDomain, spelled_out
+from ugat_marl.effects.engine import QueueModel
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
 from ugat_marl.effects.judging import Objective
 from ugat_marl.effects.observing import (
@@ -125,6 +126,7 @@ __all__ = [
     "Parking",
     "PhaseOrder",
     "QuantisedCounts",
+    "QueueModel",
     "ReactionStep",
     "RedRunning",
     "SignalClock",

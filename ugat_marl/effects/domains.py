@@ -149,9 +149,11 @@ def _transition() -> list[NamedDomain]:
         "downpour": "V3+desired_speed=0.85+headway=1.3",
         "blizzard": "V4+desired_speed=0.7+headway=2+demand_level=*,0.9",
     }
-    return found + [
+    found += [
         NamedDomain(name, "transition", effects, note=_ASSUMED) for name, effects in others.items()
     ]
+    engine = "SUMO's mesoscopic model: an engine to train in, --sim meso"
+    return [*found, NamedDomain("meso", "transition", "queue_model=100", note=engine)]
 
 
 def _reward() -> list[NamedDomain]:

@@ -1,0 +1,230 @@
+"""SUMO's mesoscopic model as an engine: the same observations, from vehicles and their routes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import libsumo
+import numpy as np
+import pytest
+
+import ugat_marl
+from ugat_marl.effects import in_domain, known_effects, load, parse_domain
+from ugat_marl.errors import OptionError
+from ugat_marl.looks import QueueLook
+from ugat_marl.testing.episodes import play, random_actions
+
+
+class FakeApi:
+    """An edge of two lanes, 200 m at 10 m/s: lane 0 leads right, lane 1 straight on and left."""
+
+    def __init__(self) -> None:
+        self.at: dict[str, float] = {}  # vehicle to the beginning of its segment
+        self.routes: dict[str, tuple[str, ...]] = {}
+        self.held_s: dict[str, float] = {}
+        self.queue: dict[str, int] = {}
+        self.lane = self.edge = self.vehicle = self
+
+    def getLinks(self, lane: str) -> Sequence[tuple[str, ...]]:
+        return {"in_0": [("right_0",)], "in_1": [("on_0",), ("left_0",)], "wide_0": [("on_0",)],
+                "wide_1": [("on_0",), ("left_0",)], "one_0": [("on_0",)], "one_1": [("on_0",)],
+                }[lane]  # fmt: skip
+
+    def getLength(self, lane: str) -> float:
+        return 200.0
+
+    def getMaxSpeed(self, lane: str) -> float:
+        return 10.0
+
+    def getLastStepVehicleIDs(self, edge: str) -> Sequence[str]:
+        return [name for name, route in self.routes.items() if route[0] == edge]
+
+    def getLanePosition(self, name: str) -> float:
+        return self.at[name]
+
+    def getRoute(self, name: str) -> tuple[str, ...]:
+        return self.routes[name]
+
+    def getRouteIndex(self, name: str) -> int:
+        return 0
+
+    def getLaneIndex(self, name: str) -> int:
+        return self.queue.get(name, 7)
+
+    def getWaitingTime(self, name: str) -> float:
+        return self.held_s.get(name, 0.0)
+
+    def getSpeed(self, name: str) -> float:
+        return 8.0
+
+    def enter(self, name: str, edge: str, following: str, at: float = 0.0) -> None:
+        self.routes[name], self.at[name] = (edge, following), at
+
+
+LANES = ("in_0", "in_1", "wide_0", "wide_1", "one_0", "one_1")
+LIMITS = np.full(6, 10.0)
+
+
+def test_vehicles_count_where_their_routes_lead() -> None:
+    api = FakeApi()
+    look = QueueLook(api, LANES, 100.0)
+    for name, following in (("a", "right"), ("b", "on"), ("c", "left"), ("d", "left")):
+        api.enter(name, "in", following)
+    assert look.look(0.0, LIMITS)[0].tolist() == [1, 3, 0, 0, 0, 0]
+    assert look.look(0.0, LIMITS)[2].tolist() == [8, 8, 10, 10, 10, 10], (
+        "an empty lane has its limit"
+    )
+
+
+def test_where_two_lanes_lead_on_the_queue_decides_and_then_the_shorter_one() -> None:
+    api = FakeApi()
+    look = QueueLook(api, LANES, 100.0)
+    for name in "abc":
+        api.enter(name, "wide", "on")
+    assert look.look(0.0, LIMITS)[0].tolist() == [0, 0, 2, 1, 0, 0]
+    api.enter("d", "wide", "on")
+    assert look.look(10.0, LIMITS)[0].tolist() == [0, 0, 2, 2, 0, 0], "nobody changes over"
+    api.queue = dict.fromkeys("abcd", 1)
+    assert look.look(20.0, LIMITS)[0].tolist() == [0, 0, 0, 4, 0, 0]
+    for name in "efg":
+        api.enter(name, "one", "on")
+        api.queue[name] = 0
+    found = look.look(30.0, LIMITS)[0].tolist()
+    assert found == [0, 0, 0, 4, 2, 1], "one queue for both lanes says nothing"
+
+
+def test_who_stays_longer_than_the_way_takes_halts() -> None:
+    """Two segments of 100 m, 10 s each: who has not moved on after that is in a queue."""
+    api = FakeApi()
+    look = QueueLook(api, LANES, 100.0)
+    api.enter("a", "in", "right")
+    rows = [look.look(time_s, LIMITS)[:, 0] for time_s in (0.0, 8.0, 16.0, 24.0)]
+    assert [row[1] for row in rows] == [0, 1, 1, 1], "5 s before the first look"
+    assert rows[3][3] - rows[2][3] == 8.0 and rows[2][2] == 0
+    api.at["a"] = 100.0
+    assert look.look(32.0, LIMITS)[:, 0].tolist() == [1, 0, 8, 0], "it has moved on"
+    api.held_s["a"] = 3.0
+    assert look.look(33.0, LIMITS)[:, 0].tolist() == [1, 1, 0, 3], "SUMO says so"
+    del api.routes["a"]
+    assert not look.look(40.0, LIMITS)[:2].any()
+
+
+# --- in the running simulation
+
+
+def test_the_engine_is_an_effect_no_diagnosis_looks_for(tmp_path: Path) -> None:
+    assert "queue_model" not in known_effects()
+    scenario = load("single-v1")
+    changed = in_domain(scenario, "meso")
+    assert parse_domain("meso") == parse_domain("queue_model=100")
+    assert changed.hash != scenario.hash and changed.documents == scenario.documents
+    assert load(changed.write(tmp_path / "written")).hash == changed.hash
+
+
+def test_lanes_hold_all_vehicles_that_go_their_way() -> None:
+    env = ugat_marl.parallel_env("single-v1", "meso", duration_s=900, simulator="inprocess")
+    item = env.network.intersections[0]
+    lanes = env.network.lane_table().ids
+    leads = {lane: {x.to_lane[:-2] for x in item.links if x.from_lane == lane} for lane in lanes}
+    seen = 0
+    try:
+        env.reset(seed=1)
+        while env.agents:
+            env.step({"signal_0": (seen // 40) % 8})
+            if not env.agents:
+                break
+            for lane, count in zip(lanes, env.snapshot.vehicles, strict=True):
+                edge = lane.rpartition("_")[0]
+                if leads[lane]:
+                    goes = [
+                        libsumo.vehicle.getRoute(name)[1] in leads[lane]
+                        for name in libsumo.edge.getLastStepVehicleIDs(edge)
+                    ]
+                    assert count == sum(goes)
+                    seen += sum(goes)
+            assert (env.snapshot.halting <= env.snapshot.vehicles).all()
+        assert seen > 1000
+    finally:
+        env.close()
+
+
+def test_signals_are_obeyed() -> None:
+    """Only through traffic of north and south, and right turns, get through the first phase."""
+    env = ugat_marl.parallel_env("single-v1", "meso", duration_s=600, simulator="inprocess")
+    try:
+        env.reset(seed=1)
+        arrived: set[str] = set()
+        ways: dict[str, tuple[str, ...]] = {}
+        for _ in range(59):
+            env.step({"signal_0": 0})
+            now = set(libsumo.vehicle.getIDList())
+            ways |= {name: libsumo.vehicle.getRoute(name) for name in now}
+            arrived |= set(ways) - now
+    finally:
+        env.close()
+    greens = {(x.from_edge, x.to_lane[:-2]) for x in env.network.intersections[0].links
+              if env.network.intersections[0].phases[0][x.index] in "Gg"}  # fmt: skip
+    assert len(arrived) > 50
+    assert {ways[name] for name in arrived} == greens
+    assert len(set(ways.values()) - greens) >= 6, "others wanted to"
+
+
+def test_a_policy_fits_both_engines_and_a_seed_repeats() -> None:
+    def episode(domain: str, **options: Any) -> Any:
+        env = ugat_marl.parallel_env(
+            "mixed-v1", domain, observation="waiting", duration_s=300, **options
+        )
+        try:
+            return env.layouts, play(env, 5, random_actions(5), 999)
+        finally:
+            env.close()
+
+    layouts, here = episode("meso", simulator="inprocess")
+    _, there = episode("meso")
+    other, _ = episode("sim")
+    assert layouts == other
+    assert here.scores == there.scores
+    for ours, theirs in zip(here.moments, there.moments, strict=True):
+        for agent, vector in ours.observations.items():
+            assert np.array_equal(vector, theirs.observations[agent])
+
+
+def test_queues_are_about_those_of_car_following() -> None:
+    """The same signals: a fixed cycle through eight phases, half an hour, as many vehicles."""
+    scores: list[Any] = []
+    for domain in ("sim", "meso"):
+        env = ugat_marl.parallel_env("single-v1", domain, duration_s=1800)
+        try:
+            cycle = lambda step, *_: {"signal_0": (step // 3) % 8}  # noqa: E731
+            scores.append(play(env, 1, cycle, 999).scores)
+        finally:
+            env.close()
+    street, queues = scores
+    assert queues.due == street.due
+    assert queues.queue == pytest.approx(street.queue, rel=0.25)
+    assert queues.att_s == pytest.approx(street.att_s, rel=0.25)
+
+
+@pytest.mark.parametrize(
+    ("domain", "options"),
+    [("meso+detection_zone=50", {}), ("meso", {"crossings": True})],
+)
+def test_what_needs_positions_is_refused(domain: str, options: dict[str, Any]) -> None:
+    env = ugat_marl.parallel_env("single-v1", domain, duration_s=60, **options)
+    with pytest.raises(OptionError, match="mesoscopic model.*leave out queue_model"):
+        env.reset(seed=1)
+    env.close()
+
+
+def test_a_picture_can_be_drawn() -> None:
+    env = ugat_marl.parallel_env("single-v1", "meso", duration_s=60, render_mode="rgb_array")
+    try:
+        env.reset(seed=1)
+        for _ in range(3):
+            env.step({"signal_0": 0})
+        picture = env.render()
+    finally:
+        env.close()
+    assert picture is not None and picture.std() > 0

@@ -1,0 +1,176 @@
+"""Looks at single vehicles, where what SUMO tells of lanes is not enough.
+
+In its mesoscopic model there are no lanes and no positions. An edge is a chain of segments, and a
+vehicle knows its segment, its route, and for how long it has been kept from leaving. From these
+follow the same numbers as lanes have in car following, so that observations mean the same in both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.errors import OptionError
+from ugat_marl.measurements import HALTING_MPS
+
+
+@dataclass
+class _Stay:
+    """A vehicle in one segment.
+
+    Attributes:
+        edge: Its edge.
+        position_m: Where the segment begins on it.
+        since_s: About when the vehicle got there.
+        lanes: Positions of the lanes that lead where it goes next.
+        lane: The one it was counted on.
+    """
+
+    edge: str
+    position_m: float
+    since_s: float
+    lanes: Sequence[int]
+    lane: int
+
+
+class QueueLook:
+    """Looks at the vehicles of a running mesoscopic simulation.
+
+    A vehicle counts on the lane that leads to the next edge of its route; where several do, on the
+    one in whose queue SUMO has it, or else on the one with the fewest vehicles. It halts when it
+    has been in its segment for longer than that takes at the speed limit: as SUMO counts it, only
+    the first of a queue is held up. When it got there is known to within the time of two looks.
+
+    Args:
+        api: The module `libsumo`, with a simulation under way.
+        lanes: Lanes to measure.
+        segment_m: Length of a segment that was asked for.
+    """
+
+    def __init__(self, api: Any, lanes: Sequence[str], segment_m: float) -> None:
+        self._api = api
+        self._count = len(lanes)
+        self._own: dict[str, list[int]] = defaultdict(list)
+        self._towards: dict[tuple[str, str], list[int]] = defaultdict(list)
+        self._index = [int(lane.rpartition("_")[2]) for lane in lanes]
+        self._segment_s: dict[str, float] = {}
+        followed: dict[str, set[str]] = defaultdict(set)
+        for place, lane in enumerate(lanes):
+            edge = lane.rpartition("_")[0]
+            self._own[edge].append(place)
+            for following in {link[0].rpartition("_")[0] for link in api.lane.getLinks(lane)}:
+                self._towards[edge, following].append(place)
+                followed[edge].add(following)
+            length = api.lane.getLength(lane)
+            segments = max(1, math.floor(length / segment_m + 0.5))
+            self._segment_s[edge] = length / segments / api.lane.getMaxSpeed(lane)
+        # Where an edge has but one successor, SUMO has one queue for all its lanes.
+        self._with_queues = {edge for edge, others in followed.items() if len(others) > 1}
+        self._stays: dict[str, _Stay] = {}
+        self._looked_s = -math.inf
+
+    def look(self, time_s: float, limits: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vehicles, halting ones, mean speed and waiting time of all lanes, ``(4, lanes)``.
+
+        Args:
+            time_s: Now.
+            limits: Speed of an empty lane, m/s, ``(lanes,)``.
+        """
+        vehicles, halting, speeds, waits = ([0.0] * self._count for _ in range(4))
+        waiting_s, speed_mps = self._api.vehicle.getWaitingTime, self._api.vehicle.getSpeed
+        before, self._stays = self._stays, {}
+        passed_s = time_s - self._looked_s
+        for edge in self._own:
+            segment_s = self._segment_s[edge]
+            entered_s = time_s - min(passed_s, segment_s) / 2
+            for name in self._api.edge.getLastStepVehicleIDs(edge):
+                stay = self._stay(name, edge, before.get(name), entered_s)
+                self._stays[name] = stay
+                lane = stay.lane = self._lane(name, stay, vehicles)
+                waited = time_s - stay.since_s - segment_s
+                if waited <= 0:
+                    waited = waiting_s(name)
+                speed = 0.0 if waited > 0 else speed_mps(name)
+                vehicles[lane] += 1.0
+                halting[lane] += speed < HALTING_MPS
+                speeds[lane] += speed
+                waits[lane] += waited
+        self._looked_s = time_s
+        measured = np.array([vehicles, halting, speeds, waits])
+        there = measured[0] > 0
+        measured[2] = np.where(there, measured[2] / np.maximum(measured[0], 1.0), limits)
+        return measured
+
+    def _stay(self, name: str, edge: str, before: _Stay | None, entered_s: float) -> _Stay:
+        position = self._api.vehicle.getLanePosition(name)
+        if before is None or before.edge != edge:
+            route = self._api.vehicle.getRoute(name)
+            place = self._api.vehicle.getRouteIndex(name) + 1
+            following = route[place] if place < len(route) else ""
+            lanes = self._towards.get((edge, following)) or self._own[edge]
+            return _Stay(edge, position, entered_s, lanes, -1)
+        if position != before.position_m:
+            return _Stay(edge, position, entered_s, before.lanes, before.lane)
+        return before
+
+    def _lane(self, name: str, stay: _Stay, vehicles: Sequence[float]) -> int:
+        """The lane on which a vehicle counts, when so many have been counted already."""
+        if len(stay.lanes) == 1:
+            return stay.lanes[0]
+        if stay.edge in self._with_queues:
+            queue = self._api.vehicle.getLaneIndex(name)
+            for place in stay.lanes:
+                if self._index[place] == queue:
+                    return place
+        if stay.lane in stay.lanes:
+            return stay.lane
+        return min(stay.lanes, key=lambda place: vehicles[place])
+
+
+def near_the_end(
+    api: Any, lanes: Sequence[str], taken: Sequence[str], zone_m: float
+) -> NDArray[np.float64]:
+    """Vehicles, halting ones and waiting time in the last metres of each lane, ``(3, lanes)``.
+
+    Args:
+        api: The module `libsumo`.
+        lanes: All lanes.
+        taken: Those of them with vehicles.
+        zone_m: How many metres; 0 for nothing, an empty array.
+    """
+    if not zone_m:
+        return np.empty(0)
+    near = np.zeros((3, len(lanes)))
+    places = {lane: place for place, lane in enumerate(lanes)}
+    for lane in taken:
+        begins = api.lane.getLength(lane) - zone_m
+        for name in api.lane.getLastStepVehicleIDs(lane):
+            if api.vehicle.getLanePosition(name) >= begins:
+                halts = float(api.vehicle.getSpeed(name) < HALTING_MPS)
+                near[:, places[lane]] += (1.0, halts, api.vehicle.getWaitingTime(name))
+    return near
+
+
+def refuse_in_queues(scenario: str, **asked: bool) -> None:
+    """Refuses what needs positions on lanes.
+
+    Raises:
+        OptionError: Crossings, zones or a window are asked for in the mesoscopic model.
+    """
+    words = {
+        "crossings": "when vehicles cross stop lines (crossings, timed grounding)",
+        "zone": "who is near a stop line (detection_zone)",
+        "gui": 'pictures of vehicles (render_mode "human")',
+    }
+    for name, wanted in asked.items():
+        if wanted:
+            raise OptionError(
+                f"scenario {scenario!r} runs in SUMO's mesoscopic model, in which vehicles have no "
+                f"position on a lane: it cannot tell {words[name]}; leave out queue_model"
+            )
