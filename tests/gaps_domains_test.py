@@ -33,6 +33,7 @@ from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.judging import HIDDEN
 from ugat_marl.measurements import Snapshot
 from ugat_marl.sensing import Sensing
+from ugat_marl.testing import check_determinism, check_environment
 from ugat_marl.traffic_env import TrafficEnv
 
 THEIRS = (  # scripts/run_nonrl_gap_evals.sh of the benchmark
@@ -434,3 +435,15 @@ def test_an_incident_needs_a_lane_that_is_long_enough() -> None:
     changed = replace(scenario, network=scenario.network.edited(short))
     with pytest.raises(ScenarioError, match="no lane of 60 m"):
         in_domain(changed, "incident")
+
+
+@pytest.mark.parametrize(
+    "domain",
+    ["combined-2+lost_readings=0.2+observation_delay=20+execution_delay=20+lost_commands=0.2"
+     "+phase_order=cyclic+max_green=30+objective=safety", "meso+barrier-both+noise-3-percent"],
+)  # fmt: skip
+def test_an_environment_with_gaps_is_conformant(domain: str) -> None:
+    def make() -> TrafficEnv:
+        return ugat_marl.parallel_env("mixed-v1", domain, duration_s=60)
+
+    assert all(found.passed for found in [*check_environment(make), *check_determinism(make)])
