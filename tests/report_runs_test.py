@@ -271,6 +271,20 @@ def test_no_damage_is_a_traceback(run: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.tmp"))
 
 
+def test_a_file_that_makes_its_reader_panic_is_broken(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seen in one of a hundred files with a wrong byte; polars then raises a BaseException."""
+
+    def panic(path: Path) -> None:
+        raise pl.exceptions.PanicException("assertion failed")
+
+    monkeypatch.setattr(pl, "read_parquet", panic)
+    _, page = page_of(run)
+    for name in ("metrics.parquet", "queues.parquet"):
+        assert f"{name} cannot be used (cannot be read (assertion failed)" in page.text
+
+
 def test_values_of_a_wrong_kind_are_no_traceback(run: Path) -> None:
     table = json.loads((run / "table.json").read_text())
     table["episodes"][0]["att_s"] = None
@@ -287,6 +301,19 @@ def test_values_of_a_wrong_kind_are_no_traceback(run: Path) -> None:
     metrics.add("episode", 0, {"return": np.nan})
     metrics.write(run / "metrics.parquet")
     page_of(run)
+
+
+def test_what_only_an_objective_measures_is_shown_with_its_unit(run: Path) -> None:
+    found = evaluation()
+    results = tuple(
+        replace(r, scores=replace(r.scores, hidden={"co2_g": 250.0})) if r.domain == "V4" else r
+        for r in found.results
+    )
+    replace(found, results=results).write(run / "table.json")
+    _, page = page_of(run)
+    assert "CO2 [g/veh]" in page.text
+    rows = [row for row in page.cells if row[:1] == ["UGAT"] and len(row) == 10]
+    assert [row[-1] for row in rows] == ["–", "250"]
 
 
 def test_a_scenario_that_is_gone_or_changed_is_said(run: Path) -> None:

@@ -101,7 +101,7 @@ def read_queues(path: Path) -> pl.DataFrame:
     """
     try:
         frame = pl.read_parquet(path)
-    except (OSError, pl.exceptions.PolarsError) as error:
+    except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
         reason = str(error).splitlines()[0]
         raise CheckpointError(f"{path}: cannot be read ({reason})") from None
     if frame.schema != pl.Schema(_SCHEMA):

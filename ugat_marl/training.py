@@ -60,7 +60,7 @@ class Metrics:
         """
         try:
             frame = pl.read_parquet(path)
-        except (OSError, pl.exceptions.PolarsError) as error:
+        except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
             reason = str(error).splitlines()[0]
             raise CheckpointError(
                 f"{path}: cannot be read ({reason}); it may have been cut short. Remove the run "

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from html import escape
 from typing import Any
 
+from ugat_marl.judging import HIDDEN
 from ugat_marl.metrics import MEASURES
 from ugat_marl.report import diagnosis_words as words
 from ugat_marl.report.diagnosis_sections import pairs
@@ -173,13 +174,16 @@ def scores_table(found: Evaluation) -> str:
 
 
 def _measures(found: Evaluation) -> str:
+    hidden = list(dict.fromkeys(name for r in found.results for name in r.scores.hidden))
     headings = ["policy", "domain", *MEASURES.values(), "never entered [veh]"]
+    headings += [HIDDEN.get(name, name) for name in hidden]
     rows = [
         [
             policy,
             domain,
             *(with_interval(found.estimate(policy, domain, measure)) for measure in MEASURES),
             words.number(found.estimate(policy, domain, "backlog").mean),
+            *(words.number(found.estimate(policy, domain, name).mean) for name in hidden),
         ]
         for policy in found.policies
         for domain in found.domains
