@@ -83,7 +83,9 @@ def test_every_command_explains_itself(
 MEASURING = ("record", "import-atspm", "diagnose", "policy-gap")
 
 
-@pytest.mark.parametrize("command", [c for c in COMMANDS if c.split()[0] in (*MEASURING, "blind")])
+@pytest.mark.parametrize(
+    "command", [c for c in COMMANDS if c.split()[0] in (*MEASURING, "blind", "scenario")]
+)
 def test_help_fits_a_terminal_and_says_what_defaults_mean(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

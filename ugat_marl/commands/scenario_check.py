@@ -37,8 +37,9 @@ MOST_APPROACHES = 8
 class ScenarioCheck:
     """Says what a controller will face; leaves with 1 if something has to be mended.
 
-    Agents, lanes, phases, conflicts, traffic, and an episode under the network's own programme and
-    under a good rule. With --conformance the conformance kit runs instead (docs/conformance.md).
+    It plays an episode under the network's own programme and one under a good rule.
+
+    With --conformance it runs the conformance kit instead (docs/conformance.md).
 
     Examples:
         ugat-marl scenario check single-v1

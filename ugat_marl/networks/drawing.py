@@ -288,8 +288,8 @@ def _names(axes: Any, place: _Place) -> None:
         end = np.mean([shape[-1] for shape in shapes], axis=0)
         back = -_direction(shapes[0][-2], shapes[0][-1])
         point = end + back * 0.17 * width
-        point = np.clip(point, [left + 0.1 * width, bottom + 0.05 * height],
-                        [left + 0.9 * width, bottom + 0.95 * height])  # fmt: skip
+        point = np.clip(point, [left + 0.17 * width, bottom + 0.05 * height],
+                        [left + 0.83 * width, bottom + 0.95 * height])  # fmt: skip
         indices = sorted({link.index for link in item.links if link.from_edge == edge})
         axes.text(
             *point, f"{_short(edge, 16)}\n{_ranges(indices)}", size=6.5, ha="center", va="center",
