@@ -70,6 +70,13 @@ def test_killed_and_unharmed_episodes_have_one_digest() -> None:
     assert harmed["episodes"] == unharmed["episodes"] == 6
 
 
+def test_what_is_sumo_s_and_what_is_not_is_all() -> None:
+    asked = {"scenario": "grid2x2-v1", "duration_s": 500.0, "seed": 1, "settled": 20}
+    found = WORK["split"]({**asked, "decisions": 20})
+    assert found["sumo_ms"] > found["rest_ms"] > 0
+    assert found["us_per_vehicle_s"] > 0.1
+
+
 @pytest.mark.slow
 def test_a_report_of_the_leaks() -> None:
     report = ScaleBench(parts=("leaks",), environments=2, resets=16).run()
@@ -80,7 +87,7 @@ def test_a_report_of_the_leaks() -> None:
 
 
 def test_wrong_options() -> None:
-    assert set(WORK) == {"steps", "grounded", "leaks", "kills", "decide", "ray"}
+    assert set(WORK) == {"steps", "split", "grounded", "leaks", "kills", "decide", "ray"}
     with pytest.raises(OptionError, match="parts holds 'speed'; allowed: workers, grounded"):
         ScaleBench(parts=("speed",))
     with pytest.raises(OptionError, match="rounds = 0"):

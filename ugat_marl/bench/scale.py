@@ -89,7 +89,7 @@ class ScaleBench:
     decisions: int = 120
     settled: int = 60
     sides: tuple[int, ...] = (4, 8, 16)
-    vph: float = 300.0
+    vph: float = 150.0
     environments: int = 64
     resets: int = 500
     episodes: int = 500
@@ -182,6 +182,14 @@ class ScaleBench:
                 {side: partial(self._steps, str(grid), 1) for side, grid in grids.items()},
                 reporter,
             )
+            parts = self._rounds(
+                "size, in SUMO and outside",
+                {
+                    side: partial(self._ask, "split", scenario=str(grid), **self._lengths)
+                    for side, grid in grids.items()
+                },
+                reporter,
+            )
         costs = {
             side: [1e3 * run["seconds"] / (run["steps"] * run["agents"]) for run in own]
             for side, own in runs.items()
@@ -189,10 +197,20 @@ class ScaleBench:
         first, last = self.sides[0], self.sides[-1]
         growth = Spread.of_ratios(costs[last], costs[first])
         name = f"{last}x{last} / {first}x{first}, cost per agent and step"
-        figures = [Figure(name, growth, 1.5, 1.0, False)]
+        rest = {side: [run["rest_ms"] for run in own] for side, own in parts.items()}
+        outside = Spread.of_ratios(rest[last], rest[first])
+        figures = [
+            Figure(name, growth, 1.5, 1.0, False),
+            Figure(f"{name}, outside SUMO", outside, 1.5, 1.0, False),
+        ]
         for side, own in runs.items():
-            agents = own[-1]["agents"]
+            agents, lasting = own[-1]["agents"], parts[side]
             figures += [
+                _told(f"{side}x{side}: CPU outside SUMO", Spread.of(rest[side])),
+                _told(
+                    f"{side}x{side}: CPU of SUMO per vehicle and second [us]",
+                    Spread.of([run["us_per_vehicle_s"] for run in lasting]),
+                ),
                 _told(f"{side}x{side}: ms per agent and step", Spread.of(costs[side])),
                 _told(f"{side}x{side}: the same, CPU alone", _cpu_cost(own)),
                 _told(f"{side}x{side}: vehicles on lanes per agent", own[-1]["vehicles"] / agents),
@@ -266,8 +284,11 @@ class ScaleBench:
         return runs
 
     def _steps(self, scenario: str, n: int) -> Run:
-        decisions = {"settled": self.settled, "decisions": self.decisions}
-        return self._ask("steps", scenario=scenario, n=n, **decisions)
+        return self._ask("steps", scenario=scenario, n=n, **self._lengths)
+
+    @property
+    def _lengths(self) -> dict[str, int]:
+        return {"settled": self.settled, "decisions": self.decisions}
 
     def _ask(self, work: str, **request: Any) -> Run:
         # One decision more than is measured: none of the episodes ends, which would cost a reset.

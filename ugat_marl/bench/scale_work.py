@@ -58,6 +58,46 @@ def steps(request: Request) -> dict[str, Any]:
         }
 
 
+def split(request: Request) -> dict[str, Any]:
+    """Seconds of CPU that the same decisions take in SUMO, and in all else, in one process."""
+    env = parallel_env(request["scenario"], duration_s=request["duration_s"], simulator="inprocess")
+    _, infos = env.reset(seed=request["seed"])
+    simulator: Any = env._simulator
+    inside = {"advance": 0.0, "_snapshot": 0.0}
+
+    def timed(name: str) -> Callable[..., Any]:
+        plain = getattr(simulator, name)
+
+        def call(*arguments: Any) -> Any:
+            began = time.process_time()
+            found = plain(*arguments)
+            inside[name] += time.process_time() - began
+            return found
+
+        return call
+
+    for name in inside:
+        setattr(simulator, name, timed(name))
+    began = 0.0
+    for decision in range(request["settled"] + request["decisions"]):
+        if decision == request["settled"]:
+            inside.update(advance=0.0, _snapshot=0.0)
+            began = time.process_time()
+        masks = {agent: infos[agent]["action_mask"] for agent in env.agents}
+        chosen = {agent: int(cycle(mask, decision)) for agent, mask in masks.items()}
+        _, _, _, _, infos = env.step(chosen)
+    total = time.process_time() - began
+    vehicles = env.snapshot.vehicles.sum()
+    env.close()
+    sumo = inside["advance"] - inside["_snapshot"]  # reading its lanes is not simulating
+    agents, steps = len(env.possible_agents), request["decisions"]
+    return {
+        "sumo_ms": 1e3 * sumo / (agents * steps),
+        "rest_ms": 1e3 * (total - sumo) / (agents * steps),
+        "us_per_vehicle_s": 1e6 * sumo / (10.0 * steps * max(float(vehicles), 1.0)),
+    }
+
+
 def grounded(request: Request) -> dict[str, Any]:
     """An episode, plain or with models that are asked and never obeyed: the same traffic."""
     from ugat_marl.grounding.gate import GateConfig
@@ -233,8 +273,8 @@ def _kill(env: VectorEnv, number: int) -> None:
 
 
 WORK: Mapping[str, Callable[[Request], dict[str, Any]]] = {
-    "steps": steps, "grounded": grounded, "leaks": leaks, "kills": kills, "decide": decide,
-    "ray": ray,
+    "steps": steps, "split": split, "grounded": grounded, "leaks": leaks, "kills": kills,
+    "decide": decide, "ray": ray,
 }  # fmt: skip
 
 
