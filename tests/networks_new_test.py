@@ -274,6 +274,11 @@ def test_a_network_that_is_none(
             '<routes>\n<trip id="t" depart="0" from="a" to="b"/></routes>',
             "cars.rou.xml, line 2: <trip",
         ),
+        (
+            '<routes><vehicle id="v" depart="0">\n'
+            '<route edges="A1_east1 A1_west1"/></vehicle></routes>',
+            "cars.rou.xml, line 2: a route goes from edge 'A1_east1' to 'A1_west1', but no conn",
+        ),
         ("<routes/>", "no vehicle departs between 0 s and 3600 s"),
         ("<net/>", "a route file begins with <routes> or <additional>, this with <net>"),
         (BOMB.replace("net", "routes"), "document types and entities"),

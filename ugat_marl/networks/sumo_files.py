@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shutil
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.files import parse_xml, read_bytes, write_whole
+from ugat_marl.files import Tag, parse_xml, read_bytes, write_whole
 from ugat_marl.networks.making import Draft, Fleet, Roads, Vehicles
 from ugat_marl.networks.reading import scan
 from ugat_marl.progress import Reporter
@@ -47,9 +47,11 @@ def given_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
     """Route files the user has."""
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
-        del network
+        leads = _leads(network)
         for path in paths:
-            _require_root(path, ("routes", "additional"), "route file", reporter)
+            for tag in _rooted(path, ("routes", "additional"), "route file", reporter):
+                if tag.name == "route":
+                    _require_connected(tag, leads, path, network)
         return Fleet(tuple(_placed(path, folder, link) for path in paths))
 
     return vehicles
@@ -111,15 +113,39 @@ def _placed(path: Path, folder: Path, link: bool) -> str:
     return path.name
 
 
+def _leads(network: Path) -> dict[str, set[str]]:
+    """The edges that every edge of a network leads to."""
+    root = parse_xml(read_bytes(network), str(network))
+    found: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
+    for item in root.iter("connection"):
+        found.setdefault(item.get("from", ""), set()).add(item.get("to", ""))
+    return found
+
+
+def _require_connected(tag: Tag, leads: Mapping[str, set[str]], path: Path, network: Path) -> None:
+    """Refuses a route that jumps; edges that do not exist are refused with all other demand."""
+    for a, b in pairwise(tag.attributes.get("edges", "").split()):
+        if a in leads and b in leads and b not in leads[a]:
+            raise ScenarioError(
+                f"{path}, line {tag.line}: a route goes from edge {a!r} to {b!r}, but no "
+                f"connection of {network} leads there; route the demand again (duarouter)"
+            )
+
+
 def _require_root(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> None:
-    first: Any = None
-    for tag in scan(path, reporter):
-        if first is None and tag.name not in tags:
+    for _ in _rooted(path, tags, what, reporter):
+        pass
+
+
+def _rooted(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> Iterator[Tag]:
+    """All elements of a file, if its first one is what it should be."""
+    for number, tag in enumerate(scan(path, reporter)):
+        if not number and tag.name not in tags:
             raise ScenarioError(
                 f"{path}, line {tag.line}: a {what} begins with "
                 f"{' or '.join(f'<{name}>' for name in tags)}, this with <{tag.name}>"
             )
-        first = tag
+        yield tag
 
 
 def _origin(paths: Sequence[Path], link: bool) -> str:
