@@ -625,7 +625,7 @@ def browse(directory: Path, *options: str) -> str:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
-@pytest.mark.parametrize("width", [390, 900, 1440])
+@pytest.mark.parametrize("width", [390, 700, 1440])
 def test_nothing_is_clipped_in_a_browser(width: int, tmp_path: Path) -> None:
     for seed in (0, 1):
         make_run(tmp_path / "runs" / f"a-rather-long-name-of-a-run-{seed}", seed=seed)

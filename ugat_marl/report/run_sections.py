@@ -181,14 +181,15 @@ def _measures(found: Evaluation) -> str:
         [
             policy,
             domain,
-            *(with_interval(found.estimate(policy, domain, measure)) for measure in MEASURES),
+            *(_with_half(found.estimate(policy, domain, measure)) for measure in MEASURES),
             words.number(found.estimate(policy, domain, "backlog").mean),
             *(words.number(found.estimate(policy, domain, name).mean) for name in hidden),
         ]
         for policy in found.policies
         for domain in found.domains
     ]
-    return folded("All measures", grid(headings, rows, headings[2:]))
+    legend = '<p class="soft">±: half of the 95 % bootstrap interval over the episodes.</p>'
+    return folded("All measures", legend + grid(headings, rows, headings[2:]))
 
 
 def group_tables(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -316,6 +317,13 @@ def with_interval(found: Estimate) -> str:
     if not math.isfinite(found.low) or found.low == found.high:
         return words.number(found.mean)
     return f"{words.number(found.mean)} {_ends(found.low, found.high)}"
+
+
+def _with_half(found: Estimate) -> str:
+    """A mean with half of its interval, if it has one, where there is little room."""
+    if not math.isfinite(found.low) or found.low == found.high:
+        return words.number(found.mean)
+    return f"{words.number(found.mean)} ±{words.number((found.high - found.low) / 2, 2)}"
 
 
 def _ends(low: float, high: float) -> str:

@@ -26,11 +26,18 @@ ul.plain {{ padding-left: 1.1rem; margin: .4rem 0; }}
 .many {{ font-size: .86rem; }}
 .many th, .many td {{ padding-right: .5rem; }}
 .many td:not(.n, [data-label=rank]) {{ min-width: 3.2rem; }}
+th, .n {{ overflow-wrap: normal; }}
+@media screen and (max-width: 56rem) {{
+  .many {{ font-size: .72rem; }}
+  .many th, .many .n {{ overflow-wrap: anywhere; }}
+}}
 @media screen and (max-width: 40rem) {{
   .stack thead {{ display: block; left: 0; width: 1px; }}
+  .many {{ font-size: .9rem; }}
 }}
 @media print {{
   :root {{ {_properties(LIGHT)} }}
   .maps {{ grid-template-columns: 1fr 1fr; }}
+  .many {{ font-size: .72rem; }}
 }}
 """
