@@ -75,7 +75,7 @@ def test_each_cell_is_the_mean_over_domains_and_seeds() -> None:
 def test_the_tables_fit_a_terminal() -> None:
     text = shown(matrix_table(planted()), *hidden_tables(planted()))
     assert max(map(len, text.splitlines())) <= 80
-    assert "V4 +30" in text and "+200.0" in text and "zone-50" in text
+    assert "+30" in text and "+200.0" in text and "zone-50" in text
     assert "3.0" in text and "measured in want-safety" in text
     assert not hidden_tables(Evaluation("x", "0", (Result("a", "sim", 0, scores(1)),), {}))
 
@@ -89,7 +89,7 @@ def test_a_table_survives_writing(tmp_path: Path) -> None:
     ("domains", "words"),
     [
         (["sim", "reward"], ["cost of what is wanted", "measured in want-efficiency, want-emis"]),
-        (["sim", "action"], ["what each gap costs", "action (12), s", "barrier-both"]),
+        (["sim", "action"], ["what each gap costs", "(12) s", "barrier-both"]),
     ],
 )
 def test_evaluate_plays_whole_gaps(

@@ -178,18 +178,24 @@ NAMED: dict[str, NamedDomain] = {
 """All of them, by name."""
 
 
+TO_TRAIN_IN = frozenset({"meso"})
+"""Named domains that stand for a simulation, and for no street."""
+
+
 def spelled_out(names: Sequence[str]) -> list[str]:
     """Domains with ``"all"`` and names of gaps in place of lists, each domain once.
 
     Args:
-        names: Domains; ``"all"`` is ``sim`` and every named one, the name of a gap all of its own.
+        names: Domains; ``"all"`` is ``sim`` and every named one, the name of a gap all of its own,
+            but for those that are there `TO_TRAIN_IN`.
     """
     found: list[str] = []
+    streets = [item for item in NAMED.values() if item.name not in TO_TRAIN_IN]
     for name in names:
         if name.lower() == "all":
-            found += ["sim", *NAMED]
+            found += ["sim", *(item.name for item in streets)]
         elif name.lower() in GAPS:
-            found += [item.name for item in NAMED.values() if item.gap == name.lower()]
+            found += [item.name for item in streets if item.gap == name.lower()]
         else:
             found.append(name)
     return list(dict.fromkeys(found))

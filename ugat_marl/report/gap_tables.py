@@ -20,18 +20,21 @@ def matrix_table(found: Evaluation) -> RenderableType:
     gaps = gaps_of(found)
     first = found.domains[0]
     table = _table(f"{found.scenario}: what each gap costs each controller")
-    table.add_column("policy", max_width=18, overflow="fold")
-    table.add_column(f"{first}, ATT s", justify="right")
+    table.add_column("policy", max_width=16, overflow="fold")
+    table.add_column(f"{first}\nATT s", justify="right")
     for gap, domains in gaps.items():
         unit = "%" if gap == "reward" else "s"
-        table.add_column(f"{gap} ({len(domains)}), {unit}", justify="right", overflow="fold")
+        heading = f"{gap}\n({len(domains)}) {unit}"
+        table.add_column(heading, justify="right", overflow="fold")
     for policy, cells in gap_matrix(found).items():
         start = found.estimate(policy, first, "att_s").mean
         table.add_row(
             Text(policy), number(start), *(f"{cell.cost.mean:+.1f}" for cell in cells.values())
         )
         worst = [
-            f"{cell.worst} {cell.worst_cost:+.0f}" if cell.worst_cost > 0 else "-"
+            f"{cell.worst.removeprefix('want-')}\n{cell.worst_cost:+.0f}"
+            if cell.worst_cost > 0
+            else "-"
             for cell in cells.values()
         ]
         table.add_row(*(Text(text, style="dim") for text in ("  worst", "", *worst)))
