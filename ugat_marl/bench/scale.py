@@ -142,20 +142,30 @@ class ScaleBench:
         return report
 
     def _workers(self, reporter: Reporter) -> list[Figure]:
-        runs = self._rounds(
-            "workers", {n: partial(self._steps, self.scenario, n) for n in (1, 2)}, reporter
-        )
-        ratio = Spread.of_ratios(_speeds(runs[2]), _speeds(runs[1]))
+        variants = {
+            name: partial(self._steps, self.scenario, n, halves=name == "halves")
+            for name, n in (("one", 1), ("together", 2), ("halves", 2))
+        }
+        runs = self._rounds("workers", variants, reporter)
+        one, two = runs["one"], runs["together"]
+        figures = [
+            Figure(name, Spread.of_ratios(_speeds(runs[variant]), _speeds(one)), 1.7, 1.9, True)
+            for name, variant in (
+                ("2 simulations / 1, steps per s, by halves", "halves"),
+                ("2 simulations / 1, steps per s, together", "together"),
+            )
+        ]
         return [
-            Figure("2 simulations together / 1, steps per s", ratio, 1.7, 1.9, True),
-            _told("steps per s of 1 simulation", Spread.of(_speeds(runs[1]))),
-            _told("steps per s of 2 simulations", Spread.of(_speeds(runs[2]))),
-            _told("CPU of a simulation per step [ms]", _milliseconds(runs[2], "simulation_cpu_s")),
-            _told("CPU of its user per step [ms]", _milliseconds(runs[2], "user_cpu_s")),
-            _told("memory of 1 simulation and its user [MiB]", runs[1][-1]["memory_mib"]),
+            *figures,
+            _told("steps per s of 1 simulation", Spread.of(_speeds(one))),
+            _told("steps per s of 2 simulations, by halves", Spread.of(_speeds(runs["halves"]))),
+            _told("steps per s of 2 simulations, together", Spread.of(_speeds(two))),
+            _told("CPU of a simulation per step [ms]", _milliseconds(two, "simulation_cpu_s")),
+            _told("CPU of its user per step [ms]", _milliseconds(two, "user_cpu_s")),
+            _told("memory of 1 simulation and its user [MiB]", one[-1]["memory_mib"]),
             _told(
                 "memory of a further simulation [MiB]",
-                runs[2][-1]["memory_mib"] - runs[1][-1]["memory_mib"],
+                two[-1]["memory_mib"] - one[-1]["memory_mib"],
             ),
         ]
 
@@ -283,8 +293,8 @@ class ScaleBench:
                     advance()
         return runs
 
-    def _steps(self, scenario: str, n: int) -> Run:
-        return self._ask("steps", scenario=scenario, n=n, **self._lengths)
+    def _steps(self, scenario: str, n: int, *, halves: bool = False) -> Run:
+        return self._ask("steps", scenario=scenario, n=n, halves=halves, **self._lengths)
 
     @property
     def _lengths(self) -> dict[str, int]:

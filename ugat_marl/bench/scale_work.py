@@ -21,7 +21,7 @@ from ugat_marl.bench.memory_resets import family, look, processes
 from ugat_marl.policy import AnyParallelEnv
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.traffic_env import parallel_env
-from ugat_marl.vector import VectorEnv, vector_env
+from ugat_marl.vector import Batch, VectorEnv, vector_env
 
 Request = Mapping[str, Any]
 _HELD = 3
@@ -44,8 +44,12 @@ def steps(request: Request) -> dict[str, Any]:
             batch = env.step(cycle(batch.masks, decision))
         computed, simulated = time.process_time(), _cpu_s(env)
         began = time.perf_counter()
-        for decision in range(request["settled"], request["settled"] + request["decisions"]):
-            batch = env.step(cycle(batch.masks, decision))
+        last = request["settled"] + request["decisions"]
+        if request["halves"]:
+            _by_halves(env, batch, request["settled"], last)
+        else:
+            for decision in range(request["settled"], last):
+                batch = env.step(cycle(batch.masks, decision))
         seconds = time.perf_counter() - began
         return {
             "seconds": seconds,
@@ -56,6 +60,19 @@ def steps(request: Request) -> dict[str, Any]:
             "memory_mib": _memory_mib(),
             "vehicles": _vehicles(batch.observations),
         }
+
+
+def _by_halves(env: VectorEnv, batch: Batch, first: int, last: int) -> None:
+    """One half decides while the other one is simulated."""
+    halves = env.halves()
+    masks = [batch.masks[: halves[0].n], batch.masks[halves[0].n :]]
+    for half, own in zip(halves, masks, strict=True):
+        half.step_async(cycle(own, first))
+    for decision in range(first + 1, last + 1):
+        for half in halves:
+            found = half.step_wait()
+            if decision < last:
+                half.step_async(cycle(found.masks, decision))
 
 
 def split(request: Request) -> dict[str, Any]:
