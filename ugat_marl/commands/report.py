@@ -35,17 +35,27 @@ class Report:
     Examples:
         ugat-marl report runs/first
         ugat-marl report runs/first runs/second --out both.html
-        ugat-marl report runs/paper results/single-v1/main --out paper.html --pictures pictures
+        ugat-marl report runs/paper --out paper.html --pictures pictures
 
     Attributes:
-        runs: Folders.
-        out: Page to write; default: report.html, in the folder if one is given.
+        runs: Folders, one or more.
+        out: Page to write.
         pictures: Folder for the pictures as SVG and PNG, too.
     """
 
-    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN")]
-    out: Path | None = None
-    pictures: Path | None = None
+    runs: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="RUN", help_behavior_hint="(required)")
+    ]
+    out: Annotated[
+        Path | None,
+        arg(
+            metavar="FILE",
+            help_behavior_hint="(default: report.html, in the folder if one is given)",
+        ),
+    ] = None
+    pictures: Annotated[
+        Path | None, arg(metavar="DIR", help_behavior_hint="(default: no files)")
+    ] = None
 
     def run(self, console: Console) -> int:
         """Reads, writes the page, says what is missing."""

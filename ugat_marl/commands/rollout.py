@@ -78,7 +78,9 @@ class Rollout:
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
-    out: Path | None = None
+    out: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: nothing is recorded)")
+    ] = None
     policy: str = "largest-queue:20"
     domain: str = "sim"
     episodes: int = 3
@@ -90,8 +92,12 @@ class Rollout:
     crossings: bool = False
     workers: Workers = None
     ray: Ray = None
-    video: Path | None = None
-    beside: str | None = None
+    video: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: nothing is filmed)")
+    ] = None
+    beside: Annotated[str | None, arg(metavar="POLICY", help_behavior_hint="(default: none)")] = (
+        None
+    )
     film: VideoConfig = field(default_factory=VideoConfig)
 
     def run(self, console: Console) -> int:
