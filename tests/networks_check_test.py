@@ -15,7 +15,7 @@ from ugat_marl.effects import load
 from ugat_marl.network import Network
 from ugat_marl.networks.drawing import STYLES, draw
 from ugat_marl.networks.survey import SATURATION_VPH, survey
-from ugat_marl.networks.trial import Run, problems
+from ugat_marl.networks.trial import Run, left_outside, problems
 from ugat_marl.progress import Silent
 from ugat_marl.scenario import Document, Scenario, resco_maps
 
@@ -107,6 +107,26 @@ def test_a_short_episode_and_a_full_road_are_named(single: Scenario) -> None:
     assert "20 of 1000 vehicles cannot enter even under rule" in text
     runs[1] = Run("rule", 90, 1000, 995, 900, 5)
     assert problems(survey(single), runs) == []
+
+
+def test_roads_where_vehicles_wait_outside_are_named(single: Scenario) -> None:
+    """3 000 vehicles an hour want onto one road, a handful onto another."""
+    (item,) = Network.read(single).intersections
+    full, free, *_ = dict.fromkeys(link.from_edge for link in item.links)
+    goal = {k.from_edge: k.to_edge for k in item.links if k.direction == "s"}
+    vehicles = "".join(
+        f'<vehicle id="v{i}" depart="{i * 0.3:.1f}"><route edges="{road} {goal[road]}"/></vehicle>'
+        for i in range(1000)
+        for road in [free if i % 100 == 0 else full]
+    )
+    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
+    crowded = replace(single, routes=routes).with_duration(300)
+    outside = left_outside(crowded, 1)
+    assert set(outside) == {full}
+    assert outside[full] > 300
+    runs = [Run("programme", 100, 1000, 500, 100, 500)]
+    (text,) = problems(survey(crowded), runs, outside)
+    assert f"they wait at {full} ({outside[full]})" in text
 
 
 def test_the_command_prints_tables(

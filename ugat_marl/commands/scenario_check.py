@@ -17,7 +17,15 @@ from ugat_marl.effects import in_domain, load
 from ugat_marl.errors import OptionError
 from ugat_marl.headroom import HOLDS_S, Row
 from ugat_marl.networks.survey import IntersectionFacts, Survey, survey
-from ugat_marl.networks.trial import Run, as_json, measured_headroom, problems, try_out
+from ugat_marl.networks.trial import (
+    Run,
+    as_json,
+    is_full,
+    left_outside,
+    measured_headroom,
+    problems,
+    try_out,
+)
 from ugat_marl.progress import Bars, Silent
 from ugat_marl.testing import (
     Result,
@@ -86,9 +94,12 @@ class ScenarioCheck:
         rows = None
         if self.headroom:
             rows = measured_headroom(scenario, self.headroom, self.workers, reporter)
-        wrong = problems(facts, runs)
+        outside = left_outside(scenario, self.seed) if is_full(runs) else {}
+        wrong = problems(facts, runs, outside)
         if self.json:
-            text = json.dumps(as_json(facts, runs, rows, wrong), indent=2, ensure_ascii=False)
+            text = json.dumps(
+                as_json(facts, runs, rows, wrong, outside), indent=2, ensure_ascii=False
+            )
             print(text)
         else:
             show(console, facts, runs, rows, wrong)

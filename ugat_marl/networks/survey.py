@@ -280,26 +280,26 @@ class _Traffic:
         begin = scenario.settings.begin_s
         end = begin + scenario.settings.duration_s
         passes: Counter[str] = Counter()
-        drives: list[float] = []
+        lengths_s: list[float] = []
         first = end
-        for depart, edges in _drives(scenario):
+        for _, depart, edges in drives(scenario):
             if begin <= depart < end:
                 passes.update(edges)
-                drives.append(sum(seconds.get(edge, 0.0) for edge in edges))
+                lengths_s.append(sum(seconds.get(edge, 0.0) for edge in edges))
                 first = min(first, depart)
         hours = scenario.settings.duration_s / 3600
-        drives.sort()
-        fill_s = drives[int(0.95 * (len(drives) - 1))] if drives else 0.0
+        lengths_s.sort()
+        fill_s = lengths_s[int(0.95 * (len(lengths_s) - 1))] if lengths_s else 0.0
         return cls(Counter({e: n / hours for e, n in passes.items()}), first - begin, fill_s)
 
 
-def _drives(scenario: Scenario) -> Iterator[tuple[float, list[str]]]:
-    """Departure and roads of every vehicle, whether trips and flows are routed or not."""
+def drives(scenario: Scenario) -> Iterator[tuple[str, float, list[str]]]:
+    """Name, departure and roads of every vehicle, whether trips and flows are routed or not."""
     for document in explicit(scenario).routes:
-        depart = 0.0
+        name, depart = "", 0.0
         for tag in document.scan():
             if tag.name == "vehicle":
-                text = tag.attributes.get("depart", "0")
+                name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
                 depart = seconds_of(text) if text[:1].isdigit() else scenario.settings.begin_s
             elif tag.name == "route" and "id" not in tag.attributes:
-                yield depart, tag.attributes.get("edges", "").split()
+                yield name, depart, tag.attributes.get("edges", "").split()

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 from ugat_marl.evaluation import evaluate, rule_factory
+from ugat_marl.files import chunks_of, scan_xml
 from ugat_marl.headroom import DOMAINS, HOLDS_S, Row, headroom
-from ugat_marl.networks.survey import Survey
+from ugat_marl.networks.programs import run
+from ugat_marl.networks.survey import Survey, drives
 from ugat_marl.progress import Reporter
+from ugat_marl.redraw import sumo_program
 from ugat_marl.scenario import Scenario
+from ugat_marl.simulator import launch_of
+
+TRIPS = "trips.xml"
+"""What the simulator calls SUMO's report on its vehicles."""
 
 RULES = ("programme", "largest-queue:20")
+_NAMED = 5
 MOST_BACKLOG = 0.01
 """Share of the vehicles due that may be left outside under the better rule."""
 
@@ -70,8 +81,41 @@ def measured_headroom(
     )
 
 
-def problems(facts: Survey, runs: Sequence[Run]) -> list[str]:
-    """What has to be mended before training makes sense, each with the way out."""
+def is_full(runs: Sequence[Run]) -> bool:
+    """Whether too many vehicles stay outside under every rule."""
+    return bool(runs) and all(run.backlog > MOST_BACKLOG * run.due for run in runs)
+
+
+def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
+    """At which roads vehicles wait at the end under the network's own programme.
+
+    Raises:
+        ScenarioError: SUMO refused; holds its words.
+    """
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+        directory = Path(name) / "run"
+        launch = launch_of(scenario, seed, directory, ())
+        launch.write()
+        end_s = scenario.settings.begin_s + scenario.settings.duration_s
+        run("sumo", [str(sumo_program("sumo")), *launch.arguments, "--end", repr(end_s)])
+        waiting = {
+            item.attributes.get("id", "")
+            for item in scan_xml(chunks_of(directory / TRIPS), "SUMO's report")
+            if item.name == "tripinfo" and float(item.attributes.get("depart", "-1")) < 0
+        }
+    return Counter(edges[0] for who, _, edges in drives(scenario) if who in waiting and edges)
+
+
+def problems(
+    facts: Survey, runs: Sequence[Run], outside: Mapping[str, int] | None = None
+) -> list[str]:
+    """What has to be mended before training makes sense, each with the way out.
+
+    Args:
+        facts: What was looked at.
+        runs: What was tried.
+        outside: From `left_outside`, if it was asked.
+    """
     found: list[str] = []
     for item in facts.intersections:
         if item.unserved_lanes:
@@ -91,20 +135,27 @@ def problems(facts: Survey, runs: Sequence[Run]) -> list[str]:
         )
     if runs:
         best = min(runs, key=lambda run: run.backlog)
-        if best.backlog > MOST_BACKLOG * best.due:
+        if is_full(runs):
+            roads = Counter(outside or {}).most_common(_NAMED)
+            where = "; they wait at " + ", ".join(f"{road} ({n})" for road, n in roads)
             found.append(
-                f"{best.backlog} of {best.due} vehicles cannot enter even under {best.rule}; "
-                "the roads into the network are full, or lead nowhere: lower the demand"
+                f"{best.backlog} of {best.due} vehicles cannot enter even under {best.rule}"
+                f"{where if roads else ''}; lower the demand, or look at what blocks these roads"
             )
     return found
 
 
 def as_json(
-    facts: Survey, runs: Sequence[Run], rows: Sequence[Row] | None, wrong: Sequence[str]
+    facts: Survey,
+    runs: Sequence[Run],
+    rows: Sequence[Row] | None,
+    wrong: Sequence[str],
+    outside: Mapping[str, int] | None = None,
 ) -> dict[str, object]:
     """Everything as plain values."""
     found: dict[str, object] = asdict(facts)
     found["runs"] = [asdict(run) for run in runs]
     found["headroom"] = None if rows is None else [asdict(row) for row in rows]
+    found["left_outside"] = dict(outside or {})
     found["problems"] = list(wrong)
     return found
