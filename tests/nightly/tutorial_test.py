@@ -1,0 +1,39 @@
+"""The tutorial, command by command as it stands on its page: a quarter of an hour of two cores."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
+
+
+def test_from_clone_to_own_city(python: list[str], tmp_path: Path) -> None:
+    program = tmp_path / "bin" / "ugat-marl"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec {python[0]} -m ugat_marl "$@"\n')
+    program.chmod(0o755)
+    clone = tmp_path / "clone"
+    clone.mkdir()
+    (clone / "tests").symlink_to(ROOT / "tests")
+    environment = {**os.environ, "PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}"}
+    begin = time.monotonic()
+    for block in re.findall(r"```sh\n(.*?)```", PAGE, flags=re.DOTALL):
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", block],
+            cwd=clone, env=environment, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{block}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    print(f"{time.monotonic() - begin:.0f} s without the installation")
+    for left in ("runs/first/report.html", "runs/first/before-after.gif", "both.html",
+                 "my-city/scenario.toml", "my-city-pictures"):  # fmt: skip
+        assert (clone / left).exists(), left
+    assert "Missing here" not in (clone / "both.html").read_text(encoding="utf-8")
