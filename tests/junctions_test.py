@@ -166,3 +166,13 @@ def test_unserved_movements_of_a_hand_made_matrix() -> None:
 def test_crossings_of_a_network_without_any() -> None:
     root = parse_xml(b"<net><edge id='a'/><junction id='J'/></net>", "net")
     assert crossings_of(root) == {}
+
+
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_permitted_phases_are_those_netconvert_draws_up(lanes: int, tmp_path: Path) -> None:
+    """Letter by letter: who is protected, who waits, and which crossings go along."""
+    scenario = junction(tmp_path, *WALKS, lanes=lanes)
+    own = {state for _, state in Network.read(scenario).intersections[0].programme}
+    item, _ = derived(scenario, "permitted")
+    assert len(item.phases) == 2
+    assert set(item.phases) <= own

@@ -142,7 +142,7 @@ def _readme(made: Made, draft: Draft, command: str) -> str:
     phases = [len(item.phases) for item in made.network.intersections]
     spread = f"{min(phases)} to {max(phases)}" if len(set(phases)) > 1 else f"{phases[0]}"
     others = len(made.network.uncontrolled)
-    more = f"; {others} more lights run their own programme" if others else ""
+    more = f"; on their own programme: {others} more" if others else ""
     lines = [
         f"# {made.scenario.id}",
         "",
