@@ -4,6 +4,7 @@
 #   make test       builds the wheel, installs it into .venv and tests it
 #   make test-all   the same, and small versions of the paper's tables (half an hour)
 #   make check      format, lint, types, architecture, tests
+#   make compat     the learners of other libraries: what runs where (LATEST=1: their newest releases)
 #   make bench      the figures of docs/, measured on this machine
 #   make scenarios  builds the shipped scenarios again from their sources
 #
@@ -26,7 +27,7 @@ unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV
 export PYTHONSAFEPATH := 1
 export PYTHONNOUSERSITE := 1
 
-.PHONY: help demo test test-all check static format lint types architecture bench scenarios oldest python environment environment-dev
+.PHONY: help demo test test-all check static format lint types architecture bench scenarios oldest compat python environment environment-dev
 .DEFAULT_GOAL := help
 
 help:
@@ -74,6 +75,10 @@ oldest: environment-dev
 	$(VENV)-oldest/bin/python -m pip install -q -c constraints-oldest.txt --force-reinstall --no-deps $(VENV)/wheel/*.whl
 	$(VENV)-oldest/bin/python -m pip install -q -c constraints-oldest.txt ugat-marl hypothesis pytest pytest-timeout pytest-xdist sumo-rl==1.4.5
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(VENV)-oldest/bin/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
+
+# Every learner of every library, in .venv-compat; LATEST=1 tries each library's newest release in one of its own.
+compat: environment-dev
+	OMP_NUM_THREADS=1 "$(PYTHON)" .ci/compat.py $(VENV)/wheel/*.whl $(if $(LATEST),--latest) $(ARGS)
 
 environment: python
 	@$(ENVIRONMENT)
