@@ -109,6 +109,18 @@ def test_a_short_episode_and_a_full_road_are_named(single: Scenario) -> None:
     assert problems(survey(single), runs) == []
 
 
+def test_phases_a_rule_cannot_work_with_are_named() -> None:
+    mixed = load("mixed-v1")
+    runs = [
+        Run("programme", 90, 1000, 1000, 900, 0),
+        Run("largest-queue:20", 270, 1000, 1000, 9, 0),
+    ]
+    (text,) = problems(survey(mixed.with_control(phases="conflict-free")), runs)
+    assert "takes 270 s where the programme takes 90 s" in text
+    assert 'phases = "permitted"' in text
+    assert problems(survey(load("single-v1")), runs) == []  # it has lanes for every turn
+
+
 def test_roads_where_vehicles_wait_outside_are_named(single: Scenario) -> None:
     """3 000 vehicles an hour want onto one road, a handful onto another."""
     (item,) = Network.read(single).intersections

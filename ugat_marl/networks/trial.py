@@ -22,6 +22,8 @@ TRIPS = "trips.xml"
 """What the simulator calls SUMO's report on its vehicles."""
 
 RULES = ("programme", "largest-queue:20")
+MUCH_WORSE = 1.5
+"""A rule that takes so many times as long as the programme has phases it cannot work with."""
 _NAMED = 5
 MOST_BACKLOG = 0.01
 """Share of the vehicles due that may be left outside under the better rule."""
@@ -133,6 +135,8 @@ def problems(
             f"an episode of {facts.duration_s:g} s is shorter than the shortest useful one "
             f"({facts.shortest_episode_s:g} s); set duration_s"
         )
+    if text := _unsuited(facts, runs):
+        found.append(text)
     if runs:
         best = min(runs, key=lambda run: run.backlog)
         if is_full(runs):
@@ -143,6 +147,22 @@ def problems(
                 f"{where if roads else ''}; lower the demand, or look at what blocks these roads"
             )
     return found
+
+
+def _unsuited(facts: Survey, runs: Sequence[Run]) -> str:
+    """A rule far behind the programme, where phases serve lanes in part."""
+    lanes = sum(len(item.partly_served) for item in facts.intersections)
+    att_s = {run.rule: run.att_s for run in runs}
+    if not lanes or any(rule not in att_s for rule in RULES):
+        return ""
+    programme_s, rule_s = (att_s[rule] for rule in RULES)
+    if rule_s <= MUCH_WORSE * programme_s:
+        return ""
+    return (
+        f"{RULES[1]} takes {rule_s:g} s where the programme takes {programme_s:g} s, and {lanes} "
+        "lanes are served in part by some phase: whoever waits there for another phase blocks the "
+        'lane; phases = "permitted" serves whole lanes'
+    )
 
 
 def as_json(
