@@ -143,9 +143,10 @@ class BlindRun:
 
 @dataclass(frozen=True)
 class BlindVisible:
-    """Asks of single effects whether a test that knows them would see them; opens their labels.
+    """Asks of single effects whether a test that knows them would see them.
 
-    Only cases that have been diagnosed are judged. Grade them again afterwards.
+    Opens their labels, so only cases that have been diagnosed are judged. Grade them again
+    afterwards.
 
     Examples:
         ugat-marl blind visible blind
