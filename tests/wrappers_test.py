@@ -30,6 +30,7 @@ from ugat_marl.testing import (
 )
 from ugat_marl.wrappers import (
     agent_indicator,
+    appended_mask,
     frame_stack,
     masked_observation,
     pad,
@@ -208,6 +209,19 @@ def test_masked_observations_come_last(wrapper: str) -> None:
         SINGLE[wrapper](masked_observation(Steep()))
 
 
+def test_an_appended_mask_is_that_of_the_infos_behind_the_observation() -> None:
+    env, plain = appended_mask(Steep()), Steep()
+    seen, infos = env.reset(seed=0)
+    own, _ = plain.reset(seed=0)
+    for agent in env.possible_agents:
+        mask = infos[agent]["action_mask"]
+        np.testing.assert_array_equal(seen[agent], np.append(own[agent], mask))
+        assert env.observation_space(agent).contains(seen[agent])
+    unmasked = appended_mask(Steep(masks=False))
+    seen, _ = unmasked.reset(seed=0)
+    assert all(seen[a][-unmasked.action_space(a).n :].all() for a in unmasked.possible_agents)
+
+
 def test_actions_must_be_counted_from_zero() -> None:
     env = Steep()
     env.action_spaces["a_1"] = Discrete(2, start=1)
@@ -366,7 +380,7 @@ def test_a_wrapped_road_network_conforms(name: str, scenarios: dict[str, Scenari
 def test_the_page_names_every_wrapper_and_its_example_runs() -> None:
     page = (Path(__file__).parent.parent / "docs" / "wrappers.md").read_text(encoding="utf-8")
     named = set(re.findall(r"^\| `(\w+)\(env", page, flags=re.MULTILINE))
-    assert named == {*SINGLE, "masked_observation"}
+    assert named == {*SINGLE, "appended_mask", "masked_observation"}
     example = re.search(r"```python\n(.*?)```", page, flags=re.DOTALL)
     assert example is not None
     names: dict[str, Any] = {}

@@ -145,8 +145,7 @@ class BlindRun:
 class BlindVisible:
     """Asks of single effects whether a test that knows them would see them.
 
-    Opens their labels, so only cases that have been diagnosed are judged. Grade them again
-    afterwards.
+    Opens the labels of diagnosed cases, and of no others. Grade them again then.
 
     Examples:
         ugat-marl blind visible blind
