@@ -9,6 +9,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+LISTED = 32
+"""So many names an error lists: the nearest, if there are more."""
+
 
 class UgatMarlError(Exception):
     """Base of all errors a user of `ugat_marl` can provoke."""
@@ -35,7 +38,11 @@ class UnknownNameError(UgatMarlError, ValueError):
         self.allowed = sorted(set(allowed))
         near = nearest(name, self.allowed)
         guess = f" Did you mean {near!r}?" if near else ""
-        listed = ", ".join(self.allowed)
+        shown = self.allowed
+        if len(shown) > LISTED:
+            close = difflib.get_close_matches(name, shown, n=LISTED, cutoff=0.0)
+            shown = [*sorted(close), f"and {len(self.allowed) - LISTED} more"]
+        listed = ", ".join(repr(item) if "," in item else item for item in shown)
         super().__init__(
             f"unknown {kind} {name!r}.{guess} Known: {listed}.{' ' + hint if hint else ''}"
         )

@@ -1,0 +1,19 @@
+"""What a wrong name is answered with."""
+
+from __future__ import annotations
+
+from ugat_marl.errors import LISTED, UnknownNameError
+
+
+def test_a_short_list_is_whole_and_names_with_commas_are_told_apart() -> None:
+    said = str(UnknownNameError("row", "timd", ["UGAT, timed", "UGAT"]))
+    assert said == "unknown row 'timd'. Did you mean 'UGAT, timed'? Known: UGAT, 'UGAT, timed'."
+
+
+def test_of_a_long_list_the_nearest_are_shown_and_the_rest_counted() -> None:
+    names = [f"effect_{number}" for number in range(LISTED)] + ["delay", "delays"]
+    error = UnknownNameError("effect", "dely", names, "See the page.")
+    said = str(error)
+    assert said.startswith("unknown effect 'dely'. Did you mean 'delay'? Known: delay, delays, ")
+    assert said.endswith("and 2 more. See the page.")
+    assert error.allowed == sorted(names)
