@@ -89,7 +89,8 @@ svg text { fill: var(--ink); }
 .other .bar { background: var(--soft); }
 .big { display: grid; grid-template-columns: repeat(auto-fit, minmax(8.5rem, 1fr)); gap: .6rem; }
 .big div { background: var(--card); border-radius: .4rem; padding: .5rem .8rem; }
-.big b { display: block; font-size: 1.35rem; font-variant-numeric: tabular-nums; }
+.big b { display: block; font-size: 1.2rem; font-variant-numeric: tabular-nums;
+  white-space: nowrap; }
 .big span { font-size: .85rem; color: var(--soft); }
 pre { background: var(--card); border-radius: .4rem; padding: .7rem .9rem; margin: .5rem 0;
   font-size: .88rem; white-space: pre-wrap; overflow-wrap: anywhere; }
