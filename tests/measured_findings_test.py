@@ -370,6 +370,21 @@ def test_signals_that_begin_late_stop_or_clash(read: Read) -> None:
     assert found.periods[0].signals["C"][2] == (40.0, "rr")
 
 
+@pytest.mark.parametrize(("lengths", "adaptive"), [((20, 30), False), ((20, 30, 45), True)])
+def test_greens_of_many_lengths_follow_the_traffic(
+    read: Read, lengths: tuple[int, ...], adaptive: bool
+) -> None:
+    times = np.cumsum([0.0, *(lengths[i // 2 % len(lengths)] for i in range(1000))])
+    signals = {"C": tuple((float(t), ("Gr", "rG")[i % 2]) for i, t in enumerate(times) if t < END)}
+    whole = recording()
+    days = tuple(replace(period, signals=signals) for period in whole.periods)
+    _, findings = read(replace(whole, periods=days))
+    if not adaptive:
+        assert findings == {}
+    else:
+        assert only(findings, "('C') with greens of many lengths", "other vehicles") == ()
+
+
 def test_a_log_without_yellow(tmp_path: Path, scenario: Scenario, network: Network) -> None:
     directory = write_measured(recording(), tmp_path / "street")
     yellow = scenario.with_control(yellow_s=3.0, decision_interval_s=10.0)

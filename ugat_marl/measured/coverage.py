@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -28,6 +29,8 @@ EXPECTED = 10.0
 """Vehicles that must be missing for a silence to be worth a word."""
 MOST_ON_RED = 0.6
 """Share of vehicles that leave the stop line on red only where something is mixed up."""
+MANY_LENGTHS = 3
+"""Different lengths of one green, in whole s, that no fixed programme has."""
 NAMED = 6
 """Names listed in one finding; the rest is counted."""
 
@@ -133,6 +136,26 @@ def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Ite
                 f"{scenario.control.yellow_s:g} s of it; was the yellow left out of the log?",
                 NEEDS_YELLOW if len(bare) == len(controlled) - len(never) else (),
             )
+
+    adaptive = [tls for tls in controlled if _follows_traffic(periods, tls)]
+    if adaptive:
+        yield Finding(
+            f"signals: {_list('traffic light', adaptive)} with greens of many lengths, as if they "
+            "followed the traffic: a replay meets other vehicles than those they answered, so that "
+            "queues differ where nothing is missing; doubt small effects, and the verdict unknown"
+        )
+
+
+def _follows_traffic(periods: Sequence[Period], tls: str) -> bool:
+    """Whether some green lasts differently long; twice in one cycle it may in a fixed programme."""
+    lengths: dict[str, set[float]] = {}
+    for period in periods:
+        changes = period.signals.get(tls, ())
+        # The first and the last are cut by the ends of the period.
+        for (begin_s, state), (end_s, _) in itertools.pairwise(changes[1:]):
+            if set(state) & GREEN:
+                lengths.setdefault(state, set()).add(round(end_s - begin_s))
+    return any(len(found) >= MANY_LENGTHS for found in lengths.values())
 
 
 def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
