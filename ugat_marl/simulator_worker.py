@@ -9,23 +9,18 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import signal
 import socket
 import sys
-import threading
-import time
 from typing import Any, NoReturn
 
 import numpy as np
 
 from ugat_marl.channel import Channel, ChannelClosed, Message
 from ugat_marl.errors import SimulatorError
+from ugat_marl.lifeline import LOOK_EVERY_S, Lifeline, abandoned
 from ugat_marl.measurements import Snapshot
 from ugat_marl.simulator import Launch, LibsumoSimulator, Simulator
-
-_LOOK_EVERY_S = 1.0
-"""How often a process looks whether the one it works for is still there."""
 
 
 def _answer(simulator: Simulator, header: dict[str, Any]) -> Message:
@@ -73,36 +68,24 @@ class _Worker:
 
     def __init__(self, channel: Channel, parent: int, user: int) -> None:
         self._channel = channel
-        self._parent = parent
-        self._user = user
-        self._directory: str | None = None
+        self._life = Lifeline(parent, user)
 
     def run(self) -> NoReturn:
         """Answers questions, then removes SUMO's files and exits."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        threading.Thread(target=self._watch, daemon=True).start()
+        self._life.watch()
         simulator = LibsumoSimulator()
         with contextlib.suppress(ChannelClosed):
             while (question := self._hear()).header["what"] != "close":
                 if question.header["what"] == "own":
-                    self._directory = question.header["directory"]
+                    self._life.directory = question.header["directory"]
                     continue
                 try:
                     answer = _answer(simulator, question.header)
                 except SimulatorError as error:
                     answer = Message({"error": str(error)}, [])
                 self._tell(answer)
-        self._leave()
-
-    def _watch(self) -> None:
-        while not _abandoned(self._parent, self._user):
-            time.sleep(_LOOK_EVERY_S)
-        self._leave()
-
-    def _leave(self) -> NoReturn:
-        if self._directory is not None:
-            shutil.rmtree(self._directory, ignore_errors=True)
-        os._exit(0)  # no destructors: libsumo's may take long on a large network
+        self._life.leave()
 
     def _hear(self) -> Message:
         try:
@@ -117,32 +100,18 @@ class _Worker:
             raise ChannelClosed from None
 
 
-def _abandoned(parent: int, user: int) -> bool:
-    """Whether this process lost its parent because the user's process ended.
-
-    A warm parent may be killed alone; then its workers go on.
-    """
-    if os.getppid() == parent:
-        return False
-    try:
-        os.kill(user, 0)
-    except (ProcessLookupError, PermissionError):  # gone, or its number is somebody else's by now
-        return True
-    return False
-
-
 def _serve(descriptor: int, user: int) -> None:
     """The warm parent: forks a worker for every pair of file descriptors that arrives."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # workers leave no zombies
     here = os.getpid()
     with socket.socket(fileno=descriptor) as control, contextlib.suppress(ConnectionError):
-        control.settimeout(_LOOK_EVERY_S)
+        control.settimeout(LOOK_EVERY_S)
         while True:
             try:
                 request, descriptors, _, _ = socket.recv_fds(control, 1, 2)
             except TimeoutError:
-                if _abandoned(user, user):
+                if abandoned(user, user):
                     return
                 continue
             if not request:

@@ -16,8 +16,6 @@ import signal
 import socket
 import sys
 import tempfile
-import threading
-import time
 import traceback
 import warnings
 from collections import OrderedDict
@@ -31,9 +29,9 @@ from numpy.typing import NDArray
 from ugat_marl.channel import Channel, ChannelClosed, Message
 from ugat_marl.errors import EpisodeError, ScenarioError, UgatMarlError
 from ugat_marl.learners.agents import AgentSet
+from ugat_marl.lifeline import LOOK_EVERY_S, Lifeline, abandoned
 from ugat_marl.metrics import Scores
 from ugat_marl.policy import AnyParallelEnv
-from ugat_marl.simulator_worker import _LOOK_EVERY_S, _abandoned
 from ugat_marl.vector.arrays import Arrays, Shape
 from ugat_marl.vector.nursery import LENGTH
 from ugat_marl.vector.spec import Spec, agents_of
@@ -98,21 +96,19 @@ class _EpisodeServer:
         self._memory = memory
         self._env = env
         self._order = order
-        self._parent = parent
-        self._user = user
-        self._directory: str | None = None
+        self._life = Lifeline(parent, user)
         self._warnings: list[str] = []
 
     def run(self) -> NoReturn:
         """Answers questions, then removes the simulation's files and exits."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        threading.Thread(target=self._watch, daemon=True).start()
+        self._life.watch()
         warnings.showwarning = self._note
         with contextlib.suppress(ChannelClosed, OSError):
             while (question := self._channel.receive()).header["what"] != "close":
                 self._channel.send(Message(self._answer(question), []))
-        self._leave()
+        self._life.leave()
 
     def _answer(self, question: Message) -> dict[str, Any]:
         try:
@@ -131,7 +127,7 @@ class _EpisodeServer:
     def _begin(self, question: Message) -> None:
         asked = question.header
         self._index: int = asked["index"]
-        self._directory = tempfile.tempdir = asked["directory"]
+        self._life.directory = tempfile.tempdir = asked["directory"]
         Path(asked["directory"]).mkdir(mode=0o700, exist_ok=True)
         if self._env is None:
             self._env = Spec(**self._order["spec"]).environment(self._order["domain"])
@@ -181,16 +177,6 @@ class _EpisodeServer:
     def _note(self, message: Warning | str, *_: Any, **__: Any) -> None:
         self._warnings.append(str(message))
 
-    def _watch(self) -> None:
-        while not _abandoned(self._parent, self._user):
-            time.sleep(_LOOK_EVERY_S)
-        self._leave()
-
-    def _leave(self) -> NoReturn:
-        if self._directory is not None:
-            shutil.rmtree(self._directory, ignore_errors=True)
-        os._exit(0)  # no destructors: libsumo's may take long on a large network
-
 
 def _serve(descriptor: int, user: int) -> None:
     """The parent: forks a process for every order that arrives."""
@@ -224,13 +210,13 @@ def _serve(descriptor: int, user: int) -> None:
 
 def _next(control: socket.socket, user: int) -> tuple[dict[str, Any], list[int]] | None:
     """The next order and the open files that came with it; None if the user's process is gone."""
-    control.settimeout(_LOOK_EVERY_S)
+    control.settimeout(LOOK_EVERY_S)
     while True:
         try:
             first, descriptors, _, _ = socket.recv_fds(control, 1, 3)
             break
         except TimeoutError:
-            if _abandoned(user, user):
+            if abandoned(user, user):
                 return None
     control.settimeout(None)
     if not first:
