@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import gzip
+import math
+import re
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from ugat_marl.__main__ import main
 from ugat_marl.files import parse_xml
+from ugat_marl.junctions import foes_of
 from ugat_marl.network import Network
 from ugat_marl.networks.osm_pbf import pbf_to_xml
+from ugat_marl.networks.osm_walks import utm
 from ugat_marl.networks.phasing import suited
 from ugat_marl.networks.survey import survey
+from ugat_marl.networks.trial import problems
+from ugat_marl.phases import RightOfWay, are_foes
 from ugat_marl.progress import Silent
 from ugat_marl.scenario import Scenario, load_scenario, shipped_scenarios
 
@@ -277,3 +284,131 @@ def test_lights_can_be_guessed(tmp_path: Path) -> None:
 def test_other_files_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert made(tmp_path / "a", tmp_path / "city.shp") == 2
     assert "give a file that ends in .osm" in capsys.readouterr().err
+
+
+# --- crossings ------------------------------------------------------------------------------------
+
+
+def crossroads(kind: str = "traffic_signals") -> str:
+    """A signalled crossroads with crossings 13 m from it in the west, east and north.
+
+    150 m to the west people cross without a light.
+    """
+
+    def node(name: int, x: float, y: float, **tags: str) -> str:
+        lat, lon = 48 + y / 111195, 11 + x / (111195 * math.cos(math.radians(48)))
+        inner = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
+        return f'<node id="{name}" lat="{lat:.7f}" lon="{lon:.7f}">{inner}</node>'
+
+    def way(name: int, *refs: int, **tags: str) -> str:
+        inner = "".join(f'<nd ref="{ref}"/>' for ref in refs)
+        inner += "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
+        return f'<way id="{name}">{inner}</way>'
+
+    road = {"highway": "secondary", "lanes": "2", "maxspeed": "50"}
+    walk = {"highway": "crossing", "crossing": kind}
+    parts = [
+        node(1, 0, 0, highway="traffic_signals"),
+        *(node(2 + i, 300 * x, 300 * y) for i, (x, y) in enumerate(COMPASS)),
+        *(node(6 + i, 13 * x, 13 * y, **walk) for i, (x, y) in enumerate(COMPASS[:3])),
+        node(9, -150, 0, highway="crossing", crossing="uncontrolled"),
+        way(100, 2, 9, 6, 1, **road), way(101, 1, 7, 3, **road), way(102, 1, 8, 4, **road),
+        way(103, 5, 1, **road),
+    ]  # fmt: skip
+    return f'<osm version="0.6">{"".join(parts)}</osm>'
+
+
+COMPASS = ((-1, 0), (1, 0), (0, 1), (0, -1))
+
+
+def test_crossings_are_where_the_extract_has_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.osm").write_text(crossroads())
+    assert made(tmp_path / "a", tmp_path / "x.osm") == 0
+    said = capsys.readouterr().out
+    assert "3 crossings for people on foot have a light" in said
+    assert "1 crossings that have no light" in said
+    scenario = load_scenario(tmp_path / "a")
+    root = scenario.network.parse()
+    crossed = {e.get("crossingEdges") for e in root.iter("edge") if e.get("function") == "crossing"}
+    assert {frozenset(re.findall(r"10\d", edges or "")) for edges in crossed} == {
+        frozenset({"100"}), frozenset({"101"}), frozenset({"102"})
+    }  # fmt: skip
+    (item,) = Network.read(scenario).intersections
+    rules = RightOfWay(foes_of(root), {})
+    assert len(item.crossings) == 3
+    for walk in item.crossings:
+        shown = [phase for phase in item.phases if phase[walk.index] == "G"]
+        assert shown
+        for phase in shown:
+            crossing = {phase[k.index] for k in item.links if are_foes(k, walk, rules.foes)}
+            assert crossing <= {"r", "g"}
+
+
+def test_crossings_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "x.osm").write_text(crossroads())
+    made(tmp_path / "a", tmp_path / "x.osm")
+    (item,) = survey(load_scenario(tmp_path / "a")).intersections
+    assert (item.crossings, item.unserved_crossings, item.foot_phases) == (3, 0, 0)
+    assert (item.clashes, item.uncontrolled) == ((), 0)
+    capsys.readouterr()
+    main(["scenario", "check", str(tmp_path / "a"), "--no-simulate"])
+    assert "crossings" in capsys.readouterr().out
+
+
+def test_a_green_across_a_crossing_is_a_finding(tmp_path: Path) -> None:
+    """All links of a phase protected, all crossings green: through traffic runs people over."""
+    (tmp_path / "x.osm").write_text(crossroads())
+    made(tmp_path / "a", tmp_path / "x.osm")
+    scenario = load_scenario(tmp_path / "a")
+    (item,) = Network.read(scenario).intersections
+    width = len(item.phases[0])
+    walks = {walk.index for walk in item.crossings}
+    start = item.links[0].from_edge
+    own = {link.index for link in item.links if link.from_edge == start}
+    bad = "".join("G" if i in walks | own else "r" for i in range(width))
+    rest = "".join("g" if i not in walks | own else "r" for i in range(width))
+    settings = scenario.settings.model_dump()
+    settings |= {"intersections": {item.id: {"phases": [bad, rest]}}}
+    spoilt = replace(scenario, settings=type(scenario.settings).model_validate(settings))
+    facts = survey(spoilt)
+    assert facts.intersections[0].clashes
+    assert all(text.startswith(f"phase 0: {start} ") for text in facts.intersections[0].clashes)
+    assert any("people on foot have green while vehicles" in text for text in problems(facts, ()))
+
+
+def test_crossings_without_lights_stay_away(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.osm").write_text(crossroads("uncontrolled"))
+    assert made(tmp_path / "a", tmp_path / "x.osm") == 0
+    assert "4 crossings that have no light" in capsys.readouterr().out
+    (item,) = Network.read(load_scenario(tmp_path / "a")).intersections
+    assert item.crossings == ()
+    assert len(item.incoming_lanes) == 4
+
+
+def test_a_light_for_a_crossing_alone_may_be_told_what_to_show(town: Scenario) -> None:
+    """Derived, its phases leave no choice to who sees vehicles; listed, they are what was asked."""
+    settings = town.settings.model_dump()
+    settings["intersections"]["8"] = {"phases": ["GGr", "rrG"]}
+    told = replace(town, settings=type(town.settings).model_validate(settings))
+    assert "8" in {item.id for item in Network.read(told).intersections}
+    assert survey(told).intersections[0].foot_phases == 1
+
+
+def test_metres_of_a_place_are_those_of_utm() -> None:
+    """The middle of a zone at the equator, and a published point: the CN Tower."""
+    assert utm(9.0, 0.0, 32) == pytest.approx((5e5, 0.0), abs=1e-6)
+    assert utm(-(79 + 23 / 60 + 13.7 / 3600), 43 + 38 / 60 + 33.24 / 3600, 17) == pytest.approx(
+        (630084, 4833439), abs=1.0
+    )
+
+
+def test_a_node_without_a_place_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.osm").write_text(re.sub(r'(<node id="6") lat="[^"]*"', r"\1", crossroads()))
+    assert made(tmp_path / "a", tmp_path / "bad.osm") == 2
+    assert "line 1: the node '6' has no lon and lat" in capsys.readouterr().err

@@ -20,7 +20,7 @@ from ugat_marl.phases import (
     programme_phases,
 )
 from ugat_marl.scenario import Scenario
-from ugat_marl.signals import STATES, check_phases
+from ugat_marl.signals import GREEN, STATES, check_phases
 
 VEHICLE_SPACE_M = 7.5
 """Room of a queued default vehicle: 5 m length plus 2.5 m gap."""
@@ -136,7 +136,7 @@ class Network:
             programme = programmes.get(tls, ())
             walks = tuple(crossings.get(tls, ()))
             phases = _phases_of(scenario, tls, own, walks, programme, rules)
-            if len(phases) < 2:
+            if _choices(phases, own, _source_of(scenario, tls)) < 2:
                 uncontrolled.append(tls)
                 continue
             found.append(
@@ -213,6 +213,24 @@ def signal_widths(scenario: Scenario) -> dict[str, int]:
     }
 
 
+def _source_of(scenario: Scenario, tls: str) -> str | Sequence[str]:
+    """Where the phases of a traffic light come from; states if they are listed."""
+    own = scenario.settings.intersections.get(tls)
+    return own.phases if own and own.phases is not None else scenario.control.phases
+
+
+def _choices(phases: Sequence[str], links: Sequence[Link], source: str | Sequence[str]) -> int:
+    """Phases between which an agent that sees vehicles can choose.
+
+    At a light for a crossing alone it would never stop the vehicles: that keeps its programme,
+    unless its phases are listed.
+    """
+    if not isinstance(source, str):
+        return len(phases)
+    letters = {link.index for link in links}
+    return sum(any(phase[i] in GREEN for i in letters) for phase in phases)
+
+
 def _phases_of(
     scenario: Scenario,
     tls: str,
@@ -221,8 +239,7 @@ def _phases_of(
     programme: tuple[tuple[float, str], ...],
     rules: RightOfWay,
 ) -> tuple[str, ...]:
-    own = scenario.settings.intersections.get(tls)
-    source = own.phases if own and own.phases is not None else scenario.control.phases
+    source = _source_of(scenario, tls)
     width = max(link.index for link in (*links, *crossings)) + 1
     where = f"scenario {scenario.id!r}, traffic light {tls!r}"
     if programme:

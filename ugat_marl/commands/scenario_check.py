@@ -199,6 +199,8 @@ def _row(item: IntersectionFacts) -> tuple[str, ...]:
         "always green": item.always_green,
         "U-turns": item.u_turns,
         "crossings": item.crossings,
+        "crossings never green": item.unserved_crossings,
+        "phases for people on foot alone": item.foot_phases,
         "links without a light": item.uncontrolled,
         "links never green": len(item.unserved_links),
         "lanes served in part": len(item.partly_served),

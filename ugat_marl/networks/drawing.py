@@ -179,7 +179,10 @@ def _legend(figure: Any, item: Intersection, height: float) -> None:
         if letter in shown
     ]
     if item.crossings:
-        lines.append(Line2D([], [], color=_WALK, linewidth=4, label="crossing, green"))
+        lines.append(
+            Line2D([], [], color=_WALK, linewidth=5, linestyle=(0, (0.6, 0.4)),
+                   dash_capstyle="butt", label="crossing, green")
+        )  # fmt: skip
     figure.legend(
         handles=lines, loc="upper left", bbox_to_anchor=(0.012, 1 - 0.58 / height), ncols=5,
         frameon=False, fontsize=8.5, borderaxespad=0, handlelength=3.2,
@@ -237,10 +240,20 @@ def _ways(axes: Any, place: _Place, state: str) -> None:
     for link in sorted(place.item.links, key=lambda one: order.find(state[one.index])):
         letter = state[link.index] if state[link.index] in STYLES else "r"
         _arrow(axes, _curve(link, place.network), letter)
+    _crossings(axes, place, state)
+
+
+def _crossings(axes: Any, place: _Place, state: str = "") -> None:
+    """Crossings as stripes across the road: green ones in colour, others pale."""
     for crossing in place.item.crossings:
-        if state[crossing.index] in "Gg" and crossing.to_lane in place.walks:
-            shape = place.walks[crossing.to_lane]
-            axes.plot(*shape.T, color=_WALK, linewidth=4, solid_capstyle="butt", zorder=5)
+        if crossing.to_lane not in place.walks:
+            continue
+        green = bool(state) and state[crossing.index] in "Gg"
+        axes.plot(
+            *place.walks[crossing.to_lane].T, color=_WALK if green else STYLES["r"][0],
+            linewidth=5 if green else 3, linestyle=(0, (0.6, 0.4)), dash_capstyle="butt",
+            zorder=5 if green else 2,
+        )  # fmt: skip
 
 
 def _arrow(axes: Any, curve: NDArray[np.float64], letter: str) -> None:
@@ -297,6 +310,7 @@ def _names(axes: Any, place: _Place) -> None:
         )  # fmt: skip
     for link in item.links:
         _arrow(axes, _curve(link, network), "r")
+    _crossings(axes, place)
 
 
 def _ranges(numbers: Sequence[int]) -> str:

@@ -14,9 +14,10 @@ from pathlib import Path
 
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import Tag, chunks_of, parse_xml, read_bytes, write_whole
-from ugat_marl.junctions import foes_of, links_of
+from ugat_marl.junctions import crossings_of, foes_of, links_of
 from ugat_marl.networks.making import NETWORK, Draft, Roads
 from ugat_marl.networks.osm_pbf import pbf_to_xml
+from ugat_marl.networks.osm_walks import crossings_for, has_light
 from ugat_marl.networks.programs import netconvert
 from ugat_marl.networks.reading import scan
 from ugat_marl.phases import are_foes
@@ -31,14 +32,16 @@ _FOR_CARS = frozenset(
         "living_street", "service", "road",
     }
 )  # fmt: skip
+_AGAIN = (
+    "--tls.default-type", "static", "--tls.yellow.time", "3", "--tls.allred.time", "2",
+    "--no-turnarounds", "--junctions.corner-detail", "5", "--output.street-names",
+)  # fmt: skip
 _OPTIONS = (
     "--geometry.remove", "--ramps.guess", "--roundabouts.guess",
     "--junctions.join", "--junctions.join-dist", "15",
     "--tls.guess-signals", "--tls.guess-signals.dist", "30",
     "--tls.join", "--tls.join-dist", "30",
-    "--tls.default-type", "static", "--tls.yellow.time", "3", "--tls.allred.time", "2",
-    "--remove-edges.isolated", "--keep-edges.by-vclass", "passenger",
-    "--no-turnarounds", "--junctions.corner-detail", "5", "--output.street-names",
+    "--remove-edges.isolated", "--keep-edges.by-vclass", "passenger", *_AGAIN,
 )  # fmt: skip
 
 
@@ -50,11 +53,15 @@ class _Extract:
         roads: Ways for cars.
         signals: Nodes with a traffic light.
         walks: Those of them that are a crossing for people on foot, by their ids.
+        crossings: Longitude and latitude of crossings that may have a light.
+        unlit: Crossings without one.
     """
 
     roads: int
     signals: int
     walks: frozenset[str]
+    crossings: tuple[tuple[float, float], ...] = ()
+    unlit: int = 0
 
 
 def from_osm(path: Path, *, guess: bool) -> Roads:
@@ -112,10 +119,25 @@ def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
 
 def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
     """Counts roads and lights; refuses entities before any other program sees the file."""
-    roads = signals = 0
+    roads = signals = unlit = 0
     walks: set[str] = set()
+    crossings: list[tuple[float, float]] = []
     item: Tag | None = None
-    crossing = light = False
+    tags: dict[str, str] = {}
+
+    def close() -> None:
+        nonlocal signals, unlit
+        if item is None or item.name != "node" or not tags:
+            return
+        light = "traffic_signals" in (tags.get("highway"), tags.get("crossing"))
+        signals += light
+        if light and ("crossing" in tags or tags.get("highway") == "crossing"):
+            walks.add(item.attributes.get("id", ""))
+        if has_light(tags):
+            crossings.append(_place(item, path))
+        else:
+            unlit += tags.get("highway") == "crossing"
+
     try:
         for tag in scan(source, reporter):
             if item is None and tag.name != "osm":
@@ -124,19 +146,28 @@ def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
                     f"with <{tag.name}>"
                 )
             if tag.name in ("osm", "node", "way", "relation"):
-                item, crossing, light = tag, False, False
+                close()
+                item, tags = tag, {}
             elif tag.name == "tag" and item is not None:
-                key, value = tag.attributes.get("k"), tag.attributes.get("v")
+                key, value = tag.attributes.get("k", ""), tag.attributes.get("v", "")
                 roads += item.name == "way" and key == "highway" and value in _FOR_CARS
-                if item.name == "node" and key in ("highway", "crossing"):
-                    crossing |= key == "crossing" or value == "crossing"
-                    signals += value == "traffic_signals" and not light
-                    light |= value == "traffic_signals"
-                    if crossing and light:
-                        walks.add(item.attributes.get("id", ""))
+                if item.name == "node" and key.startswith(("highway", "crossing")):
+                    tags[key] = value
+        close()
     except ScenarioError as error:
         raise ScenarioError(str(error).replace(str(source), str(path))) from None
-    return _Extract(roads, signals, frozenset(walks))
+    return _Extract(roads, signals, frozenset(walks), tuple(crossings), unlit)
+
+
+def _place(node: Tag, path: Path) -> tuple[float, float]:
+    """Longitude and latitude."""
+    try:
+        return float(node.attributes["lon"]), float(node.attributes["lat"])
+    except (KeyError, ValueError):
+        name = node.attributes.get("id", "")
+        raise ScenarioError(
+            f"{path}, line {node.line}: the node {name!r} has no lon and lat in degrees"
+        ) from None
 
 
 def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: bool) -> list[str]:
@@ -144,12 +175,16 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
     arguments = ["--osm-files", str(source), "--type-files", str(types), *_OPTIONS]
     if guess:
         arguments.append("--tls.guess")
+    if extract.crossings:
+        arguments.append("--sidewalks.guess.from-permissions")
     made = work / "made.net.xml"
     netconvert(arguments, made)
     # What is left of lights on plain roads, far from the junction they belong to, stops nobody's
     # foes; those at crossings do stop the traffic for people on foot.
     if idle := _idle_lights(made, extract.walks):
         netconvert([*arguments, "--tls.unset", ",".join(idle)], made)
+    if extract.crossings:
+        _add_crossings(extract, made, work)
     write_whole(out, made.read_bytes())
     root = parse_xml(read_bytes(out), str(out))
     lights = len(links_of(root))
@@ -159,12 +194,30 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
     ]
     if idle:
         notes.append(f"{len(idle)} lights on plain roads were left out")
+    walked = sum(len(own) for own in crossings_of(root).values())
+    left = extract.unlit + max(0, len(extract.crossings) - walked)
+    if walked:
+        notes.append(f"{walked} crossings for people on foot have a light; roads have sidewalks")
+    if left:
+        notes.append(f"{left} crossings that have no light, or are at no road, were left out")
     if not lights:
         raise ScenarioError(
             f"{source}: none of its lights is at a road for cars; --guess-signals puts some at "
             "large junctions"
         )
     return notes
+
+
+def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
+    """Crossings at lights, and programmes that have green for them."""
+    root = parse_xml(read_bytes(made), str(made))
+    if not (content := crossings_for(root, extract.crossings)):
+        return
+    listed, before = work / "crossings.con.xml", work / "before.net.xml"
+    listed.write_bytes(content)
+    made.replace(before)
+    options = ("--sumo-net-file", str(before), "--connection-files", str(listed), "--tls.rebuild")
+    netconvert([*options, *_AGAIN], made)
 
 
 def _idle_lights(network: Path, walks: Iterable[str]) -> list[str]:

@@ -80,6 +80,11 @@ class IntersectionFacts:
         right_on_red: Links that may go on red after a stop.
         u_turns: Links that turn around.
         crossings: Links for people on foot.
+        unserved_crossings: Those of them that are green in no phase.
+        foot_phases: Phases in which people on foot alone have green: a controller that sees
+            vehicles has no reason to choose them.
+        clashes: Crossings with green while vehicles that cross them need not wait, as ``phase n:
+            edge turn``.
         uncontrolled: Links at its junctions without a light.
         approaches: Its roads with their traffic.
     """
@@ -98,6 +103,9 @@ class IntersectionFacts:
     right_on_red: int
     u_turns: int
     crossings: int
+    unserved_crossings: int
+    foot_phases: int
+    clashes: tuple[str, ...]
     uncontrolled: int
     approaches: tuple[ApproachFacts, ...]
 
@@ -194,6 +202,11 @@ def _facts(
         right_on_red=sum(link.index in stop_and_go for link in item.links),
         u_turns=sum(link.direction in "tT" for link in item.links),
         crossings=len(item.crossings),
+        unserved_crossings=sum(
+            all(phase[walk.index] not in GREEN for phase in item.phases) for walk in item.crossings
+        ),
+        foot_phases=sum(not green & {link.index for link in item.links} for green in served),
+        clashes=tuple(_clashes(item, rules)),
         uncontrolled=sum(free.get(junction, 0) for junction in junctions),
         approaches=tuple(_approaches(item, network, traffic)),
     )
@@ -203,6 +216,19 @@ def _in_part(lane: str, item: Intersection) -> bool:
     indices = {link.index for link in item.links if link.from_lane == lane}
     shown = ({state[index] in GREEN for index in indices} for state in item.phases)
     return any(len(letters) > 1 for letters in shown)
+
+
+def _clashes(item: Intersection, rules: RightOfWay) -> Iterator[str]:
+    """Protected greens of vehicles across a crossing that is green."""
+    for number, phase in enumerate(item.phases):
+        walks = [walk for walk in item.crossings if phase[walk.index] in GREEN]
+        through = [link for link in item.links if phase[link.index] == "G"]
+        found = (
+            f"phase {number}: {_movement(link)}"
+            for link in through
+            if any(link.index != walk.index and are_foes(link, walk, rules.foes) for walk in walks)
+        )
+        yield from dict.fromkeys(found)
 
 
 def _movement(link: Link) -> str:
@@ -260,7 +286,8 @@ def _free_links(root: ET.Element) -> Counter[str]:
     return Counter(
         ends.get(item.get("from", ""), "")
         for item in root.iter("connection")
-        if item.get("tl") is None and not item.get("from", ":").startswith(":")
+        if item.get("tl") is None
+        and not any(item.get(end, ":").startswith(":") for end in ("from", "to"))
     )
 
 

@@ -130,6 +130,11 @@ def problems(
                 f"traffic light {item.id!r}: never green: {', '.join(item.unserved_links)}; "
                 "vehicles that turn there block their lane"
             )
+        if item.clashes:
+            found.append(
+                f"traffic light {item.id!r}: people on foot have green while vehicles that cross "
+                f"their way need not wait ({'; '.join(item.clashes)}); write g for these vehicles"
+            )
     if facts.duration_s < facts.shortest_episode_s:
         found.append(
             f"an episode of {facts.duration_s:g} s is shorter than the shortest useful one "
