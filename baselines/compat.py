@@ -11,7 +11,6 @@ was found with, and how many decisions a second that is (training included; orde
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
 import os
 import subprocess
@@ -28,19 +27,10 @@ from rich.console import Console
 from rich.table import Table
 
 from ugat_marl.errors import OptionError, UgatMarlError
-from ugat_marl.learners.registry import BASELINES, learner_factory
+from ugat_marl.learners.registry import BASELINES, learner_factory, library_of
 from ugat_marl.testing import ToyTraffic
 from ugat_marl.traffic_env import parallel_env
 
-LIBRARIES = {
-    "": "ugat-marl",
-    "sb3": "sb3-contrib",
-    "supersuit": "supersuit",
-    "torchrl": "torchrl",
-    "skrl": "skrl",
-    "benchmarl": "benchmarl",
-    "rllib": "ray",
-}
 EPISODES = 3
 PATIENCE_S = 900.0
 
@@ -147,7 +137,7 @@ class Compat:
                     failed = True
                     errors.append(f"{name}, {column}: {text}")
             cells = [short(found[column]) for column in COLUMNS]
-            table.add_row(name, version_of(BASELINES[name].extra), *cells)
+            table.add_row(name, library_of(name), *cells)
         console = Console()
         console.width = max(console.width, 110)
         console.print(table)
@@ -195,14 +185,6 @@ def short(text: str) -> str:
     if text.endswith("/s"):
         return text.removesuffix("/s")
     return "-" if "is not installed" in text else "fails"
-
-
-def version_of(extra: str) -> str:
-    """Library and version."""
-    try:
-        return f"{LIBRARIES[extra]} {importlib.metadata.version(LIBRARIES[extra])}"
-    except importlib.metadata.PackageNotFoundError:
-        return f"{LIBRARIES[extra]} -"
 
 
 if __name__ == "__main__":

@@ -10,12 +10,9 @@ that matter (Huang et al. 2022, "The 37 implementation details of PPO").
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
-import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -24,19 +21,17 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-import ugat_marl
+from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.batched import BatchedMLP, one_thread
 from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
-from ugat_marl.errors import CheckpointError, EpisodeError, OptionError, UgatMarlError
-from ugat_marl.evaluation import evaluate, fixed_policy
-from ugat_marl.files import require_writable, write_whole
+from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_policy import DQNPolicy, header
 from ugat_marl.learners.q_network import SharedMLP, flatten_parameters
+from ugat_marl.learners.scaling import InputScale, places
 from ugat_marl.policy import AnyParallelEnv as Env
 from ugat_marl.policy import EpisodeCallback as Callback
 from ugat_marl.seeding import derive_seed, torch_generator
-from ugat_marl.transfer import EVALUATION_SEED
 
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
 
@@ -48,7 +43,7 @@ class IPPOConfig:
     centralised: bool = False  # the critic sees env.state() (MAPPO), not an observation (IPPO)
     shared: bool = True  # one actor and critic for all agents, told whose they are; or one for each
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
-    learning_rate: float = 5e-4  # step size of Adam
+    learning_rate: float = 1e-3  # step size of Adam
     anneal_episodes: int = 0  # the step size falls to 0 over so many episodes; 0 keeps it
     discount: float = 0.95  # weight of the next decision's value (gamma)
     gae_lambda: float = 0.95  # from one-step (0) to Monte Carlo (1) advantages
@@ -135,10 +130,12 @@ class IPPO:
             state: Any = getattr(env, "state_space", None)
             if state is None:
                 raise OptionError("a centralised critic needs env.state_space and env.state()")
-            n_in = state.shape[0]
+            n_in = int(state.shape[0])
         self._critic = network(agents, config, n_in, 1, 1.0, rng)
         self._weights = flatten_parameters(nn.ModuleList([self._actor, self._critic]))
         self._adam = torch.optim.Adam([self._weights], eps=1e-5)
+        # of what observations and states are divided by, so that small numbers are heard at once
+        self._seen, self._stated = InputScale(agents.widest_observation), InputScale(n_in)
         # of each agent's rewards so far: their number, their sum, the sum of their squares
         self._rewards = torch.zeros(3, len(agents), 1, dtype=torch.float64)
 
@@ -160,7 +157,10 @@ class IPPO:
 
         It is of DQN's class, with logits in place of Q, so that all of `ugat-marl` reads its files.
         """
-        parameters = nn.utils.parameters_to_vector(self._actor.parameters()).detach()
+        named, factors = list(self._actor.named_parameters()), torch.from_numpy(self._seen.factors)
+        first = next(name for name, _ in named if name.endswith("weight"))  # (..., n_in, n_out)
+        scaled = [p * factors[:, None] if name == first else p for name, p in named]
+        parameters = nn.utils.parameters_to_vector(scaled).detach()
         hidden, shared = self.config.hidden, self.config.shared
         return DQNPolicy(self.agents, hidden, parameters, self.env_options, shared)
 
@@ -180,6 +180,7 @@ class IPPO:
         self.episodes = content["episodes"]
         self._weights.data.copy_(content["weights"])
         self._rewards.copy_(content["rewards"])
+        self._seen.sums[:], self._stated.sums[:] = content["seen"], content["stated"]
         self._adam.state[self._weights] = {name: content[name] for name in _MOMENTS}
 
     def _content(self) -> dict[str, Any]:
@@ -191,6 +192,8 @@ class IPPO:
             "episodes": self.episodes,
             "weights": weights,
             "rewards": self._rewards.clone(),
+            "seen": torch.from_numpy(self._seen.sums.copy()),
+            "stated": torch.from_numpy(self._stated.sums.copy()),
             **(self._adam.state[self._weights] or moments),
         }
 
@@ -222,11 +225,15 @@ class IPPO:
         return {"return": total} | told
 
     def _look(self, env: Env, observations: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """What the actors see, and what the critics see."""
-        seen = torch.from_numpy(self.agents.stack(observations))
+        """What the actors see, and what the critics see, scaled by all they have seen so far."""
+        rows = self.agents.stack(observations)
+        self._seen.note(rows, places(self.agents))
+        seen = torch.from_numpy(rows * self._seen.factors)
         if not self.config.centralised:
             return seen, seen
-        return seen, torch.from_numpy(env.state()).expand(len(self.agents), -1)
+        state = env.state()
+        self._stated.note(state[None])
+        return seen, torch.from_numpy(state * self._stated.factors).expand(len(self.agents), -1)
 
     def _log_probabilities(self, seen: Tensor, allowed: Tensor) -> Tensor:
         """Of all actions; one that is not allowed has probability 0."""
@@ -288,63 +295,16 @@ class IPPO:
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(BaselineArgs):
     """Trains IPPO, or with --centralised MAPPO, on one scenario."""
 
     ppo: Annotated[IPPOConfig, tyro.conf.arg(name="")] = IPPOConfig()
-    scenario: str = "grid2x2-v1"  # id or path of the scenario
-    domain: str = "sim"  # the world to train and to be judged in
-    duration_s: float | None = None  # length of an episode; none: the scenario's own
-    episodes: int = 100  # episodes to train
-    seed: int = 0  # seed of all that is drawn
-    evaluate_every: int = 0  # episodes from one evaluation to the next; 0: only at the end
-    evaluation_seeds: int = 5  # episodes of an evaluation, always the same; 0: none
-    out: Path | None = None  # folder for policy.pt, learner.pt and result.json
-
-
-class Result(NamedTuple):
-    """The policy, the return of each episode, and by episodes trained the ATT of each seed, s."""
-
-    policy: DQNPolicy
-    returns: list[float]
-    att_s: dict[int, list[float]]
 
 
 def train(args: Args, on_episode: Callback | None = None) -> Result:
     """Trains and evaluates; writes the results if `args.out` is given."""
-    scenario, length = ugat_marl.load_scenario(args.scenario), args.duration_s
-    env = ugat_marl.parallel_env(scenario, domain=args.domain, duration_s=length)
-    learner = IPPO(env, args.ppo, args.seed)
-    if args.out is not None:
-        require_writable(args.out / "policy.pt")
-    result = Result(learner.policy(), [], {})
-
-    def note(episode: int, numbers: Mapping[str, float]) -> None:
-        result.returns.append(numbers["return"])
-        if on_episode is not None:
-            on_episode(episode, numbers)
-
-    seeds = range(EVALUATION_SEED, EVALUATION_SEED + args.evaluation_seeds)
-    every = args.evaluate_every or max(1, args.episodes)
-    with contextlib.closing(env):
-        for until in (*range(every, args.episodes, every), args.episodes):
-            policy = fixed_policy(learner.learn(env, until - learner.episodes, args.seed, note))
-            if seeds:
-                found = evaluate(scenario, {"ppo": policy}, [args.domain], seeds, duration_s=length)
-                result.att_s[learner.episodes] = [item.scores.att_s for item in found.results]
-    result = result._replace(policy=learner.policy())
-    if args.out is not None:
-        result.policy.save(args.out / "policy.pt")
-        learner.save(args.out / "learner.pt")
-        told = {"args": asdict(args), "returns": result.returns, "att_s": result.att_s}
-        write_whole(args.out / "result.json", json.dumps(told, default=str) + "\n")
-    return result
+    return train_baseline(args, lambda env: IPPO(env, args.ppo, args.seed), on_episode)
 
 
 if __name__ == "__main__":
-    try:
-        trained = train(tyro.cli(Args), lambda n, told: print(n, f"return {told['return']:.1f}"))
-    except UgatMarlError as error:
-        sys.exit(f"ippo.py: error: {error}")
-    for episodes, att_s in trained.att_s.items():
-        print(f"{episodes} episodes: mean travel time {np.mean(att_s):.1f} s, by seed {att_s}")
+    baseline_command(Args, train)

@@ -58,7 +58,7 @@ class SB3Config:
 
     algorithm: Literal["ppo", "maskable-ppo", "dqn"] = "maskable-ppo"
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
-    learning_rate: float = 5e-4  # step size of Adam
+    learning_rate: float = 1e-3  # step size of Adam
     discount: float = 0.95  # weight of the next decision's value (gamma)
     max_gradient: float = 0.5  # longer gradients are scaled down to this norm
     # PPO
@@ -73,7 +73,7 @@ class SB3Config:
     replay: int = 20_000  # decisions it remembers
     batch: int = 512  # transitions, each of one agent, in a gradient step
     warmup: int = 100  # decisions before it learns
-    explore: int = 5_000  # decisions over which random actions get rare
+    explore: int = 2_400  # decisions over which random actions get rare
     least_exploration: float = 0.03  # share of random actions that stays
     target_rate: float = 0.01  # share by which the target network follows at each step
 

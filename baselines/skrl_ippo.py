@@ -51,7 +51,7 @@ class SkrlConfig:
 
     centralised: bool = False  # the critics see env.state() (MAPPO), not an observation (IPPO)
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
-    learning_rate: float = 5e-4  # step size of Adam
+    learning_rate: float = 1e-3  # step size of Adam
     discount: float = 0.95  # weight of the next decision's value (gamma)
     gae_lambda: float = 0.95  # from one-step (0) to Monte Carlo (1) advantages
     clip: float = 0.2  # share by which the probability of an action may move in an update

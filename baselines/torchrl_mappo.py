@@ -47,7 +47,7 @@ class TorchRLConfig:
     """Settings of the learner; a decision is one of all agents together."""
 
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers of actor and critic
-    learning_rate: float = 5e-4  # step size of Adam
+    learning_rate: float = 1e-3  # step size of Adam
     discount: float = 0.95  # weight of the next decision's value (gamma)
     gae_lambda: float = 0.95  # from one-step (0) to Monte Carlo (1) advantages
     clip: float = 0.2  # share by which the probability of an action may move in an update

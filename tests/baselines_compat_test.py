@@ -83,7 +83,7 @@ def test_what_crashes_or_hangs_is_a_cell(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_every_learner_is_in_the_matrix() -> None:
-    assert {item.extra for item in BASELINES.values()} <= set(compat.LIBRARIES)
+    assert all(bool(item.extra) == bool(item.library) for item in BASELINES.values())
     ci = FILE.parent.parent / ".ci" / "compat.py"
     if ci.is_file():
         learners = load(ci, "ci_compat").LEARNERS

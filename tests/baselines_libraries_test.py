@@ -296,7 +296,12 @@ def test_what_it_cannot_learn_in_is_refused(name: str, tmp_path: Path) -> None:
 
 def value_of(name: str, learner: Any) -> list[float]:
     """What the learner holds the four observations of `PaidEnv` to be worth."""
-    eye, agent, mask = torch.eye(4), torch.ones(4, 1), torch.ones(4, 2)
+    scale = learner.states if name in ("torchrl-mappo", "skrl-mappo") else learner.inputs
+    eye, agent, mask = (
+        torch.diag(torch.from_numpy(scale.factors)),
+        torch.ones(4, 1),
+        torch.ones(4, 2),
+    )
     if name in ("sb3-ppo", "maskable-ppo", "supersuit-ppo"):
         seen = [eye, agent] if name == "maskable-ppo" else [eye, agent, mask]
         values = learner._model.policy.predict_values(torch.cat(seen, 1))

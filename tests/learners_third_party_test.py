@@ -12,9 +12,9 @@ from torch import nn
 
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
+from ugat_marl.learners.scaling import LEAST, InputScale, RewardScale, places
 from ugat_marl.learners.third_party import (
     LibraryLearner,
-    RewardScale,
     TrainingEnv,
     check_settings,
     decisions_of,
@@ -25,9 +25,10 @@ from ugat_marl.learners.third_party import (
     roll_out_length,
     seed_generators,
 )
+from ugat_marl.seeding import derive_seed
 from ugat_marl.testing import ToyTraffic
 from ugat_marl.traffic_env import parallel_env
-from ugat_marl.wrappers import appended_mask, pad
+from ugat_marl.wrappers import agent_indicator, appended_mask, pad
 
 
 class Still(LibraryLearner):
@@ -127,6 +128,38 @@ def test_rewards_are_scaled_by_all_seen_so_far() -> None:
     assert found[0].tolist() == [0.0, 0.0]
     assert found[-1] == pytest.approx([(-10 + 4) / np.std([-4, -2, 0, -10]), 0.0])
     assert scale.sums[0].tolist() == [4.0, 4.0]
+
+
+def test_what_is_seen_is_divided_by_its_size_so_far() -> None:
+    scale = InputScale(3)
+    assert scale.factors.tolist() == [1, 1, 1]
+    there = np.array([[True, True, True], [True, False, True]])
+    scale.note(np.array([[3, 0.5, 0], [4, 9, 0]], dtype=np.float32), there)
+    assert scale.sums.tolist() == [[2, 1, 2], [25, 0.25, 0]]
+    assert scale.factors == pytest.approx([1 / np.sqrt(12.5), 2, 1 / LEAST])
+    agents = AgentSet.of(ToyTraffic())
+    assert places(agents).sum(1).tolist() == list(agents.observation_sizes)
+    assert places(agents)[:, : min(agents.observation_sizes)].all()
+
+
+def test_libraries_see_scaled_numbers_and_policies_plain_ones() -> None:
+    env = ToyTraffic()
+    learner = Still(env)
+    learner.learn(env, 2, 5)
+    factors = learner.inputs.factors
+    assert factors.min() > 1 and factors.max() > 2
+    world = TrainingEnv(env, learner, 5)
+    seen, _ = world.reset()
+    plain, _ = ToyTraffic().reset(seed=derive_seed(5, "learner", "episode", 2))
+    for name, vector in plain.items():
+        assert np.array_equal(seen[name], vector * factors[: vector.size])
+    assert np.array_equal(world.state(), env.state() * learner.states.factors)
+    # the network reads scaled numbers, the policy reads them as they are
+    values = learner.policy().q_values(plain)
+    shown, _ = agent_indicator(pad(world)).reset()
+    for name, vector in shown.items():
+        wanted = learner.network(torch.from_numpy(vector)).detach().numpy()
+        assert np.allclose(values[name], wanted[: len(values[name])], atol=1e-5)
 
 
 def test_the_number_of_an_episode_decides_its_seed() -> None:

@@ -6,6 +6,7 @@ dataclass of its settings. Its policies are `DQNPolicy`, so that all of ``ugat-m
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -35,6 +36,7 @@ class Baseline:
         learner: Class in it.
         config: Dataclass of its settings.
         extra: Extra of the package that brings what it imports; "" for none.
+        library: Distribution that does the work; "" for none.
         settings: What its name says, in place of the defaults.
     """
 
@@ -42,26 +44,49 @@ class Baseline:
     learner: str
     config: str
     extra: str = ""
+    library: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 BASELINES: Mapping[str, Baseline] = {
     "ippo": Baseline("ippo", "IPPO", "IPPOConfig"),
     "mappo": Baseline("ippo", "IPPO", "IPPOConfig", settings={"centralised": True}),
-    "sb3-ppo": Baseline("sb3", "SB3", "SB3Config", "sb3", {"algorithm": "ppo"}),
-    "sb3-dqn": Baseline("sb3", "SB3", "SB3Config", "sb3", {"algorithm": "dqn"}),
-    "maskable-ppo": Baseline("sb3", "SB3", "SB3Config", "sb3", {"algorithm": "maskable-ppo"}),
-    "supersuit-ppo": Baseline("supersuit_ppo", "SuperSuitPPO", "SuperSuitConfig", "sb3"),
-    "torchrl-mappo": Baseline("torchrl_mappo", "TorchRLMAPPO", "TorchRLConfig", "torchrl"),
-    "skrl-ippo": Baseline("skrl_ippo", "Skrl", "SkrlConfig", "skrl"),
-    "skrl-mappo": Baseline("skrl_ippo", "Skrl", "SkrlConfig", "skrl", {"centralised": True}),
+    "sb3-ppo": Baseline(
+        "sb3", "SB3", "SB3Config", "sb3", "stable-baselines3", {"algorithm": "ppo"}
+    ),
+    "sb3-dqn": Baseline(
+        "sb3", "SB3", "SB3Config", "sb3", "stable-baselines3", {"algorithm": "dqn"}
+    ),
+    "maskable-ppo": Baseline(
+        "sb3", "SB3", "SB3Config", "sb3", "sb3-contrib", {"algorithm": "maskable-ppo"}
+    ),
+    "supersuit-ppo": Baseline(
+        "supersuit_ppo", "SuperSuitPPO", "SuperSuitConfig", "sb3", "supersuit"
+    ),
+    "torchrl-mappo": Baseline(
+        "torchrl_mappo", "TorchRLMAPPO", "TorchRLConfig", "torchrl", "torchrl"
+    ),
+    "skrl-ippo": Baseline("skrl_ippo", "Skrl", "SkrlConfig", "skrl", "skrl"),
+    "skrl-mappo": Baseline(
+        "skrl_ippo", "Skrl", "SkrlConfig", "skrl", "skrl", {"centralised": True}
+    ),
     "qmix": Baseline(
-        "benchmarl_task", "BenchMARL", "BenchMARLConfig", "benchmarl", {"algorithm": "qmix"}
+        "benchmarl_task",
+        "BenchMARL",
+        "BenchMARLConfig",
+        "benchmarl",
+        "benchmarl",
+        {"algorithm": "qmix"},
     ),
     "vdn": Baseline(
-        "benchmarl_task", "BenchMARL", "BenchMARLConfig", "benchmarl", {"algorithm": "vdn"}
+        "benchmarl_task",
+        "BenchMARL",
+        "BenchMARLConfig",
+        "benchmarl",
+        "benchmarl",
+        {"algorithm": "vdn"},
     ),
-    "rllib-ppo": Baseline("rllib_ppo", "RLlib", "RLlibConfig", "rllib"),
+    "rllib-ppo": Baseline("rllib_ppo", "RLlib", "RLlibConfig", "rllib", "ray"),
 }
 
 
@@ -101,6 +126,17 @@ def require_known(name: str) -> None:
     """
     if name != DQN_NAME and name not in BASELINES:
         raise UnknownNameError("learner", name, (DQN_NAME, *BASELINES))
+
+
+def library_of(name: str) -> str:
+    """The library that does a learner's work, with its version; "" for the suite's own learners."""
+    library = BASELINES[name].library if name in BASELINES else ""
+    if not library:
+        return ""
+    try:
+        return f"{library} {importlib.metadata.version(library)}"
+    except importlib.metadata.PackageNotFoundError:
+        return f"{library} -"
 
 
 def load_baseline(name: str) -> ModuleType:

@@ -3,7 +3,8 @@
 That is the environment they are given, the policies they are read out as, and their checkpoints.
 
 A library knows nothing of this suite's episodes, seeds and files. `TrainingEnv` stands between: it
-seeds each episode by its number, scales rewards, refuses forbidden actions and reports returns.
+seeds each episode by its number, scales what is seen and paid, refuses forbidden actions and
+reports returns.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_policy import DQNPolicy, header, parse_header
+from ugat_marl.learners.scaling import InputScale, RewardScale, places
 from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator
 
@@ -45,6 +47,8 @@ class LibraryLearner(abc.ABC):
         self.env_options = dict(getattr(env.unwrapped, "env_options", {}))
         self.episodes = 0
         self.rewards = RewardScale(len(self.agents))
+        self.inputs = InputScale(self.agents.widest_observation)
+        self.states = InputScale(_state_size(env))
         self._kind = kind
 
     def learn(
@@ -73,7 +77,7 @@ class LibraryLearner(abc.ABC):
 
     def policy(self) -> DQNPolicy:
         """The current greedy policy, a snapshot; of DQN's class, with logits in the place of Q."""
-        return policy_of(self.agents, self._actors(), self.env_options)
+        return policy_of(self.agents, self._actors(), self.env_options, self.inputs.factors)
 
     def save(self, path: Path) -> None:
         """Writes the whole state, from which `load` goes on to the same numbers."""
@@ -81,7 +85,7 @@ class LibraryLearner(abc.ABC):
         content = {
             **header(self.agents, policy.hidden, self.env_options, policy.shared),
             "episodes": self.episodes,
-            "rewards": torch.from_numpy(self.rewards.sums.copy()),
+            "sums": [torch.from_numpy(one.sums.copy()) for one in self._scales],
             "networks": {name: tensor.clone() for name, tensor in self._networks().items()},
             "rest": self._rest(),
         }
@@ -95,12 +99,19 @@ class LibraryLearner(abc.ABC):
             if agents != self.agents:
                 raise CheckpointError(f"{path}: its agents are {agents}, not {self.agents}")
             _require_like(path, content["networks"], self._networks())
-            episodes, sums = int(content["episodes"]), content["rewards"].numpy()
+            episodes, sums = int(content["episodes"]), [one.numpy() for one in content["sums"]]
+            if [one.shape for one in sums] != [one.sums.shape for one in self._scales]:
+                raise CheckpointError(f"{path}: its sums have shapes of another learner")
             self._restore(content["networks"], content["rest"])
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a whole checkpoint ({error!r})") from None
         self.episodes = episodes
-        self.rewards.sums[:] = sums
+        for one, own in zip(sums, self._scales, strict=True):
+            own.sums[:] = one
+
+    @property
+    def _scales(self) -> tuple[RewardScale | InputScale, ...]:
+        return self.rewards, self.inputs, self.states
 
     @abc.abstractmethod
     def _train(self, env: TrainingEnv, episodes: int, seed: int) -> None:
@@ -126,9 +137,12 @@ class LibraryLearner(abc.ABC):
 class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
     """An environment as a library gets it, whose calls of `reset` know no seed.
 
+    What is seen and paid comes back scaled, so that observations may leave their bounds.
+
     Args:
         env: The environment.
-        learner: Its `episodes` go up with each one that ends, and so does what it knows of rewards.
+        learner: Its `episodes` go up with each one that ends, and so does what it knows of rewards,
+            observations and states.
         seed: Root of the seeds of all episodes.
         on_episode: Called after each episode with its number and ``return``.
     """
@@ -145,6 +159,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         self._agents = learner.agents
         self._seed = seed
         self._on_episode = on_episode
+        self._places = places(self._agents)
         self._allowed: NDArray[np.bool_] | None = None
 
     def reset(
@@ -155,7 +170,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         observations, infos = self.env.reset(seed=seed, options=options)
         self._allowed = self._agents.masks(infos)
         self._return = 0.0
-        return observations, infos
+        return self._seen(observations), infos
 
     def step(
         self, actions: dict[str, Any]
@@ -183,40 +198,39 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         if not np.isfinite(paid).all():
             raise EpisodeError(f"a reward is not finite: {rewards}; correct the reward")
         self._return += float(paid.mean())
-        scaled = self._agents.names, self._learner.rewards(paid).tolist()
+        scaled = dict(zip(self._agents.names, self._learner.rewards(paid).tolist(), strict=True))
         self._allowed = self._agents.masks(infos)
         if not self.env.agents:
             number = self._learner.episodes
             self._learner.episodes += 1
             if self._on_episode is not None:
                 self._on_episode(number, {"return": self._return})
-        return observations, dict(zip(*scaled, strict=True)), terminated, truncated, infos
+        self._note(observations)
+        return self._seen(observations), scaled, terminated, truncated, infos
 
+    def state(self) -> NDArray[np.float32]:
+        """That of the environment, scaled."""
+        return self.env.state() * self._learner.states.factors
 
-class RewardScale:
-    """Centres and scales each agent's rewards by mean and deviation of all it had so far.
+    def _note(self, observations: dict[str, Any]) -> None:
+        """Counts observations in; not those of `reset`, which libraries call as they like."""
+        learner = self._learner
+        learner.inputs.note(self._agents.stack(observations), self._places)
+        if learner.states.sums.size:
+            learner.states.note(self.env.state()[None])
 
-    Args:
-        agents: Their number.
-
-    Attributes:
-        sums: Number, sum and sum of squares of the rewards of each agent, ``(3, agents)``.
-    """
-
-    def __init__(self, agents: int) -> None:
-        self.sums = np.zeros((3, agents))
-
-    def __call__(self, rewards: NDArray[np.float32]) -> NDArray[np.float64]:
-        """The rewards of one decision, ``(agents,)``, scaled; they count themselves."""
-        paid = rewards.astype(np.float64)
-        self.sums += paid ** np.arange(3)[:, None]
-        _, mean, square = self.sums / self.sums[0]
-        deviation = np.sqrt(np.maximum(square - mean**2, 0))
-        return (paid - mean) / np.where(deviation > 1e-6, deviation, 1.0)
+    def _seen(self, observations: dict[str, Any]) -> dict[str, Any]:
+        """Observations, scaled."""
+        rows = self._agents.stack(observations) * self._learner.inputs.factors
+        sizes = zip(self._agents.names, self._agents.observation_sizes, strict=True)
+        return {name: rows[row, :size] for row, (name, size) in enumerate(sizes)}
 
 
 def policy_of(
-    agents: AgentSet, actors: Sequence[Sequence[nn.Linear]], env_options: Mapping[str, Any]
+    agents: AgentSet,
+    actors: Sequence[Sequence[nn.Linear]],
+    env_options: Mapping[str, Any],
+    factors: NDArray[np.float32] | None = None,
 ) -> DQNPolicy:
     """A policy that takes the allowed action of highest output.
 
@@ -226,6 +240,8 @@ def policy_of(
             observation, zeros behind it or not; or of one for all, which reads an observation
             padded to the widest, then a one-hot of the agent.
         env_options: Options of the environment the policy relies on.
+        factors: What the perceptrons' observations were multiplied with, ``(widest_observation,)``;
+            the policy's are not.
 
     Raises:
         ValueError: The layers are of other sizes.
@@ -235,6 +251,8 @@ def policy_of(
     hidden = tuple(layer.out_features for layer in actors[0][:-1])
     with torch.no_grad():
         parts = _shared_parts(agents, actors[0]) if shared else _own_parts(agents, actors)
+        if factors is not None:  # (..., observation, hidden)
+            parts[0] = parts[0] * torch.from_numpy(factors)[:, None]
         parameters = torch.cat([part.reshape(-1) for part in parts])
     return DQNPolicy(agents, hidden, parameters, env_options, shared)
 
@@ -352,6 +370,12 @@ def seed_generators(seed: int, *path: int | str) -> None:
     torch.manual_seed(derived)
     np.random.seed(derived)  # noqa: NPY002 - libraries draw from it
     random.seed(derived)
+
+
+def _state_size(env: AnyParallelEnv) -> int:
+    """Length of `state()`; 0 where there is none."""
+    space: Any = getattr(env, "state_space", None)
+    return 0 if space is None else int(space.shape[0])
 
 
 def _require_like(path: Path, found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
