@@ -28,7 +28,7 @@ FACTS = {
 
 def curve(*att_s: list[float], speed: float = 10.0) -> Curve:
     marks = dict(zip(PLAN.marks, att_s, strict=True))
-    return Curve(MADE, marks, decisions=100, seconds=100 / speed)
+    return Curve(MADE, marks, decisions=100, seconds=100 / speed, own_seconds=0.5)
 
 
 def test_it_is_judged_every_few_episodes_and_at_the_end() -> None:
@@ -65,22 +65,22 @@ def test_the_page_by_hand() -> None:
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if "| " in line]
     # seeds 3 and 4 end with 120 and 140, 150 is fixed time; their best are 120 and 90
     half = 12.706 * np.std([120, 140], ddof=1) / np.sqrt(2)
-    assert cells[1][:4] == ["ippo", "wonder 1.0", "2", "20"]
+    assert cells[1][:5] == ["ippo", "wonder 1.0", "2", "20", "5.0"]
     assert (
-        cells[1][4].startswith("105 (")
-        and cells[1][5] == f"130 ({130 - half:.1f}–{130 + half:.0f})"
+        cells[1][5].startswith("105 (")
+        and cells[1][6] == f"130 ({130 - half:.1f}–{130 + half:.0f})"
     )
-    assert cells[1][6:] == ["-20.0", "2 of 2", "1 of 2"]
-    assert cells[2][4:] == ["400", "400", "250", "0 of 1", "0 of 1"]
+    assert cells[1][7:] == ["-20.0", "2 of 2", "1 of 2"]
+    assert cells[2][5:] == ["400", "400", "250", "0 of 1", "0 of 1"]
     assert [row[0] for row in cells[3:]] == [
         "*programme*",
         "*fixed-time:30*",
         "*sotl* (best tuned rule)",
     ]
-    assert [row[5] for row in cells[3:]] == ["200", "150", "125"]
+    assert [row[6] for row in cells[3:]] == ["200", "150", "125"]
     assert "    results.py --seeds 2" in lines
     rows = as_csv(curves).splitlines()
-    assert len(rows) == 1 + 3 * 2 and rows[2] == "ippo,wonder 1.0,3,4,120.0,10.0"
+    assert len(rows) == 1 + 3 * 2 and rows[2] == "ippo,wonder 1.0,3,4,120.0,10.0,5.0"
 
 
 @pytest.fixture
@@ -107,7 +107,12 @@ def test_a_training_that_was_interrupted_goes_on(
     assert att_of(parts) == att_of(whole)
     assert sorted(path.name for path in parts.glob("learner*")) == ["learner-4.pt"]
     curve = Curve.read(whole)
-    assert curve is not None and curve.decisions == 4 * 12 and curve.seconds > 0
+    assert (
+        curve is not None
+        and curve.decisions == 4 * 12
+        and curve.seconds > 0
+        and curve.own_seconds > 0
+    )
     with pytest.raises(OptionError, match="is beyond it"):
         perform(replace(PLAN, episodes=3), parts)
     monkeypatch.setattr(module, "version_of", lambda name: "0")

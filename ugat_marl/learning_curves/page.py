@@ -50,16 +50,17 @@ def page(
         f"{one.episodes} episodes of training, *best* the best of the evaluations every "
         f"{one.evaluate_every} episodes, chosen on the very episodes it is reported on, so that "
         "it flatters. *Fixed time* is the better of the network's own programme and a tuned "
-        "cycle. Decisions are of all agents together, while training, learning included.",
+        "cycle. Decisions are of all agents together, while training, learning included; the time "
+        "of one is the processor time of the learner's process, which the simulation is not in.",
         "",
-        "| learner | library | seeds | decisions/s | best | last | last − fixed time "
+        "| learner | library | seeds | decisions/s | ms/decision | best | last | last − fixed time "
         "| last below fixed time | last below the best rule |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
         *(_row(name, own, curves, fixed, means[best]) for name, own in by_learner.items()),
     ]
     for rule, mean in means.items():
         kind = " (best tuned rule)" if rule == best else ""
-        lines.append(f"| *{rule}*{kind} | | | | | {number(mean)} | | | |")
+        lines.append(f"| *{rule}*{kind} | | | | | | {number(mean)} | | | |")
     return "\n".join(lines)
 
 
@@ -77,6 +78,7 @@ def _row(
         str(curves[trainings[0]].made_with["library"]),
         str(len(trainings)),
         f"{np.median([curves[one].speed for one in trainings]):.0f}",
+        number(float(np.median([curves[one].own_ms for one in trainings]))),
         with_interval(Interval.of(np.array([min(own) for own in means]))),
         with_interval(Interval.of(last)),
         number(float(last.mean() - fixed)),
@@ -89,10 +91,12 @@ def as_csv(curves: Mapping[Training, Curve]) -> str:
     """Every evaluation of every training."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["learner", "library", "seed", "episodes", "att_s", "decisions_per_s"])
+    writer.writerow(
+        ["learner", "library", "seed", "episodes", "att_s", "decisions_per_s", "ms_per_decision"]
+    )
     for one, curve in curves.items():
-        speed = round(curve.speed, 1)
+        speed, ms = round(curve.speed, 1), round(curve.own_ms, 2)
         for mark, mean in zip(one.marks, curve.means(one), strict=True):
-            own = one.learner, curve.made_with["library"], one.seed, mark, round(mean, 2), speed
+            own = one.learner, curve.made_with["library"], one.seed, mark, round(mean, 2), speed, ms
             writer.writerow(own)
     return text.getvalue()

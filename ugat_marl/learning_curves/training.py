@@ -68,6 +68,7 @@ class Curve:
         att_s: By episodes trained the mean travel time of each evaluation seed, s.
         decisions: Decisions of all agents together, in training.
         seconds: Time they took, learning included, evaluations not.
+        own_seconds: Processor time of the learner's process in them; the simulation has another.
         learner: File of the learner as it was after the last evaluation.
     """
 
@@ -75,6 +76,7 @@ class Curve:
     att_s: dict[int, list[float]] = field(default_factory=dict)
     decisions: int = 0
     seconds: float = 0.0
+    own_seconds: float = 0.0
     learner: str = ""
 
     @classmethod
@@ -107,6 +109,11 @@ class Curve:
     def speed(self) -> float:
         """Decisions a second."""
         return self.decisions / self.seconds
+
+    @property
+    def own_ms(self) -> float:
+        """Processor time of a decision outside the simulation, in ms."""
+        return 1000 * self.own_seconds / self.decisions
 
     def means(self, training: Training) -> list[float]:
         """Mean travel time of each evaluation, in their order, s."""
@@ -141,9 +148,10 @@ def perform(training: Training, folder: Path) -> None:
                     f"{folder} has no evaluation of {len(seeds)} episodes after {mark} of "
                     "training and is beyond it; remove it, or name another --runs"
                 )
-            begin = time.perf_counter()
+            begin, own = time.perf_counter(), time.process_time()
             policy = learner.learn(env, mark - learner.episodes, training.seed)
             curve.seconds += time.perf_counter() - begin
+            curve.own_seconds += time.process_time() - own
             curve.decisions = learner.episodes * scenario.decisions
             curve.att_s[mark] = played(scenario, fixed_policy(policy), seeds)
             before, curve.learner = curve.learner, f"learner-{mark}.pt"
