@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from ugat_marl.demand import Demand, check_demand
 from ugat_marl.effects import load
 from ugat_marl.errors import ScenarioError
 from ugat_marl.network import Network
+from ugat_marl.networks.survey import survey
+from ugat_marl.redraw import explicit
 from ugat_marl.scenario import shipped_scenarios
 
 Crossing = Callable[..., Path]
@@ -49,6 +52,54 @@ def test_only_the_episode_counts(crossing: Crossing) -> None:
 def test_triggered_departures_are_no_times(crossing: Crossing) -> None:
     vehicles = car("a", 50) + car("b", "triggered") + car("c", 60)
     assert check(crossing(vehicles=vehicles)) == Demand(vehicles=3, flows=0)
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "routed"),
+    [
+        ('<vehicle id="a" depart="0"><route edges="S_C C_N"/></vehicle>' * 2, True),
+        (car("a", 0), False),
+        ('<trip id="b" depart="10" from="W_C" to="C_E"/>', False),
+        ('<flow id="d" begin="30" end="60" period="5" from="S_C" to="C_N"/>', False),
+    ],
+)
+def test_what_needs_no_router_is_known(vehicles: str, routed: bool, crossing: Crossing) -> None:
+    directory = crossing(vehicles=vehicles)
+    assert check(directory).routed is routed
+    assert (explicit(load(directory)).routes[0].path is not None) is routed
+
+
+def test_an_episode_need_not_know_what_comes_long_after_it(crossing: Crossing) -> None:
+    """A mistake a day later: `scenario check` says so, an environment drives until then."""
+    late = '<vehicle id="late" depart="86400"><route edges="W_C C_X"/></vehicle>'
+    soon = car("a", 10) + car("b", 2000)
+    scenario = load(crossing(vehicles=soon + late))
+    network = Network.read(scenario)
+    assert check_demand(scenario, network, whole=False).vehicles == 1
+    with pytest.raises(ScenarioError, match="C_X"):
+        check_demand(scenario, network)
+    scenario = load(crossing(vehicles=car("a", 10) + late.replace("86400", "500")))
+    with pytest.raises(ScenarioError, match="C_X"):  # SUMO reads so far ahead
+        check_demand(scenario, network, whole=False)
+
+
+def test_a_long_file_is_never_in_memory(crossing: Crossing) -> None:
+    """20 MB of vehicles: counted, looked at and hashed in a few MB."""
+    line = '<vehicle id="v{0}" depart="{1:.3f}"><route edges="W_C C_E"/></vehicle>' + " " * 900
+    vehicles = "\n".join(line.format(i, i / 100) for i in range(20_000))
+    directory = crossing(vehicles=vehicles)
+    size = load(directory).routes[0].read()
+    assert len(size) > 19_000_000
+    del size
+    scenario = load(directory)
+    tracemalloc.start()
+    try:
+        survey(scenario)
+        assert scenario.hash
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 8_000_000
 
 
 @pytest.mark.parametrize(

@@ -360,7 +360,7 @@ class Listening(Silent):
 
 
 def test_long_files_are_read_with_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ugat_marl.networks.reading._LONG", 1000)
+    monkeypatch.setattr("ugat_marl.progress._LONG", 1000)
     reporter = Listening()
     assert next(iter(scan(SINGLE / "network.net.xml", reporter))).name == "net"
     assert reporter.heard == ["reading network.net.xml, MiB"]

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import Tag
 from ugat_marl.network import Network
+from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.scenario_settings import seconds_of
 
 _ROUTED = ("from", "to", "via", "edges")
 _NO_TIME = frozenset({"triggered", "containerTriggered", "split", "now", "begin"})
+
+
+SPARE_S = 600.0
+"""SUMO reads route files so far ahead at most."""
 
 
 @dataclass(frozen=True)
@@ -22,14 +27,29 @@ class Demand:
     Attributes:
         vehicles: Single vehicles and trips that depart within the episode.
         flows: Flows within the episode, each of which makes many vehicles.
+        routed: Whether the route files hold single vehicles with their own edges only.
     """
 
     vehicles: int
     flows: int
+    routed: bool = field(default=True, compare=False)
 
 
-def check_demand(scenario: Scenario, network: Network) -> Demand:
+def check_demand(
+    scenario: Scenario,
+    network: Network,
+    reporter: Reporter | None = None,
+    *,
+    whole: bool = True,
+) -> Demand:
     """Reads all route files and checks that they can be driven.
+
+    Args:
+        scenario: Whose files.
+        network: Its network.
+        reporter: Shows progress where a file is long.
+        whole: Whether to read on behind the end of the episode; vehicles are in the order of their
+            departures, so nobody within it is missed.
 
     Raises:
         ScenarioError: A route uses an edge the network does not have, vehicles are not in the order
@@ -39,30 +59,40 @@ def check_demand(scenario: Scenario, network: Network) -> Demand:
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
     vehicles = flows = 0
+    routed = True
     for document in (*scenario.routes, *scenario.additional):
-        latest = -math.inf
-        for item in document.scan():
+        latest, own = -math.inf, document in scenario.routes
+        waiting = False
+        for item in document.scan(reporter):
+            if own and item.name in ("vehicle", "trip", "flow", "route", "routeDistribution"):
+                single = item.name == "vehicle" and "route" not in item.attributes
+                routed &= item.name == "route" or (single and not waiting)
+                waiting = single
             if item.name in ("vehicle", "trip", "flow", "route"):
                 used = " ".join(item.attributes.get(key, "") for key in _ROUTED).split()
-                for edge in used:
-                    if edge not in edges:
-                        raise _unknown_edge(document, item, edge, scenario)
+                if not edges.issuperset(used):
+                    edge = next(edge for edge in used if edge not in edges)
+                    raise _unknown_edge(document, item, edge, scenario)
             if item.name in ("vehicle", "trip", "flow"):
                 depart = _depart_s(item, document, max(begin, latest))
-                if depart < latest and document in scenario.routes:
+                if depart < latest and own:
                     raise _unsorted(document, item, depart, latest)
                 latest = max(latest, depart)
                 if item.name == "flow":
                     flows += depart < end and begin < _end_s(item, document)
                 else:
                     vehicles += begin <= depart < end
+                if own and not whole and latest > end + SPARE_S:
+                    break
+        else:
+            routed &= not waiting
     if not vehicles and not flows:
         files = ", ".join(document.source for document in scenario.routes)
         raise ScenarioError(
             f"{files}: no vehicle departs between {begin:g} s and {end:g} s; "
             "check begin_s and duration_s against the departure times"
         )
-    return Demand(vehicles, flows)
+    return Demand(vehicles, flows, routed)
 
 
 def _who(item: Tag) -> str:

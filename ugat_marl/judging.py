@@ -66,10 +66,10 @@ class Judge:
         self._weights = OBJECTIVES[wanted]
         self.persons: dict[str, float] = {"": PERSONS_IN_A_CAR}
         for document in (*scenario.additional, *scenario.routes):
-            if b"<vType" in document.read():
-                for item in document.parse().iter("vType"):
-                    carried = PERSONS.get(item.get("vClass", ""), PERSONS_IN_A_CAR)
-                    self.persons[item.get("id", "")] = carried
+            for item in document.scan():
+                if item.name == "vType":
+                    carried = PERSONS.get(item.attributes.get("vClass", ""), PERSONS_IN_A_CAR)
+                    self.persons[item.attributes.get("id", "")] = carried
 
     @classmethod
     def of(cls, effects: Sequence[Effect], scenario: Scenario) -> Judge | None:

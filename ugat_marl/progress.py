@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any, Protocol
 
 from rich.console import Console
@@ -18,6 +19,13 @@ from rich.progress import (
 
 Advance = Callable[..., None]
 """Called as ``advance()`` or ``advance(note="...")`` when a unit of work is done."""
+
+
+Pieces = Iterable[bytes]
+"""A file, cut anywhere."""
+
+_LONG = 8 << 20
+"""Bytes from which reading a file is worth a bar."""
 
 
 class Reporter(Protocol):
@@ -80,3 +88,25 @@ class Bars:
     def say(self, text: str) -> None:
         """Writes a line."""
         self._console.print(text, highlight=False, markup=False)
+
+
+@contextlib.contextmanager
+def reading(path: Path, reporter: Reporter) -> Iterator[Callable[[Pieces], Pieces]]:
+    """A bar over the pieces of a long file, each of a mebibyte; nothing for a short one.
+
+    Args:
+        path: The file.
+        reporter: Shows the bar.
+    """
+    size = path.stat().st_size if path.is_file() else 0
+    if size < _LONG or path.suffix == ".gz":  # how long a packed file is shows only at its end
+        yield lambda pieces: pieces
+        return
+    with reporter.task(f"reading {path.name}, MiB", size >> 20) as advance:
+
+        def counted(pieces: Pieces) -> Pieces:
+            for piece in pieces:
+                yield piece
+                advance()
+
+        yield counted

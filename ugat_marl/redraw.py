@@ -53,7 +53,7 @@ def explicit(scenario: Scenario) -> Scenario:
     Raises:
         ScenarioError: duarouter refuses; its own words are in the message.
     """
-    if all(_is_explicit(document.read()) for document in scenario.routes):
+    if all(map(_is_explicit, scenario.routes)):
         return scenario
     return replace(scenario, routes=(_routed(scenario),))
 
@@ -124,28 +124,39 @@ def redrawn(scenario: Scenario, seed: int) -> Scenario:
     )
 
 
-@functools.lru_cache(maxsize=8)
-def _is_explicit(content: bytes) -> bool:
+def _is_explicit(document: Document) -> bool:
     """Whether every vehicle of the file stands there with its own edges, and there is no flow."""
-    root = parse_xml(content, "routes")
-    if any(item.tag in ("trip", "flow", "routeDistribution") for item in root):
-        return False
-    return all(
-        item.find("route") is not None and item.get("route") is None
-        for item in root.iter("vehicle")
-    )
+    if document.path is None or document.content is not None:
+        return _explicit_content(document, 0, 0)
+    state = document.path.stat()
+    return _explicit_content(document, state.st_size, state.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=8)
+def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
+    """The same, remembered for a file as long as it does not change."""
+    del size, changed_ns
+    routeless = False
+    for tag in document.scan():
+        if tag.name in ("trip", "flow", "routeDistribution"):
+            return False
+        if tag.name == "vehicle":
+            if routeless or "route" in tag.attributes:
+                return False
+            routeless = True
+        elif tag.name == "route":
+            routeless = False
+    return not routeless
 
 
 def _routed(scenario: Scenario) -> Document:
     """All demand of the scenario through duarouter."""
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
-        for document in scenario.documents:
-            write_whole(directory / document.name.removesuffix(".gz"), document.read())
         out = directory / "routed.rou.xml"
 
         def files(documents: tuple[Document, ...]) -> str:
-            return ",".join(str(directory / item.name.removesuffix(".gz")) for item in documents)
+            return ",".join(str(_for_sumo(item, directory)) for item in documents)
 
         settings = scenario.settings
         command = [
@@ -169,6 +180,17 @@ def _routed(scenario: Scenario) -> Document:
                 f"scenario {scenario.id!r}: its trips or flows cannot be turned into routes: {said}"
             )
         return Document("routed.rou.xml", None, out.read_bytes())
+
+
+def _for_sumo(document: Document, directory: Path) -> Path:
+    """Where SUMO finds a document: a plain file where it lies, else a copy in `directory`."""
+    path = document.path
+    plain = path is not None and document.content is None and path.suffix != ".gz"
+    if path is not None and plain and "," not in str(path.resolve()):  # it ends a name for SUMO
+        return path.resolve()
+    copy = directory / document.name.removesuffix(".gz").replace(",", "_")
+    write_whole(copy, document.read())
+    return copy
 
 
 def sumo_program(name: str) -> Path:

@@ -14,7 +14,7 @@ import json
 import re
 import tomllib
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from ugat_marl.files import (
     write_whole,
     xml_bytes,
 )
+from ugat_marl.progress import Reporter, reading
 from ugat_marl.scenario_settings import (
     ControlSettings,
     ScenarioFile,
@@ -64,11 +65,23 @@ class Document:
         assert self.path is not None
         return read_bytes(self.path)
 
-    def scan(self) -> Iterator[Tag]:
-        """The starts of its elements with their lines, in little memory."""
+    def pieces(self) -> Iterable[bytes]:
+        """The (unpacked) bytes piece by piece, in little memory."""
         if self.path is not None and self.content is None:
-            return scan_xml(chunks_of(self.path), self.source)
-        return scan_xml([self.read()], self.source)
+            return chunks_of(self.path)
+        return [self.read()]
+
+    def scan(self, reporter: Reporter | None = None) -> Iterator[Tag]:
+        """The starts of its elements with their lines, in little memory.
+
+        Args:
+            reporter: Shows progress where the document is a long file.
+        """
+        if self.path is None or self.content is not None or reporter is None:
+            yield from scan_xml(self.pieces(), self.source)
+            return
+        with reading(self.path, reporter) as counted:
+            yield from scan_xml(counted(self.pieces()), self.source)
 
     def parse(self) -> ET.Element:
         """The document as an element tree, a fresh one at each call."""
@@ -123,9 +136,10 @@ class Scenario:
             settings.pop(cosmetic)
         digest.update(json.dumps(settings, sort_keys=True).encode())
         for document in self.documents:
-            content = document.read()
-            digest.update(f"\0{len(content)}\0".encode())
-            digest.update(content)
+            length = sum(len(piece) for piece in document.pieces())
+            digest.update(f"\0{length}\0".encode())
+            for piece in document.pieces():
+                digest.update(piece)
         return digest.hexdigest()
 
     def with_control(self, **changes: Any) -> Scenario:

@@ -75,7 +75,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.options = options
         self.render_mode = options.render_mode
         self.network = Network.read(self.scenario)
-        self.demand = check_demand(self.scenario, self.network)
+        self.demand = check_demand(self.scenario, self.network, whole=False)
         control = self.scenario.control
         self.decision_interval_s = control.decision_interval_s
         self._timing = signals.SignalTiming(

@@ -89,7 +89,7 @@ class ScenarioCheck:
         if self.duration_s is not None:
             scenario = scenario.with_duration(self.duration_s)
         reporter = Silent() if self.json else Bars(console)
-        facts = survey(scenario)
+        facts = survey(scenario, reporter)
         runs = try_out(scenario, self.seed, self.workers, reporter) if self.simulate else ()
         rows = None
         if self.headroom:

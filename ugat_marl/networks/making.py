@@ -131,7 +131,7 @@ def make_scenario(
         write_whole(folder / "scenario.toml", scenario_toml(content))
         scenario = load_scenario(folder)
         network = Network.read(scenario)
-        demand = check_demand(scenario, network)
+        demand = check_demand(scenario, network, reporter)
         made = Made(scenario, network, demand, notes)
         write_whole(folder / "README.md", _readme(made, draft, command))
     return Made(load_scenario(target), network, demand, made.notes)

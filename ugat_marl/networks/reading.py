@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import codecs
-import contextlib
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import Tag, chunks_of, read_bytes, scan_xml
-from ugat_marl.progress import Reporter
+from ugat_marl.progress import Reporter, reading
 
-_LONG = 8 << 20
-"""Bytes from which reading a file is worth a bar."""
 _MOST = 32 << 20
 """Characters of a single object; more are a file that is broken in the middle."""
 
@@ -27,7 +24,7 @@ def scan(path: Path, reporter: Reporter) -> Iterator[Tag]:
     Raises:
         ScenarioError: As for `ugat_marl.files.scan_xml`.
     """
-    with _progress(path, reporter) as counted:
+    with reading(path, reporter) as counted:
         yield from scan_xml(counted(chunks_of(path)), str(path))
 
 
@@ -39,7 +36,7 @@ def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], in
     """
     decoder = json.JSONDecoder()
     text, line, opened = "", 1, False
-    with _progress(path, reporter) as counted:
+    with reading(path, reporter) as counted:
         pieces = _texts(counted(chunks_of(path)), path)
         while True:
             rest = text.lstrip(" \t\r\n" if not opened else " \t\r\n,")
@@ -98,20 +95,3 @@ def _texts(pieces: Pieces, path: Path) -> Iterator[str]:
         yield decoder.decode(b"", final=True)
     except UnicodeDecodeError as error:
         raise ScenarioError(f"{path}: is not UTF-8: {error}") from None
-
-
-@contextlib.contextmanager
-def _progress(path: Path, reporter: Reporter) -> Iterator[Callable[[Pieces], Pieces]]:
-    """A bar over the pieces of a long file; nothing for a short one."""
-    size = path.stat().st_size if path.is_file() else 0
-    if size < _LONG or path.suffix == ".gz":  # how long a packed file is shows only at its end
-        yield lambda pieces: pieces
-        return
-    with reporter.task(f"reading {path.name}, MiB", size >> 20) as advance:
-
-        def counted(pieces: Pieces) -> Pieces:
-            for piece in pieces:
-                yield piece
-                advance()
-
-        yield counted

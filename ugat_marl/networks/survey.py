@@ -8,10 +8,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-from ugat_marl.demand import check_demand
+from ugat_marl.demand import Demand, check_demand
 from ugat_marl.junctions import Link, foes_of, yields_of
 from ugat_marl.network import Intersection, Network
 from ugat_marl.phases import RightOfWay, are_foes, turn_of
+from ugat_marl.progress import Reporter
 from ugat_marl.redraw import explicit
 from ugat_marl.scenario import Scenario
 from ugat_marl.scenario_settings import seconds_of
@@ -140,16 +141,20 @@ class Survey:
     uncontrolled: tuple[str, ...]
 
 
-def survey(scenario: Scenario) -> Survey:
+def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
     """Looks at everything that needs no simulation.
+
+    Args:
+        scenario: What to look at.
+        reporter: Shows progress where a route file is long.
 
     Raises:
         ScenarioError: The scenario cannot be controlled or driven.
     """
     network = Network.read(scenario)
-    demand = check_demand(scenario, network)
+    demand = check_demand(scenario, network, reporter)
     root = scenario.network.parse()
-    traffic = _Traffic.of(scenario, network)
+    traffic = _Traffic.of(scenario, network, demand, reporter)
     free = _free_links(root)
     rules = RightOfWay(foes_of(root), yields_of(root))
     interval = scenario.control.decision_interval_s
@@ -300,7 +305,9 @@ class _Traffic:
     fill_s: float
 
     @classmethod
-    def of(cls, scenario: Scenario, network: Network) -> _Traffic:
+    def of(
+        cls, scenario: Scenario, network: Network, demand: Demand, reporter: Reporter | None
+    ) -> _Traffic:
         seconds: dict[str, float] = {}
         for lane in network.lanes.values():
             seconds[lane.edge] = lane.length_m / max(lane.speed_mps, 0.1)
@@ -309,7 +316,7 @@ class _Traffic:
         passes: Counter[str] = Counter()
         lengths_s: list[float] = []
         first = end
-        for _, depart, edges in drives(scenario):
+        for _, depart, edges in drives(scenario, routed=demand.routed, reporter=reporter):
             if begin <= depart < end:
                 passes.update(edges)
                 lengths_s.append(sum(seconds.get(edge, 0.0) for edge in edges))
@@ -320,13 +327,25 @@ class _Traffic:
         return cls(Counter({e: n / hours for e, n in passes.items()}), first - begin, fill_s)
 
 
-def drives(scenario: Scenario) -> Iterator[tuple[str, float, list[str]]]:
-    """Name, departure and roads of every vehicle, whether trips and flows are routed or not."""
-    for document in explicit(scenario).routes:
+def drives(
+    scenario: Scenario, *, routed: bool, reporter: Reporter | None = None
+) -> Iterator[tuple[str, float, list[str]]]:
+    """Name, departure and roads of every vehicle that departs before the end of the episode.
+
+    Args:
+        scenario: Whose demand; it has passed `check_demand`.
+        routed: Whether it holds single vehicles with roads only; others are routed before.
+        reporter: Shows progress where a file is long.
+    """
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    for document in scenario.routes if routed else explicit(scenario).routes:
         name, depart = "", 0.0
-        for tag in document.scan():
+        for tag in document.scan(reporter):
             if tag.name == "vehicle":
                 name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
-                depart = seconds_of(text) if text[:1].isdigit() else scenario.settings.begin_s
+                depart = seconds_of(text) if text[:1].isdigit() else begin
+                if depart >= end:  # they are in the order of their departures
+                    break
             elif tag.name == "route" and "id" not in tag.attributes:
                 yield name, depart, tag.attributes.get("edges", "").split()

@@ -105,7 +105,8 @@ def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
             for item in scan_xml(chunks_of(directory / TRIPS), "SUMO's report")
             if item.name == "tripinfo" and float(item.attributes.get("depart", "-1")) < 0
         }
-    return Counter(edges[0] for who, _, edges in drives(scenario) if who in waiting and edges)
+    all_drives = drives(scenario, routed=False)
+    return Counter(edges[0] for who, _, edges in all_drives if who in waiting and edges)
 
 
 def problems(
