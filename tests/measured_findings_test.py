@@ -382,7 +382,7 @@ def test_greens_of_many_lengths_follow_the_traffic(
     if not adaptive:
         assert findings == {}
     else:
-        assert only(findings, "('C') with greens of many lengths", "other vehicles") == ()
+        assert only(findings, "('C') with greens of many lengths", "arrivals they answered") == ()
 
 
 def test_a_log_without_yellow(tmp_path: Path, scenario: Scenario, network: Network) -> None:

@@ -19,6 +19,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from ugat_marl.discrepancy.arrivals import corrected
 from ugat_marl.discrepancy.features import FEATURES, Tally, tally
 from ugat_marl.discrepancy.replay import Day, Replay
 from ugat_marl.discrepancy.site import Greens, Site
@@ -100,7 +101,7 @@ class Engine:
         self._known: dict[str, Replicate] = {}
         head = (VERSION, FEATURES, scenario.hash, site.detectors, _versions(), seed)
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
-        self._signals = [_signals_hash(period) for period in periods]
+        self._signals = [_signals_hash(period, replay.answering) for period in periods]
 
     @property
     def known(self) -> int:
@@ -200,6 +201,8 @@ class Engine:
             day = self._day(effects, number)
             place = number % len(self.periods)
             counted = tally(self.site, day.period, self._greens[place])
+            if day.due is not None:
+                counted = corrected(counted, self.site, day.due)
             # As precise as what is remembered, so that the answer does not depend on the cache.
             counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
             found = Replicate(counted, day.travel_time_s)
@@ -228,7 +231,7 @@ class Engine:
                     break
         if not faults:
             return day
-        return Day(self._replay.observed(faults, day.period), day.travel_time_s)
+        return replace(day, period=self._replay.observed(faults, day.period))
 
     def _simulated(self, effects: tuple[Effect, ...], period: Period, seed: int) -> Day:
         if not isinstance(self._workers, Executor):
@@ -275,6 +278,10 @@ def _versions() -> tuple[str, ...]:
     return tuple(importlib.metadata.version(name) for name in ("eclipse-sumo", "numpy"))
 
 
-def _signals_hash(period: Period) -> str:
+def _signals_hash(period: Period, answering: bool) -> str:
+    """Of what a simulated day takes from a measured one."""
     content = (period.begin_s, period.end_s, sorted(period.signals.items()))
-    return hashlib.sha256(repr(content).encode()).hexdigest()
+    digest = hashlib.sha256(repr(content).encode())
+    for name, seen in sorted(period.passages.items()) if answering else ():
+        digest.update(repr((name, seen.on_s.tolist(), seen.off_s.tolist())).encode())
+    return digest.hexdigest()

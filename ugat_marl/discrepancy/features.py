@@ -83,7 +83,9 @@ EVENT_FEATURES = frozenset(
     }
 )  # fmt: skip
 """Features that count how often something happens, which may be hardly ever."""
-BIN_FEATURES = ("count_advance", "count_stop", "count_exit", "occupied")
+COUNT_FEATURES = ("count_advance", "count_stop", "count_exit")
+PLATOON_FEATURES = ("platoon_gap", "platoon_short", "platoon_middle", "platoon_time")
+BIN_FEATURES = (*COUNT_FEATURES, "occupied")
 BIN_S = 300.0
 
 _BREAK_S = 5.0

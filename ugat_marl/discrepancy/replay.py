@@ -6,6 +6,7 @@ process per day; the same day has the same vehicles under every model (common ra
 
 from __future__ import annotations
 
+import functools
 import subprocess
 import tempfile
 import threading
@@ -18,7 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.effects import detector_effects, parked_at_other_times
+from ugat_marl.discrepancy.arrivals import Arrivals, Due
+from ugat_marl.discrepancy.site import Site
+from ugat_marl.effects import (
+    DemandLevel,
+    DemandSurge,
+    DemandTiming,
+    detector_effects,
+    parked_at_other_times,
+)
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
 from ugat_marl.effects.signals import late_greens
@@ -39,6 +48,8 @@ WARM_UP_S = 600.0
 """Simulated before a period that does not begin with the scenario, under its own first signals."""
 
 _DAYS = 64
+_WHEN = (DemandLevel, DemandSurge, DemandTiming)
+"""How many vehicles depart, and when: measured arrivals say that of the day they belong to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +59,12 @@ class Day:
     Attributes:
         period: What the detectors saw.
         travel_time_s: Mean time in the network of the vehicles due, waiting to enter included.
+        due: What the demand asked for, if the day had measured arrivals instead.
     """
 
     period: Period
     travel_time_s: float
+    due: Due | None = None
 
 
 class Replay:
@@ -62,6 +75,7 @@ class Replay:
         network: Its network.
         detectors: What is measured.
         owner: Detector to its traffic light.
+        answering: Whether the signals answered the traffic, so that days need its arrivals.
     """
 
     def __init__(
@@ -70,43 +84,49 @@ class Replay:
         network: Network,
         detectors: Sequence[Detector],
         owner: Mapping[str, str],
+        *,
+        answering: bool = False,
     ) -> None:
         self._given = scenario, network, detectors, owner
+        self.answering = answering
         self._scenario = explicit(scenario)
         self._network = network
         self._detectors = tuple(detectors)
         self._owner = dict(owner)
+        self._arrivals = Arrivals(Site.of(network, detectors), network) if answering else None
         self._own = detector_effects(scenario)
         self._days: OrderedDict[int, Scenario] = OrderedDict()
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[type[Replay], tuple[Any, ...]]:
+    def __reduce__(self) -> tuple[functools.partial[Replay], tuple[Any, ...]]:
         """For executors elsewhere: the days it remembers stay here."""
-        return Replay, self._given
+        return functools.partial(Replay, answering=self.answering), self._given
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
         """Simulates one day.
 
         Args:
             effects: Applied to the day one after the other; those of detectors to what they see.
-            period: Begin, end and signals.
+            period: Begin, end and signals; what was detected, if the signals answered it.
             seed: Which day, and SUMO's own seed.
 
         Raises:
             SimulatorError: SUMO refused.
         """
-        scenario = self._day(seed)
-        for effect in effects:
-            scenario = effect.apply(scenario)
+        day = self._day(seed)
+        scenario, due = _with(day, effects), None
+        if self._arrivals is not None:
+            drivers = _with(day, [item for item in effects if not isinstance(item, _WHEN)])
+            scenario, due = self._arrivals.given(scenario, drivers, period)
         scenario = parked_at_other_times(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)
-            day = self._run(scenario, period, seed, directory)
-        seen = day.period
+            done = self._run(scenario, period, seed, directory)
+        seen = done.period
         for effect in (*self._own, *effects):
             if isinstance(effect, DetectorEffect):
                 seen = effect.observe(seen, self._detectors, self._owner)
-        return Day(_logged(seen), day.travel_time_s)
+        return Day(_logged(seen), done.travel_time_s, due)
 
     def observed(self, effects: Sequence[DetectorEffect], period: Period) -> Period:
         """A simulated period as other detectors would have seen it; costs no simulation."""
@@ -147,6 +167,12 @@ class Replay:
         seen = read_loops(loops, self._detectors, period.begin_s, period.end_s)
         travel = float(np.mean(trips.travel_time_s)) if len(trips.travel_time_s) else np.nan
         return Day(replace(period, passages=seen), travel)
+
+
+def _with(scenario: Scenario, effects: Sequence[Effect]) -> Scenario:
+    for effect in effects:
+        scenario = effect.apply(scenario)
+    return scenario
 
 
 def _logged(period: Period) -> Period:

@@ -58,6 +58,7 @@ class Null:
         directed: Makes further statistics of a distance, which small effects move most, for the
             model whose distance it is. It is made anew for each half: what was adapted to the days
             it judges would find them more usual than others.
+        doubt: What the model's means may be off by, see `Reference`; its own days are not.
     """
 
     def __init__(
@@ -68,9 +69,10 @@ class Null:
         *,
         speeds: bool,
         directed: Callable[[Reference], Directed] | None = None,
+        doubt: Mapping[str, Array] | None = None,
     ) -> None:
         generator = np.random.default_rng(7)
-        self.reference = Reference(pools, tallies, speeds=speeds)
+        self.reference = Reference(pools, tallies, speeds=speeds, doubt=doubt)
         self._directed = directed(self.reference) if directed else None
         draws: dict[str, list[float]] = {}
         for half in (0, 1):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,7 @@ class Block:
         error: Variance of `mean` itself.
         used: Which statistics are used.
         correlation: Between features, ``(features, features)``.
+        doubt: Variance of `mean` that no number of days takes away.
     """
 
     mean: Array
@@ -96,6 +97,7 @@ class Block:
     error: Array
     used: NDArray[np.bool_]
     correlation: Array
+    doubt: Array | float = 0.0
 
     def noise(self, weight: Array, periods: int) -> Array:
         """Variance of measured minus expected; fewer observations than usual say less.
@@ -105,7 +107,7 @@ class Block:
             periods: Measured periods.
         """
         thin = np.clip(self.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
-        return self.variance * thin / periods + self.error
+        return self.variance * thin / periods + self.error + self.doubt
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +140,8 @@ class Reference:
             days are shrunk.
         paired: Days of `prior` with the same numbers as `tallies`: their difference is what is
             known of the mean (common random numbers).
+        doubt: Variance of the means that no number of days takes away, by block; None for that of
+            `prior`.
     """
 
     def __init__(
@@ -148,6 +152,7 @@ class Reference:
         speeds: bool = True,
         prior: Reference | None = None,
         paired: Sequence[Tally] = (),
+        doubt: Mapping[str, Array] | None = None,
     ) -> None:
         self.pools = pools
         self.days = len(tallies)
@@ -157,7 +162,9 @@ class Reference:
         self.blocks: dict[str, Block] = {}
         for name, sums in stacked.items():
             before = prior.blocks[name] if prior else None
-            self.blocks[name] = self._block(sums, before, partners.get(name), name)
+            block = self._block(sums, before, partners.get(name), name)
+            known = before.doubt if before else 0.0
+            self.blocks[name] = replace(block, doubt=doubt[name] if doubt else known)
 
     def _block(self, sums: Array, prior: Block | None, partner: Array | None, name: str) -> Block:
         """From sums ``(days, members, features, 2)``."""

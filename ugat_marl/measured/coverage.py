@@ -137,16 +137,16 @@ def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Ite
                 NEEDS_YELLOW if len(bare) == len(controlled) - len(never) else (),
             )
 
-    adaptive = [tls for tls in controlled if _follows_traffic(periods, tls)]
+    adaptive = [tls for tls in controlled if follows_traffic(periods, tls)]
     if adaptive:
         yield Finding(
             f"signals: {_list('traffic light', adaptive)} with greens of many lengths, as if they "
-            "followed the traffic: a replay meets other vehicles than those they answered, so that "
-            "queues differ where nothing is missing; doubt small effects, and the verdict unknown"
+            "followed the traffic: simulated days get the arrivals they answered, as the advance "
+            "detectors saw them; where an approach has none, doubt the verdict unknown"
         )
 
 
-def _follows_traffic(periods: Sequence[Period], tls: str) -> bool:
+def follows_traffic(periods: Sequence[Period], tls: str) -> bool:
     """Whether some green lasts differently long; twice in one cycle it may in a fixed programme."""
     lengths: dict[str, set[float]] = {}
     for period in periods:
