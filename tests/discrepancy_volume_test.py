@@ -128,6 +128,32 @@ def test_a_planted_turn_comes_out_with_its_share(way: Way, share: float) -> None
     assert sizes["turning"] > sizes["demand"]
 
 
+@pytest.mark.parametrize("origin", ["a", "b"])
+def test_lanes_tell_from_where_vehicles_turn_elsewhere(origin: str) -> None:
+    """Two approaches with a lane for each of two ways: where they go is the same for both."""
+    lanes = tuple(
+        SiteLane(f"{edge}_{i}", edge, 0, (i,), 14.0, {}, frozenset({target}))
+        for edge in "ab"
+        for i, target in enumerate("xy")
+    )
+    site = Site(("C",), lanes, tuple((0, f"{x}_0", (f"exit:{x}",)) for x in "xy"), (), {})
+    ways: dict[Way, float] = {(edge, target): 200.0 for edge in "ab" for target in "xy"}
+    distance = a_distance(site, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
+    row = INDEX["count_stop"]
+    for place, lane in enumerate(lanes):
+        moved = 80.0 if lane.edge == origin else 1e-6
+        value = moved if "x" in lane.following else -moved
+        distance.difference["lane"][place, row] = value / 60.0
+        distance.z["lane"][place, row] = value / 14.0
+    first = next(h for h in Volume(site, routes(ways)).hypotheses(distance) if h.name == "turning")
+    assert first.fixed == (("from_edge", origin), ("to_edge", "x"))
+    # Two lanes, 80 more and 80 fewer, errors of 14: 2 (80 / 14)^2 beside what the exits say.
+    counted = a_distance(site, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
+    gain = Volume(site, routes(ways)).directed(distance)["turning"]
+    alone = Volume(site, routes(ways)).directed(counted)["turning"]
+    assert gain - alone == pytest.approx(2 * (80.0 / 14.0) ** 2, rel=0.01)
+
+
 def test_counts_as_expected_propose_nothing() -> None:
     assert proposed(SITE, WAYS, changed({})) == []
 

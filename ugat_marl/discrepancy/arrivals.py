@@ -86,7 +86,7 @@ class Arrivals:
 
     def __init__(self, site: Site, network: Network) -> None:
         self._pace = {lane.edge: (lane.length_m, lane.speed_mps) for lane in network.lanes.values()}
-        self._approaches = _approaches(site, network)
+        self._approaches = _approaches(site)
         self._counted = frozenset(edge for _, edge, _ in site.places)
 
     def given(self, asked: Scenario, drivers: Scenario, period: Period) -> tuple[Scenario, Due]:
@@ -339,12 +339,11 @@ def corrected(counted: Tally, site: Site, due: Due) -> Tally:
     return replace(counted, sums=sums, bins=np.maximum(bins, 0.0))
 
 
-def _approaches(site: Site, network: Network) -> dict[str, tuple[_Lane, ...]]:
+def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
     """Edges all of whose lanes in front of the traffic light have an advance detector."""
     position = {item.id: item.position_m for item in site.detectors}
     lanes: dict[str, list[_Lane] | None] = {}
     for lane in site.lanes:
-        links = network.intersections[lane.intersection].links
         advance = lane.detectors.get("advance")
         known = lanes.setdefault(lane.edge, [])
         if advance is None or known is None:
@@ -353,11 +352,10 @@ def _approaches(site: Site, network: Network) -> dict[str, tuple[_Lane, ...]]:
         stop = lane.detectors.get("stop", (None,))[0]
         begin = position[advance[0]]
         end = begin if stop is None else position[stop]
-        following = frozenset(
-            link.to_lane.rsplit("_", 1)[0] for link in links if link.from_lane == lane.id
-        )
         travel = max(end - begin, 0.0) / (_FASTEST * lane.speed_mps)
-        known.append(_Lane(lane.id, advance[0], stop, begin, lane.speed_mps, travel, following))
+        known.append(
+            _Lane(lane.id, advance[0], stop, begin, lane.speed_mps, travel, lane.following)
+        )
     return {edge: tuple(known) for edge, known in lanes.items() if known}
 
 

@@ -26,6 +26,7 @@ class SiteLane:
         links: Letters of the signal state that concern it.
         speed_mps: Speed limit.
         detectors: Kind to the ids of the detectors on it.
+        following: Edges it leads to.
     """
 
     id: str
@@ -34,6 +35,7 @@ class SiteLane:
     links: tuple[int, ...]
     speed_mps: float
     detectors: Mapping[DetectorKind, tuple[str, ...]]
+    following: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ class Site:
                         _links(item, lane),
                         network.lanes[lane].speed_mps,
                         kinds,
+                        _following(item, lane),
                     )
                 )
                 owner |= {name: item.id for names in kinds.values() for name in names}
@@ -144,6 +147,12 @@ class Site:
 
 def _links(item: Intersection, lane: str) -> tuple[int, ...]:
     return tuple(sorted({link.index for link in item.links if link.from_lane == lane}))
+
+
+def _following(item: Intersection, lane: str) -> frozenset[str]:
+    return frozenset(
+        link.to_lane.rsplit("_", 1)[0] for link in item.links if link.from_lane == lane
+    )
 
 
 def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:

@@ -120,7 +120,7 @@ class Volume:
         counts = self._counts(distance)
         return {
             "demand": max((item[0] for item in self._origins(counts)), default=0.0),
-            "turning": max((item[0] for item in self._turns(counts)), default=0.0),
+            "turning": max((item[0] for item in self._turns(counts, distance)), default=0.0),
         }
 
     def hypotheses(self, distance: Distance) -> list[Hypothesis]:
@@ -137,7 +137,9 @@ class Volume:
                             "demand_level", fixed, ("factor",), ((level,),), (1.0,), 0.03, both=True
                         )
                     )
-        for gain, origin, target, share in sorted(self._turns(counts), reverse=True)[:_PLACES]:
+        for gain, origin, target, share in sorted(self._turns(counts, distance), reverse=True)[
+            :_PLACES
+        ]:
             fixed = (("from_edge", origin), ("to_edge", target))
             if gain > _SUSPECT:
                 found.append(Hypothesis("turning", fixed, ("share",), ((share,),), (0.0,), 0.03))
@@ -185,8 +187,11 @@ class Volume:
                 found.append((gain, origin, 1.0 + strength))
         return found
 
-    def _turns(self, counts: _Counts) -> list[tuple[float, str, str, float]]:
-        """Squared z, edges and share of every pair of edges between which vehicles may move."""
+    def _turns(self, counts: _Counts, distance: Distance) -> list[tuple[float, str, str, float]]:
+        """Squared z, edges and share of every pair of edges between which vehicles may move.
+
+        What arrives says where to, and hardly where from; that is told by the lanes vehicles left.
+        """
         found: list[tuple[float, str, str, float]] = []
         approaches = {lane.edge for lane in self._site.lanes}
         for origin in sorted(approaches & set(self._routes.turns)):
@@ -197,5 +202,36 @@ class Volume:
                 change[target] += total
                 strength, gain, size = counts.weighed(change)
                 if size > 4.0 and strength > 0.02:
+                    gain += self._lanes_left(origin, target, distance)
                     found.append((gain, origin, target, min(strength, 0.9)))
         return found
+
+    def _lanes_left(self, origin: str, target: str, distance: Distance) -> float:
+        """Squared z of vehicles that moved to those lanes of an edge that lead to another."""
+        rates = self._routes.turns[origin]
+        row = INDEX["count_stop"]
+        ray: list[float] = []
+        z: list[float] = []
+        errors: list[float] = []
+        lanes = [(i, lane) for i, lane in enumerate(self._site.lanes) if lane.edge == origin]
+        for index, lane in lanes:
+            difference = float(distance.difference["lane"][index, row])
+            score = float(distance.z["lane"][index, row])
+            if not difference or not score:
+                continue
+            change = 0.0
+            for edge, rate in rates.items():
+                alike = sum(edge in other.following for _, other in lanes)
+                if edge in lane.following:
+                    change += (
+                        sum(rates.values()) if edge == target else 0.0
+                    ) / alike - rate / alike
+            ray.append(change)
+            z.append(score)
+            errors.append(60.0 * abs(difference / score))
+        if len(ray) < 2:
+            return 0.0
+        scaled = np.array(ray) / np.array(errors)
+        scaled -= scaled.mean()  # how many came in all is counted already
+        found = float(scaled @ np.array(z))
+        return max(found, 0.0) ** 2 / max(float(scaled @ scaled), 1e-9)
