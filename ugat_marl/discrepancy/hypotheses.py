@@ -113,8 +113,9 @@ _GLOBAL: dict[str, _Entry] = {
     "lane_discipline": _Entry("strategic", (0.1, 5.0), 1.0, 0.2, attribute="lcStrategic"),
     "heavy_share": _Entry("share", (0.12,), 0.0, 0.01),
     "late_green": _Entry("seconds", (2.0,), 0.0, 0.3, place="place", step=LATE_STEP_S),
-    "signal_clock": _Entry("seconds", (-2.0, 2.0), 0.0, 0.2, place="place"),
-    "clock_drift": _Entry("seconds_per_hour", (3.0,), 0.0, 0.5, place="place", both=True),
+    # What a clock moves across the start of green is not in proportion; faults cost no simulation.
+    "signal_clock": _Entry("seconds", (-4.0, -1.5, 1.5, 4.0), 0.0, 0.2, place="place"),
+    "clock_drift": _Entry("seconds_per_hour", (-7.0, -2.5, 2.5, 7.0), 0.0, 0.5, place="place"),
     "undercount": _Entry("share", (0.15,), 0.0, 0.02, place="place"),
     "demand_level": _Entry("factor", (1.15,), 1.0, 0.03, place="edge", both=True),
     "demand_timing": _Entry("seconds", (300.0,), 0.0, 45.0, place="edge", both=True),

@@ -289,13 +289,15 @@ class Proposer:
             found.append(
                 Hypothesis("late_green", place, ("seconds",), ((2.0,),), (0.0,), 0.3, LATE_STEP_S)
             )
-            sign = 2.0 if lost[index] > 0 else -2.0
-            found.append(Hypothesis("signal_clock", place, ("seconds",), ((sign,),), (0.0,), 0.2))
+            sign = 1.0 if lost[index] > 0 else -1.0
+            levels = ((1.5 * sign,), (4.0 * sign,))
+            found.append(Hypothesis("signal_clock", place, ("seconds",), levels, (0.0,), 0.2))
         for index in np.argsort(-np.abs(drift))[:1]:
-            sign = 3.0 if drift[index] > 0 else -3.0
+            sign = 1.0 if drift[index] > 0 else -1.0
+            levels = ((2.5 * sign,), (7.0 * sign,))
             place = (("place", names[int(index)]),)
             found.append(
-                Hypothesis("clock_drift", place, ("seconds_per_hour",), ((sign,),), (0.0,), 0.5)
+                Hypothesis("clock_drift", place, ("seconds_per_hour",), levels, (0.0,), 0.5)
             )
         return found
 
