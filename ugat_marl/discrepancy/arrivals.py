@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,7 +85,9 @@ class Arrivals:
     """
 
     def __init__(self, site: Site, network: Network) -> None:
-        self._pace = {lane.edge: (lane.length_m, lane.speed_mps) for lane in network.lanes.values()}
+        lanes = network.lanes.values()
+        self._pace_s = {lane.edge: lane.length_m / lane.speed_mps for lane in lanes}
+        self._ways: dict[str, _Way] = {}
         self._approaches = _approaches(site)
         self._counted = frozenset(edge for _, edge, _ in site.places)
 
@@ -105,6 +107,8 @@ class Arrivals:
         """
         document = drivers.routes[0]
         root = document.parse()
+        demand = root if asked is drivers else asked.routes[0].parse()
+        due = self._by_edge(demand, period)
         pools: dict[str, list[_Coming]] = {edge: [] for edge in self._approaches}
         stay: list[ET.Element] = []
         for item in root:
@@ -117,28 +121,42 @@ class Arrivals:
             stay += _filled(pool, self._came(edge, period), drivers.settings.begin_s, period)
         root[:] = stay
         sort_departures(root)
-        changed = replace(
-            drivers,
-            routes=(Document(document.name, None, xml_bytes(root)), *drivers.routes[1:]),
+        changed = Document(document.name, None, xml_bytes(root))
+        return (
+            replace(drivers, routes=(changed, *drivers.routes[1:])),
+            Due(due, self._by_edge(root, period)),
         )
-        return changed, Due(self._by_edge(asked, period), self._by_edge(changed, period))
 
     def _coming(self, item: ET.Element, period: Period) -> _Coming | None:
         """Where a vehicle is seen first, and when; None if it has to be left alone."""
-        edges = _edges(item)
-        first = next((i for i, edge in enumerate(edges) if edge in self._approaches), None)
-        if first is None or item.find("stop") is not None:
+        way = self._way(_route(item))
+        if way.approach is None or item.find("stop") is not None:
             return None
-        factor = float(item.get("speedFactor", "1"))
-        edge = edges[first]
-        lane = self._approaches[edge][0]
-        way = sum(length / limit for length, limit in map(self._pace.__getitem__, edges[:first]))
-        way = (way + lane.position_m / lane.speed_mps) / factor
-        time = depart_s(item) + way
+        way_s = way.approach_s / _factor(item)
+        time = depart_s(item) + way_s
         if not time >= period.begin_s:
             return None
-        following = edges[first + 1] if first + 1 < len(edges) else None
-        return _Coming(edge, time, way, following, item)
+        return _Coming(way.approach, time, way_s, way.following, item)
+
+    def _way(self, route: str) -> _Way:
+        """A route at the speed limit; remembered, since thousands drive the same few."""
+        found = self._ways.get(route)
+        if found is not None:
+            return found
+        edges = route.split()
+        ends = np.cumsum([0.0, *(self._pace_s[edge] for edge in edges)]).tolist()
+        counted = tuple(
+            (edge, end) for edge, end in zip(edges, ends[1:], strict=True) if edge in self._counted
+        )
+        found = _Way(counted)
+        first = next((i for i, edge in enumerate(edges) if edge in self._approaches), None)
+        if first is not None:
+            lane = self._approaches[edges[first]][0]
+            following = edges[first + 1] if first + 1 < len(edges) else None
+            there = ends[first] + lane.position_m / lane.speed_mps
+            found = _Way(counted, edges[first], there, following)
+        self._ways[route] = found
+        return found
 
     def _came(self, edge: str, period: Period) -> list[tuple[float, frozenset[str]]]:
         """When vehicles would have come by an approach's advance detectors, and where they went."""
@@ -166,23 +184,37 @@ class Arrivals:
         ]
         return sorted(found, key=lambda row: row[0])
 
-    def _by_edge(self, scenario: Scenario, period: Period) -> dict[str, Array]:
+    def _by_edge(self, vehicles: Iterable[ET.Element], period: Period) -> dict[str, Array]:
         """Vehicles that would come by the end of each counted edge, by bin of time."""
         bins = max(1, round((period.end_s - period.begin_s) / BIN_S))
         times: dict[str, list[float]] = {edge: [] for edge in self._counted}
-        for item in scenario.routes[0].parse().iter("vehicle"):
-            when = depart_s(item)
-            factor = float(item.get("speedFactor", "1"))
-            for edge in _edges(item):
-                length, limit = self._pace[edge]
-                when += length / limit / factor
-                if edge in times:
-                    times[edge].append(when)
+        for item in vehicles:
+            if item.tag == "vehicle":
+                depart, factor = depart_s(item), _factor(item)
+                for edge, end_s in self._way(_route(item)).counted:
+                    times[edge].append(depart + end_s / factor)
         span = period.begin_s, period.end_s
         return {
             edge: np.histogram(found, bins, span)[0].astype(np.float64)
             for edge, found in times.items()
         }
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A route at the speed limit.
+
+    Attributes:
+        counted: Edges with detectors, and when their ends are reached, s.
+        approach: The first one on which vehicles are seen to come.
+        approach_s: When its advance detector is reached, s.
+        following: The edge behind it.
+    """
+
+    counted: tuple[tuple[str, float], ...]
+    approach: str | None = None
+    approach_s: float = 0.0
+    following: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,6 +391,10 @@ def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
     return {edge: tuple(known) for edge, known in lanes.items() if known}
 
 
-def _edges(item: ET.Element) -> list[str]:
+def _route(item: ET.Element) -> str:
     route = item.find("route")
-    return [] if route is None else route.get("edges", "").split()
+    return "" if route is None else route.get("edges", "")
+
+
+def _factor(item: ET.Element) -> float:
+    return float(item.get("speedFactor", "1"))

@@ -116,7 +116,8 @@ class Replay:
         day = self._day(seed)
         scenario, due = _with(day, effects), None
         if self._arrivals is not None:
-            drivers = _with(day, [item for item in effects if not isinstance(item, _WHEN)])
+            others = [item for item in effects if not isinstance(item, _WHEN)]
+            drivers = scenario if len(others) == len(effects) else _with(day, others)
             scenario, due = self._arrivals.given(scenario, drivers, period)
         scenario = parked_at_other_times(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
