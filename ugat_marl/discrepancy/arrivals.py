@@ -58,6 +58,7 @@ class _Lane:
     advance: str
     stop: str | None
     position_m: float
+    zone_m: float
     speed_mps: float
     travel_s: float
     following: frozenset[str]
@@ -163,7 +164,8 @@ class Arrivals:
         lanes = self._approaches[edge]
         seen = [period.passages.get(lane.advance, Passages.none()) for lane in lanes]
         times = [
-            unhindered(one, lane.speed_mps, period) for one, lane in zip(seen, lanes, strict=True)
+            unhindered(one, lane.speed_mps, period, lane.zone_m)
+            for one, lane in zip(seen, lanes, strict=True)
         ]
         crossed = [
             np.sort(found.off_s[np.isfinite(found.off_s)])
@@ -228,7 +230,7 @@ class _Coming:
     item: ET.Element
 
 
-def unhindered(seen: Passages, limit_mps: float, period: Period) -> Array:
+def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float = 0.0) -> Array:
     """When vehicles would have come if nobody had stood in their way, s.
 
     Vehicles that came through a queue arrived at its end before; when, nobody saw. They are spread
@@ -238,11 +240,15 @@ def unhindered(seen: Passages, limit_mps: float, period: Period) -> Array:
         seen: An advance detector's vehicles.
         limit_mps: Speed limit there.
         period: Its begin and end.
+        zone_m: Length of the detection zone.
     """
     seen = seen.at(np.isfinite(seen.on_s))
     times = seen.on_s.copy()
     over = np.maximum(seen.off_s - seen.on_s, 1e-3)
-    pace = np.where(np.isfinite(seen.speed_mps), seen.speed_mps, _LENGTH_M / over) / limit_mps
+    pace = (
+        np.where(np.isfinite(seen.speed_mps), seen.speed_mps, (_LENGTH_M + zone_m) / over)
+        / limit_mps
+    )
     slow = pace < HELD_UP
     close = np.diff(times, prepend=-np.inf) < _CLOSE_S
     for place in np.flatnonzero(close & ~slow & (pace < FREE)).tolist():
@@ -373,7 +379,7 @@ def corrected(counted: Tally, site: Site, due: Due) -> Tally:
 
 def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
     """Edges all of whose lanes in front of the traffic light have an advance detector."""
-    position = {item.id: item.position_m for item in site.detectors}
+    zones = {item.id: item for item in site.detectors}
     lanes: dict[str, list[_Lane] | None] = {}
     for lane in site.lanes:
         advance = lane.detectors.get("advance")
@@ -382,11 +388,21 @@ def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
             lanes[lane.edge] = None
             continue
         stop = lane.detectors.get("stop", (None,))[0]
-        begin = position[advance[0]]
-        end = begin if stop is None else position[stop]
+        zone = zones[advance[0]]
+        begin = zone.position_m
+        end = begin if stop is None else zones[stop].position_m
         travel = max(end - begin, 0.0) / (_FASTEST * lane.speed_mps)
         known.append(
-            _Lane(lane.id, advance[0], stop, begin, lane.speed_mps, travel, lane.following)
+            _Lane(
+                lane.id,
+                advance[0],
+                stop,
+                begin,
+                zone.length_m,
+                lane.speed_mps,
+                travel,
+                lane.following,
+            )
         )
     return {edge: tuple(known) for edge, known in lanes.items() if known}
 
