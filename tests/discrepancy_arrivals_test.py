@@ -74,10 +74,10 @@ def test_without_speeds_time_on_the_detector_tells() -> None:
 
 def test_a_long_zone_is_left_later() -> None:
     # 5 m of vehicle and 15 m of zone at 10 m/s: 2 s, and nobody was held up.
-    on = np.array([20.0, 50.0])
+    on = np.array([150.0, 190.0])
     free = Passages(on, on + 2.0, on * np.nan, on * np.nan)
-    assert unhindered(free, LIMIT, a_period(), 15.0).tolist() == [20.0, 50.0]
-    assert unhindered(free, LIMIT, a_period()).tolist() != [20.0, 50.0]
+    assert unhindered(free, LIMIT, a_period(), 15.0).tolist() == [150.0, 190.0]
+    assert unhindered(free, LIMIT, a_period()).tolist() != [150.0, 190.0]
 
 
 def test_who_changes_lanes_is_counted_where_he_left() -> None:
