@@ -5,15 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.effects import Domain
+from ugat_marl.executors import Workers
 from ugat_marl.learners.registry import LearnerFactory
 from ugat_marl.policy import AnyParallelEnv, Learner, Policy
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Scenario
-from ugat_marl.traffic_env import TrafficEnv, parallel_env
+from ugat_marl.traffic_env import parallel_env
 from ugat_marl.training import Run
 from ugat_marl.ugat import CHUNK, UgatConfig
 from ugat_marl.worlds import SimulatedWorld
@@ -54,6 +56,7 @@ def simulated_worlds(
     real: Domain,
     ugat: UgatConfig,
     options: Mapping[str, Any],
+    workers: Workers = None,
 ) -> tuple[SimulatedWorld, SimulatedWorld]:
     """Where D_sim and D_real come from if both worlds can be played.
 
@@ -63,14 +66,13 @@ def simulated_worlds(
         real: The real domain.
         ugat: How often is rolled out, and whether greens are delayed by chance.
         options: Of both environments.
+        workers: As for `SimulatedWorld`.
     """
 
     def world(domain: Domain, name: str, episodes: int, most_delay_s: int = 0) -> SimulatedWorld:
-        def make() -> TrafficEnv:
-            crossings = ugat.most_delay_s > 0  # they tell best when a green began
-            return parallel_env(scenario, domain, crossings=crossings, **options)
-
-        return SimulatedWorld(make, name, episodes, ugat.rollout_epsilon, most_delay_s)
+        crossings = ugat.most_delay_s > 0  # they tell best when a green began
+        make = partial(parallel_env, scenario, domain, crossings=crossings, **options)
+        return SimulatedWorld(make, name, episodes, ugat.rollout_epsilon, most_delay_s, workers)
 
     return (
         world(sim, "sim", ugat.sim_rollouts, ugat.most_delay_s),

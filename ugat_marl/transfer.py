@@ -23,6 +23,7 @@ from ugat_marl.evaluation import (
     fixed_policy,
     rule_factory,
 )
+from ugat_marl.executors import Workers
 from ugat_marl.grounding.random_delays import RandomDelays
 from ugat_marl.grounding.view import neighbours_of
 from ugat_marl.learners.agents import AgentSet
@@ -189,6 +190,7 @@ def transfer(
     *,
     resume: bool = False,
     reporter: Reporter | None = None,
+    workers: Workers = None,
 ) -> Evaluation:
     """Trains by UGAT, evaluates, and leaves everything in `directory`.
 
@@ -198,6 +200,7 @@ def transfer(
             TensorBoard files, checkpoints and what `ugat-marl report` shows go there.
         resume: Go on with the run in the folder.
         reporter: Shows progress.
+        workers: An executor for roll-outs and the search for rules; the rest is played here.
     """
     reporter = reporter or Silent()
     make = learner_factory(config.learner, config.learner_settings, config.dqn)
@@ -218,7 +221,7 @@ def transfer(
     try:
         state = State(learner, transform)
         restore(state, run, DQNPolicy.load)
-        policy = _train(config, scenario, env, recorded, state, run)
+        policy = _train(config, scenario, env, recorded, state, run, workers)
         policies: dict[str, Policy] = {}
         if state.direct is not None:
             policies[DIRECT] = state.direct
@@ -235,7 +238,7 @@ def transfer(
         if isinstance(trained, DQNPolicy):
             trained.save(directory / "policies" / f"{file_name(name)}.pt")
     queues = QueueRecord()
-    table = judge(config, scenario, policies, reporter, queues.watch)
+    table = judge(config, scenario, policies, reporter, queues.watch, workers)
     queues.write(directory / QUEUES)
     table.write(directory / "table.json")
     return table
@@ -256,11 +259,12 @@ def judge(
     policies: Mapping[str, Policy],
     reporter: Reporter,
     watch: Watch | None = None,
+    workers: Workers = None,
 ) -> Evaluation:
-    """Evaluates policies beside the rules that are best in each domain."""
+    """Evaluates policies beside the rules that are best in each domain, which `workers` find."""
     seeds = [TUNING_SEED + k for k in range(config.tuning_seeds)]
     options: dict[str, Any] = {"duration_s": config.duration_s, "reporter": reporter}
-    budget = config.rule_budget
+    options["workers"], budget = workers, config.rule_budget
     if budget is None:
         rules = best_rules(scenario, config.domains, seeds=seeds, **options)
         searched = ", ".join(STANDARD_RULES)
@@ -297,6 +301,7 @@ def _train(
     recorded: RecordedWorld | None,
     state: State,
     run: Run,
+    workers: Workers,
 ) -> Policy:
     def probe(policy: Policy) -> dict[str, float]:
         """ATT after each iteration, on a seed that is not reported."""
@@ -310,9 +315,11 @@ def _train(
         return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
 
     street = config.sim if config.placebo == "same-world" else config.real
-    worlds = simulated_worlds(scenario, config.sim, street, config.ugat, config.env_options)
-    sim: World = worlds[0]
-    real: World = recorded or worlds[1]
+    options = config.env_options
+    sim, street_world = simulated_worlds(
+        scenario, config.sim, street, config.ugat, options, workers
+    )
+    real: World = recorded or street_world
     if config.placebo == "shuffled":
         real = ShuffledWorld(real)
     try:
@@ -369,11 +376,6 @@ def _other_env(
     return env
 
 
-def _digest(path: Path) -> str:
-    """A log is the same if its content is, wherever it lies."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def _identity(
     config: TransferConfig, scenario: Scenario, env: TrafficEnv, controls: Sequence[Control]
 ) -> dict[str, Any]:
@@ -386,7 +388,8 @@ def _identity(
         settings.pop("learner")
         settings.pop("learner_settings")
     settings.pop("corrected")  # a scenario is the same if its hash is, wherever it lies
-    settings["real_log"] = _digest(config.real_log) if config.real_log else None
+    log = config.real_log  # the same if its content is, wherever it lies
+    settings["real_log"] = hashlib.sha256(log.read_bytes()).hexdigest() if log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":
         hashes["real"] = in_domain(scenario, config.real).hash

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol
 
 import polars as pl
@@ -16,7 +15,6 @@ from ugat_marl.evaluation import PolicyFactory
 from ugat_marl.executors import Stop, Workers, as_done
 from ugat_marl.grounding.random_delays import RandomDelays
 from ugat_marl.metrics import Scores
-from ugat_marl.observations import Observer
 from ugat_marl.policy import AnyParallelEnv, Policy
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.rollout import Exploring, observer_of, persistently, roll_out, until
@@ -51,6 +49,8 @@ class SimulatedWorld:
         episodes: Roll-outs per iteration.
         epsilon: Chance of a random phase.
         most_delay_s: Longest of the random delays of greens; 0 for none.
+        workers: An executor that plays each roll-out in an environment of its own; anything else:
+            one after the other here, in one environment.
     """
 
     def __init__(
@@ -60,34 +60,39 @@ class SimulatedWorld:
         episodes: int,
         epsilon: float,
         most_delay_s: int = 0,
+        workers: Workers = None,
     ) -> None:
         self._make_env = make_env
         self._name = name
         self._episodes = episodes
         self._epsilon = epsilon
         self._most_delay_s = most_delay_s
+        self._workers = workers
         self._env: AnyParallelEnv | None = None
-        self._stop = threading.Event()
+        self._stop = Stop()
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
         """Plays the iteration's episodes and returns their transitions."""
+        seeds = [
+            derive_seed(seed, "roll-out", self._name, iteration, episode)
+            for episode in range(self._episodes)
+        ]
+        if isinstance(self._workers, Executor):
+            return TransitionLog.concatenate(self._played_by(self._workers, policy, seeds))
         if self._env is None:
-            env = self._make_env()
-            self._env = RandomDelays(env, self._most_delay_s) if self._most_delay_s else env
-        exploring = Exploring(policy, self._epsilon)
-        observer = observer_of(self._env)
-        logs: list[TransitionLog] = []
-        for episode in range(self._episodes):
-            episode_seed = derive_seed(seed, "roll-out", self._name, iteration, episode)
-            log = persistently(partial(self._played, self._env, exploring, episode_seed, observer))
-            assert log is not None
-            logs.append(log)
-        return TransitionLog.concatenate(logs)
+            self._env = _delayed(self._make_env, self._most_delay_s)
+        env, exploring = self._env, Exploring(policy, self._epsilon)
+        return TransitionLog.concatenate([_recorded(env, exploring, s, self._stop) for s in seeds])
 
-    def _played(
-        self, env: AnyParallelEnv, policy: Policy, seed: int, observer: Observer
-    ) -> TransitionLog | None:
-        return roll_out(env, policy, seed, record=observer, on_step=until(self._stop)).log
+    def _played_by(
+        self, workers: Executor, policy: Policy, seeds: Sequence[int]
+    ) -> list[TransitionLog]:
+        """The roll-outs in the order of their seeds."""
+        stop, made = self._stop, (self._make_env, self._most_delay_s, policy, self._epsilon)
+        parts = [(*made, seed, stop) for seed in seeds]
+        found = dict(as_done(workers, _roll_out_alone, parts, stop))
+        self._stop = Stop()  # the other is set now, since nobody waits any more
+        return [found[number] for number in range(len(seeds))]
 
     def stop(self) -> None:
         """Ends the roll-out that is under way."""
@@ -98,6 +103,34 @@ class SimulatedWorld:
         if self._env is not None:
             self._env.close()
             self._env = None
+
+
+def _delayed(make_env: Callable[[], TrafficEnv], most_delay_s: int) -> AnyParallelEnv:
+    env = make_env()
+    return RandomDelays(env, most_delay_s) if most_delay_s else env
+
+
+def _recorded(env: AnyParallelEnv, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
+    observer = observer_of(env)
+    played = persistently(lambda: roll_out(env, policy, seed, record=observer, on_step=until(stop)))
+    assert played.log is not None
+    return played.log
+
+
+def _roll_out_alone(
+    make_env: Callable[[], TrafficEnv],
+    most_delay_s: int,
+    policy: Policy,
+    epsilon: float,
+    seed: int,
+    stop: Stop,
+) -> TransitionLog:
+    """One roll-out in an environment of its own, wherever that is."""
+    env = _delayed(make_env, most_delay_s)
+    try:
+        return _recorded(env, Exploring(policy, epsilon), seed, stop)
+    finally:
+        env.close()
 
 
 @dataclass(frozen=True)

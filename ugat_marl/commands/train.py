@@ -10,6 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import arg
 
+from ugat_marl.commands.arguments import Ray, workers_of
 from ugat_marl.effects import describe
 from ugat_marl.errors import OptionError
 from ugat_marl.progress import Bars
@@ -28,16 +29,19 @@ class Train:
         ugat-marl train resco:cologne3 --real V3 --seed 1 --out runs/cologne3
         ugat-marl train path/to/my.sumocfg --real startup_delay=0.8+acceleration=1.2
         ugat-marl train single-v1 --real none --real-log measured.parquet
+        ugat-marl train grid4x4-v1 --real V4 --ray auto
 
     Attributes:
         config: What to train, where, and how to judge it.
         out: Folder of the run; default: runs/SCENARIO-REAL-sSEED.
         resume: Go on with the run in that folder.
+        ray: Play roll-outs and the search for the best rule on Ray; learning stays here.
     """
 
     config: Annotated[TransferConfig, arg(name="")]
     out: Path | None = None
     resume: bool = False
+    ray: Ray = None
 
     def run(self, console: Console) -> int:
         """Trains, evaluates, prints the table, draws it."""
@@ -46,7 +50,10 @@ class Train:
             raise OptionError("--out is empty; give the name of a folder")
         name = "-".join(re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in _names(config))
         directory = self.out or Path("runs") / f"{name}-s{config.seed}"
-        found = transfer(config, directory, resume=self.resume, reporter=Bars(console))
+        with workers_of(None, self.ray) as workers:
+            found = transfer(
+                config, directory, resume=self.resume, reporter=Bars(console), workers=workers
+            )
         picture = directory / "gap.png"
         metrics = Metrics.read(directory / METRICS)
         transfer_picture(found, metrics, picture)
