@@ -159,6 +159,34 @@ def test_effects_on_demand_leave_what_is_simulated_alone(
     assert more.due.asked["S_C"].sum() > 1.5 * plain.due.asked["S_C"].sum()
 
 
+def test_effects_on_demand_cost_no_simulation(
+    crossing: tuple[Scenario, Network, Site], tmp_path: Path
+) -> None:
+    scenario, network, site = crossing
+    times = np.linspace(20.0, 180.0, 8).tolist()
+    period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
+
+    def engine() -> Engine:
+        replay = Replay(scenario, network, site.detectors, site.owner, answering=True)
+        return Engine(scenario, site, replay, [period], 5, cache=tmp_path)
+
+    first = engine()
+    more = parse_domain("demand_level=*,3+headway=1.5")
+    (found,) = first.replicates(more, [0])
+    assert first.simulated == 1
+    (plain,) = first.replicates(parse_domain("headway=1.5"), [0])
+    assert first.simulated == 1
+    again = engine()
+    (remembered,) = again.replicates(parse_domain("demand_level=*,2+headway=1.5"), [0])
+    assert again.simulated == 0
+    counts = [
+        item.tally.sums[INDEX["count_stop"], :, 0].sum() for item in (plain, remembered, found)
+    ]
+    assert counts[0] < counts[1] < counts[2]
+    for name in ("lost", "gap2", "occupied_in_red"):
+        np.testing.assert_array_equal(found.tally.sums[INDEX[name]], plain.tally.sums[INDEX[name]])
+
+
 def test_detectors_that_missed_vehicles_do_not_keep_them_away(
     crossing: tuple[Scenario, Network, Site],
 ) -> None:

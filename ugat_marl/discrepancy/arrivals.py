@@ -128,6 +128,10 @@ class Arrivals:
             Due(due, self._by_edge(root, period)),
         )
 
+    def asked(self, day: Scenario, period: Period) -> dict[str, Array]:
+        """Vehicles of a day that would come by the end of each counted edge, by bin of time."""
+        return self._by_edge(day.routes[0].parse(), period)
+
     def _coming(self, item: ET.Element, period: Period) -> _Coming | None:
         """Where a vehicle is seen first, and when; None if it has to be left alone."""
         way = self._way(_route(item))

@@ -15,13 +15,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from ugat_marl.discrepancy.arrivals import corrected
+from ugat_marl.discrepancy.arrivals import Due, corrected
 from ugat_marl.discrepancy.features import FEATURES, Tally, tally
-from ugat_marl.discrepancy.replay import Day, Replay
+from ugat_marl.discrepancy.replay import WHEN, Day, Replay
 from ugat_marl.discrepancy.site import Greens, Site
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
@@ -52,10 +52,14 @@ class Replicate:
     Attributes:
         tally: Its features.
         travel_time_s: Mean travel time.
+        counted: The features as they were counted, if what was asked for was put in their place.
+        due: What that was.
     """
 
     tally: Tally
     travel_time_s: float
+    counted: Tally | None = None
+    due: Due | None = None
 
 
 class Engine:
@@ -101,6 +105,7 @@ class Engine:
         self._known: dict[str, Replicate] = {}
         head = (VERSION, FEATURES, scenario.hash, site.detectors, _versions(), seed)
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
+        self._edges = sorted({edge for _, edge, _ in site.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
 
     @property
@@ -198,17 +203,37 @@ class Engine:
         key = self._key(effects, number)
         found = self._known.get(key) or self._remembered(key)
         if found is None:
-            day = self._day(effects, number)
-            place = number % len(self.periods)
-            counted = tally(self.site, day.period, self._greens[place])
-            if day.due is not None:
-                counted = corrected(counted, self.site, day.due)
-            # As precise as what is remembered, so that the answer does not depend on the cache.
-            counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
-            found = Replicate(counted, day.travel_time_s)
+            others = tuple(effect for effect in effects if not isinstance(effect, WHEN))
+            if self._replay.answering and len(others) < len(effects):
+                found = self._asked_for(self._one(others, number), effects, number)
+            else:
+                found = self._counted(effects, number)
             self._remember(key, found)
         self._known[key] = found
         return found
+
+    def _counted(self, effects: tuple[Effect, ...], number: int) -> Replicate:
+        """A simulated day, counted."""
+        day = self._day(effects, number)
+        counted = tally(self.site, day.period, self._greens[number % len(self.periods)])
+        # As precise as what is remembered, so that the answer does not depend on the cache.
+        counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
+        return self._with_due(counted, day.travel_time_s, day.due)
+
+    def _asked_for(self, given: Replicate, effects: tuple[Effect, ...], number: int) -> Replicate:
+        """The same simulated day, of a model that asks for other vehicles."""
+        if given.counted is None or given.due is None:
+            return self._counted(effects, number)
+        physics = [effect for effect in effects if not isinstance(effect, DetectorEffect)]
+        period = self.periods[number % len(self.periods)]
+        seed = derive_seed(self._seed, "replicate", number)
+        due = Due(self._replay.asked(physics, period, seed), given.due.given)
+        return self._with_due(given.counted, given.travel_time_s, due)
+
+    def _with_due(self, counted: Tally, travel_time_s: float, due: Due | None) -> Replicate:
+        if due is None:
+            return Replicate(counted, travel_time_s)
+        return Replicate(corrected(counted, self.site, due), travel_time_s, counted, due)
 
     def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
         """A day as the detectors saw it; faults of detectors cost no further simulation."""
@@ -252,7 +277,14 @@ class Engine:
                 counted = Tally(
                     stored["sums"].astype(np.float64), stored["bins"].astype(np.float64)
                 )
-                return Replicate(counted, float(stored["travel_time_s"]))
+                due = None
+                if "asked" in stored:
+                    asked, given = (
+                        dict(zip(self._edges, stored[name], strict=True))
+                        for name in ("asked", "given")
+                    )
+                    due = Due(asked, given)
+                return self._with_due(counted, float(stored["travel_time_s"]), due)
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
             return None  # absent or damaged: simulated again
 
@@ -260,12 +292,16 @@ class Engine:
         if self._cache is None:
             return
         content = io.BytesIO()
-        np.savez_compressed(
-            content,
-            sums=found.tally.sums,
-            bins=found.tally.bins.astype(np.float32),
-            travel_time_s=np.float64(found.travel_time_s),
-        )
+        counted = found.counted or found.tally
+        arrays: dict[str, Any] = {
+            "sums": counted.sums,
+            "bins": counted.bins.astype(np.float32),
+            "travel_time_s": np.float64(found.travel_time_s),
+        }
+        if found.due is not None:
+            for name, of_edge in (("asked", found.due.asked), ("given", found.due.given)):
+                arrays[name] = np.stack([of_edge[edge] for edge in self._edges])
+        np.savez_compressed(content, **arrays)
         write_whole(self._cache / key[:2] / f"{key}.npz", content.getvalue())
 
 
@@ -282,6 +318,8 @@ def _signals_hash(period: Period, answering: bool) -> str:
     """Of what a simulated day takes from a measured one."""
     content = (period.begin_s, period.end_s, sorted(period.signals.items()))
     digest = hashlib.sha256(repr(content).encode())
+    if answering:
+        digest.update(b"arrivals/2")
     for name, seen in sorted(period.passages.items()) if answering else ():
         digest.update(repr((name, seen.on_s.tolist(), seen.off_s.tolist())).encode())
     return digest.hexdigest()

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.discrepancy.arrivals import Arrivals, Due
+from ugat_marl.discrepancy.arrivals import Array, Arrivals, Due
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.effects import (
     DemandLevel,
@@ -48,7 +48,7 @@ WARM_UP_S = 600.0
 """Simulated before a period that does not begin with the scenario, under its own first signals."""
 
 _DAYS = 64
-_WHEN = (DemandLevel, DemandSurge, DemandTiming)
+WHEN = (DemandLevel, DemandSurge, DemandTiming)
 """How many vehicles depart, and when: measured arrivals say that of the day they belong to."""
 
 
@@ -77,6 +77,8 @@ class Replay:
         owner: Detector to its traffic light.
         answering: Whether the signals answered the traffic, so that days need its arrivals.
     """
+
+    answering = False
 
     def __init__(
         self,
@@ -116,7 +118,7 @@ class Replay:
         day = self._day(seed)
         scenario, due = _with(day, effects), None
         if self._arrivals is not None:
-            others = [item for item in effects if not isinstance(item, _WHEN)]
+            others = [item for item in effects if not isinstance(item, WHEN)]
             drivers = scenario if len(others) == len(effects) else _with(day, others)
             scenario, due = self._arrivals.given(scenario, drivers, period)
         scenario = parked_at_other_times(scenario, derive_seed(seed, "parking"))
@@ -134,6 +136,16 @@ class Replay:
         for effect in effects:
             period = effect.observe(period, self._detectors, self._owner)
         return _logged(period)
+
+    def asked(self, effects: Sequence[Effect], period: Period, seed: int) -> Mapping[str, Array]:
+        """What a day of a model asks for, see `Due`; costs no simulation.
+
+        Raises:
+            ValueError: The signals answered nobody.
+        """
+        if self._arrivals is None:
+            raise ValueError("no arrivals are given in the place of those asked for")
+        return self._arrivals.asked(_with(self._day(seed), effects), period)
 
     def _day(self, seed: int) -> Scenario:
         with self._lock:
