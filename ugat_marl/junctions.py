@@ -105,6 +105,40 @@ def yields_of(root: ET.Element) -> dict[str, list[int]]:
     return _matrix(root, "response")
 
 
+def neighbours_of(
+    links: Mapping[str, Sequence[Link]], root: ET.Element
+) -> dict[str, tuple[str, ...]]:
+    """Traffic lights reached along roads without another traffic light in between."""
+    enters = {link.from_edge: tls for tls, own in links.items() for link in own}
+    following: dict[str, set[str]] = defaultdict(set)
+    for item in root.iter("connection"):
+        if not item.get("from", ":").startswith(":") and item.get("tl") is None:
+            following[item.get("from", "")].add(item.get("to", ""))
+    adjacent: dict[str, set[str]] = {tls: set() for tls in links}
+    for tls, own in links.items():
+        edges = {link.to_lane.rsplit("_", 1)[0] for link in own}
+        seen: set[str] = set()
+        while edges:
+            edge = edges.pop()
+            seen.add(edge)
+            other = enters.get(edge)
+            if other is None:
+                edges |= following[edge] - seen
+            elif other != tls:
+                adjacent[tls].add(other)
+                adjacent[other].add(tls)
+    return {tls: tuple(sorted(found)) for tls, found in adjacent.items()}
+
+
+def right_on_red_of(root: ET.Element) -> frozenset[str]:
+    """Junctions where right turns may go on red after a stop."""
+    return frozenset(
+        item.get("id", "")
+        for item in root.iter("junction")
+        if item.get("type") == "traffic_light_right_on_red"
+    )
+
+
 def has_bit(a: Link, b: Link, matrix: Matrix) -> bool:
     """Whether the matrix marks link `b` in the row of link `a`."""
     if a.junction != b.junction or a.request < 0 or b.request < 0:
@@ -129,3 +163,56 @@ def _request_of(via: str) -> tuple[str, int]:
         return "", -1
     junction, first, lane = via[1:].rsplit("_", 2)
     return junction, int(first) + int(lane)
+
+
+def behind_of(
+    root: ET.Element, lengths_m: Mapping[str, float], room_m: float
+) -> dict[str, dict[str, float]]:
+    """Lanes where those wait who have no room on the lane at the light.
+
+    Networks made of maps have lanes at lights that are shorter than a vehicle, with a node of the
+    map before them. Who waits there stands on the lane behind, of which nothing would be seen.
+
+    Args:
+        root: The ``<net>``.
+        lengths_m: Length of every lane outside of junctions, m.
+        room_m: Lanes shorter than this are too short; lanes behind are added until they have it.
+
+    Returns:
+        For each lane at a light that is too short, the lanes, inside junctions and outside, from
+        which one can only get to it, with the share of each that is its own: one over the lanes a
+        lane leads to. Roads that end at a light of their own are not behind another one.
+    """
+    feeds: dict[str, list[tuple[str, str]]] = defaultdict(list)
+    roads: dict[str, set[str]] = defaultdict(set)
+    ways: dict[str, int] = defaultdict(int)
+    at_lights: dict[str, None] = {}
+    for item in root.iter("connection"):
+        start, end = item.get("from", ":"), item.get("to", ":")
+        if start.startswith(":") or end.startswith(":"):
+            continue
+        lane = f"{start}_{item.get('fromLane')}"
+        roads[start].add(end)
+        ways[lane] += 1
+        if item.get("tl") is None:
+            feeds[f"{end}_{item.get('toLane')}"].append((lane, item.get("via", "")))
+        else:
+            at_lights[lane] = None
+    found: dict[str, dict[str, float]] = {}
+    for lane in at_lights:
+        reach, room, shares = {lane: 1.0}, lengths_m.get(lane, room_m), dict[str, float]()
+        while reach and room < room_m:
+            before: dict[str, float] = defaultdict(float)
+            for here, share in reach.items():
+                for feeder, via in feeds[here]:
+                    road = feeder.rsplit("_", 1)[0]
+                    if roads[road] == {here.rsplit("_", 1)[0]} and feeder not in shares:
+                        before[feeder] += share / ways[feeder]
+                        if via:
+                            shares[via] = share
+            shares |= before
+            room += sum(lengths_m.get(name, 0.0) * share for name, share in before.items())
+            reach = before
+        if shares:
+            found[lane] = shares
+    return found

@@ -174,3 +174,33 @@ def refuse_in_queues(scenario: str, **asked: bool) -> None:
                 f"scenario {scenario!r} runs in SUMO's mesoscopic model, in which vehicles have no "
                 f"position on a lane: it cannot tell {words[name]}; leave out queue_model"
             )
+
+
+def add_those_behind(
+    api: Any,
+    behind: Sequence[Sequence[tuple[str, float]]],
+    measured: tuple[
+        NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
+    ],
+) -> None:
+    """Counts vehicles that wait behind a lane that is too short for them as if they were on it.
+
+    Args:
+        api: The module `libsumo`, with a simulation under way.
+        behind: As in `ugat_marl.measurements.LaneTable`.
+        measured: Vehicles, halting vehicles, mean speed in m/s and waiting times in s (may be
+            empty) per lane, each ``(lanes,)``; changed in place.
+    """
+    vehicles, halting, speed_mps, waiting_s = measured
+    for index, shares in enumerate(behind):
+        for lane, share in shares:
+            count = share * api.lane.getLastStepVehicleNumber(lane)
+            if not count:
+                continue
+            total = vehicles[index] + count
+            own = vehicles[index] * speed_mps[index] if vehicles[index] else 0.0
+            speed_mps[index] = (own + count * api.lane.getLastStepMeanSpeed(lane)) / total
+            vehicles[index] = total
+            halting[index] += share * api.lane.getLastStepHaltingNumber(lane)
+            if waiting_s.size:
+                waiting_s[index] += share * api.lane.getWaitingTime(lane)

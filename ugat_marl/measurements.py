@@ -12,6 +12,10 @@ HALTING_MPS = 0.1
 """A vehicle slower than this stands in a queue (SUMO's definition of halting, m/s)."""
 
 
+Behind = tuple[tuple[tuple[str, float], ...], ...]
+"""For each lane the lanes that are counted with it, with the share of each."""
+
+
 @dataclass(frozen=True)
 class LaneTable:
     """Which lanes are measured, in the order of every array of a `Snapshot`.
@@ -20,11 +24,14 @@ class LaneTable:
         ids: Lane ids of SUMO, ``(lanes,)``.
         capacity: Vehicles that fit on the lane, ``(lanes,)``, float64.
         speed_mps: Speed limit, ``(lanes,)``, float64.
+        behind: Lanes that are counted with a lane on which no vehicle has room; empty if there is
+            no such lane.
     """
 
     ids: tuple[str, ...]
     capacity: NDArray[np.float64]
     speed_mps: NDArray[np.float64]
+    behind: Behind = ()
 
     def indices(self, lanes: Sequence[str]) -> NDArray[np.int64]:
         """Positions of `lanes` in the arrays, int64."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +10,16 @@ import numpy as np
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml
-from ugat_marl.junctions import Link, crossings_of, foes_of, links_of, yields_of
+from ugat_marl.junctions import (
+    Link,
+    behind_of,
+    crossings_of,
+    foes_of,
+    links_of,
+    neighbours_of,
+    right_on_red_of,
+    yields_of,
+)
 from ugat_marl.measurements import LaneTable
 from ugat_marl.phases import (
     RightOfWay,
@@ -36,6 +44,8 @@ class Lane:
         length_m: Length.
         speed_mps: Speed limit.
         shape: Centre line, ``((x, y), ...)`` in m.
+        behind: Lanes that are measured along with it, since no vehicle has room on it, and shares.
+        room_m: Length on which vehicles are measured, those lanes included.
     """
 
     id: str
@@ -43,11 +53,13 @@ class Lane:
     length_m: float
     speed_mps: float
     shape: tuple[tuple[float, float], ...]
+    behind: tuple[tuple[str, float], ...] = ()
+    room_m: float = 0.0
 
     @property
     def capacity(self) -> float:
-        """Default vehicles that fit on the lane, at least one."""
-        return max(1.0, self.length_m / VEHICLE_SPACE_M)
+        """Default vehicles that fit on the lane and those behind, at least one."""
+        return max(1.0, max(self.length_m, self.room_m) / VEHICLE_SPACE_M)
 
 
 @dataclass(frozen=True)
@@ -116,7 +128,7 @@ class Network:
     @classmethod
     def _of(cls, root: ET.Element, scenario: Scenario) -> Network:
         document = scenario.network
-        lanes = _lanes(root)
+        lanes = _with_room(_lanes(root), root)
         links = links_of(root)
         programmes = _programmes(root, scenario)
         if unknown := sorted(set(scenario.settings.intersections) - set(links)):
@@ -125,9 +137,9 @@ class Network:
                 f"{document.source}; it has: {', '.join(sorted(links)) or 'none'}"
             )
         _check_lanes(links, lanes, document.source)
-        rules = RightOfWay(foes_of(root), yields_of(root), _right_on_red(root))
+        rules = RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
         crossings = crossings_of(root)
-        reachable = _neighbours(links, root)
+        reachable = neighbours_of(links, root)
         positions = _positions(root)
         found: list[Intersection] = []
         uncontrolled: list[str] = []
@@ -177,10 +189,12 @@ class Network:
             for item in self.intersections
             for lane in (*item.incoming_lanes, *item.outgoing_lanes)
         )
+        behind = tuple(self.lanes[name].behind for name in names)
         return LaneTable(
             names,
             np.array([self.lanes[name].capacity for name in names]),
             np.array([self.lanes[name].speed_mps for name in names]),
+            behind if any(behind) else (),
         )
 
 
@@ -323,6 +337,16 @@ def _lanes(root: ET.Element) -> dict[str, Lane]:
     return lanes
 
 
+def _with_room(lanes: dict[str, Lane], root: ET.Element) -> dict[str, Lane]:
+    """The lanes, those too short for a vehicle with the lanes behind them."""
+    lengths_m = {name: lane.length_m for name, lane in lanes.items()}
+    for name, shares in behind_of(root, lengths_m, VEHICLE_SPACE_M).items():
+        room_m = sum(lengths_m.get(other, 0.0) * share for other, share in shares.items())
+        short = lanes[name]
+        lanes[name] = replace(short, behind=tuple(shares.items()), room_m=short.length_m + room_m)
+    return lanes
+
+
 def _shape(text: str) -> tuple[tuple[float, float], ...]:
     points = (point.split(",") for point in text.split())
     return tuple((float(xyz[0]), float(xyz[1])) for xyz in points)
@@ -340,37 +364,6 @@ def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[f
             if phases:
                 programmes[logic.get("id", "")] = phases
     return programmes
-
-
-def _neighbours(links: Mapping[str, list[Link]], root: ET.Element) -> dict[str, tuple[str, ...]]:
-    """Traffic lights reached along roads without another traffic light in between."""
-    enters = {link.from_edge: tls for tls, own in links.items() for link in own}
-    following: dict[str, set[str]] = defaultdict(set)
-    for item in root.iter("connection"):
-        if not item.get("from", ":").startswith(":") and item.get("tl") is None:
-            following[item.get("from", "")].add(item.get("to", ""))
-    adjacent: dict[str, set[str]] = {tls: set() for tls in links}
-    for tls, own in links.items():
-        edges = {link.to_lane.rsplit("_", 1)[0] for link in own}
-        seen: set[str] = set()
-        while edges:
-            edge = edges.pop()
-            seen.add(edge)
-            other = enters.get(edge)
-            if other is None:
-                edges |= following[edge] - seen
-            elif other != tls:
-                adjacent[tls].add(other)
-                adjacent[other].add(tls)
-    return {tls: tuple(sorted(found)) for tls, found in adjacent.items()}
-
-
-def _right_on_red(root: ET.Element) -> frozenset[str]:
-    return frozenset(
-        item.get("id", "")
-        for item in root.iter("junction")
-        if item.get("type") == "traffic_light_right_on_red"
-    )
 
 
 def _positions(root: ET.Element) -> dict[str, tuple[float, float]]:

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.files import write_whole
-from ugat_marl.looks import QueueLook, near_the_end, refuse_in_queues
-from ugat_marl.measurements import Snapshot, Trips
+from ugat_marl.looks import QueueLook, add_those_behind, near_the_end, refuse_in_queues
+from ugat_marl.measurements import Behind, Snapshot, Trips
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.signals import Segment
 from ugat_marl.trips import measuring_options, read_trips
@@ -28,6 +28,7 @@ from ugat_marl.trips import measuring_options, read_trips
 Plans = Mapping[str, Sequence[Segment]]
 """Traffic light to what it shows in the coming seconds; lights left out go on as before."""
 
+_Floats = NDArray[np.float64]
 _TRIPS, _ERRORS = "trips.xml", "errors.log"
 
 
@@ -46,6 +47,7 @@ class Launch:
         files: Names and content of the scenario's edited files.
         zone_m: Length of what is measured apart at the end of each lane, or 0 for nothing.
         persons: Vehicle types with the persons in each vehicle; what is hidden is then measured.
+        behind: As in `ugat_marl.measurements.LaneTable`.
     """
 
     arguments: tuple[str, ...]
@@ -58,6 +60,7 @@ class Launch:
     files: tuple[tuple[str, bytes], ...] = ()
     zone_m: float = 0.0
     persons: tuple[tuple[str, float], ...] = ()
+    behind: Behind = ()
 
     @property
     def segment_m(self) -> float:
@@ -133,6 +136,7 @@ def launch_of(
     gui: bool = False,
     zone_m: float = 0.0,
     persons: Mapping[str, float] | None = None,
+    behind: Behind = (),
 ) -> Launch:
     """Lists SUMO's options, and the files that have to be written for it; writes nothing.
 
@@ -145,8 +149,8 @@ def launch_of(
         crossings: Whether to look every second for vehicles that leave a lane's road.
         gui: Whether to open a window.
         zone_m: Length of what is to be measured apart at the end of each lane, or 0 for nothing.
-        persons: Vehicle type to the persons in each vehicle, "" for all others, if emissions,
-            persons and dangers are to be measured.
+        persons: Vehicle type to its persons, "" for all others, if what is hidden is measured.
+        behind: As in `ugat_marl.measurements.LaneTable`.
     """
     settings = scenario.settings
     if "mesosim" in settings.sumo:
@@ -192,6 +196,7 @@ def launch_of(
         tuple(written.items()),
         zone_m,
         tuple((persons or {}).items()),
+        behind,
     )
 
 
@@ -250,8 +255,7 @@ class LibsumoSimulator:
             self._fail("SUMO did not start", error)
         self._shown, self._on = {}, {}
         self._time_s = launch.begin_s
-        limits = map(libsumo.lane.getMaxSpeed, launch.lanes)
-        self._limits = np.fromiter(limits, np.float64, len(launch.lanes))
+        self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
         self._queues = None
         if launch.segment_m:
             self._queues = QueueLook(libsumo, launch.lanes, launch.segment_m)
@@ -344,28 +348,29 @@ class LibsumoSimulator:
         if self._queues is not None:
             rows = self._queues.look(self._time_s, self._limits)
             waiting = rows[3] if self._launch.waiting else np.empty(0)
-            measured = rows[0], rows[1], rows[2], waiting
-            return Snapshot(self._time_s, *measured, departed, backlog)
+            return Snapshot(self._time_s, rows[0], rows[1], rows[2], waiting, departed, backlog)
         lanes, api = self._launch.lanes, libsumo.lane
         vehicles = np.fromiter(map(api.getLastStepVehicleNumber, lanes), np.float64, len(lanes))
         taken = np.flatnonzero(vehicles)
         names = [lanes[index] for index in taken.tolist()]
 
-        def measure(
-            what: Callable[[str], float], empty: NDArray[np.float64]
-        ) -> NDArray[np.float64]:
+        def measure(what: Callable[[str], float], empty: _Floats) -> _Floats:
             """Asks only lanes with vehicles; most of a network is empty at any instant."""
             values = empty.copy()
             values[taken] = np.fromiter(map(what, names), np.float64, len(names))
             return values
 
         none = np.zeros(len(lanes))
+        halting = measure(api.getLastStepHaltingNumber, none)
+        speed_mps = measure(api.getLastStepMeanSpeed, self._limits)
+        waiting_s = measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0)
+        add_those_behind(libsumo, self._launch.behind, (vehicles, halting, speed_mps, waiting_s))
         return Snapshot(
             time_s=self._time_s,
             vehicles=vehicles,
-            halting=measure(api.getLastStepHaltingNumber, none),
-            mean_speed_mps=measure(api.getLastStepMeanSpeed, self._limits),
-            waiting_s=measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0),
+            halting=halting,
+            mean_speed_mps=speed_mps,
+            waiting_s=waiting_s,
             departed=departed,
             backlog=backlog,
             near=near_the_end(libsumo, lanes, names, self._launch.zone_m),

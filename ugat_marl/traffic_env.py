@@ -293,19 +293,19 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._all_free = [np.ones(count, dtype=np.int8) for count in phases]
 
     def _start(self, seed: int) -> None:
-        directory = self._directory.fresh()
         if self._simulator is None:
             self._simulator = simulator_of(self.options.simulator)
         launch = launch_of(
             with_late_programmes(self.scenario),
             seed,
-            directory,
+            self._directory.fresh(),
             self._lanes.ids,
             waiting=self._observer.needs_waiting or self._rewarder.needs_waiting,
             crossings=self.options.crossings,
             gui=self.render_mode == "human",
             zone_m=self._sensing.zone_m if self._sensing else 0.0,
             persons=self._judge.persons if self._judge else None,
+            behind=self._lanes.behind,
         )
         self.agents = []
         for part in (self._sensing, self._cabinet):

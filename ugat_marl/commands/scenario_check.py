@@ -204,6 +204,7 @@ def _row(item: IntersectionFacts) -> tuple[str, ...]:
         "links without a light": item.uncontrolled,
         "links never green": len(item.unserved_links),
         "lanes served in part": len(item.partly_served),
+        "lanes shorter than a vehicle": len(item.lanes_behind),
     }
     counts = (item.lanes, item.links, item.movements, item.conflicts, len(item.phases))
     return (*map(str, counts), "; ".join(f"{n} {what}" for what, n in remarks.items() if n))

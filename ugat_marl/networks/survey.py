@@ -77,6 +77,8 @@ class IntersectionFacts:
         unserved_links: Links that are green in no phase, as ``lane -> lane``.
         partly_served: Lanes that some phase serves in one direction only: who waits for the other
             blocks them.
+        lanes_behind: Lanes on which no vehicle has room, so that those are counted with them who
+            wait on the lanes behind.
         always_green: Links that are green in every phase: the signal never stops them.
         right_on_red: Links that may go on red after a stop.
         u_turns: Links that turn around.
@@ -100,6 +102,7 @@ class IntersectionFacts:
     unserved_lanes: tuple[str, ...]
     unserved_links: tuple[str, ...]
     partly_served: tuple[str, ...]
+    lanes_behind: tuple[str, ...]
     always_green: int
     right_on_red: int
     u_turns: int
@@ -203,6 +206,7 @@ def _facts(
             f"{link.from_lane} -> {link.to_lane}" for link in item.links if link.index not in may_go
         ),
         partly_served=tuple(lane for lane in item.incoming_lanes if _in_part(lane, item)),
+        lanes_behind=tuple(lane for lane in item.incoming_lanes if network.lanes[lane].behind),
         always_green=sum(all(link.index in green for green in served) for link in item.links),
         right_on_red=sum(link.index in stop_and_go for link in item.links),
         u_turns=sum(link.direction in "tT" for link in item.links),
