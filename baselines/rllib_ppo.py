@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.errors import UgatMarlError
-from ugat_marl.learners.agents import AgentSet
+from ugat_marl.learners.agents import groups_of
 from ugat_marl.learners.third_party import (
     LibraryLearner,
     TrainingEnv,
@@ -102,22 +102,6 @@ class Seat(ParallelPettingZooEnv):
         observations, rewards, _, truncated, infos = self.par_env.step(action_dict)
         over = {"__all__": all(truncated.values())}
         return observations, rewards, {"__all__": False}, over, infos
-
-
-def groups_of(agents: AgentSet) -> dict[str, str]:
-    """Agent to its policy: that of all agents with its prefix, if they are alike, or its own."""
-    kinds: dict[str, set[tuple[int, int]]] = {}
-    sizes = dict(
-        zip(
-            agents.names,
-            zip(agents.observation_sizes, agents.action_counts, strict=True),
-            strict=True,
-        )
-    )
-    for agent, kind in sizes.items():
-        kinds.setdefault(agent.rpartition("_")[0], set()).add(kind)
-    prefixes = {agent: agent.rpartition("_")[0] for agent in agents.names}
-    return {a: p if p and len(kinds[p]) == 1 else a for a, p in prefixes.items()}
 
 
 class RLlib(LibraryLearner):

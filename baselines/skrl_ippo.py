@@ -1,8 +1,12 @@
-"""IPPO and MAPPO of skrl: PPO with networks of its own for every intersection.
+"""IPPO and MAPPO of skrl: PPO by every intersection for itself.
 
 skrl's wrapper, trainer and memories. It knows no masks: here they stand at the end of the
 observation, where the policy below takes them off and gives actions that are not allowed no
-probability. Critics see the same observation (IPPO) or `env.state()` (MAPPO).
+probability. Critics see the same observation (IPPO), and `env.state()` with it (MAPPO).
+
+skrl updates agent after agent. Those of a group (`<group>_<n>`: the same phases, the same lanes)
+share their networks and Adam, so that each learns from what all have seen; `--no-shared` is skrl's
+own way, with networks for each, and needs many times as many episodes.
 
     python baselines/skrl_ippo.py --scenario grid2x2-v1 --episodes 100 --out runs/skrl
     python baselines/skrl_ippo.py --scenario mixed-v1 --centralised
@@ -12,10 +16,12 @@ probability. Critics see the same observation (IPPO) or `env.state()` (MAPPO).
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import torch
 import tyro
 from skrl.envs.wrappers.torch import wrap_env
 from skrl.memories.torch import RandomMemory
@@ -27,6 +33,7 @@ from torch import Tensor, nn
 
 from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.errors import OptionError
+from ugat_marl.learners.agents import groups_of
 from ugat_marl.learners.third_party import (
     LibraryLearner,
     TrainingEnv,
@@ -49,7 +56,8 @@ _FORBIDDEN = -1e8  # in the place of logits; not infinite, or the entropy is not
 class SkrlConfig:
     """Settings of the learner."""
 
-    centralised: bool = False  # the critics see env.state() (MAPPO), not an observation (IPPO)
+    centralised: bool = False  # the critics see env.state(), too (MAPPO)
+    shared: bool = True  # networks for each group of equal intersections; or for each of them
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
     learning_rate: float = 1e-3  # step size of Adam
     discount: float = 0.95  # weight of the next decision's value (gamma)
@@ -59,7 +67,7 @@ class SkrlConfig:
     value_weight: float = 0.5  # weight of the critic's squared error
     max_gradient: float = 0.5  # longer gradients are scaled down to this norm
     update_every: int = 120  # decisions in a roll-out, or a few more: it has to divide an episode
-    epochs: int = 8  # passes over each roll-out
+    epochs: int = 8  # passes over each roll-out; fewer, at least 2, by those that share networks
     minibatches: int = 4  # parts of a roll-out, one for each gradient step
 
     def __post_init__(self) -> None:
@@ -85,18 +93,18 @@ class Actor(CategoricalMixin, Model):
 
 
 class Critic(DeterministicMixin, Model):
-    """The value of an observation, or of the state of the whole network."""
+    """The value of an observation, or of that and the state of the whole network."""
 
     def __init__(self, spaces: Mapping[str, Any], hidden: Sequence[int], centralised: bool) -> None:
         Model.__init__(self, **spaces, device="cpu")
         DeterministicMixin.__init__(self)
-        self._key = "states" if centralised else "observations"
-        size = self.num_states if centralised else self.num_observations
+        self._keys = ("observations", "states") if centralised else ("observations",)
+        size = self.num_observations + (self.num_states if centralised else 0)
         self.network = perceptron(size, hidden, 1)
 
     def compute(self, inputs: Mapping[str, Any], role: str) -> tuple[Tensor, dict[str, Any]]:
         """Skrl asks for values."""
-        return self.network(inputs[self._key]), {}
+        return self.network(torch.cat([inputs[key] for key in self._keys], dim=-1)), {}
 
 
 class Skrl(LibraryLearner):
@@ -120,21 +128,31 @@ class Skrl(LibraryLearner):
             }
             for agent in self.agents.names
         }
-        self._models: dict[str, dict[str, Any]] = {}
+        self._groups = groups_of(self.agents) if config.shared else {a: a for a in spaces}
+        self._models: dict[str, dict[str, Any]] = {}  # of each group
         with kept_generators():
             seed_generators(seed, "skrl", "weights")
             for agent, own in spaces.items():
-                critic = Critic(own, config.hidden, config.centralised)
-                self._models[agent] = {"policy": Actor(own, config.hidden), "value": critic}
+                if self._groups[agent] not in self._models:
+                    critic = Critic(own, config.hidden, config.centralised)
+                    made = {"policy": Actor(own, config.hidden), "value": critic}
+                    self._models[self._groups[agent]] = made
             self._learning = self._made(spaces)
+        self._adams: dict[str, Any] = {}  # of each group, too
+        for agent, group in self._groups.items():
+            own = self._adams.setdefault(group, self._learning.optimizers[agent])
+            self._learning.optimizers[agent] = own
 
     def _made(self, spaces: Mapping[str, Mapping[str, Any]]) -> Any:
         config = self.config
         steps = roll_out_length(self._decisions, config.update_every)
-        names = list(self.agents.names)
+        names, members = list(self.agents.names), Counter(self._groups.values())
         settings: dict[str, Any] = {
             "rollouts": steps,
-            "learning_epochs": config.epochs,
+            "learning_epochs": {
+                name: max(config.epochs // members[self._groups[name]], min(2, config.epochs))
+                for name in names
+            },
             "mini_batches": min(config.minibatches, steps),
             "discount_factor": config.discount,
             "gae_lambda": config.gae_lambda,
@@ -152,7 +170,7 @@ class Skrl(LibraryLearner):
         kind, kind_of_settings = (MAPPO, MAPPO_CFG) if config.centralised else (IPPO, IPPO_CFG)
         return kind(
             possible_agents=names,
-            models=self._models,
+            models={name: self._models[self._groups[name]] for name in names},
             memories={name: RandomMemory(memory_size=steps, device="cpu") for name in names},
             cfg=kind_of_settings(**settings),
             device="cpu",
@@ -180,25 +198,25 @@ class Skrl(LibraryLearner):
             self._learning.tracking_data.clear()  # skrl keeps all it tracks until it is written
 
     def _actors(self) -> Sequence[Sequence[nn.Linear]]:
-        return [linear_layers(self._models[agent]["policy"].network) for agent in self.agents.names]
+        own = [self._models[self._groups[agent]]["policy"] for agent in self.agents.names]
+        return [linear_layers(policy.network) for policy in own]
 
     def _networks(self) -> Mapping[str, Tensor]:
         return {
-            f"{agent}.{role}.{name}": tensor
-            for agent, models in self._models.items()
+            f"{group}.{role}.{name}": tensor
+            for group, models in self._models.items()
             for role, model in models.items()
             for name, tensor in model.state_dict().items()
         }
 
     def _rest(self) -> dict[str, Any]:
-        made = self._learning.optimizers
-        return {"adam": {agent: made[agent].state_dict() for agent in self.agents.names}}
+        return {"adam": {group: made.state_dict() for group, made in self._adams.items()}}
 
     def _restore(self, networks: Mapping[str, Tensor], rest: Mapping[str, Any]) -> None:
         for name, tensor in self._networks().items():
             tensor.copy_(networks[name])
-        for agent, state in rest["adam"].items():
-            self._learning.optimizers[agent].load_state_dict(state)
+        for group, state in rest["adam"].items():
+            self._adams[group].load_state_dict(state)
 
 
 @dataclass(frozen=True)

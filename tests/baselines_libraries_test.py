@@ -296,7 +296,7 @@ def test_what_it_cannot_learn_in_is_refused(name: str, tmp_path: Path) -> None:
 
 def value_of(name: str, learner: Any) -> list[float]:
     """What the learner holds the four observations of `PaidEnv` to be worth."""
-    scale = learner.states if name in ("torchrl-mappo", "skrl-mappo") else learner.inputs
+    scale = learner.states if name == "torchrl-mappo" else learner.inputs
     eye, agent, mask = (
         torch.diag(torch.from_numpy(scale.factors)),
         torch.ones(4, 1),
@@ -310,9 +310,10 @@ def value_of(name: str, learner: Any) -> list[float]:
     elif name == "torchrl-mappo":
         values = learner._critic(eye)
     elif name.startswith("skrl"):
-        critic = learner._models["signal_0"]["value"]
-        seen = eye if name == "skrl-mappo" else torch.cat([eye, mask], 1)
-        values = critic.network(seen)
+        critic = learner._models["signal"]["value"]
+        state = torch.diag(torch.from_numpy(learner.states.factors))
+        seen = [eye, mask, state] if name == "skrl-mappo" else [eye, mask]
+        values = critic.network(torch.cat(seen, 1))
     elif name == "rllib-ppo":
         module = learner._learner.module["signal"].unwrapped()
         batch = {"obs": {"observations": torch.cat([eye, agent], 1), "action_mask": mask}}

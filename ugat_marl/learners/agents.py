@@ -109,6 +109,16 @@ class AgentSet:
         return np.array([by_agent[name] for name in self.names], dtype=np.float32)
 
 
+def groups_of(agents: AgentSet) -> dict[str, str]:
+    """Agent to its group: all agents ``<group>_<n>`` if they are alike, or the agent itself."""
+    sizes = zip(agents.observation_sizes, agents.action_counts, strict=True)
+    kinds: dict[str, set[tuple[int, int]]] = {}
+    for agent, kind in zip(agents.names, sizes, strict=True):
+        kinds.setdefault(agent.rpartition("_")[0], set()).add(kind)
+    prefixes = {agent: agent.rpartition("_")[0] for agent in agents.names}
+    return {a: p if p and len(kinds[p]) == 1 else a for a, p in prefixes.items()}
+
+
 def _vector_length(agent: str, space: spaces.Space[Any]) -> int:
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise OptionError(
