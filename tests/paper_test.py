@@ -19,6 +19,7 @@ from ugat_marl.paper.runner import LOG, Planned, done, perform_all
 from ugat_marl.paper.settings import TABLES, Setting, settings_of
 from ugat_marl.paper.tables import PaperConfig, Planner
 from ugat_marl.progress import Silent
+from ugat_marl.queues import QUEUES, read_queues
 from ugat_marl.training import locked
 from ugat_marl.transfer import DIRECT, TIMED
 from ugat_marl.ugat import UgatConfig
@@ -187,6 +188,7 @@ def test_a_table_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
     }  # fmt: skip
     before = (folder / "table.csv").read_bytes()
     trained = sorted(path for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    assert all(set(read_queues(path / QUEUES)["domain"]) >= {"V4"} for path in trained)
     times = [path.joinpath(SCORES).stat().st_mtime_ns for path in trained]
     assert main(call) == 0  # nothing is trained again
     assert [path.joinpath(SCORES).stat().st_mtime_ns for path in trained] == times

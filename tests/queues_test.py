@@ -75,6 +75,30 @@ def test_an_evaluation_fills_it(tmp_path: Path) -> None:
             assert own["queue"].mean() == pytest.approx(mean)
 
 
+def test_another_evaluation_replaces_its_own_part(tmp_path: Path) -> None:
+    path = tmp_path / "queues.parquet"
+
+    def write(domain: str, halting: float, *, keep: bool = True) -> None:
+        env = stub(decisions=2, interval_s=60.0)
+        look = (record := QueueRecord()).watch("policy", domain, env)
+        env.snapshot = SimpleNamespace(halting=np.full(len(env.network.lane_table().ids), halting))
+        look(1)
+        record.write(path, keep=keep)
+
+    path.write_bytes(b"broken")
+    write("sim", 1.0)
+    write("V4", 2.0)
+    first = read_queues(path)
+    assert set(first["domain"]) == {"sim", "V4"}
+    write("V4", 4.0)
+    again = read_queues(path)
+    assert len(again) == len(first)
+    assert again.filter(domain="sim").equals(first.filter(domain="sim"))
+    assert again.filter(domain="V4")["queue"].sum() == 2 * first.filter(domain="V4")["queue"].sum()
+    write("V1", 1.0, keep=False)
+    assert set(read_queues(path)["domain"]) == {"V1"}
+
+
 @pytest.mark.parametrize("content", [b"", b"PAR1 no more"])
 def test_a_damaged_file_is_one_line(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "q.parquet").write_bytes(content)

@@ -419,6 +419,18 @@ def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
     assert page.row("waiting")[5] == "not finished"
 
 
+def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
+    make_job(tmp_path, "direct-0", ("sim", "V4"), seed=0)
+    rows = [("policy", d, m, "A1", 3.0 + m) for d in ("sim", "V4") for m in range(5)]
+    schema = ["policy", "domain", "minute", "intersection", "queue"]
+    pl.DataFrame(rows, schema=schema, orient="row").write_parquet(
+        tmp_path / "direct-0" / "queues.parquet"
+    )
+    _, page = page_of(tmp_path / "direct-0")
+    assert "The worst intersections and minutes" in page.text
+    assert "direct transfer in V4" in page.text
+
+
 @pytest.mark.parametrize("table", TABLES)
 def test_jobs_are_called_as_in_the_tables_of_the_paper(table: str) -> None:
     for row in settings_of(table, UgatConfig(), "sim"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 from dataclasses import dataclass
@@ -87,10 +88,21 @@ class QueueRecord:
                     rows += [(policy, domain, minute, tls, mean) for tls, mean in named]
         return pl.DataFrame(rows, schema=_SCHEMA, orient="row")
 
-    def write(self, path: Path) -> None:
-        """Writes `frame` as Parquet, whole or not at all."""
+    def write(self, path: Path, *, keep: bool = False) -> None:
+        """Writes `frame` as Parquet, whole or not at all.
+
+        Args:
+            path: The file.
+            keep: Whether what is there of other policies and domains stays; a file that cannot be
+                read does not.
+        """
+        frame = self.frame()
+        if keep and path.exists():
+            with contextlib.suppress(CheckpointError):
+                before = read_queues(path).join(frame, on=["policy", "domain"], how="anti")
+                frame = pl.concat([before, frame])
         with replacing(path) as temporary:
-            self.frame().write_parquet(temporary)
+            frame.write_parquet(temporary)
 
 
 def read_queues(path: Path) -> pl.DataFrame:

@@ -33,6 +33,7 @@ from ugat_marl.metrics import Scores
 from ugat_marl.paper.settings import Kind
 from ugat_marl.policy import AnyParallelEnv, Policy
 from ugat_marl.progress import Bars, Reporter
+from ugat_marl.queues import QUEUES, QueueRecord
 from ugat_marl.randomised import randomised_env
 from ugat_marl.recipes import simulated_worlds, train_until
 from ugat_marl.traffic_env import parallel_env
@@ -133,6 +134,7 @@ def perform(job: Job, folder: Path, reporter: Reporter) -> None:
     else:
         factory = fixed_policy(_policy(job, folder, reporter))
     scenario = load(job.scenario)
+    queues = QueueRecord()
     for domain, seeds in missing.items():
         if not seeds:
             continue
@@ -145,10 +147,12 @@ def perform(job: Job, folder: Path, reporter: Reporter) -> None:
             workers=1,
             reporter=reporter,
             title=f"evaluating in {domain}",
+            watch=queues.watch,
         )
         known |= {(domain, result.seed): result.scores for result in found.results}
         rows = [{"domain": d, "seed": s, **asdict(scores)} for (d, s), scores in known.items()]
         write_whole(folder / SCORES, json.dumps(rows, indent=1) + "\n")
+        queues.write(folder / QUEUES, keep=True)
 
 
 def _rule(job: Job, folder: Path) -> str:

@@ -240,7 +240,10 @@ def _run(directory: Path, name: str) -> RunRecord:
             TABLE, Evaluation.read, "the run is under way, or was stopped; no final table"
         )
     grounded = not job or isinstance(settings.get("ugat"), dict)
-    read_queue = evaluation is not None and not job
+    without = "nobody knows where and when vehicles stood"
+    queues = reader.read(QUEUES, read_queues, without) if evaluation is not None else None
+    if job and queues is not None:
+        queues = queues.with_columns(policy=pl.lit(job_name(settings)))
     return RunRecord(
         name=name,
         directory=directory,
@@ -251,9 +254,7 @@ def _run(directory: Path, name: str) -> RunRecord:
         evaluation=evaluation,
         metrics=_metrics(reader) if grounded else None,
         state=_state(reader) if grounded else None,
-        queues=reader.read(QUEUES, read_queues, "nobody knows where and when vehicles stood")
-        if read_queue
-        else None,
+        queues=queues,
         missing=tuple(reader.missing),
         written=_written(directory),
     )
