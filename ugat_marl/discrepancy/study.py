@@ -183,6 +183,10 @@ class Study:
         """
         with reporter.task("the scenario as it is", self.effort.base) as advance:
             days = self.engine.replicates([], range(self.effort.base), advance)
+        if self.other_days is not None:
+            numbers = range(min(DOUBT_DAYS, self.effort.base))
+            with reporter.task("the same with other vehicles", len(numbers)) as advance:
+                self.other_days.replicates([], numbers, advance)  # remembered for `doubt`
         aside = locked_up([day.tally for day in days])
         self.engine.set_aside = frozenset(aside)
         tallies = tuple(day.tally for number, day in enumerate(days) if number not in aside)
