@@ -14,6 +14,7 @@ import ugat_marl
 from ugat_marl.effects import in_domain, known_effects, load, parse_domain
 from ugat_marl.errors import OptionError
 from ugat_marl.looks import QueueLook
+from ugat_marl.network import Network
 from ugat_marl.testing.episodes import play, random_actions
 
 
@@ -121,6 +122,24 @@ def test_the_engine_is_an_effect_no_diagnosis_looks_for(tmp_path: Path) -> None:
     assert parse_domain("meso") == parse_domain("queue_model=100")
     assert changed.hash != scenario.hash and changed.documents == scenario.documents
     assert load(changed.write(tmp_path / "written")).hash == changed.hash
+
+
+def test_queues_do_not_drive_on_in_yellow() -> None:
+    """SUMO's would, at the full rate: what agents show between two greens is red."""
+    scenario = load("single-v1").with_control(yellow_s=3.0, all_red_s=2.0)
+    changed = in_domain(scenario, "meso")
+    assert (changed.control.yellow_s, changed.control.all_red_s) == (0.0, 5.0)
+    assert Network.read(changed).intersections == Network.read(scenario).intersections
+    env = ugat_marl.parallel_env(scenario, "meso", duration_s=300, simulator="inprocess")
+    shown: set[str] = set()
+    try:
+        env.reset(seed=1)
+        for step in range(10):
+            env.step({"signal_0": step % 8})
+            shown |= set("".join(libsumo.trafficlight.getRedYellowGreenState("A1")))
+    finally:
+        env.close()
+    assert "y" not in shown
 
 
 def test_lanes_hold_all_vehicles_that_go_their_way() -> None:

@@ -24,8 +24,12 @@ class QueueModel(Effect):
     metres: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets options of SUMO: signals and right of way are obeyed, each lane has its queue.
+        """Sets options of SUMO: signals and right of way are obeyed; agents' yellow becomes red.
 
+        SUMO's queues go on through yellow at the full rate and start without delay, so a change of
+        phases would cost them the all-red alone. On the street what is driven in yellow and what is
+        lost at the start of green are about equal: queues have the green that is shown. (The
+        network's own programmes keep their yellow, from which phases may be read.)
         (Not `meso-lane-queue`, with which SUMO 1.28 crashes on some networks.)
         """
         options = {
@@ -35,6 +39,9 @@ class QueueModel(Effect):
         }
         settings = scenario.settings.model_dump()
         settings["sumo"] = {**settings["sumo"], **options}
+        control = settings["control"]
+        clearance_s = control["yellow_s"] + control["all_red_s"]
+        settings["control"] = {**control, "yellow_s": 0.0, "all_red_s": clearance_s}
         return replace(
             scenario,
             settings=validated(settings, f"scenario {scenario.id!r}"),
