@@ -107,6 +107,13 @@ def test_the_licence_is_named(town: Scenario) -> None:
     assert "4 lights in the extract make 3 in the network" in text
 
 
+def test_a_comma_in_a_name_is_no_end(town: Scenario, tmp_path: Path) -> None:
+    plain = tmp_path / "Stadt, süd.osm"
+    plain.write_bytes(TOWN.read_bytes())
+    assert made(tmp_path / "a", plain) == 0
+    assert load_scenario(tmp_path / "a").network.read() == town.network.read()
+
+
 def test_packed_extracts_make_the_same_network(town: Scenario, tmp_path: Path) -> None:
     packed = tmp_path / "Stadt, süd.osm.gz"
     packed.write_bytes(gzip.compress(TOWN.read_bytes()))

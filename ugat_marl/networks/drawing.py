@@ -211,6 +211,8 @@ def _roads(axes: Any, place: _Place) -> None:
     axes.set_aspect("equal")
     axes.axis("off")
     names = {*item.incoming_lanes, *item.outgoing_lanes}
+    before = (network.lanes[lane].behind for lane in item.incoming_lanes)
+    names |= {name for lanes in before for name, _ in lanes if name in network.lanes}
     shapes = [np.array(network.lanes[name].shape) for name in sorted(names)]
     axes.add_collection(
         LineCollection(shapes, colors=_ROAD, linewidths=_points(2.9, frame), capstyle="butt")

@@ -109,7 +109,7 @@ def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
     if path.name.lower().endswith(".pbf"):
         pbf_to_xml(path, plain, reporter)
         return plain
-    if path.suffix != ".gz":
+    if path.suffix != ".gz" and "," not in str(path):  # ends a name for netconvert
         return path
     with plain.open("wb") as file:
         for piece in chunks_of(path):

@@ -50,6 +50,8 @@ def given_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
         leads = _leads(network)
         for path in paths:
             for tag in _rooted(path, ("routes", "additional"), "route file", reporter):
+                if tag.name in ("vehicle", "trip", "flow", "route"):
+                    _require_known(tag, leads, path)
                 if tag.name == "route":
                     _require_connected(tag, leads, path, network)
         return Fleet(tuple(_placed(path, folder, link) for path in paths))
@@ -122,8 +124,19 @@ def _leads(network: Path) -> dict[str, set[str]]:
     return found
 
 
+def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
+    """Refuses edges that do not exist, by the file the user has, not the copy to be."""
+    used = " ".join(tag.attributes.get(key, "") for key in ("from", "to", "via", "edges")).split()
+    if not leads.keys() >= set(used):
+        edge = next(edge for edge in used if edge not in leads)
+        raise ScenarioError(
+            f"{path}, line {tag.line}: <{tag.name}> uses the edge {edge!r}, which the network does "
+            "not have; were the routes made for another network?"
+        )
+
+
 def _require_connected(tag: Tag, leads: Mapping[str, set[str]], path: Path, network: Path) -> None:
-    """Refuses a route that jumps; edges that do not exist are refused with all other demand."""
+    """Refuses a route that jumps."""
     for a, b in pairwise(tag.attributes.get("edges", "").split()):
         if a in leads and b in leads and b not in leads[a]:
             raise ScenarioError(
