@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ugat_marl.discrepancy.arrivals import Arrivals, Due, by_lane_left, corrected, unhindered
+from ugat_marl.discrepancy.arrivals import Arrivals, Due, corrected
 from ugat_marl.discrepancy.engine import Engine
 from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, INDEX, Tally
+from ugat_marl.discrepancy.inflow import by_lane_left, unhindered
 from ugat_marl.discrepancy.replay import Replay
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Pools, Reference

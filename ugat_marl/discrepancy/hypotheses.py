@@ -96,13 +96,22 @@ class _Entry:
     step: float = 0.0
 
 
+CLOCK_S = (0.7, 1.4, 2.2, 3.1, 4.3)
+DRIFT = (1.5, 3.1, 5.2, 7.5)
+"""Strengths at which clocks are looked at, s and s/h."""
+
+
+def _both_sides(*levels: float) -> tuple[float, ...]:
+    return (*(-level for level in reversed(levels)), *levels)
+
+
 _GLOBAL: dict[str, _Entry] = {
     "acceleration": _Entry("mps2", (0.8, 1.6), 2.6, 0.1, attribute="accel", both=True),
     "deceleration": _Entry("mps2", (2.0, 3.2), 4.5, 0.2, attribute="decel", both=True),
     "emergency_deceleration": _Entry("mps2", (3.0, 6.0), 9.0, 0.5, attribute="emergencyDecel"),
     "startup_delay": _Entry("seconds", (0.3, 0.6, 0.8, 1.2), 0.0, 0.05, attribute="startupDelay"),
     "headway": _Entry("seconds", (1.3, 1.7), 1.0, 0.05, attribute="tau"),
-    "min_gap": _Entry("metres", (1.5, 3.5, 5.0), 2.5, 0.2, attribute="minGap"),
+    "min_gap": _Entry("metres", (1.2, 1.8, 3.1, 3.8, 4.7), 2.5, 0.2, attribute="minGap"),
     "imperfection": _Entry("sigma", (0.15, 0.85), 0.5, 0.05, attribute="sigma"),
     "desired_speed": _Entry("factor", (0.87,), 1.0, 0.01, both=True),
     "speed_spread": _Entry("deviation", (0.03, 0.2), 0.1, 0.01, attribute="speedDev"),
@@ -114,8 +123,8 @@ _GLOBAL: dict[str, _Entry] = {
     "heavy_share": _Entry("share", (0.12,), 0.0, 0.01),
     "late_green": _Entry("seconds", (2.0,), 0.0, 0.3, place="place", step=LATE_STEP_S),
     # What a clock moves across the start of green is not in proportion; faults cost no simulation.
-    "signal_clock": _Entry("seconds", (-4.0, -1.5, 1.5, 4.0), 0.0, 0.2, place="place"),
-    "clock_drift": _Entry("seconds_per_hour", (-7.0, -2.5, 2.5, 7.0), 0.0, 0.5, place="place"),
+    "signal_clock": _Entry("seconds", _both_sides(*CLOCK_S), 0.0, 0.2, place="place"),
+    "clock_drift": _Entry("seconds_per_hour", _both_sides(*DRIFT), 0.0, 0.5, place="place"),
     "undercount": _Entry("share", (0.15,), 0.0, 0.02, place="place"),
     "demand_level": _Entry("factor", (1.15,), 1.0, 0.03, place="edge", both=True),
     "demand_timing": _Entry("seconds", (300.0,), 0.0, 45.0, place="edge", both=True),

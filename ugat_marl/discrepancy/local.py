@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.faults import fault_hypotheses
 from ugat_marl.discrepancy.features import BIN_FEATURES, BIN_S, INDEX
-from ugat_marl.discrepancy.hypotheses import LATE_STEP_S, Hypothesis
+from ugat_marl.discrepancy.hypotheses import CLOCK_S, DRIFT, LATE_STEP_S, Hypothesis
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Distance, Reference
 from ugat_marl.discrepancy.stretches import (
@@ -290,11 +290,11 @@ class Proposer:
                 Hypothesis("late_green", place, ("seconds",), ((2.0,),), (0.0,), 0.3, LATE_STEP_S)
             )
             sign = 1.0 if lost[index] > 0 else -1.0
-            levels = ((1.5 * sign,), (4.0 * sign,))
+            levels = tuple((sign * level,) for level in CLOCK_S)
             found.append(Hypothesis("signal_clock", place, ("seconds",), levels, (0.0,), 0.2))
         for index in np.argsort(-np.abs(drift))[:1]:
             sign = 1.0 if drift[index] > 0 else -1.0
-            levels = ((2.5 * sign,), (7.0 * sign,))
+            levels = tuple((sign * level,) for level in DRIFT)
             place = (("place", names[int(index)]),)
             found.append(
                 Hypothesis("clock_drift", place, ("seconds_per_hour",), levels, (0.0,), 0.5)

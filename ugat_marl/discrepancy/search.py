@@ -8,6 +8,7 @@ no simulation: so effects that hide each other are proposed together and not one
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,6 +24,8 @@ Array = NDArray[np.float64]
 FARTHEST = 1.6
 """A ray is followed so far beyond the simulated strength."""
 NEAREST = 0.08
+CANDIDATES = (3, 2, 2)
+"""Sets of one, two and three effects that are simulated in a round, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,3 +181,18 @@ def _useful(best: dict[tuple[object, ...], Proposal], rays: Sequence[Ray], count
         if len(found) >= count:
             break
     return found[:count]
+
+
+def promising(proposals: Sequence[Proposal]) -> list[Proposal]:
+    """The best sets of each size, if a larger one promises more than a smaller one."""
+    if not proposals:
+        return []
+    chosen = [item for item in proposals if len(item.members) == 1][:1]
+    least = math.inf
+    for size in (1, 2, 3):
+        own = [item for item in proposals if len(item.members) == size]
+        if own and own[0].expected < 0.95 * least - 20.0:  # more effects must be worth it
+            near = [item for item in own if item.expected <= 1.3 * own[0].expected + 50.0]
+            chosen += near[: CANDIDATES[size - 1]]
+            least = own[0].expected
+    return list(dict.fromkeys(chosen))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -24,7 +24,7 @@ from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.matched import Directions
 from ugat_marl.discrepancy.members import each_left_out, merged, names_of
 from ugat_marl.discrepancy.residual import Null, Residual
-from ugat_marl.discrepancy.search import Proposal, Ray, between, propose
+from ugat_marl.discrepancy.search import Ray, between, promising, propose
 from ugat_marl.discrepancy.statistics import Array, shift
 from ugat_marl.discrepancy.whitening import Whitener
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
@@ -32,8 +32,7 @@ from ugat_marl.measured.data import Period
 from ugat_marl.progress import Reporter
 
 ROUNDS = 4
-CANDIDATES = (3, 2, 2)
-"""Sets of one, two and three effects that are simulated in a round, at most."""
+NEAREST = 3
 CANDIDATES_FITTED = 3
 NEGLIGIBLE = 60.0
 """Cost up to which a smaller set of effects is examined in the place of a larger one."""
@@ -210,13 +209,14 @@ class Selector:
         chance = float(len(whitener.measured))
         enough = chance + _MOST * max(gap - chance, 0.0)
         proposals = propose(rays, whitener, self._fitter.price)
-        chosen = [item.members for item in _promising(proposals)]
+        chosen = [item.members for item in promising(proposals)]
         little = gap < _LITTLE * chance  # what differs does so in single places
         near = little or not proposals or proposals[0].expected > enough
         if near:
             chosen = [*chosen[:2], *self._elsewhere(start.model, rays, number)]
-        if number == 0 and gap > _HUGE * chance:
-            chosen += settings_as_members(self._library)
+        if number == 0:
+            chosen += self._nearest()
+            chosen += settings_as_members(self._library) if gap > _HUGE * chance else []
         best = self._fitted(start, chosen, f"round {number + 1}: candidates")
         if best is None and not near:  # the library promised more than it kept
             chosen = self._elsewhere(start.model, rays, number)
@@ -238,6 +238,19 @@ class Selector:
             return tested if tested.residual.p > self._alpha else None
         return None
 
+    def _nearest(self) -> list[Members]:
+        """The single strengths of the library that come nearest, simulated, not along rays.
+
+        What an effect does may come in steps: clocks move whole vehicles across the start of green,
+        and a larger gap puts another vehicle of the queue onto the detector.
+        """
+        strengths = [((item, level),) for item in self._library for level in item.levels]
+        found: list[tuple[float, int]] = []
+        for place, members in enumerate(strengths):
+            with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
+                found.append((self._fitter.simulate(members, self._effort.bank).cost, place))
+        return [strengths[place] for _, place in sorted(found)[:NEAREST]]
+
     def _elsewhere(self, model: Fitted, rays: Sequence[Ray], number: int) -> list[Members]:
         """Proposals with effects at places and in windows, judged by lanes and minutes too."""
         present = {item.key for item in self._library}
@@ -258,7 +271,7 @@ class Selector:
         here = list(best.values())[:KINDS_OF_PLACES]
         # What the counts say may be nearer than what a straight ray makes of it.
         here += [((h, h.levels[0]),) for ((h, _),) in here if h.levels[0]]
-        return [*(item.members for item in _promising(proposals)), *here]
+        return [*(item.members for item in promising(proposals)), *here]
 
     def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
         data, base = self._fitter.data, self._fitter.base
@@ -319,8 +332,10 @@ class Selector:
         return found
 
     def _refined(self, models: Sequence[Fitted], count: int, gap: float) -> Fitted | None:
-        """The best of several models once the most promising are fitted."""
-        ranked = sorted(models, key=_cost)[:count]
+        """The best of several models once the most promising and the best simple are fitted."""
+        ranked = sorted(models, key=_cost)
+        simple = [model for model in ranked[count:] if len(model.members) == 1]
+        ranked = ranked[:count] + simple[:1]
         best: Fitted | None = None
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
@@ -382,18 +397,3 @@ def _doubtful(tested: Tested) -> list[int]:
             if (away <= HALF_INTERVAL * errors).all():
                 found.append(place)
     return found
-
-
-def _promising(proposals: Sequence[Proposal]) -> list[Proposal]:
-    """The best sets of each size, if a larger one promises more than a smaller one."""
-    if not proposals:
-        return []
-    chosen = [item for item in proposals if len(item.members) == 1][:1]
-    least = math.inf
-    for size in (1, 2, 3):
-        own = [item for item in proposals if len(item.members) == size]
-        if own and own[0].expected < 0.95 * least - 20.0:  # more effects must be worth it
-            near = [item for item in own if item.expected <= 1.3 * own[0].expected + 50.0]
-            chosen += near[: CANDIDATES[size - 1]]
-            least = own[0].expected
-    return list(dict.fromkeys(chosen))

@@ -232,7 +232,9 @@ class Reference:
             parts[name] = _mahalanobis(softened(name, z[name]), used, other.correlation)
             total += parts[name]
             if relative_to:
-                ratio = np.log(np.maximum(variance, 1e-12) / (other.variance / len(data)))
+                ratio = np.log(
+                    np.maximum(variance, 1e-12) / (other.variance / len(data) + other.doubt)
+                )
                 penalty += float(ratio[used].sum())
         return Distance(total, parts, penalty, z, difference)
 
