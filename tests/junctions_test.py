@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.effects import load
+from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml
 from ugat_marl.junctions import Link, crossings_of, foes_of, has_bit, links_of, yields_of
 from ugat_marl.network import Intersection, Network
@@ -98,7 +99,9 @@ def test_crossings_are_found_where_the_matrix_has_them(tmp_path: Path) -> None:
             assert are_foes(crossing, link, foes) == touches, (crossing, link)
 
 
-def test_a_crossing_between_junctions_gets_a_phase_of_its_own(tmp_path: Path) -> None:
+def test_a_light_for_a_crossing_alone_is_an_agent_only_if_its_phases_are_listed(
+    tmp_path: Path,
+) -> None:
     nodes = '<node id="M" x="0" y="0" type="traffic_light"/><node id="E" x="200" y="0"/>'
     (tmp_path / "n.nod.xml").write_text(f'<nodes>{nodes}<node id="W" x="-200" y="0"/></nodes>')
     edges = "".join(f'<edge id="{n}" from="{n[0]}" to="{n[1]}"/>' for n in ("WM", "MW", "ME", "EM"))
@@ -113,6 +116,10 @@ def test_a_crossing_between_junctions_gets_a_phase_of_its_own(tmp_path: Path) ->
     )  # fmt: skip
     (tmp_path / "r.rou.xml").write_text("<routes/>")
     (tmp_path / "scenario.toml").write_text('network = "n.net.xml"\nroutes = ["r.rou.xml"]\n')
+    with pytest.raises(ScenarioError, match="fewer than two green phases"):
+        derived(load(tmp_path), "conflict-free")
+    with (tmp_path / "scenario.toml").open("a") as file:
+        file.write('[intersections.M]\nphases = ["GGr", "rrG"]\n')
     item, rules = derived(load(tmp_path), "conflict-free")
     assert len(item.crossings) == 1
     assert item.phases == ("GGr", "rrG")

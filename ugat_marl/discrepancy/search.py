@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.hypotheses import Hypothesis
-from ugat_marl.discrepancy.statistics import without_noise
+from ugat_marl.discrepancy.statistics import Distance, Reference, softened, without_noise
 from ugat_marl.discrepancy.whitening import Whitener
 
 Array = NDArray[np.float64]
@@ -196,3 +196,19 @@ def promising(proposals: Sequence[Proposal]) -> list[Proposal]:
             chosen += near[: CANDIDATES[size - 1]]
             least = own[0].expected
     return list(dict.fromkeys(chosen))
+
+
+def squared_gap(distance: Distance, base: Reference, periods: int) -> float:
+    """Squared differences in units of the noise of the scenario as it is, whatever the model's is.
+
+    Args:
+        distance: Of a data set from a model.
+        base: The scenario as it is.
+        periods: Periods in the data set.
+    """
+    total = 0.0
+    for name, difference in distance.difference.items():
+        block = base.blocks[name]
+        noise = block.variance / periods + block.error + block.doubt
+        total += float((softened(name, np.nan_to_num(difference / np.sqrt(noise))) ** 2).sum())
+    return total

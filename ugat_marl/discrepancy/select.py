@@ -24,7 +24,7 @@ from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.matched import Directions
 from ugat_marl.discrepancy.members import each_left_out, merged, names_of
 from ugat_marl.discrepancy.residual import Null, Residual
-from ugat_marl.discrepancy.search import Ray, between, promising, propose
+from ugat_marl.discrepancy.search import Ray, between, promising, propose, squared_gap
 from ugat_marl.discrepancy.statistics import Array, shift
 from ugat_marl.discrepancy.whitening import Whitener
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
@@ -32,7 +32,7 @@ from ugat_marl.measured.data import Period
 from ugat_marl.progress import Reporter
 
 ROUNDS = 4
-NEAREST = 3
+NEAREST, NEARER = 3, 0.8
 CANDIDATES_FITTED = 3
 NEGLIGIBLE = 60.0
 """Cost up to which a smaller set of effects is examined in the place of a larger one."""
@@ -199,8 +199,6 @@ class Selector:
         residual = base.null.test(self._fitter.data)
         return Tested(model, base.null, residual, 0.0 * model.values, {})
 
-    # --- one round ----------------------------------------------------------------------------
-
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Adds, changes or removes effects; None if nothing is worth it."""
         rays = between(self._library_rays(start.model, number))
@@ -241,14 +239,17 @@ class Selector:
     def _nearest(self) -> list[Members]:
         """The single strengths of the library that come nearest, simulated, not along rays.
 
-        What an effect does may come in steps: clocks move whole vehicles across the start of green,
-        and a larger gap puts another vehicle of the queue onto the detector.
+        What effects do may come in steps, as whole vehicles cross the start of green or a detector.
         """
         strengths = [((item, level),) for item in self._library for level in item.levels]
         found: list[tuple[float, int]] = []
+        base, periods = self._fitter.base, len(self._fitter.data)
+        gap = squared_gap(self._first, base, periods)
         for place, members in enumerate(strengths):
             with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
-                found.append((self._fitter.simulate(members, self._effort.bank).cost, place))
+                model = self._fitter.simulate(members, self._effort.bank)
+                if squared_gap(model.distance, base, periods) < NEARER * gap:
+                    found.append((model.cost, place))
         return [strengths[place] for _, place in sorted(found)[:NEAREST]]
 
     def _elsewhere(self, model: Fitted, rays: Sequence[Ray], number: int) -> list[Members]:

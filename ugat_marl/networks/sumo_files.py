@@ -127,7 +127,7 @@ def _leads(network: Path) -> dict[str, set[str]]:
 def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
     """Refuses edges that do not exist, by the file the user has, not the copy to be."""
     used = " ".join(tag.attributes.get(key, "") for key in ("from", "to", "via", "edges")).split()
-    if not leads.keys() >= set(used):
+    if leads and not leads.keys() >= set(used):  # a network without roads has its own message
         edge = next(edge for edge in used if edge not in leads)
         raise ScenarioError(
             f"{path}, line {tag.line}: <{tag.name}> uses the edge {edge!r}, which the network does "
