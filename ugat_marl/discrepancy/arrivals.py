@@ -13,7 +13,7 @@ demand itself and put in the place of the counts.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.features import (
     BIN_FEATURES,
-    BIN_S,
     COUNT_FEATURES,
     INDEX,
     PLATOON_FEATURES,
     Tally,
+    bins_of,
 )
 from ugat_marl.discrepancy.inflow import by_lane_left, missed, unhindered
 from ugat_marl.discrepancy.site import Site
@@ -46,7 +46,6 @@ _FASTEST = 1.3
 class _Lane:
     """A lane on which vehicles are seen to come."""
 
-    id: str
     advance: str
     stop: str | None
     position_m: float
@@ -184,7 +183,7 @@ class Arrivals:
 
     def _by_edge(self, vehicles: Iterable[ET.Element], period: Period) -> dict[str, Array]:
         """Vehicles that would come by the end of each counted edge, by bin of time."""
-        bins = max(1, round((period.end_s - period.begin_s) / BIN_S))
+        bins = bins_of(period)
         times: dict[str, list[float]] = {edge: [] for edge in self._counted}
         for item in vehicles:
             if item.tag == "vehicle":
@@ -277,9 +276,7 @@ def corrected(counted: Tally, site: Site, due: Due) -> Tally:
         Its gaps in moving platoons are left out: they are what was put in.
     """
     sums, bins = counted.sums.copy(), counted.bins.copy()
-    lanes: dict[str, int] = {}
-    for _, edge, _ in site.places:
-        lanes[edge] = lanes.get(edge, 0) + 1
+    lanes = Counter(edge for _, edge, _ in site.places)
     for place, (_, edge, _) in enumerate(site.places):
         more = due.asked[edge] - due.given[edge]
         given = float(due.given[edge].sum())
@@ -311,7 +308,6 @@ def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
         travel = max(end - begin, 0.0) / (_FASTEST * lane.speed_mps)
         known.append(
             _Lane(
-                lane.id,
                 advance[0],
                 stop,
                 begin,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from ugat_marl.discrepancy.features import BIN_FEATURES, BIN_S, FEATURES, INDEX, Tally
+from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, INDEX, Tally, bins_of
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.measured.data import Period
 
@@ -19,7 +19,7 @@ def counts_tally(site: Site, period: Period, counts: pl.DataFrame) -> Tally:
         counts: ``period_id, begin_s, end_s, detector_id, count``.
     """
     places = len(site.lanes) + len(site.exits)
-    length = max(1, round((period.end_s - period.begin_s) / BIN_S))
+    length = bins_of(period)
     sums = np.zeros((len(FEATURES), places, 2))
     bins = np.zeros((len(BIN_FEATURES), places, length))
     edges = np.linspace(period.begin_s, period.end_s, length + 1)

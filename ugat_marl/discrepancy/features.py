@@ -118,6 +118,11 @@ class Tally:
         )
 
 
+def bins_of(period: Period) -> int:
+    """Number of bins of time in a period."""
+    return max(1, round((period.end_s - period.begin_s) / BIN_S))
+
+
 def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
     """Reduces a period to its features.
 
@@ -127,7 +132,7 @@ def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
         greens: ``site.greens(period)``; those of the measured period for its replicates.
     """
     places = len(site.lanes) + len(site.exits)
-    bins = max(1, round((period.end_s - period.begin_s) / BIN_S))
+    bins = bins_of(period)
     counter = _Counter(
         np.zeros((len(FEATURES), places, 2)), np.zeros((len(BIN_FEATURES), places, bins)), period
     )

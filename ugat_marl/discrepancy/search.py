@@ -209,6 +209,6 @@ def squared_gap(distance: Distance, base: Reference, periods: int) -> float:
     total = 0.0
     for name, difference in distance.difference.items():
         block = base.blocks[name]
-        noise = block.variance / periods + block.error + block.doubt
+        noise = block.noise(block.weight, periods)
         total += float((softened(name, np.nan_to_num(difference / np.sqrt(noise))) ** 2).sum())
     return total

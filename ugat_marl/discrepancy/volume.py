@@ -220,12 +220,10 @@ class Volume:
             if not difference or not score:
                 continue
             change = 0.0
-            for edge, rate in rates.items():
+            for edge in sorted(rates.keys() & lane.following):
                 alike = sum(edge in other.following for _, other in lanes)
-                if edge in lane.following:
-                    change += (
-                        sum(rates.values()) if edge == target else 0.0
-                    ) / alike - rate / alike
+                come = sum(rates.values()) if edge == target else 0.0
+                change += (come - rates[edge]) / alike
             ray.append(change)
             z.append(score)
             errors.append(60.0 * abs(difference / score))
