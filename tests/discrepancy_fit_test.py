@@ -274,3 +274,31 @@ def test_windows_stay_on_the_clock_and_keep_a_minute() -> None:
         began, ended = map(float, text.split(",")[1:3])
         assert began >= 0.0
         assert ended - began >= SHORTEST_S
+
+
+def test_how_strong_a_surge_was_is_only_known_together_with_how_long_it_lasted() -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    model = fitter.simulate(a_surge(*Windows.TRUTH))
+    (error,), extra = uncertainty(fitter, model)
+    # Least squares by hand: the derivatives in strength, begin and end, and noise of variance 1.
+    strength = surge(*Windows.TRUTH)
+    begin = (surge(960.0, 2400.0) - strength) * 0.5 / 60.0
+    end = (surge(900.0, 2340.0) - strength) * 0.5 / 60.0
+    rows = np.stack([strength, begin, end])
+    covariance = np.linalg.inv(rows @ rows.T) * (1 / 5 + 1 / 8)
+    alone = np.sqrt((1 / 5 + 1 / 8) / (strength @ strength))
+    assert covariance[0, 0] ** 0.5 > 1.02 * alone
+    assert error == pytest.approx(covariance[0, 0] ** 0.5, rel=0.35)
+    edge = int(2400.0 / 180.0)
+    assert extra["network"][0, edge] > 0.0, "the minutes at the ends are uncertain, too"
+
+
+def test_a_value_that_does_nothing_is_not_known_exactly() -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    after = (("edge", "a"), ("begin_s", 3600.0), ("end_s", 4200.0))
+    dead = Hypothesis("demand_surge", after, ("factor",), ((1.5,),), (1.0,), 0.05)
+    model = fitter.simulate((*a_surge(*Windows.TRUTH), (dead, (1.3,))))
+    (known, unknown), _ = uncertainty(fitter, model)
+    ((_, delta),) = fitter.changes(fitter.simulate(((dead, (1.3,)),)))
+    assert known < 0.05
+    assert unknown == pytest.approx(abs(delta))

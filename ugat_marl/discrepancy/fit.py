@@ -244,13 +244,30 @@ class Fitter:
     def _change(self, model: Fitted, place: int, index: int, share: float) -> Change:
         """What moving one value by a share of its distance from nominal does; how far it went."""
         hypothesis, values = model.members[place]
-        before = model.tallies[: self.days]
         moved = _moved_a_little(hypothesis, values, index, share)
         members = _replaced(model.members, place, moved)
+        return self._difference(model, members), (moved[index] - values[index]) or 1.0
+
+    def window_changes(self, model: Fitted) -> list[Change]:
+        """What it does to begin and to end a minute nearer to the middle, in models with numbers.
+
+        How strong an effect was is only known together with how long it lasted.
+        """
+        found: list[Change] = []
+        for place, (hypothesis, values) in enumerate(model.members):
+            for move in ((SHORTEST_S, 0.0), (0.0, -SHORTEST_S)):
+                moved = _shifted(hypothesis, move) if values else hypothesis
+                if moved is not hypothesis:
+                    members = (*model.members[:place], (moved, values), *model.members[place + 1 :])
+                    found.append((self._difference(model, members), SHORTEST_S))
+        return found
+
+    def _difference(self, model: Fitted, members: Members) -> dict[str, Array]:
+        """The statistics of other members minus those of a model, without what may be chance."""
+        before = model.tallies[: self.days]
         numbers = self.engine.first(len(before))
         days = self.engine.replicates(effects_of(members), numbers, self.tick)
-        change, noise = shift(self.pools, [day.tally for day in days], before)
-        return shrunk(change, noise), (moved[index] - values[index]) or 1.0
+        return shrunk(*shift(self.pools, [day.tally for day in days], before))
 
     def _moved(self, model: Fitted, step: Array) -> Members:
         """The model's values after a step, in range and not too far at once."""
@@ -317,7 +334,9 @@ def uncertainty(
     """Standard errors of the free values, and what they make uncertain in the statistics.
 
     The parts of the distance depend on each other, so the errors come from how much the estimate
-    would move between simulated days (a sandwich estimate), not from the curvature alone.
+    would move between simulated days (a sandwich estimate), not from the curvature alone. Where
+    windows begin and end is estimated as well. A value whose change does nothing that is more than
+    chance is not known better than to this change.
 
     Args:
         fitter: Simulates.
@@ -333,6 +352,8 @@ def uncertainty(
         }
     whitener = fitter.whitener(model)
     changes = fitter.changes(model)
+    free = len(changes)
+    changes += fitter.window_changes(model)
     jacobian = _derivatives(changes, whitener)
     inverse = np.linalg.pinv(jacobian @ jacobian.T)
     influences: list[Array] = []
@@ -343,10 +364,12 @@ def uncertainty(
     spread = np.atleast_2d(np.cov(np.stack(influences).T))
     covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies))
     grids = np.array([h.step for h, values in model.members for _ in values])
-    covariance += np.diag(grids**2 / 12.0)
+    covariance[:free, :free] += np.diag(grids**2 / 12.0)
+    unseen = np.flatnonzero(~jacobian[:free].any(axis=1))
+    covariance[unseen, unseen] += [changes[index][1] ** 2 for index in unseen]
     extra: dict[str, Array] = {}
     for name, block in model.reference.blocks.items():
         slopes = np.stack([change[name] / delta for change, delta in changes])
         extra[name] = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes) + 0.0 * block.mean
         extra[name] = np.nan_to_num(extra[name])
-    return np.sqrt(np.diag(covariance)), extra
+    return np.sqrt(np.diag(covariance)[:free]), extra
