@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import TypeVar
 
+from ugat_marl.discrepancy.volume import Routes
 from ugat_marl.effects.places import places_of
 from ugat_marl.evaluation import policy_factory
 from ugat_marl.measured.data import Detector
 from ugat_marl.network import Network
 from ugat_marl.recording import record
-from ugat_marl.redraw import ways
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
-
-Key = TypeVar("Key", str, tuple[str, str])
 
 TURN_PER_HOUR = 60.0
 """A turn to which vehicles are diverted is already taken by so many."""
@@ -67,7 +63,8 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
     """
     network = Network.read(scenario)
     rates, detectors = _detected(scenario, seed)
-    origins, turns, edges = _demanded(scenario)
+    routes = Routes.of(scenario)
+    turns = {(edge, other): n for edge, far in routes.turns.items() for other, n in far.items()}
     incoming = {lane for item in network.intersections for lane in item.incoming_lanes}
     approaches = {network.lanes[lane].edge for lane in incoming}
     lanes = [
@@ -83,13 +80,13 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
     }
     return Busy(
         lights=tuple(item.id for item in network.intersections),
-        origins={x: rate for x, rate in sorted(origins.items()) if rate >= BUSY_PER_HOUR},
+        origins={x: rate for x, rate in sorted(routes.origins.items()) if rate >= BUSY_PER_HOUR},
         turns=tuple(
             sorted(
                 (edge, other)
                 for edge, other in ways
-                if turns[edge, other] >= TURN_PER_HOUR
-                and edges[edge] - turns[edge, other] >= BUSY_PER_HOUR
+                if (turning := turns.get((edge, other), 0.0)) >= TURN_PER_HOUR
+                and routes.joint[edge][edge] - turning >= BUSY_PER_HOUR
             )
         ),
         closable=tuple(x for x in lanes if cars[network.lanes[x].edge] > 1),
@@ -97,7 +94,7 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         edges=tuple(sorted({network.lanes[x].edge for x in lanes})),
         detectors=tuple(item.id for item in detectors if rates.get(item.id, 0.0) >= BUSY_PER_HOUR),
         pairs=_pairs(detectors, rates, network),
-        permitted=any(turns[way] >= YIELDING_PER_HOUR for way in _yielding(network)),
+        permitted=any(turns.get(way, 0.0) >= YIELDING_PER_HOUR for way in _yielding(network)),
         several_lanes=any(cars[edge] > 1 for edge in approaches),
     )
 
@@ -123,25 +120,6 @@ def _detected(scenario: Scenario, seed: int) -> tuple[dict[str, float], tuple[De
     )
     hours = (day.periods[0].end_s - day.periods[0].begin_s) / 3600.0
     return {x: len(seen) / hours for x, seen in day.periods[0].passages.items()}, day.detectors
-
-
-def _demanded(
-    scenario: Scenario,
-) -> tuple[Mapping[str, float], Mapping[tuple[str, str], float], Mapping[str, float]]:
-    """Vehicles per hour that start on an edge, that make a turn, and that pass an edge."""
-    origins: Counter[str] = Counter()
-    turns: Counter[tuple[str, str]] = Counter()
-    edges: Counter[str] = Counter()
-    for way in ways(scenario):
-        origins[way[0]] += 1
-        edges.update(set(way))
-        turns.update(set(pairwise(way)))
-    hours = scenario.settings.duration_s / 3600.0
-    return _per_hour(origins, hours), _per_hour(turns, hours), _per_hour(edges, hours)
-
-
-def _per_hour(counts: Counter[Key], hours: float) -> defaultdict[Key, float]:
-    return defaultdict(float, {key: count / hours for key, count in counts.items()})
 
 
 def _pairs(
