@@ -58,7 +58,7 @@ class FakeApi:
         return self.held_s.get(name, 0.0)
 
     def getSpeed(self, name: str) -> float:
-        return 8.0
+        return 0.0 if name in self.held_s else 8.0
 
     def enter(self, name: str, edge: str, following: str, at: float = 0.0) -> None:
         self.routes[name], self.at[name] = (edge, following), at
@@ -87,7 +87,7 @@ def test_where_two_lanes_lead_on_the_queue_decides_and_then_the_shorter_one() ->
     assert look.look(0.0, LIMITS)[0].tolist() == [0, 0, 2, 1, 0, 0]
     api.enter("d", "wide", "on")
     assert look.look(10.0, LIMITS)[0].tolist() == [0, 0, 2, 2, 0, 0], "nobody changes over"
-    api.queue = dict.fromkeys("abcd", 1)
+    api.queue, api.at = dict.fromkeys("abcd", 1), dict.fromkeys("abcd", 100.0)
     assert look.look(20.0, LIMITS)[0].tolist() == [0, 0, 0, 4, 0, 0]
     for name in "efg":
         api.enter(name, "one", "on")
@@ -113,6 +113,90 @@ def test_who_stays_longer_than_the_way_takes_halts() -> None:
 
 
 # --- in the running simulation
+
+
+class PlainLook:
+    """The same numbers, by asking every vehicle for everything at every look."""
+
+    def __init__(self, lanes: Sequence[str], segment_m: float) -> None:
+        self.lanes = lanes
+        self.links = {lane: {x[0][:-2] for x in libsumo.lane.getLinks(lane)} for lane in lanes}
+        self.of: dict[str, list[int]] = {}
+        for place, lane in enumerate(lanes):
+            self.of.setdefault(lane[:-2], []).append(place)
+        self.segment_m = segment_m
+        self.known: dict[str, tuple[str, float, float, int]] = {}
+        self.asked, self.looked_s = 0, -1e9
+
+    def look(self, time_s: float, limits: Any) -> Any:
+        ask, rows = libsumo.vehicle, np.zeros((4, len(self.lanes)))
+        before, self.known = self.known, {}
+        for edge, own in self.of.items():
+            metres = libsumo.lane.getLength(edge + "_0")
+            pieces = max(1, int(metres / self.segment_m + 0.5))
+            needs_s = metres / pieces / libsumo.lane.getMaxSpeed(edge + "_0")
+            for name in libsumo.edge.getLastStepVehicleIDs(edge):
+                self.asked += 1
+                at_m = ask.getLanePosition(name)
+                was = before.get(name, ("", 0.0, 0.0, -1))
+                moved, since_s = was[:2] != (edge, at_m), was[2]
+                if moved:
+                    since_s = time_s - min(time_s - self.looked_s, needs_s) / 2
+                following = (*ask.getRoute(name), "")[ask.getRouteIndex(name) + 1]
+                fit = [x for x in own if following in self.links[self.lanes[x]]] or own
+                several = len(set[str]().union(*(self.links[self.lanes[x]] for x in own))) > 1
+                queue = f"{edge}_{ask.getLaneIndex(name)}" if several else ""
+                lane = min(fit, key=lambda x: rows[0, x])
+                if was[0] == edge and was[3] in fit:
+                    lane = was[3]
+                lane = next((x for x in fit if self.lanes[x] == queue), lane)
+                waited = time_s - since_s - needs_s
+                waited = waited if waited > 0 else ask.getWaitingTime(name)
+                speed = 0.0 if waited > 0 else ask.getSpeed(name)
+                rows[:, lane] += (1.0, speed < 0.1, speed, waited)
+                self.known[name] = edge, at_m, since_s, lane
+        self.looked_s = time_s
+        rows[2] = np.where(rows[0] > 0, rows[2] / np.maximum(rows[0], 1.0), limits)
+        return rows
+
+
+@pytest.mark.parametrize(
+    ("scenario", "domain", "seconds", "least"),
+    [
+        ("single-v1", "meso", 3600.0, 30_000),
+        ("mixed-v1", "meso+heavy-loads", 900.0, 8_000),
+        ("single-v1", "queue_model=30", 900.0, 4_000),
+    ],
+)
+def test_what_is_not_asked_again_has_not_changed(
+    scenario: str, domain: str, seconds: float, least: int
+) -> None:
+    """Equal to the bit, at every decision of an episode with random phases."""
+    env = ugat_marl.parallel_env(
+        scenario, domain, observation="waiting", duration_s=seconds, simulator="inprocess"
+    )
+    choose = np.random.default_rng(3)
+    table = env.network.lane_table()
+    try:
+        env.reset(seed=2)
+        plain = PlainLook(table.ids, 30.0 if "30" in domain else 100.0)
+        limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in table.ids])
+        actions: dict[str, int] = {}
+        for step in range(int(seconds) // 10):
+            rows = plain.look(env.snapshot.time_s, limits)
+            got = env.snapshot
+            for row, ours in zip(
+                rows, (got.vehicles, got.halting, got.mean_speed_mps, got.waiting_s), strict=True
+            ):
+                assert row.tolist() == ours.tolist(), (step, got.time_s)
+            if step % 2 == 0:
+                actions = {
+                    agent: int(choose.integers(env.action_space(agent).n)) for agent in env.agents
+                }
+            env.step(actions)
+        assert plain.asked > least
+    finally:
+        env.close()
 
 
 def test_the_engine_is_an_effect_no_diagnosis_looks_for(tmp_path: Path) -> None:

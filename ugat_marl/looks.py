@@ -20,23 +20,42 @@ from ugat_marl.errors import OptionError
 from ugat_marl.measurements import HALTING_MPS
 
 
-@dataclass
+@dataclass(slots=True)
 class _Stay:
     """A vehicle in one segment.
 
     Attributes:
-        edge: Its edge.
-        position_m: Where the segment begins on it.
+        position_m: Where the segment begins on its edge.
         since_s: About when the vehicle got there.
         lanes: Positions of the lanes that lead where it goes next.
-        lane: The one it was counted on.
+        lane: The one it counts on; -1 while that is not known.
     """
 
-    edge: str
     position_m: float
     since_s: float
     lanes: Sequence[int]
     lane: int
+
+
+@dataclass(slots=True)
+class _Road:
+    """An edge whose lanes are measured.
+
+    Attributes:
+        edge: Its name.
+        lanes: Positions of its lanes.
+        towards: Following edge to the positions of the lanes that lead there.
+        segment_s: Time through a segment at the speed limit.
+        last_m: Segments that begin after this are the last one.
+        stays: Who was there at the last look.
+    """
+
+    edge: str
+    lanes: list[int]
+    towards: dict[str, list[int]]
+    segment_s: float
+    last_m: float
+    stays: dict[str, _Stay]
 
 
 class QueueLook:
@@ -47,6 +66,10 @@ class QueueLook:
     has been in its segment for longer than that takes at the speed limit: as SUMO counts it, only
     the first of a queue is held up. When it got there is known to within the time of two looks.
 
+    A call to SUMO takes longer than all else here, so a vehicle is asked for what may have changed
+    alone: its route when it enters an edge, its queue when it enters a segment, nothing more while
+    it waits in the last one.
+
     Args:
         api: The module `libsumo`, with a simulation under way.
         lanes: Lanes to measure.
@@ -56,23 +79,17 @@ class QueueLook:
     def __init__(self, api: Any, lanes: Sequence[str], segment_m: float) -> None:
         self._api = api
         self._count = len(lanes)
-        self._own: dict[str, list[int]] = defaultdict(list)
-        self._towards: dict[tuple[str, str], list[int]] = defaultdict(list)
         self._index = [int(lane.rpartition("_")[2]) for lane in lanes]
-        self._segment_s: dict[str, float] = {}
-        followed: dict[str, set[str]] = defaultdict(set)
+        self._roads: dict[str, _Road] = {}
         for place, lane in enumerate(lanes):
-            edge = lane.rpartition("_")[0]
-            self._own[edge].append(place)
-            for following in {link[0].rpartition("_")[0] for link in api.lane.getLinks(lane)}:
-                self._towards[edge, following].append(place)
-                followed[edge].add(following)
-            length = api.lane.getLength(lane)
+            edge, length = lane.rpartition("_")[0], api.lane.getLength(lane)
             segments = max(1, math.floor(length / segment_m + 0.5))
-            self._segment_s[edge] = length / segments / api.lane.getMaxSpeed(lane)
-        # Where an edge has but one successor, SUMO has one queue for all its lanes.
-        self._with_queues = {edge for edge, others in followed.items() if len(others) > 1}
-        self._stays: dict[str, _Stay] = {}
+            road = self._roads.setdefault(edge, _Road(edge, [], defaultdict(list), 0.0, 0.0, {}))
+            road.lanes.append(place)
+            for following in {link[0].rpartition("_")[0] for link in api.lane.getLinks(lane)}:
+                road.towards[following].append(place)
+            road.segment_s = length / segments / api.lane.getMaxSpeed(lane)
+            road.last_m = length * (1 - 1.5 / segments)
         self._looked_s = -math.inf
 
     def look(self, time_s: float, limits: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -83,47 +100,53 @@ class QueueLook:
             limits: Speed of an empty lane, m/s, ``(lanes,)``.
         """
         vehicles, halting, speeds, waits = ([0.0] * self._count for _ in range(4))
-        waiting_s, speed_mps = self._api.vehicle.getWaitingTime, self._api.vehicle.getSpeed
-        before, self._stays = self._stays, {}
+        names_on, api = self._api.edge.getLastStepVehicleIDs, self._api.vehicle
+        position_m, waiting_s, speed_mps = api.getLanePosition, api.getWaitingTime, api.getSpeed
         passed_s = time_s - self._looked_s
-        for edge in self._own:
-            segment_s = self._segment_s[edge]
+        for road in self._roads.values():
+            segment_s, last_m = road.segment_s, road.last_m
             entered_s = time_s - min(passed_s, segment_s) / 2
-            for name in self._api.edge.getLastStepVehicleIDs(edge):
-                stay = self._stay(name, edge, before.get(name), entered_s)
-                self._stays[name] = stay
-                lane = stay.lane = self._lane(name, stay, vehicles)
-                waited = time_s - stay.since_s - segment_s
-                if waited <= 0:
-                    waited = waiting_s(name)
-                speed = 0.0 if waited > 0 else speed_mps(name)
+            before, road.stays = road.stays, {}
+            for name in names_on(road.edge):
+                stay = before.get(name)
+                if stay is None:
+                    stay = self._entered(name, road, entered_s)
+                    stay.lane = self._lane(name, road, stay, vehicles)
+                elif stay.position_m <= last_m and (at_m := position_m(name)) != stay.position_m:
+                    stay.position_m, stay.since_s = at_m, entered_s
+                    stay.lane = self._lane(name, road, stay, vehicles)
+                road.stays[name] = stay
+                lane = stay.lane
                 vehicles[lane] += 1.0
-                halting[lane] += speed < HALTING_MPS
+                waited = time_s - stay.since_s - segment_s
+                if waited > 0:
+                    halting[lane] += 1.0
+                    waits[lane] += waited
+                    continue
+                speed = speed_mps(name)
                 speeds[lane] += speed
-                waits[lane] += waited
+                halting[lane] += speed < HALTING_MPS
+                if speed == 0:  # as SUMO has it, whoever it holds up has no speed
+                    waits[lane] += waiting_s(name)
         self._looked_s = time_s
         measured = np.array([vehicles, halting, speeds, waits])
         there = measured[0] > 0
         measured[2] = np.where(there, measured[2] / np.maximum(measured[0], 1.0), limits)
         return measured
 
-    def _stay(self, name: str, edge: str, before: _Stay | None, entered_s: float) -> _Stay:
-        position = self._api.vehicle.getLanePosition(name)
-        if before is None or before.edge != edge:
-            route = self._api.vehicle.getRoute(name)
-            place = self._api.vehicle.getRouteIndex(name) + 1
-            following = route[place] if place < len(route) else ""
-            lanes = self._towards.get((edge, following)) or self._own[edge]
-            return _Stay(edge, position, entered_s, lanes, -1)
-        if position != before.position_m:
-            return _Stay(edge, position, entered_s, before.lanes, before.lane)
-        return before
+    def _entered(self, name: str, road: _Road, entered_s: float) -> _Stay:
+        route = self._api.vehicle.getRoute(name)
+        place = self._api.vehicle.getRouteIndex(name) + 1
+        following = route[place] if place < len(route) else ""
+        lanes = road.towards.get(following) or road.lanes
+        return _Stay(self._api.vehicle.getLanePosition(name), entered_s, lanes, -1)
 
-    def _lane(self, name: str, stay: _Stay, vehicles: Sequence[float]) -> int:
+    def _lane(self, name: str, road: _Road, stay: _Stay, vehicles: Sequence[float]) -> int:
         """The lane on which a vehicle counts, when so many have been counted already."""
         if len(stay.lanes) == 1:
             return stay.lanes[0]
-        if stay.edge in self._with_queues:
+        # Where an edge has but one successor, SUMO has one queue for all its lanes.
+        if len(road.towards) > 1:
             queue = self._api.vehicle.getLaneIndex(name)
             for place in stay.lanes:
                 if self._index[place] == queue:
