@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.features import Tally
+from ugat_marl.discrepancy.fit import Fitted
 from ugat_marl.discrepancy.statistics import Distance, Pools, Reference
 
 Array = NDArray[np.float64]
@@ -147,3 +148,22 @@ def _statistics(found: Distance, directed: Directed | None) -> dict[str, float]:
 def _log_moments(values: Sequence[float]) -> tuple[float, float]:
     logs = np.log(np.maximum(values, 1e-9))
     return float(logs.mean()), max(float(logs.std(ddof=1)), 0.02)
+
+
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """A fitted model with the test of what it leaves.
+
+    Attributes:
+        model: The model.
+        null: Its own distribution of distances.
+        residual: The test on the fitted periods.
+        errors: Standard errors of its free values.
+        extra: What they make uncertain in the statistics, and the tolerance.
+    """
+
+    model: Fitted
+    null: Null
+    residual: Residual
+    errors: Array
+    extra: dict[str, Array]

@@ -6,12 +6,9 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from ugat_marl.discrepancy.engine import OutOfTime
 from ugat_marl.discrepancy.features import Tally
 from ugat_marl.discrepancy.fit import (
-    HALF_INTERVAL,
     WIDE,
     Fitted,
     Fitter,
@@ -22,10 +19,11 @@ from ugat_marl.discrepancy.fit import (
 from ugat_marl.discrepancy.hypotheses import Hypothesis, a_few, both_ways, settings_as_members
 from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.matched import Directions
-from ugat_marl.discrepancy.members import each_left_out, merged, names_of
-from ugat_marl.discrepancy.residual import Null, Residual
+from ugat_marl.discrepancy.members import merged, names_of
+from ugat_marl.discrepancy.pruning import pruned
+from ugat_marl.discrepancy.residual import Null, Tested
 from ugat_marl.discrepancy.search import Ray, between, promising, propose, squared_gap
-from ugat_marl.discrepancy.statistics import Array, shift
+from ugat_marl.discrepancy.statistics import shift
 from ugat_marl.discrepancy.whitening import Whitener
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
 from ugat_marl.measured.data import Period
@@ -34,8 +32,6 @@ from ugat_marl.progress import Reporter
 ROUNDS = 4
 NEAREST, NEARER = 3, 0.8
 CANDIDATES_FITTED = 3
-NEGLIGIBLE = 60.0
-"""Cost up to which a smaller set of effects is examined in the place of a larger one."""
 KINDS_OF_PLACES = 5
 """Kinds of effects at places of which the best is simulated."""
 TOLERANCE = 0.02
@@ -70,25 +66,6 @@ class Effort:
     bank: int = 3
     fit: int = 6
     test: int = 36
-
-
-@dataclass(frozen=True, eq=False)
-class Tested:
-    """A fitted model with the test of what it leaves.
-
-    Attributes:
-        model: The model.
-        null: Its own distribution of distances.
-        residual: The test on the fitted periods.
-        errors: Standard errors of its free values.
-        extra: What they make uncertain in the statistics, and the tolerance.
-    """
-
-    model: Fitted
-    null: Null
-    residual: Residual
-    errors: Array
-    extra: dict[str, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +145,7 @@ class Selector:
                 best = found
                 if best.residual.p > self._alpha:
                     break
-            best = self._pruned(best)
+            best = pruned(best, self._fitter, self._kept, self.test, self._alpha)
         except OutOfTime:
             complete = False
             cheapest = min(self._seen.values(), key=_cost, default=best.model)
@@ -353,48 +330,6 @@ class Selector:
             self._seen[key] = model
         return model
 
-    def _pruned(self, best: Tested) -> Tested:
-        """Drops effects that do not matter, or that the others can do without.
-
-        Of two sets that leave no more than chance, the smaller one is the explanation.
-        """
-        members = tuple(item for item in best.model.members if item[0].matters(item[1]))
-        if members and len(members) < len(best.model.members):
-            best = self.test(self._fitter.refine(self._fitter.simulate(members), 2))
-        while len(best.model.members) > 1:
-            fewer = [
-                self._kept(self._fitter.refine(self._fitter.simulate(part), 2))
-                for part in each_left_out(best.model.members)
-            ]
-            doubtful = [fewer[place] for place in _doubtful(best)]
-            least = min(fewer, key=_cost)
-            if least.cost - best.model.cost > NEGLIGIBLE:
-                if not doubtful:
-                    break
-                least = min(doubtful, key=_cost)
-            tested = self.test(least)
-            enough = tested.residual.p > self._alpha
-            # What may not be there is not named, either, where nothing suffices.
-            vain = least in doubtful and best.residual.p <= self._alpha
-            if least.cost > best.model.cost and not enough and not vain:
-                break
-            best = tested
-        return best
-
 
 def _cost(model: Fitted) -> float:
     return model.cost
-
-
-def _doubtful(tested: Tested) -> list[int]:
-    """Places of the effects whose intervals hold the nominal value: they may not be there."""
-    found: list[int] = []
-    first = 0
-    for place, (hypothesis, values) in enumerate(tested.model.members):
-        errors = tested.errors[first : first + len(values)]
-        first += len(values)
-        if values and hypothesis.nominal is not None:
-            away = np.abs(np.subtract(values, hypothesis.nominal))
-            if (away <= HALF_INTERVAL * errors).all():
-                found.append(place)
-    return found

@@ -18,8 +18,8 @@ from ugat_marl.discrepancy.hypotheses import Hypothesis, global_hypotheses, libr
 from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.matched import Directions
 from ugat_marl.discrepancy.replay import Replay
-from ugat_marl.discrepancy.residual import Directed, Null
-from ugat_marl.discrepancy.select import Effort, Selector, Tested
+from ugat_marl.discrepancy.residual import Directed, Null, Tested
+from ugat_marl.discrepancy.select import Effort, Selector
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import (
     Array,

@@ -11,7 +11,8 @@ import numpy as np
 from ugat_marl.discrepancy.features import FEATURES
 from ugat_marl.discrepancy.fit import HALF_INTERVAL, Fitted, Members
 from ugat_marl.discrepancy.hypotheses import WINDOW, Hypothesis
-from ugat_marl.discrepancy.select import Selection, Selector, Tested
+from ugat_marl.discrepancy.residual import Tested
+from ugat_marl.discrepancy.select import Selection, Selector
 from ugat_marl.discrepancy.verify import Verification
 from ugat_marl.effects import known_effects
 

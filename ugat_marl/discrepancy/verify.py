@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.discrepancy.features import FEATURES, INDEX, Tally
-from ugat_marl.discrepancy.residual import Null, Residual
-from ugat_marl.discrepancy.select import Tested
+from ugat_marl.discrepancy.residual import Null, Residual, Tested
 from ugat_marl.discrepancy.statistics import Array, Reference, added
 from ugat_marl.discrepancy.study import Study
 from ugat_marl.effects import Effect

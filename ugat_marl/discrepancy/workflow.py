@@ -15,7 +15,8 @@ from typing import Any
 from ugat_marl.discrepancy.engine import OutOfTime
 from ugat_marl.discrepancy.fit import Fitted
 from ugat_marl.discrepancy.locate import Disagreement, locate
-from ugat_marl.discrepancy.select import Selection, Selector, Tested
+from ugat_marl.discrepancy.residual import Tested
+from ugat_marl.discrepancy.select import Selection, Selector
 from ugat_marl.discrepancy.signal_timing import timing_effects
 from ugat_marl.discrepancy.study import DiagnosisConfig, Study
 from ugat_marl.discrepancy.verdict import Conclusion, conclude, effect_record

@@ -1,0 +1,76 @@
+"""Does without effects that the others make superfluous."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ugat_marl.discrepancy.fit import HALF_INTERVAL, Fitted, Fitter
+from ugat_marl.discrepancy.members import each_left_out
+from ugat_marl.discrepancy.residual import Tested
+
+NEGLIGIBLE = 150.0
+"""Cost up to which a smaller set of effects is tested in the place of a larger one. Whether it
+suffices the test says; this only saves the time of those that plainly do not."""
+
+
+def pruned(
+    best: Tested,
+    fitter: Fitter,
+    kept: Callable[[Fitted], Fitted],
+    test: Callable[[Fitted], Tested],
+    alpha: float,
+) -> Tested:
+    """Drops effects that do not matter, or that the others can do without.
+
+    Of two sets that leave no more than chance, the smaller one is the explanation. Costs are
+    compared for as many days: with more of them the same model costs less.
+
+    Args:
+        best: The set to begin with.
+        fitter: Simulates and fits.
+        kept: Remembers what was fitted.
+        test: Tests what a model leaves.
+        alpha: Level of the tests.
+    """
+    members = tuple(item for item in best.model.members if item[0].matters(item[1]))
+    if members and len(members) < len(best.model.members):
+        best = test(fitter.refine(fitter.simulate(members), 2))
+    while len(best.model.members) > 1:
+        fewer = [
+            kept(fitter.refine(fitter.simulate(part), 2))
+            for part in each_left_out(best.model.members)
+        ]
+        doubtful = [fewer[place] for place in _doubtful(best)]
+        least = min(fewer, key=_cost)
+        if least.cost - fitter.simulate(best.model.members).cost > NEGLIGIBLE:
+            if not doubtful:
+                break
+            least = min(doubtful, key=_cost)
+        tested = test(least)
+        enough = tested.residual.p > alpha
+        # What may not be there is not named, either, where nothing suffices.
+        vain = least in doubtful and best.residual.p <= alpha
+        if least.cost > best.model.cost and not enough and not vain:
+            break
+        best = tested
+    return best
+
+
+def _cost(model: Fitted) -> float:
+    return model.cost
+
+
+def _doubtful(tested: Tested) -> list[int]:
+    """Places of the effects whose intervals hold the nominal value: they may not be there."""
+    found: list[int] = []
+    first = 0
+    for place, (hypothesis, values) in enumerate(tested.model.members):
+        errors = tested.errors[first : first + len(values)]
+        first += len(values)
+        if values and hypothesis.nominal is not None:
+            away = np.abs(np.subtract(values, hypothesis.nominal))
+            if (away <= HALF_INTERVAL * errors).all():
+                found.append(place)
+    return found
