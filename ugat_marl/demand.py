@@ -11,6 +11,7 @@ from ugat_marl.network import Network
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.scenario_settings import seconds_of
+from ugat_marl.singles import OwnEdges
 
 _ROUTED = ("from", "to", "via", "edges")
 _NO_TIME = frozenset({"triggered", "containerTriggered", "split", "now", "begin"})
@@ -62,12 +63,10 @@ def check_demand(
     routed = True
     for document in (*scenario.routes, *scenario.additional):
         latest, own = -math.inf, document in scenario.routes
-        waiting = False
+        singles = OwnEdges()
         for item in document.scan(reporter):
-            if own and item.name in ("vehicle", "trip", "flow", "route", "routeDistribution"):
-                single = item.name == "vehicle" and "route" not in item.attributes
-                routed &= item.name == "route" or (single and not waiting)
-                waiting = single
+            if own:
+                singles.read(item)
             if item.name in ("vehicle", "trip", "flow", "route"):
                 used = " ".join(item.attributes.get(key, "") for key in _ROUTED).split()
                 if not edges.issuperset(used):
@@ -83,9 +82,10 @@ def check_demand(
                 else:
                     vehicles += begin <= depart < end
                 if own and not whole and latest > end + SPARE_S:
+                    routed &= not singles.lost
                     break
         else:
-            routed &= not waiting
+            routed &= singles.ended()
     if not vehicles and not flows:
         files = ", ".join(document.source for document in scenario.routes)
         raise ScenarioError(

@@ -25,6 +25,7 @@ from ugat_marl.files import parse_xml, write_whole, xml_bytes
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.scenario_settings import seconds_of
 from ugat_marl.seeding import numpy_generator
+from ugat_marl.singles import OwnEdges
 
 JITTER_S = 120.0
 """Departures move by up to this much either way: profiles of the day stay, minutes do not."""
@@ -136,17 +137,12 @@ def _is_explicit(document: Document) -> bool:
 def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
     """The same, remembered for a file as long as it does not change."""
     del size, changed_ns
-    routeless = False
+    singles = OwnEdges()
     for tag in document.scan():
-        if tag.name in ("trip", "flow", "routeDistribution"):
+        singles.read(tag)
+        if singles.lost:
             return False
-        if tag.name == "vehicle":
-            if routeless or "route" in tag.attributes:
-                return False
-            routeless = True
-        elif tag.name == "route":
-            routeless = False
-    return not routeless
+    return singles.ended()
 
 
 def _routed(scenario: Scenario) -> Document:
