@@ -46,6 +46,19 @@ def test_divergence_equals_torchs_own_for_every_row_without_its_masked_classes()
         assert found.item() == pytest.approx(expected.item(), abs=1e-9)
 
 
+def test_the_slope_of_the_divergence_is_that_of_finite_differences_and_of_torchs_own() -> None:
+    alpha = concentration(logits(), RAGGED).requires_grad_()
+    assert torch.autograd.gradcheck(lambda a: divergence_from_uniform(a, RAGGED), (alpha,))
+    weights = torch.tensor([1.0, -2.0, 0.5]).double()
+    (slope,) = torch.autograd.grad((weights * divergence_from_uniform(alpha, RAGGED)).sum(), alpha)
+    for row, k in enumerate((2, 3, 4)):
+        own = alpha[row, :k].detach().requires_grad_()
+        apart = kl_divergence(Dirichlet(own), Dirichlet(torch.ones(k).double()))
+        (expected,) = torch.autograd.grad(weights[row] * apart, own)
+        assert torch.allclose(slope[row, :k], expected)
+        assert (slope[row, k:] == 0).all()
+
+
 def test_squared_error_equals_its_mean_over_sampled_probabilities() -> None:
     torch.manual_seed(0)
     alpha = concentration(logits(), RAGGED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.dropout import DropoutNet, divergence, thinned
 from ugat_marl.grounding.ensemble import EnsembleNet, PlainNet
+from ugat_marl.grounding.evidential import EvidentialNet
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.stacked import Stack
@@ -67,6 +69,24 @@ def test_members_trained_at_once_are_each_trained_for_themselves() -> None:
             whole = parts[name].grad
             assert whole is not None and part.grad is not None
             assert torch.allclose(whole.view(3, *part.shape)[m], part.grad, atol=1e-4), name
+
+
+@pytest.mark.parametrize("members", [0, 1, 3])
+def test_one_pass_claims_and_errs_as_two_would(members: int) -> None:
+    if members:
+        net = EnsembleNet(SHAPE, torch_generator(0), members)
+    else:
+        net = EvidentialNet(SHAPE, torch_generator(0))
+    generator, own = torch_generator(1), (2, members) if members > 1 else (2,)
+    inputs = torch.randn(*own, 11, 6, generator=generator)
+    target = torch.randint(2, (*own, 11), generator=generator)
+    off = torch.randn(2, 6, 6, generator=generator)
+    asked = dataclasses.replace(lesson(), off_data_weight=0.3, invent=lambda count: off[:, :count])
+    everyones = off[:, None].expand(-1, members, -1, -1) if members > 1 else off
+    claimed = net.certainty(net.outputs(everyones, asked)).mean(-1, keepdim=True)
+    expected = net.loss(inputs, target, lesson()) + 0.3 * claimed
+    assert claimed.abs().min() > 1e-5
+    assert torch.allclose(net.loss(inputs, target, asked), expected, atol=1e-6)
 
 
 def test_thinning_leaves_out_the_share_it_is_told_to_and_keeps_the_mean() -> None:

@@ -206,14 +206,14 @@ def test_members_differ_in_weights_and_in_the_order_of_their_rows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen: list[torch.Tensor] = []
-    loss = EnsembleNet.row_loss
+    loss = EnsembleNet.loss
 
     def watching(net: EnsembleNet, inputs: torch.Tensor, *rest: Any) -> torch.Tensor:
         if not rest[1].held_out:
             seen.append(inputs)
         return loss(net, inputs, *rest)
 
-    monkeypatch.setattr(EnsembleNet, "row_loss", watching)
+    monkeypatch.setattr(EnsembleNet, "loss", watching)
     config = dataclasses.replace(CONFIG, epochs=1, members=3)
     h, _ = fitted("ensemble", world(steps=40), config)
     assert seen[0].shape[:3] == (2, 3, 64)

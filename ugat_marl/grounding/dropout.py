@@ -109,18 +109,17 @@ class DropoutNet(AnswerNet):
         """Learned dropout rates, layer by layer: ``(agents,)``, and ``(1,)`` for the head."""
         return [torch.sigmoid(logit.detach()).flatten() for logit in self._logits()]
 
-    def row_loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
         """Cross-entropy of one thinned network per row, and the divergence by the rows there are.
 
         Held-out rows are judged by the whole network and by its likelihood alone.
         """
-        outputs = self._outputs(inputs, lesson)
         likelihood = negative_log_likelihood(outputs, target, self.valid_actions)
         return likelihood if lesson.held_out else likelihood + self._divergence(lesson.rows)
 
-    def certainty(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+    def certainty(self, outputs: Tensor) -> Tensor:
         """Divergence from even odds of one thinned network per row."""
-        return divergence_from_even(self._outputs(inputs, lesson), self.valid_actions)
+        return divergence_from_even(outputs, self.valid_actions)
 
     def answer(self, inputs: Tensor) -> InversePrediction:
         """The mean of the thinned networks' probabilities; u is its entropy."""
@@ -131,7 +130,7 @@ class DropoutNet(AnswerNet):
         """The log odds of every rate, ``(agents, 1, 1)`` and ``(1, 1, 1)``."""
         return [SPEED * logit for logit in self.slow_logits]
 
-    def _outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
         """``(agents, batch, actions)``, every row from a network thinned anew."""
         if lesson.held_out:
             return self.head(torch.relu(self.encoders(inputs)))

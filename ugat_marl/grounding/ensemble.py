@@ -38,17 +38,20 @@ class EnsembleNet(AnswerNet):
         out = torch.baddbmm(bias, embedding, weight.transpose(1, 2))
         return out.view(members, agents, rows, -1).transpose(0, 1)
 
-    def row_loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+        """The logits."""
+        del lesson
+        return self.logits(inputs)
+
+    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
         """Cross-entropy, member by member."""
         del lesson
-        logits = self.logits(inputs)
-        own = target.reshape(logits.shape[:3])
-        return negative_log_likelihood(logits, own, self.valid_actions[:, None]).view(target.shape)
+        own = target.reshape(outputs.shape[:3])
+        return negative_log_likelihood(outputs, own, self.valid_actions[:, None]).view(target.shape)
 
-    def certainty(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+    def certainty(self, outputs: Tensor) -> Tensor:
         """Divergence from even odds, member by member."""
-        del lesson
-        certain = divergence_from_even(self.logits(inputs), self.valid_actions[:, None])
+        certain = divergence_from_even(outputs, self.valid_actions[:, None])
         return certain if self.members > 1 else certain[:, 0]
 
     def answer(self, inputs: Tensor) -> InversePrediction:
@@ -65,7 +68,7 @@ class PlainNet(EnsembleNet):
 
     def loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
         """Cross-entropy; what would be claimed off the data is nobody's concern."""
-        return self.row_loss(inputs, target, lesson)
+        return self.row_loss(self.outputs(inputs, lesson), target, lesson)
 
     def answer(self, inputs: Tensor) -> InversePrediction:
         """The likeliest action, as if beyond doubt."""

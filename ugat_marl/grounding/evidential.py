@@ -9,6 +9,8 @@ Shapes: ``(..., K)`` for logits, concentrations and masks (broadcastable), ``(..
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -46,11 +48,30 @@ def expected_squared_error(alpha: Tensor, target: Tensor) -> Tensor:
 
 def divergence_from_uniform(alpha: Tensor, mask: Tensor) -> Tensor:
     """KL of Dirichlet(alpha) from the uniform Dirichlet over the row's own classes, in nats."""
-    own = torch.where(mask, alpha, 1.0)  # a concentration of 1 contributes nothing below
-    total = (own * mask).sum(-1)
-    count = mask.sum(-1).to(alpha.dtype)
-    pull = ((own - 1.0) * (torch.digamma(own) - torch.digamma(total)[..., None])).sum(-1)
-    return torch.lgamma(total) - torch.lgamma(count) - torch.lgamma(own).sum(-1) + pull
+    return _Divergence.apply(alpha, mask)  # pyright: ignore[reportReturnType]
+
+
+class _Divergence(torch.autograd.Function):
+    """That divergence with its derivative in closed form, in which all digammas have cancelled.
+
+    With S the total: dKL/d alpha_k = (alpha_k - 1) trigamma(alpha_k) - (S - K) trigamma(S).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, alpha: Tensor, mask: Tensor) -> Tensor:
+        own = torch.where(mask, alpha, 1.0)  # a concentration of 1 contributes nothing below
+        total = (own * mask).sum(-1)
+        count = mask.sum(-1).to(alpha.dtype)
+        ctx.save_for_backward(own, mask, total, count)
+        pull = ((own - 1.0) * (torch.digamma(own) - torch.digamma(total)[..., None])).sum(-1)
+        return torch.lgamma(total) - torch.lgamma(count) - torch.lgamma(own).sum(-1) + pull
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        own, mask, total, count = ctx.saved_tensors
+        shared = (total - count) * torch.polygamma(1, total)
+        slope = (own - 1.0) * torch.polygamma(1, own) - shared[..., None]
+        return gradients[0][..., None] * slope * mask, None
 
 
 def misleading(alpha: Tensor, target: Tensor) -> Tensor:
@@ -80,15 +101,19 @@ class EvidentialNet(AnswerNet):
         embedding = torch.relu(self.encoders(inputs))
         return concentration(self.head(embedding), self.valid_actions)
 
-    def row_loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+        """The concentrations."""
+        del lesson
+        return self(inputs)
+
+    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
         """The evidential loss, its divergence annealed in."""
         weight = lesson.kl_weight * lesson.share
-        return evidential_loss(self(inputs), target, self.valid_actions, weight)
+        return evidential_loss(outputs, target, self.valid_actions, weight)
 
-    def certainty(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+    def certainty(self, outputs: Tensor) -> Tensor:
         """Divergence of the evidence from none."""
-        del lesson
-        return divergence_from_uniform(self(inputs), self.valid_actions)
+        return divergence_from_uniform(outputs, self.valid_actions)
 
     def answer(self, inputs: Tensor) -> InversePrediction:
         """The mean of the Dirichlet, and how little evidence there is."""

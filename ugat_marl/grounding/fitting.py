@@ -11,7 +11,7 @@ from ugat_marl.batched import one_thread
 from ugat_marl.errors import LogError
 from ugat_marl.grounding.evidential import annealing
 from ugat_marl.grounding.fit_config import FitConfig
-from ugat_marl.grounding.fit_loop import EpochCallback, Split, split, train_model
+from ugat_marl.grounding.fit_loop import EpochCallback, Split, split, taken, train_model
 from ugat_marl.grounding.fit_report import (
     FitReport,
     ForwardReport,
@@ -26,7 +26,7 @@ from ugat_marl.grounding.fit_report import (
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.inverse import AnswerModel, InverseModel
 from ugat_marl.grounding.off_data import OffData
-from ugat_marl.grounding.stacked import StackedTransitions, stack_log
+from ugat_marl.grounding.stacked import StackedTransitions, refuse_other_agents, stack_log
 from ugat_marl.grounding.uncertainty import Lesson
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import TransitionLog
@@ -58,11 +58,12 @@ def fit(
             scenario, observation or decision interval.
     """
     refuse_mismatch(real, simulated)
-    f = fit_forward(forward, real, config, seed, on_epoch)
-    ours, theirs = stack_log(simulated, inverse.stack), stack_log(real, inverse.stack)
+    refuse_other_agents(real, inverse.stack)
+    ours, theirs = stack_log(simulated, inverse.stack), stack_log(real, forward.stack)
+    f = _fit_forward(forward, theirs, config, seed, on_epoch)
     means = _expected(forward, ours, config, seed, on_epoch)
     pairs = means if config.pairs == "smoothed" else None
-    h = fit_inverse(inverse, simulated, config, seed, on_epoch, pairs)
+    h = _fit_inverse(inverse, ours, config, seed, on_epoch, pairs)
     held_out = split(ours, config.held_out_every, inverse.stack).held_out
     held_out_real = split(theirs, config.held_out_every, inverse.stack).held_out
     agreement, u_on_predictions = on_predictions(forward, inverse, ours, held_out)
@@ -117,7 +118,16 @@ def fit_forward(
     on_epoch: EpochCallback | None = None,
 ) -> ForwardReport:
     """Fits f by least squares on the change of the features, each agent on its own rows."""
-    data = stack_log(log, model.stack)
+    return _fit_forward(model, stack_log(log, model.stack), config, seed, on_epoch)
+
+
+def _fit_forward(
+    model: ForwardModel,
+    data: StackedTransitions,
+    config: FitConfig,
+    seed: int,
+    on_epoch: EpochCallback | None,
+) -> ForwardReport:
     parts = split(data, config.held_out_every, model.stack)
     lesson = Changes("forward", model.view.of(data), data.next_observation, data.asked)
     return fit_changes(model, lesson, parts, config, seed, on_epoch)
@@ -157,18 +167,16 @@ def fit_changes(
         model.fit_scale(asked.observation, change, parts.train)
     outputs = model.valid_outputs.sum(-1)
 
-    def predicted(columns: Tensor | slice) -> Tensor:
-        extra = None if asked.extra is None else asked.extra[:, columns]
-        return model(asked.observation[:, columns], asked.acted[:, columns], extra)
+    inputs, truth = model.inputs(asked.observation, asked.acted, asked.extra), change / model.scale
 
     def loss(columns: Tensor, _epoch: int) -> Tensor:
-        error = predicted(columns) - change[:, columns] / model.scale
+        error = model.read(taken(inputs, columns)) - taken(truth, columns)
         return (error**2).sum(-1) / outputs
 
     generator = torch_generator(seed, asked.name, "batches")
     record = train_model(asked.name, model, loss, parts, config, generator, on_epoch)
     with torch.no_grad():
-        found = predicted(slice(None)) * model.scale
+        found = model.read_all(inputs) * model.scale
     followed = asked.observation[..., : change.shape[-1]] * model.valid_outputs + change
     share = (parts.train / parts.train.sum(1, keepdim=True))[..., None]
     off_mean = followed - (followed * share).sum(1, keepdim=True)
@@ -190,6 +198,17 @@ def fit_inverse(
     next observation.
     """
     data = stack_log(log, model.stack)
+    return _fit_inverse(model, data, config, seed, on_epoch, outcome)
+
+
+def _fit_inverse(
+    model: InverseModel,
+    data: StackedTransitions,
+    config: FitConfig,
+    seed: int,
+    on_epoch: EpochCallback | None,
+    outcome: Tensor | None,
+) -> InverseReport:
     parts = split(data, config.held_out_every, model.stack)
     then = data.next_observation if outcome is None else outcome
     inputs = model.inputs(model.view.of(data), then)
@@ -240,6 +259,6 @@ def fit_answers(
         share = annealing(epoch, config.kl_epochs) if fresh and epoch >= 0 else 1.0
         weights = config.kl_weight, config.off_data_weight
         lesson = Lesson(epoch < 0, generator, rows, share, *weights, invent)
-        return model.net.loss(standardised[:, columns], asked.answers[:, columns], lesson)
+        return model.net.loss(taken(standardised, columns), taken(asked.answers, columns), lesson)
 
     return train_model("inverse", model, loss, parts, config, generator, on_epoch)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ugat_marl.batched import BatchedMLP, mask_of
 from ugat_marl.errors import OptionError
+from ugat_marl.grounding.products import rows_at_once
 from ugat_marl.grounding.scaling import SMALLEST_SPREAD, Standardiser
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.view import View
@@ -93,6 +94,19 @@ class ForwardModel(nn.Module):
             action: ``(agents, batch)`` int64.
             extra: ``(agents, batch, extra)`` float32, the further inputs; none is zeros.
         """
+        return self.read(self.inputs(observation, action, extra))
+
+    def read(self, inputs: Tensor) -> Tensor:
+        """The answer, as `forward` gives it, to ``(agents, batch, width)`` from `inputs`."""
+        return self.network(inputs) * self.valid_outputs
+
+    def read_all(self, inputs: Tensor) -> Tensor:
+        """As `read`, for any number of rows: some after the others."""
+        parts = inputs.split(rows_at_once(len(inputs)), dim=1)
+        return torch.cat([self.read(part) for part in parts], 1)
+
+    def inputs(self, observation: Tensor, action: Tensor, extra: Tensor | None = None) -> Tensor:
+        """What the network is given, ``(agents, batch, width)``; arguments as of `forward`."""
         inputs = nn.functional.pad(
             self.standardise(observation), (0, self.width - observation.shape[-1])
         )
@@ -100,11 +114,11 @@ class ForwardModel(nn.Module):
         inputs = inputs.scatter(2, self.offsets + action[..., None], 1.0)
         if extra is not None:
             inputs = inputs.scatter(2, self.extra_places.expand(-1, action.shape[1], -1), extra)
-        return self.network(inputs) * self.valid_outputs
+        return inputs
 
     def predict(self, observation: Tensor, action: Tensor) -> Tensor:
         """Predicted features (and phase, if included) of s', ``(agents, batch, outputs)``."""
-        change = self(observation, action) * self.scale
+        change = self.read_all(self.inputs(observation, action)) * self.scale
         return observation[..., : change.shape[-1]] * self.valid_outputs + change
 
     def change(self, observation: Tensor, next_observation: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from ugat_marl.errors import OptionError
 from ugat_marl.grounding.dropout import DropoutNet
 from ugat_marl.grounding.ensemble import EnsembleNet, PlainNet
 from ugat_marl.grounding.evidential import EvidentialNet
+from ugat_marl.grounding.products import rows_at_once
 from ugat_marl.grounding.scaling import Standardiser
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import AnswerNet, InversePrediction, Method, NetShape
@@ -98,7 +99,9 @@ class AnswerModel(nn.Module):
 
     def answer(self, inputs: Tensor) -> InversePrediction:
         """Answers to unscaled inputs, ``(agents, batch, width)``."""
-        return self.net.answer(self.standardise(inputs))
+        rows = rows_at_once(len(inputs) * self.net.members)
+        parts = [self.net.answer(self.standardise(part)) for part in inputs.split(rows, dim=1)]
+        return parts[0] if len(parts) == 1 else InversePrediction.joined(parts)
 
 
 class InverseModel(AnswerModel):

@@ -75,8 +75,8 @@ class OffData:
                 observed one with a change that it never had.
         """
         rows = torch.randint(len(self.candidates), (count,), generator=generator)
-        observed = self.inputs[:, self.candidates[rows]]
+        observed = self.inputs.index_select(1, self.candidates[rows])
         noise = torch.rand(observed.shape, generator=generator)
-        drawn = self.low + (self.high - self.low) * noise
+        drawn = torch.addcmul(self.low, self.high - self.low, noise)
         whole = torch.rand(1, count, 1, generator=generator) < state_share
         return torch.where((self.change | whole) & ~self.kept, drawn, observed)

@@ -106,12 +106,8 @@ class StackedTransitions:
         return self.next_observation if self.served_features is None else self.served_features
 
 
-def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
-    """All transitions of a log as padded tensors.
-
-    Raises:
-        LogError: The log is of other agents, or an agent has no rows.
-    """
+def refuse_other_agents(log: TransitionLog, stack: Stack) -> None:
+    """Transitions of other agents, or seen otherwise, are nothing for models of these."""
     if dict(log.provenance.layouts) != stack.layouts:
         raise LogError(
             f"the transition log of {log.provenance.scenario} "
@@ -119,6 +115,15 @@ def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
             f"the models, made for agents {_names(stack.agents)}; use the same scenario and "
             "the same observation options"
         )
+
+
+def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
+    """All transitions of a log as padded tensors.
+
+    Raises:
+        LogError: The log is of other agents, or an agent has no rows.
+    """
+    refuse_other_agents(log, stack)
     rows = [log.transitions(agent) for agent in stack.agents]
     for agent, own in zip(stack.agents, rows, strict=True):
         if not len(own):

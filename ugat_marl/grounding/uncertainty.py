@@ -70,6 +70,15 @@ class InversePrediction:
     probability: Tensor
     u: Tensor
 
+    @classmethod
+    def joined(cls, parts: Sequence[InversePrediction]) -> InversePrediction:
+        """Answers to some rows and those to the next ones, together."""
+        return cls(
+            torch.cat([part.action for part in parts], 1),
+            torch.cat([part.probability for part in parts], 1),
+            torch.cat([part.u for part in parts], 1),
+        )
+
 
 @dataclass(frozen=True)
 class Lesson:
@@ -136,14 +145,18 @@ class AnswerNet(nn.Module, abc.ABC):
         self.register_buffer("valid_actions", shape.valid_actions, persistent=False)
 
     @abc.abstractmethod
-    def row_loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
-        """Loss of every row, as `loss` takes and returns it."""
+    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+        """What `row_loss` and `certainty` read, rows on the last axis but one."""
 
     @abc.abstractmethod
-    def certainty(self, inputs: Tensor, lesson: Lesson) -> Tensor:
-        """What is claimed about ``(agents, count, width)`` standardised inputs off the data.
+    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+        """Loss of every row, in the shape of `target`."""
 
-        In nats, 0 where nothing is claimed: ``(agents, count)`` or ``(agents, members, count)``.
+    @abc.abstractmethod
+    def certainty(self, outputs: Tensor) -> Tensor:
+        """What is claimed about rows off the data, in nats; 0 where nothing is claimed.
+
+        ``(agents, count)`` or ``(agents, members, count)``.
         """
 
     def loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
@@ -155,10 +168,16 @@ class AnswerNet(nn.Module, abc.ABC):
             target: ``(agents, batch)`` or ``(agents, members, batch)`` int64, the true actions.
             lesson: What else a loss may need.
         """
-        error = self.row_loss(inputs, target, lesson)
         if not lesson.off_data_weight:
-            return error
-        certain = self.certainty(lesson.invent(target.shape[-1] // 2 + 1), lesson)
+            return self.row_loss(self.outputs(inputs, lesson), target, lesson)
+        rows = target.shape[-1]
+        invented = lesson.invent(rows // 2 + 1)
+        if inputs.dim() > invented.dim():
+            invented = invented[:, None].expand(-1, self.members, -1, -1)
+        # One pass for both: two would read all weights, and sum all their gradients, twice.
+        outputs = self.outputs(torch.cat([inputs, invented], -2), lesson)
+        error = self.row_loss(outputs[..., :rows, :], target, lesson)
+        certain = self.certainty(outputs[..., rows:, :])
         return error + lesson.off_data_weight * lesson.share * certain.mean(-1, keepdim=True)
 
     @abc.abstractmethod
