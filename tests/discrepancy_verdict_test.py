@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ugat_marl.discrepancy.faults import one_behind_the_other
 from ugat_marl.discrepancy.features import FEATURES
 from ugat_marl.discrepancy.hypotheses import Hypothesis
 from ugat_marl.discrepancy.select import Selection
@@ -20,6 +21,7 @@ from ugat_marl.discrepancy.verdict import (
     effect_record,
     place_and_window,
 )
+from ugat_marl.measured.data import Detector
 
 HEADWAY = Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05)
 SURGE = Hypothesis(
@@ -36,6 +38,19 @@ PARKING = Hypothesis(
     "parking", (("lane", "S_C_0"), ("dwell_s", 40.0)), ("per_hour",), ((20.0,),), (0.0,)
 )
 MODEL = Hypothesis("driver_model", (("model", "IDM"),), (), ((),), None)
+SITE: Any = SimpleNamespace(
+    detectors=[
+        Detector("east", "E_C_0", 10.0, 2.0, "advance"),
+        Detector("line", "E_C_0", 90.0, 2.0, "stop"),
+        Detector("beside", "E_C_1", 90.0, 2.0, "stop"),
+        Detector("out", "C_W_0", 10.0, 2.0, "exit"),
+        Detector("away", "C_N_0", 10.0, 2.0, "exit"),
+    ],
+    lanes=[
+        SimpleNamespace(id="E_C_0", edge="E_C", following={"C_W"}),
+        SimpleNamespace(id="E_C_1", edge="E_C", following={"C_W", "C_N"}),
+    ],
+)
 LATE = Hypothesis("late_green", (("place", "*"),), ("seconds",), ((2.0,),), (0.0,))
 
 
@@ -114,7 +129,7 @@ def test_only_a_search_that_ended_says_that_the_library_lacks_it(
     selector: Any = None
     contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
     found = conclude(
-        contradicted, Selection(best, (), complete=complete), selector, nothing_won, 0.05
+        contradicted, Selection(best, (), complete=complete), selector, nothing_won, 0.05, SITE
     )
     assert found.verdict == "unknown"
     assert ("no effect of the library explains it" in found.sentence) == complete
@@ -144,9 +159,46 @@ def test_the_end_of_a_range_is_no_answer(
     )
     selector: Any = None
     contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
-    found = conclude(contradicted, Selection(best, (), complete=True), selector, won, 0.05)
+    found = conclude(contradicted, Selection(best, (), complete=True), selector, won, 0.05, SITE)
     assert found.verdict == verdict
     assert ("as far as the effect goes" in found.sentence) == (verdict != "explained")
+
+
+def short(place: str) -> tuple[Hypothesis, tuple[float, ...]]:
+    return Hypothesis("undercount", (("place", place),), ("share",), ((0.2,),), (0.0,)), (0.2,)
+
+
+@pytest.mark.parametrize(
+    ("places", "between"),
+    [
+        (("line", "out"), ("line", "out")),
+        (("out", "line"), ("line", "out")),
+        (("out", "east"), ("east", "out")),
+        (("line", "east"), ("east", "line")),
+        (("away", "out", "beside"), ("beside", "away")),
+        (("line", "away"), None),
+        (("line", "beside"), None),
+        (("out", "away"), None),
+        (("line",), None),
+    ],
+)
+def test_vehicles_that_leave_are_not_taken_for_counters_that_miss_them(
+    places: tuple[str, ...], between: tuple[str, str] | None
+) -> None:
+    members = tuple(map(short, places))
+    assert one_behind_the_other(members, SITE) == between
+    distance = SimpleNamespace(z={"network": np.zeros((1, len(FEATURES)))})
+    residual = SimpleNamespace(p=0.6, distance=100.0)
+    model = SimpleNamespace(members=members, distance=distance)
+    best: Any = SimpleNamespace(model=model, residual=residual)
+    won: Any = SimpleNamespace(
+        before=SimpleNamespace(p=0.0, distance=1000.0), after=residual, shrink=1.0
+    )
+    selector: Any = None
+    contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
+    found = conclude(contradicted, Selection(best, (), complete=True), selector, won, 0.05, SITE)
+    assert found.verdict == ("not_identifiable" if between else "explained")
+    assert all(name in (found.next_measurement or "") for name in between or ())
 
 
 @pytest.mark.parametrize(
@@ -168,7 +220,7 @@ def test_a_hint_that_is_not_confirmed_is_weighed_with_the_other_periods(
     before = SimpleNamespace(p=heldout, distance=950.0)
     verification: Any = SimpleNamespace(before=before, after=before, shrink=None)
     selector: Any = None
-    found = conclude(best, Selection(best, (), complete=True), selector, verification, 0.05)
+    found = conclude(best, Selection(best, (), complete=True), selector, verification, 0.05, SITE)
     assert found.verdict == verdict
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ugat_marl.discrepancy.features import INDEX
+from ugat_marl.discrepancy.fit import Members
 from ugat_marl.discrepancy.hypotheses import Hypothesis
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Distance, Reference
@@ -107,3 +108,24 @@ def _swapped(
                     found.append((before - after, Hypothesis("swapped", fixed, (), ((),), None)))
     found.sort(key=lambda item: -item[0])
     return [item for _, item in found[:2]]
+
+
+def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None:
+    """Two detectors of one stream that are both said to miss vehicles, in its direction.
+
+    One detector of a stream that counts too few stands against the others. Where those behind it
+    count too few as well, the vehicles may have left the road.
+    """
+    short = [dict(item.fixed)["place"] for item, _ in members if item.name == "undercount"]
+    known = {item.id: item for item in site.detectors}
+    lanes = {lane.id: lane for lane in site.lanes}
+    found = [known[str(name)] for name in short if name in known]
+    for one in found:
+        for other in found:
+            lane, edge = lanes.get(one.lane), other.lane.rsplit("_", 1)[0]
+            if lane is None or one.kind == "exit" or one.kind == other.kind:
+                continue
+            if edge in (lane.following if other.kind == "exit" else {lane.edge}):
+                first, behind = (other, one) if other.kind == "advance" else (one, other)
+                return first.id, behind.id
+    return None

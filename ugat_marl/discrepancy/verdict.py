@@ -8,11 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ugat_marl.discrepancy.faults import one_behind_the_other
 from ugat_marl.discrepancy.features import FEATURES
 from ugat_marl.discrepancy.fit import HALF_INTERVAL, Fitted, Members
 from ugat_marl.discrepancy.hypotheses import WINDOW, Hypothesis
 from ugat_marl.discrepancy.residual import Tested
 from ugat_marl.discrepancy.select import Selection, Selector
+from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.verify import Verification
 from ugat_marl.effects import known_effects
 
@@ -56,6 +58,7 @@ def conclude(
     selector: Selector,
     verification: Verification,
     alpha: float,
+    site: Site,
 ) -> Conclusion:
     """Draws the conclusion of a search.
 
@@ -65,6 +68,7 @@ def conclude(
         selector: Tests rivals.
         verification: The held-out periods.
         alpha: Level of the tests.
+        site: Lanes and detectors.
     """
     best = selection.best
     confirmed = verification.before.distance - verification.after.distance >= CONFIRMED
@@ -93,6 +97,13 @@ def conclude(
                 "effect goes: something else may be behind it."
             )
             return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
+        if counters := one_behind_the_other(best.model.members, site):
+            first, behind = counters
+            sentence = f"The data fit {names} and vehicles that leave the road equally well."
+            return Conclusion(
+                "not_identifiable", best, (), sentence, f"video of {first} and {behind}: do they "
+                "miss vehicles, or is there a driveway or car park that the network lacks?",
+            )  # fmt: skip
         rivals = _rivals(selection, selector, alpha)
         if rivals:
             others = " or ".join(describe_members(rival.members) for rival in rivals)

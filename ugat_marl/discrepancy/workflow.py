@@ -187,7 +187,9 @@ def _search(
     selection = selector.select(base)
     try:
         verification = verify(study, base, selection.best)
-        conclusion = conclude(base, selection, selector, verification, study.config.alpha)
+        conclusion = conclude(
+            base, selection, selector, verification, study.config.alpha, study.site
+        )
         plain = conclusion.verdict == "no_discrepancy"
         tables = {} if plain else _tables(study, base, selection.best)
     except OutOfTime:
