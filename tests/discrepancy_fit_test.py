@@ -17,9 +17,9 @@ from ugat_marl.discrepancy.fit import (
     SHORTEST_S,
     Fitter,
     Members,
-    uncertainty,
 )
 from ugat_marl.discrepancy.hypotheses import Hypothesis
+from ugat_marl.discrepancy.intervals import uncertainty
 from ugat_marl.discrepancy.statistics import Pools, Reference
 from ugat_marl.effects import Effect
 
@@ -302,3 +302,27 @@ def test_a_value_that_does_nothing_is_not_known_exactly() -> None:
     ((_, delta),) = fitter.changes(fitter.simulate(((dead, (1.3,)),)))
     assert known < 0.05
     assert unknown == pytest.approx(abs(delta))
+
+
+class Steps(World):
+    """Whole vehicles: a headway of 1.3 s does what one of 1.7 s does."""
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        values = {e.name: float(e.record()["seconds"]) for e in effects}
+        return day(number, {name: round(2 * value) / 2 for name, value in values.items()})
+
+
+def test_steps_make_an_interval_wide_and_straight_ways_do_not() -> None:
+    straight = a_fitter({"headway": 1.4}, street=17)
+    model = straight.simulate(start((HEADWAY, 1.4)))
+    plain, _ = uncertainty(straight, model)
+    straightly, _ = uncertainty(straight, model, steps=True)
+    assert straightly == pytest.approx(plain, rel=1e-3)
+
+    stepped = a_fitter({"headway": 1.4}, street=17)
+    stepped.engine = Steps()
+    model = stepped.simulate(start((HEADWAY, 1.5)))
+    blind, kept = uncertainty(stepped, model)
+    seen, same = uncertainty(stepped, model, steps=True)
+    assert 3.0 * blind[0] < seen[0] < 0.5
+    assert (same["network"] == kept["network"]).all(), "what the model shows is known as it was"

@@ -1,4 +1,4 @@
-"""Fits the free numbers of a set of effects by simulation, and says how well they are known."""
+"""Fits the free numbers of a set of effects by simulation."""
 
 from __future__ import annotations
 
@@ -34,8 +34,6 @@ NEARBY, FAR = 0.2, 0.9
 """Shares of its distance from nominal by which a value is moved for a derivative."""
 PLAIN = 10.0
 """Standard deviations that such a move is meant to make."""
-HALF_INTERVAL = 1.96
-"""Half of a 95 % interval, in standard errors."""
 NEAR = 0.2
 """Standard errors by which a value may be off."""
 INTERPOLATION = 0.02
@@ -222,7 +220,7 @@ class Fitter:
 
     def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
         """Derivatives of the whitened statistics, ``(free values, statistics)``."""
-        return _derivatives(self.changes(model), whitener)
+        return derivatives(self.changes(model), whitener)
 
     def changes(self, model: Fitted) -> list[Change]:
         """For every free value: what moving it does to the statistics, and how far it was moved.
@@ -245,8 +243,8 @@ class Fitter:
         """What moving one value by a share of its distance from nominal does; how far it went."""
         hypothesis, values = model.members[place]
         moved = _moved_a_little(hypothesis, values, index, share)
-        members = _replaced(model.members, place, moved)
-        return self._difference(model, members), (moved[index] - values[index]) or 1.0
+        members = replaced(model.members, place, moved)
+        return shrunk(*self.difference(model, members)), (moved[index] - values[index]) or 1.0
 
     def window_changes(self, model: Fitted) -> list[Change]:
         """What it does to begin and to end a minute nearer to the middle, in models with numbers.
@@ -259,15 +257,17 @@ class Fitter:
                 moved = _shifted(hypothesis, move) if values else hypothesis
                 if moved is not hypothesis:
                     members = (*model.members[:place], (moved, values), *model.members[place + 1 :])
-                    found.append((self._difference(model, members), SHORTEST_S))
+                    found.append((shrunk(*self.difference(model, members)), SHORTEST_S))
         return found
 
-    def _difference(self, model: Fitted, members: Members) -> dict[str, Array]:
-        """The statistics of other members minus those of a model, without what may be chance."""
+    def difference(
+        self, model: Fitted, members: Members
+    ) -> tuple[dict[str, Array], dict[str, Array]]:
+        """What other members change in the statistics on the same days; its variances."""
         before = model.tallies[: self.days]
         numbers = self.engine.first(len(before))
         days = self.engine.replicates(effects_of(members), numbers, self.tick)
-        return shrunk(*shift(self.pools, [day.tally for day in days], before))
+        return shift(self.pools, [day.tally for day in days], before)
 
     def _moved(self, model: Fitted, step: Array) -> Members:
         """The model's values after a step, in range and not too far at once."""
@@ -311,7 +311,8 @@ def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
     return replace(hypothesis, fixed=tuple((name, changed[name]) for name, _ in hypothesis.fixed))
 
 
-def _replaced(members: Members, place: int, values: tuple[float, ...]) -> Members:
+def replaced(members: Members, place: int, values: tuple[float, ...]) -> Members:
+    """The members with other values of one of them."""
     hypothesis = members[place][0]
     return (*members[:place], (hypothesis, values), *members[place + 1 :])
 
@@ -324,52 +325,6 @@ def _solve(jacobian: Array, residual: Array) -> Array:
     return np.linalg.solve(normal, scaled @ residual) / scale
 
 
-def _derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
+def derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
+    """Changes as derivatives of the whitened statistics, ``(changes, statistics)``."""
     return np.stack([whitener(change) / delta for change, delta in changes])
-
-
-def uncertainty(
-    fitter: Fitter, model: Fitted, days: Sequence[Tally] = ()
-) -> tuple[Array, dict[str, Array]]:
-    """Standard errors of the free values, and what they make uncertain in the statistics.
-
-    The parts of the distance depend on each other, so the errors come from how much the estimate
-    would move between simulated days (a sandwich estimate), not from the curvature alone. Where
-    windows begin and end is estimated as well. A value whose change does nothing that is more than
-    chance is not known better than to this change.
-
-    Args:
-        fitter: Simulates.
-        model: The model.
-        days: Simulated days of it, the more the better; none for those it was fitted with.
-
-    Returns:
-        Standard errors ``(free values,)``, and variances of the expected statistics per block.
-    """
-    if not len(model.values):
-        return np.empty(0), {
-            name: np.zeros_like(b.mean) for name, b in model.reference.blocks.items()
-        }
-    whitener = fitter.whitener(model)
-    changes = fitter.changes(model)
-    free = len(changes)
-    changes += fitter.window_changes(model)
-    jacobian = _derivatives(changes, whitener)
-    inverse = np.linalg.pinv(jacobian @ jacobian.T)
-    influences: list[Array] = []
-    days = days or model.tallies
-    for item in days:
-        difference, _ = shift(fitter.pools, [item], days)
-        influences.append(inverse @ (jacobian @ whitener(difference)))
-    spread = np.atleast_2d(np.cov(np.stack(influences).T))
-    covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies))
-    grids = np.array([h.step for h, values in model.members for _ in values])
-    covariance[:free, :free] += np.diag(grids**2 / 12.0)
-    unseen = np.flatnonzero(~jacobian[:free].any(axis=1))
-    covariance[unseen, unseen] += [changes[index][1] ** 2 for index in unseen]
-    extra: dict[str, Array] = {}
-    for name, block in model.reference.blocks.items():
-        slopes = np.stack([change[name] / delta for change, delta in changes])
-        extra[name] = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes) + 0.0 * block.mean
-        extra[name] = np.nan_to_num(extra[name])
-    return np.sqrt(np.diag(covariance)[:free]), extra

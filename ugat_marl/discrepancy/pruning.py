@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ugat_marl.discrepancy.fit import HALF_INTERVAL, Fitted, Fitter
+from ugat_marl.discrepancy.fit import Fitted, Fitter
+from ugat_marl.discrepancy.intervals import HALF_INTERVAL
 from ugat_marl.discrepancy.members import each_left_out
 from ugat_marl.discrepancy.residual import Tested
 

@@ -14,9 +14,9 @@ from ugat_marl.discrepancy.fit import (
     Fitter,
     Members,
     effects_of,
-    uncertainty,
 )
 from ugat_marl.discrepancy.hypotheses import Hypothesis, a_few, both_ways, settings_as_members
+from ugat_marl.discrepancy.intervals import uncertainty
 from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.matched import Directions
 from ugat_marl.discrepancy.members import merged, names_of
@@ -158,7 +158,7 @@ class Selector:
         fitter = self._fitter
         model = self._kept(fitter.settled(model, uncertainty(fitter, model)[0]))
         days = self._days(model)
-        errors, extra = uncertainty(fitter, model, days)
+        errors, extra = uncertainty(fitter, model, days, steps=True)
         for name, difference in self._first.difference.items():
             extra[name] = extra[name] + (TOLERANCE * difference) ** 2
         fitted = tuple(change for change, _ in fitter.changes(model))

@@ -10,8 +10,9 @@ import numpy as np
 
 from ugat_marl.discrepancy.faults import one_behind_the_other
 from ugat_marl.discrepancy.features import FEATURES
-from ugat_marl.discrepancy.fit import HALF_INTERVAL, Fitted, Members
+from ugat_marl.discrepancy.fit import Fitted, Members
 from ugat_marl.discrepancy.hypotheses import WINDOW, Hypothesis
+from ugat_marl.discrepancy.intervals import HALF_INTERVAL
 from ugat_marl.discrepancy.residual import Tested
 from ugat_marl.discrepancy.select import Selection, Selector
 from ugat_marl.discrepancy.site import Site
