@@ -15,6 +15,7 @@ from ugat_marl.discrepancy import engine as module
 from ugat_marl.discrepancy.engine import Engine, OutOfTime, Replicate, default_cache
 from ugat_marl.discrepancy.replay import Day, Replay
 from ugat_marl.discrepancy.site import Site
+from ugat_marl.discrepancy.unmeasured import Unmeasured
 from ugat_marl.effects import Effect, load, parse_domain
 from ugat_marl.effects.detectors import observed
 from ugat_marl.errors import SimulatorError
@@ -101,6 +102,49 @@ def test_a_remembered_day_is_the_simulated_day_to_the_last_digit(
     assert silent.calls == []
     assert again.simulated == 0
     assert all(same(one, two) for one, two in zip(simulated, remembered, strict=True))
+
+
+@pytest.mark.parametrize("speeds", [True, False])
+@pytest.mark.parametrize("lengths", [True, False])
+def test_simulated_days_tell_no_more_than_the_measured_ones(
+    speeds: bool, lengths: bool, scenario: Scenario, site: Site, tmp_path: Path
+) -> None:
+    day = Streets(site).simulate((), PERIODS[0], 7).period
+    told = {
+        name: Passages(
+            item.on_s,
+            item.off_s,
+            item.speed_mps if speeds else np.full(len(item), np.nan),
+            item.length_m if lengths else np.full(len(item), np.nan),
+        )
+        for name, item in day.passages.items()
+    }
+    measured = replace(day, passages=told)
+
+    class SameDay(Streets):
+        def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
+            return Day(day, 50.0)
+
+    made = Engine(scenario, site, SameDay(site), [measured], 3, cache=tmp_path, workers=1)
+    (simulated,) = made.replicates((), [0])
+    (seen,) = made.measured([measured])
+    assert np.allclose(simulated.tally.sums, seen.sums)
+    with_all = Engine(scenario, site, SameDay(site), [day], 3, cache=tmp_path, workers=1)
+    (other,) = with_all.replicates((), [0])
+    assert np.allclose(other.tally.sums, simulated.tally.sums) == (speeds and lengths)
+
+
+def test_a_detector_that_saw_nobody_tells_nothing_of_speeds(site: Site) -> None:
+    names = [item.id for item in site.detectors]
+    none = np.full(3, np.nan)
+    times = np.arange(3.0)
+    passages = {names[0]: Passages.none(), names[1]: Passages(times, times, none, times)}
+    found = Unmeasured.of([replace(PERIODS[0], passages=passages), PERIODS[1]])
+    assert found == Unmeasured((names[1],), ())
+    full = replace(PERIODS[0], passages={names[1]: Passages(times, times, times, times)})
+    assert not Unmeasured.of([replace(PERIODS[0], passages=passages), full])
+    assert np.isnan(found.kept_from(full).passages[names[1]].speed_mps).all()
+    assert (found.kept_from(full).passages[names[1]].length_m == times).all()
 
 
 def test_within_one_run_no_day_is_simulated_twice(scenario: Scenario, site: Site) -> None:

@@ -23,6 +23,7 @@ from ugat_marl.discrepancy.arrivals import Due, corrected
 from ugat_marl.discrepancy.features import FEATURES, Tally, tally
 from ugat_marl.discrepancy.replay import WHEN, Day, Replay
 from ugat_marl.discrepancy.site import Greens, Site
+from ugat_marl.discrepancy.unmeasured import Unmeasured
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
@@ -103,7 +104,9 @@ class Engine:
         self._greens: list[tuple[Greens, ...]] = [site.greens(period) for period in periods]
         self._days: OrderedDict[str, Day] = OrderedDict()
         self._known: dict[str, Replicate] = {}
+        self._unmeasured = Unmeasured.of(periods)
         head = (VERSION, FEATURES, scenario.hash, site.detectors, _versions(), seed)
+        head += (self._unmeasured,) if self._unmeasured else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in site.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
@@ -215,7 +218,8 @@ class Engine:
     def _counted(self, effects: tuple[Effect, ...], number: int) -> Replicate:
         """A simulated day, counted."""
         day = self._day(effects, number)
-        counted = tally(self.site, day.period, self._greens[number % len(self.periods)])
+        period = self._unmeasured.kept_from(day.period)
+        counted = tally(self.site, period, self._greens[number % len(self.periods)])
         # As precise as what is remembered, so that the answer does not depend on the cache.
         counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
         return self._with_due(counted, day.travel_time_s, day.due)
