@@ -26,10 +26,13 @@ class Ledger:
 
     costs: dict[tuple[str, ...], float]
     chances: dict[tuple[str, ...], float]
+    luck: dict[tuple[str, ...], float] = field(default_factory=dict)
     tested: list[tuple[str, ...]] = field(default_factory=list)
 
     def simulate(self, members: Members, days: int | None = None) -> Fitted:
-        cost = self.costs[names(members)] + (0.0 if days else FEW)
+        cost = self.costs[names(members)]
+        if days is None:
+            cost += FEW + self.luck.get(names(members), 0.0)
         blank = cast(Any, None)
         return Fitted(members, (), blank, blank, cost)
 
@@ -70,6 +73,17 @@ def test_what_the_other_explains_alone_is_left_out(more: float) -> None:
         {both: 0.9, ("headway",): 0.8, ("demand_level",): 0.0},
     )
     assert ledger.left(HEADWAY, DEMAND) == (HEADWAY,)
+
+
+def test_luck_on_a_few_days_leaves_nothing_out() -> None:
+    both = ("headway", "demand_level")
+    ledger = Ledger(
+        {both: 1000.0, ("headway",): 1400.0, ("demand_level",): 9000.0},
+        {both: 0.9, ("headway",): 0.8, ("demand_level",): 0.0},
+        {("headway",): -700.0},
+    )
+    assert ledger.left(HEADWAY, DEMAND) == (HEADWAY, DEMAND)
+    assert not ledger.tested
 
 
 def test_what_leaves_more_than_chance_behind_stays() -> None:

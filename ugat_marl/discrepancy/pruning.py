@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ugat_marl.discrepancy.fit import Fitted, Fitter
+from ugat_marl.discrepancy.fit import SETTLING_DAYS, Fitted, Fitter
 from ugat_marl.discrepancy.intervals import HALF_INTERVAL
 from ugat_marl.discrepancy.members import each_left_out
 from ugat_marl.discrepancy.residual import Tested
@@ -26,7 +26,8 @@ def pruned(
     """Drops effects that do not matter, or that the others can do without.
 
     Of two sets that leave no more than chance, the smaller one is the explanation. Costs are
-    compared for as many days: with more of them the same model costs less.
+    compared over the same days, and enough of them: with more the same model costs less, and what
+    a few cost is luck where queues are long.
 
     Args:
         best: The set to begin with.
@@ -35,17 +36,21 @@ def pruned(
         test: Tests what a model leaves.
         alpha: Level of the tests.
     """
+
+    def settled(model: Fitted) -> Fitted:
+        return fitter.simulate(model.members, SETTLING_DAYS)
+
     members = tuple(item for item in best.model.members if item[0].matters(item[1]))
     if members and len(members) < len(best.model.members):
         best = test(fitter.refine(fitter.simulate(members), 2))
     while len(best.model.members) > 1:
         fewer = [
-            kept(fitter.refine(fitter.simulate(part), 2))
+            kept(settled(fitter.refine(fitter.simulate(part), 2)))
             for part in each_left_out(best.model.members)
         ]
         doubtful = [fewer[place] for place in _doubtful(best)]
         least = min(fewer, key=_cost)
-        if least.cost - fitter.simulate(best.model.members).cost > NEGLIGIBLE:
+        if least.cost - settled(best.model).cost > NEGLIGIBLE:
             if not doubtful:
                 break
             least = min(doubtful, key=_cost)
