@@ -16,6 +16,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 
 Advance = Callable[..., None]
 """Called as ``advance()`` or ``advance(note="...")`` when a unit of work is done."""
@@ -73,7 +74,7 @@ class Bars:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(compact=True),
-            TextColumn("[dim]{task.fields[note]}"),
+            TextColumn("[dim]{task.fields[note]}", table_column=self._rest()),
         )
         with Progress(*columns, console=self._console) as progress:
             bar = progress.add_task(name, total=total, note="")
@@ -84,6 +85,10 @@ class Bars:
 
             yield advance
             progress.update(bar, completed=total)  # the work may have ended early, by its own rule
+
+    def _rest(self) -> Column:
+        """What the other columns leave of a line: a long note must not squeeze them."""
+        return Column(no_wrap=True, overflow="ellipsis", max_width=max(self._console.width - 74, 6))
 
     def say(self, text: str) -> None:
         """Writes a line."""
