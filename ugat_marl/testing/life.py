@@ -115,8 +115,11 @@ def descendants() -> set[int]:
     unseen = [os.getpid()]
     while unseen:
         process = unseen.pop()
-        for task in Path(f"/proc/{process}/task").glob("*/children"):
-            with Listening():  # the task may have ended meanwhile
+        tasks: list[Path] = []
+        with Listening():  # the process, or one of its tasks, may have ended meanwhile
+            tasks += Path(f"/proc/{process}/task").glob("*/children")
+        for task in tasks:
+            with Listening():
                 children = {int(child) for child in task.read_text().split()}
                 unseen += children - found
                 found |= children
