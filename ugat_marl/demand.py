@@ -68,7 +68,7 @@ def check_demand(
             if own:
                 singles.read(item)
             if item.name in ("vehicle", "trip", "flow", "route"):
-                used = " ".join(item.attributes.get(key, "") for key in _ROUTED).split()
+                used = edges_used(item)
                 if not edges.issuperset(used):
                     edge = next(edge for edge in used if edge not in edges)
                     raise _unknown_edge(document, item, edge, scenario)
@@ -93,6 +93,11 @@ def check_demand(
             "check begin_s and duration_s against the departure times"
         )
     return Demand(vehicles, flows, routed)
+
+
+def edges_used(item: Tag) -> list[str]:
+    """The edges a vehicle, trip, flow or route names."""
+    return " ".join(item.attributes.get(key, "") for key in _ROUTED).split()
 
 
 def _who(item: Tag) -> str:

@@ -123,9 +123,12 @@ def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None
     for one in found:
         for other in found:
             lane, edge = lanes.get(one.lane), other.lane.rsplit("_", 1)[0]
-            if lane is None or one.kind == "exit" or one.kind == other.kind:
+            if lane is None:
                 continue
-            if edge in (lane.following if other.kind == "exit" else {lane.edge}):
-                first, behind = (other, one) if other.kind == "advance" else (one, other)
-                return first.id, behind.id
+            if other.kind == "exit":
+                behind = one.kind != "exit" and edge in lane.following
+            else:
+                behind = (one.kind, other.kind) == ("advance", "stop") and edge == lane.edge
+            if behind:
+                return one.id, other.id
     return None

@@ -70,6 +70,11 @@ class Fitted:
         return np.array([value for _, values in self.members for value in values])
 
 
+def cost_of(model: Fitted) -> float:
+    """What models are ranked by."""
+    return model.cost
+
+
 def effects_of(members: Members) -> tuple[Effect, ...]:
     """Effects of a set, in order."""
     return ordered([hypothesis.effect(values) for hypothesis, values in members])

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ugat_marl.discrepancy.fit import SETTLING_DAYS, Fitted, Fitter
+from ugat_marl.discrepancy.fit import SETTLING_DAYS, Fitted, Fitter, cost_of
 from ugat_marl.discrepancy.intervals import HALF_INTERVAL
 from ugat_marl.discrepancy.members import each_left_out
 from ugat_marl.discrepancy.residual import Tested
@@ -49,11 +49,11 @@ def pruned(
             for part in each_left_out(best.model.members)
         ]
         doubtful = [fewer[place] for place in _doubtful(best)]
-        least = min(fewer, key=_cost)
+        least = min(fewer, key=cost_of)
         if least.cost - settled(best.model).cost > NEGLIGIBLE:
             if not doubtful:
                 break
-            least = min(doubtful, key=_cost)
+            least = min(doubtful, key=cost_of)
         tested = test(least)
         enough = tested.residual.p > alpha
         # What may not be there is not named, either, where nothing suffices.
@@ -62,10 +62,6 @@ def pruned(
             break
         best = tested
     return best
-
-
-def _cost(model: Fitted) -> float:
-    return model.cost
 
 
 def _doubtful(tested: Tested) -> list[int]:

@@ -13,6 +13,7 @@ from ugat_marl.discrepancy.fit import (
     Fitted,
     Fitter,
     Members,
+    cost_of,
     effects_of,
 )
 from ugat_marl.discrepancy.hypotheses import Hypothesis, a_few, both_ways, settings_as_members
@@ -148,10 +149,10 @@ class Selector:
             best = pruned(best, self._fitter, self._kept, self.test, self._alpha)
         except OutOfTime:
             complete = False
-            cheapest = min(self._seen.values(), key=_cost, default=best.model)
+            cheapest = min(self._seen.values(), key=cost_of, default=best.model)
             if cheapest.cost < best.model.cost:
                 best = self._untested(cheapest, base)
-        return Selection(best, tuple(sorted(self._seen.values(), key=_cost)), complete)
+        return Selection(best, tuple(sorted(self._seen.values(), key=cost_of)), complete)
 
     def test(self, model: Fitted) -> Tested:
         """Simulates more days of a model and tests what it leaves."""
@@ -311,7 +312,7 @@ class Selector:
 
     def _refined(self, models: Sequence[Fitted], count: int, gap: float) -> Fitted | None:
         """The best of several models once the most promising and the best simple are fitted."""
-        ranked = sorted(models, key=_cost)
+        ranked = sorted(models, key=cost_of)
         simple = [model for model in ranked[count:] if len(model.members) == 1]
         ranked = ranked[:count] + simple[:1]
         best: Fitted | None = None
@@ -329,7 +330,3 @@ class Selector:
         if key not in self._seen or model.cost < self._seen[key].cost:
             self._seen[key] = model
         return model
-
-
-def _cost(model: Fitted) -> float:
-    return model.cost

@@ -92,28 +92,7 @@ def conclude(
         )
         return Conclusion("unknown", best, (), sentence, "more periods")
     if chance_only and selection.complete:
-        if ends := _at_an_end(best.model.members):
-            sentence = (
-                f"With {names} what is left is no more than chance, but {ends} is as far as the "
-                "effect goes: something else may be behind it."
-            )
-            return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
-        if counters := one_behind_the_other(best.model.members, site):
-            first, behind = counters
-            sentence = f"The data fit {names} and vehicles that leave the road equally well."
-            return Conclusion(
-                "not_identifiable", best, (), sentence, f"video of {first} and {behind}: do they "
-                "miss vehicles, or is there a driveway or car park that the network lacks?",
-            )  # fmt: skip
-        rivals = _rivals(selection, selector, alpha)
-        if rivals:
-            others = " or ".join(describe_members(rival.members) for rival in rivals)
-            sentence = f"The data fit {names} and {others} equally well."
-            return Conclusion(
-                "not_identifiable", best, rivals, sentence, _separating(best.model, rivals[0])
-            )
-        sentence = f"The street has {names}; with it, what is left is no more than chance."
-        return Conclusion("explained", best, (), sentence, None)
+        return _sufficient(selection, selector, alpha, site)
     if shrink >= PART:
         sentence = f"{names[:1].upper()}{names[1:]} explains {100 * shrink:.0f} % of the gap; " + (
             "something else remains that the library does not have."
@@ -122,6 +101,34 @@ def conclude(
         )
         return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
     return Conclusion("unknown", best, (), _unexplained(selection) + ".", _look_at(selection))
+
+
+def _sufficient(selection: Selection, selector: Selector, alpha: float, site: Site) -> Conclusion:
+    """The conclusion where a set of effects leaves no more than chance."""
+    best = selection.best
+    names = describe_members(best.model.members)
+    if ends := _at_an_end(best.model.members):
+        sentence = (
+            f"With {names} what is left is no more than chance, but {ends} is as far as the "
+            "effect goes: something else may be behind it."
+        )
+        return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
+    if counters := one_behind_the_other(best.model.members, site):
+        first, behind = counters
+        sentence = f"The data fit {names} and vehicles that leave the road equally well."
+        return Conclusion(
+            "not_identifiable", best, (), sentence, f"video of {first} and {behind}: do they "
+            "miss vehicles, or is there a driveway or car park that the network lacks?",
+        )  # fmt: skip
+    rivals = _rivals(selection, selector, alpha)
+    if rivals:
+        others = " or ".join(describe_members(rival.members) for rival in rivals)
+        sentence = f"The data fit {names} and {others} equally well."
+        return Conclusion(
+            "not_identifiable", best, rivals, sentence, _separating(best.model, rivals[0])
+        )
+    sentence = f"The street has {names}; with it, what is left is no more than chance."
+    return Conclusion("explained", best, (), sentence, None)
 
 
 def _unexplained(selection: Selection) -> str:

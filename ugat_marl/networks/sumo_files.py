@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
+from ugat_marl.demand import edges_used
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import Tag, parse_xml, read_bytes, write_whole
 from ugat_marl.networks.making import Draft, Fleet, Roads, Vehicles
@@ -126,7 +127,7 @@ def _leads(network: Path) -> dict[str, set[str]]:
 
 def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
     """Refuses edges that do not exist, by the file the user has, not the copy to be."""
-    used = " ".join(tag.attributes.get(key, "") for key in ("from", "to", "via", "edges")).split()
+    used = edges_used(tag)
     if leads and not leads.keys() >= set(used):  # a network without roads has its own message
         edge = next(edge for edge in used if edge not in leads)
         raise ScenarioError(
