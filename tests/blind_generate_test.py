@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.__main__ import main
-from ugat_marl.blind.busy import Busy, busy_places
+from ugat_marl.blind.busy import Busy, busy_places, telling
 from ugat_marl.blind.cases import Case, read_label, read_plan
 from ugat_marl.blind.consequence import Consequences, differing
 from ugat_marl.blind.drawing import (
@@ -30,6 +30,7 @@ from ugat_marl.blind.outside import BusStops, Driveway
 from ugat_marl.blind.run import run_cases
 from ugat_marl.blind.strengths import KINDS
 from ugat_marl.discrepancy.hypotheses import library
+from ugat_marl.discrepancy.volume import Routes
 from ugat_marl.effects import effect_from, known_effects, load
 from ugat_marl.errors import BlindTestError, OptionError, UnknownNameError
 from ugat_marl.evaluation import policy_factory
@@ -294,6 +295,21 @@ def test_the_demand_that_is_hidden_is_what_can_be_counted(single: tuple[Scenario
         assert effect is not None
         found.add(effect.record()["factor"])
     assert found == {1.3162, 0.6838}
+
+
+def test_vehicles_among_others_tell_less_than_alone() -> None:
+    # 120 of the 480 an hour on "shared" come from A: their change is as hard to see as one of
+    # 120**2 / 480 = 30 alone. On "own", where no detector is, they would be 120.
+    routes = Routes(
+        origins={"A": 120.0, "B": 360.0},
+        passing={"A": {"own": 120.0, "shared": 120.0}, "B": {"shared": 360.0}},
+        turns={},
+        joint={"own": {"own": 120.0}, "shared": {"shared": 480.0}},
+    )
+    assert telling(routes, "A", ["shared"]) == pytest.approx(30.0)
+    assert telling(routes, "A", ["shared", "own"]) == pytest.approx(120.0)
+    assert telling(routes, "B", ["shared"]) == pytest.approx(270.0)
+    assert telling(routes, "B", ["own"]) == 0.0
 
 
 @pytest.mark.parametrize(("gap_s", "shown"), [(20.0, False), (15.0, True)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from ugat_marl.discrepancy.volume import Routes
@@ -31,7 +31,7 @@ class Busy:
 
     Attributes:
         lights: Traffic lights that agents control.
-        origins: Edges where vehicles start, and how many do, per hour.
+        origins: Edges where vehicles start, and how many per hour tell of them (`telling`).
         turns: ``(from, to)`` edges of turns at traffic lights.
         closable: Lanes before a traffic light with a lane beside them.
         lanes: Lanes before a traffic light.
@@ -74,13 +74,18 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         and network.lanes[lane].length_m >= LONG_M
     ]
     places = places_of(scenario)
+    counted = {network.lanes[item.lane].edge for item in detectors}
     cars = Counter(item.edge for item in places.lanes.values() if item.cars)
     ways = {
         (edge, other) for edge in sorted(approaches) for other in places.following.get(edge, ())
     }
     return Busy(
         lights=tuple(item.id for item in network.intersections),
-        origins={x: rate for x, rate in sorted(routes.origins.items()) if rate >= BUSY_PER_HOUR},
+        origins={
+            origin: rate
+            for origin in sorted(routes.origins)
+            if (rate := telling(routes, origin, counted)) >= BUSY_PER_HOUR
+        },
         turns=tuple(
             sorted(
                 (edge, other)
@@ -97,6 +102,25 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         permitted=any(turns.get(way, 0.0) >= YIELDING_PER_HOUR for way in _yielding(network)),
         several_lanes=any(cars[edge] > 1 for edge in approaches),
     )
+
+
+def telling(routes: Routes, origin: str, counted: Collection[str]) -> float:
+    """Vehicles per hour that would tell as much of an origin if they were counted alone.
+
+    A share of `own` vehicles among `all` is told with the error of all: as by ``own**2 / all``
+    alone. The edge that tells most counts.
+
+    Args:
+        routes: Of the scenario.
+        origin: Where vehicles start.
+        counted: Edges with detectors.
+    """
+    told = (
+        own**2 / routes.joint[edge][edge]
+        for edge, own in routes.passing[origin].items()
+        if edge in counted
+    )
+    return max(told, default=0.0)
 
 
 def _yielding(network: Network) -> set[tuple[str, str]]:
