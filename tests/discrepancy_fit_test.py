@@ -70,12 +70,19 @@ class World(Engine):
         return day(number, values)
 
 
-def a_fitter(truth: dict[str, float], street: int, days: int = 8) -> Fitter:
-    world = World()
-    base_tallies = [item.tally for item in world.replicates((), range(80))]
-    base = Reference(POOLS, base_tallies)
+def played(world: World) -> dict[int, Tally]:
+    """Days of the scenario as it is."""
+    return {number: item.tally for number, item in world.ordinary((), range(80)).items()}
+
+
+def a_fitter(
+    truth: dict[str, float], street: int, days: int = 8, world: World | None = None
+) -> Fitter:
+    world = world or World()
+    base_days = played(world)
+    base = Reference(POOLS, list(base_days.values()))
     data = [day(number, truth, street) for number in range(5)]
-    return Fitter(world, POOLS, base, base_tallies, data, days=days, price=14.0, speeds=True)
+    return Fitter(world, POOLS, base, base_days, data, days=days, price=14.0, speeds=True)
 
 
 def start(*members: tuple[Hypothesis, float]) -> Members:
@@ -171,6 +178,29 @@ def test_a_fit_that_stopped_early_takes_a_last_step() -> None:
     assert len(found.tallies) == SETTLING_DAYS > len(early.tallies)
 
 
+class LocksUp(World):
+    """Traffic stands still on one day of every model but the scenario as it is."""
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        found = super().played(number, effects)
+        found.bins[0] = 1000.0 + 10.0 * np.sin(number)
+        if effects and number == 3:
+            found.bins[0] = 500.0
+            found.sums[:WIDTH, 0, 0] += 3000.0
+        return found
+
+
+def test_a_day_on_which_a_model_locks_up_is_no_part_of_it() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=14, world=LocksUp())
+    fitter.engine.day_to_day = 10.0
+    model = fitter.simulate(start((HEADWAY, 1.5)))
+    assert list(model.days) == [0, 1, 2, 4, 5, 6, 7]
+    mean = model.reference.blocks["network"].mean[0, :WIDTH]
+    assert mean == pytest.approx(20.0 + 0.5 * SLOPES["headway"], abs=0.35)
+    found = fitter.settled(fitter.refine(model), np.array([0.03]))
+    assert found.values[0] == pytest.approx(1.43, abs=0.09)
+
+
 def test_a_fit_within_its_errors_stays_where_it_is() -> None:
     fitter = a_fitter({"headway": 1.43}, street=15)
     found = fitter.settled(fitter.simulate(start((HEADWAY, 1.46))), np.array([1.0]))
@@ -234,10 +264,10 @@ def a_surge(begin_s: float, end_s: float) -> Members:
 
 def a_fitter_of_windows(truth: tuple[float, float]) -> Fitter:
     world = Windows()
-    base_tallies = [item.tally for item in world.replicates((), range(80))]
+    base_days = played(world)
     data = [with_surge(number, 0.5 * surge(*truth), 18) for number in range(5)]
-    base = Reference(POOLS, base_tallies)
-    return Fitter(world, POOLS, base, base_tallies, data, days=8, price=14.0, speeds=True)
+    base = Reference(POOLS, list(base_days.values()))
+    return Fitter(world, POOLS, base, base_days, data, days=8, price=14.0, speeds=True)
 
 
 def window_of(members: Members) -> tuple[float, float]:

@@ -34,7 +34,7 @@ class Ledger:
         if days is None:
             cost += FEW + self.luck.get(names(members), 0.0)
         blank = cast(Any, None)
-        return Fitted(members, (), blank, blank, cost)
+        return Fitted(members, {}, blank, blank, cost)
 
     def refine(self, start: Fitted, rounds: int) -> Fitted:
         del rounds

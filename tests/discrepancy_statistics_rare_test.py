@@ -46,8 +46,18 @@ def test_a_day_on_which_traffic_stood_still_is_set_aside() -> None:
 
 def test_where_traffic_often_stands_still_that_is_part_of_the_model() -> None:
     counts = 1000.0 + 30.0 * np.random.default_rng(41).standard_normal(60)
-    counts[:4] = 600.0  # more than one day in twenty
+    counts[:7] = 600.0  # more than one day in ten
     assert locked_up(counted(counts)) == []
+
+
+def test_few_days_are_judged_by_what_is_usual() -> None:
+    counts = np.array([1000.0, 1001.0, 1002.0, 1000.0, 1030.0, 999.0])
+    assert locked_up(counted(counts)) == [4]
+    assert locked_up(counted(counts), usual=30.0) == []
+    counts[2] = 600.0
+    assert locked_up(counted(counts), usual=30.0) == [2]
+    counts[4] = 600.0
+    assert locked_up(counted(counts), usual=30.0) == [], "two of six are no exception"
 
 
 def test_only_vehicles_tell_whether_traffic_stood_still() -> None:

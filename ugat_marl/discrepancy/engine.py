@@ -23,6 +23,7 @@ from ugat_marl.discrepancy.arrivals import Due, corrected
 from ugat_marl.discrepancy.features import FEATURES, Tally, tally
 from ugat_marl.discrepancy.replay import WHEN, Day, Replay
 from ugat_marl.discrepancy.site import Greens, Site
+from ugat_marl.discrepancy.statistics import locked_up
 from ugat_marl.discrepancy.unmeasured import Unmeasured
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
@@ -80,6 +81,8 @@ class Engine:
 
     set_aside: frozenset[int] = frozenset()
     """Numbers of days that `first` passes over."""
+    day_to_day: float = 0.0
+    """How much the vehicles counted on a day differ at least from day to day."""
 
     def __init__(
         self,
@@ -124,6 +127,24 @@ class Engine:
         """The numbers of the first days; those that were set aside are passed over."""
         numbers = (number for number in itertools.count() if number not in self.set_aside)
         return list(itertools.islice(numbers, count))
+
+    def ordinary(
+        self,
+        effects: Sequence[Effect],
+        numbers: Sequence[int],
+        advance: Callable[[], None] | None = None,
+    ) -> dict[int, Replicate]:
+        """Simulated days of a model by number, but for a few on which traffic stood still.
+
+        Args:
+            effects: The model.
+            numbers: Of its days.
+            advance: Called after every one.
+        """
+        days = self.replicates(effects, numbers, advance)
+        aside = locked_up([day.tally for day in days], self.day_to_day)
+        known = enumerate(zip(numbers, days, strict=True))
+        return {number: day for place, (number, day) in known if place not in aside}
 
     def replicates(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,17 +47,22 @@ class Fitted:
 
     Attributes:
         members: Its effects.
-        tallies: Its simulated days.
+        days: Its simulated days by their numbers.
         reference: Its statistics.
         distance: From the data that were fitted.
         cost: Distance, penalty for noise, and price of the effects: less is better.
     """
 
     members: Members
-    tallies: tuple[Tally, ...]
+    days: Mapping[int, Tally]
     reference: Reference
     distance: Distance
     cost: float
+
+    @property
+    def tallies(self) -> tuple[Tally, ...]:
+        """Its simulated days."""
+        return tuple(self.days.values())
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -87,12 +92,11 @@ class Fitter:
         engine: Simulates.
         pools: How places pool.
         base: Statistics of the scenario as it is.
-        base_tallies: Its simulated days.
+        base_days: Its simulated days by their numbers.
         data: Tallies of the periods to fit.
         days: Simulated days behind each evaluation.
         price: What every effect must gain.
         speeds: Whether speeds were measured.
-        tick: Called after every simulated day.
     """
 
     def __init__(
@@ -100,39 +104,37 @@ class Fitter:
         engine: Engine,
         pools: Pools,
         base: Reference,
-        base_tallies: Sequence[Tally],
+        base_days: Mapping[int, Tally],
         data: Sequence[Tally],
         *,
         days: int,
         price: float,
         speeds: bool,
-        tick: Callable[[], None] | None = None,
     ) -> None:
         self.engine = engine
         self.pools = pools
         self.base = base
-        self.base_tallies = tuple(base_tallies)
+        self.base_days = base_days
         self.data = tuple(data)
         self.days = days
         self.price = price
         self.speeds = speeds
-        self.tick = tick
 
     def simulate(self, members: Members, days: int | None = None) -> Fitted:
         """Simulates a set of effects and measures its distance from the data."""
-        count = min(days or self.days, len(self.base_tallies))
-        found = self.engine.replicates(effects_of(members), self.engine.first(count), self.tick)
-        tallies = tuple(item.tally for item in found)
+        numbers = list(self.base_days)[: days or self.days]
+        found = self.engine.ordinary(effects_of(members), numbers)
         reference = Reference(
             self.pools,
-            tallies,
+            [day.tally for day in found.values()],
             speeds=self.speeds,
             prior=self.base,
-            paired=self.base_tallies[:count],
+            paired=[self.base_days[number] for number in found],
         )
         distance = reference.distance(self.data, relative_to=self.base)
         cost = distance.total + distance.penalty + self.price * len(members)
-        return Fitted(members, tallies, reference, distance, cost)
+        known = {number: day.tally for number, day in found.items()}
+        return Fitted(members, known, reference, distance, cost)
 
     def refine(self, start: Fitted, rounds: int = 3) -> Fitted:
         """Gauss-Newton steps from a simulated model, with derivatives by finite differences."""
@@ -266,13 +268,13 @@ class Fitter:
         return found
 
     def difference(
-        self, model: Fitted, members: Members
+        self, model: Fitted, members: Members, days: int | None = None
     ) -> tuple[dict[str, Array], dict[str, Array]]:
         """What other members change in the statistics on the same days; its variances."""
-        before = model.tallies[: self.days]
-        numbers = self.engine.first(len(before))
-        days = self.engine.replicates(effects_of(members), numbers, self.tick)
-        return shift(self.pools, [day.tally for day in days], before)
+        numbers = list(model.days)[: days or self.days]
+        found = self.engine.ordinary(effects_of(members), numbers)
+        before = [model.days[number] for number in found]
+        return shift(self.pools, [day.tally for day in found.values()], before)
 
     def _moved(self, model: Fitted, step: Array) -> Members:
         """The model's values after a step, in range and not too far at once."""

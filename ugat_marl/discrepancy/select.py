@@ -24,7 +24,6 @@ from ugat_marl.discrepancy.members import merged, names_of
 from ugat_marl.discrepancy.pruning import pruned
 from ugat_marl.discrepancy.residual import Null, Tested
 from ugat_marl.discrepancy.search import Ray, between, promising, propose, squared_gap
-from ugat_marl.discrepancy.statistics import shift
 from ugat_marl.discrepancy.whitening import Whitener
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
 from ugat_marl.measured.data import Period
@@ -169,8 +168,8 @@ class Selector:
 
     def _days(self, model: Fitted) -> list[Tally]:
         engine = self._fitter.engine
-        found = engine.replicates(model.effects, engine.first(self._effort.test))
-        return [item.tally for item in found]
+        found = engine.ordinary(model.effects, engine.first(self._effort.test))
+        return [item.tally for item in found.values()]
 
     def _untested(self, model: Fitted, base: Tested) -> Tested:
         """A model for whose test there was no time: its errors are unknown."""
@@ -278,21 +277,19 @@ class Selector:
                 jobs += both_ways(hypothesis, values)
         days = self._effort.bank
         rays: list[Ray] = []
-        engine = self._fitter.engine
-        before = model.tallies[:days]
-        numbers = engine.first(len(before))
-        models = [effects_of(merged(model.members, ((h, level),))) for h, level, _ in jobs]
+        numbers = list(model.days)[:days]
+        models = [merged(model.members, ((h, level),)) for h, level, _ in jobs]
         with self._reporter.task(f"round {number + 1}: {what}", len(jobs)) as advance:
-            engine.prepare([(effects, numbers) for effects in models], advance)
-        for (hypothesis, level, origin), effects in zip(jobs, models, strict=True):
+            prepared = [(effects_of(members), numbers) for members in models]
+            self._fitter.engine.prepare(prepared, advance)
+        for (hypothesis, level, origin), members in zip(jobs, models, strict=True):
             try:
-                found = engine.replicates(effects, numbers)
+                difference, variance = self._fitter.difference(model, members, days)
             except (SimulatorError, OptionError, ScenarioError) as error:
                 # it cannot be there: the lane is too short to park on, say
                 if what == "library":
                     self._reporter.say(f"note: {hypothesis.name} left out: {error}")
                 continue
-            difference, variance = shift(self._fitter.pools, [item.tally for item in found], before)
             rays.append(Ray(hypothesis, level, difference, variance, origin))
         return rays
 

@@ -27,6 +27,7 @@ from ugat_marl.discrepancy.statistics import (
     Pools,
     Reference,
     added,
+    day_to_day,
     locked_up,
     shift,
 )
@@ -189,7 +190,9 @@ class Study:
                 self.other_days.replicates([], numbers, advance)  # remembered for `doubt`
         aside = locked_up([day.tally for day in days])
         self.engine.set_aside = frozenset(aside)
-        tallies = tuple(day.tally for number, day in enumerate(days) if number not in aside)
+        known = {number: day.tally for number, day in enumerate(days) if number not in aside}
+        tallies = list(known.values())
+        self.engine.day_to_day = day_to_day(tallies)
         reference = Reference(self.pools, tallies, speeds=self.speeds, doubt=self.doubt)
         counts = sum(float(day.bins[:3].sum()) for day in tallies) / len(tallies)
         if counts < 1.0:
@@ -198,7 +201,7 @@ class Study:
                 "measured lanes; check lane_id in detectors.csv, and the demand of the scenario"
             )
         distance = reference.distance(self.fit)
-        model = Fitted((), tallies, reference, distance, distance.total)
+        model = Fitted((), known, reference, distance, distance.total)
         null = self.null(tallies, len(self.fit))
         return Tested(model, null, null.test(self.fit), np.empty(0), {})
 
@@ -259,7 +262,7 @@ class Study:
             self.engine,
             self.pools,
             base.model.reference,
-            base.model.tallies,
+            base.model.days,
             self.fit,
             days=self.effort.fit,
             price=PRICE,

@@ -50,8 +50,8 @@ def verify(study: Study, base: Tested, best: Tested) -> Verification:
         days = model.model.tallies
         if model.model.members:
             numbers = study.engine.first(study.effort.test)
-            found = study.engine.replicates(model.model.effects, numbers)
-            days = tuple(day.tally for day in found)
+            found = study.engine.ordinary(model.model.effects, numbers)
+            days = tuple(day.tally for day in found.values())
         return study.null(days, count)
 
     before = null(base).test(study.heldout)
@@ -180,7 +180,7 @@ def travel_times(study: Study, best: Tested) -> dict[str, float]:
     numbers = study.engine.first(min(study.effort.test, study.effort.base))
 
     def mean(effects: tuple[Effect, ...]) -> float:
-        found = study.engine.replicates(effects, numbers)
-        return float(np.nanmean([day.travel_time_s for day in found]))
+        found = study.engine.ordinary(effects, numbers)
+        return float(np.nanmean([day.travel_time_s for day in found.values()]))
 
     return {"before_s": mean(()), "after_s": mean(best.model.effects)}
