@@ -23,6 +23,7 @@ from ugat_marl.network import Network
 from ugat_marl.report import diagnosis_words as words
 from ugat_marl.report.diagnosis_page import commands_on_page, diagnosis_page, write_diagnosis_page
 from ugat_marl.report.diagnosis_tables import diagnosis_summary
+from ugat_marl.wording import STATISTICS, statistic
 
 LANES = ("S_C_0", "W_C_0", "C_N_0", "C_E_0")
 NASTY = "</style><script>alert(1)</script>\"'><img src=x onerror=alert(2)>&amp;"
@@ -185,6 +186,17 @@ def test_a_partial_result_says_so_first(verdict: str, network: Network) -> None:
     assert "The same command goes on" in lines
 
 
+def test_the_page_does_not_contradict_its_sentence(network: Network) -> None:
+    cut = diagnosis_page(record_of("partially_explained", complete=False), network)
+    assert not any(text in Page(cut).text for text in words.MEANINGS.values())
+    # A value at its end, where what is left is no more than chance, is partially explained, too.
+    assert "more than chance" not in words.MEANINGS["partially_explained"]
+    logged = record_of("explained")["effects"][:1]
+    found = Page(diagnosis_page(record_of("unknown", effects=logged), network)).text
+    assert "No effect is named" not in found
+    assert "stands in the log of the signals" in found
+
+
 def test_a_result_without_any_simulation_has_a_page(network: Network) -> None:
     record = record_of("unknown", complete=False, heldout=None, where=[], alternatives=[])
     record["evidence"] = {}
@@ -299,10 +311,8 @@ def test_long_names_do_not_widen_the_summary() -> None:
 
 
 def test_every_statistic_has_words() -> None:
-    assert set(words.STATISTICS) == {name for name, _, _ in FEATURES} | {"occupied"}
-    assert words.statistic("count_stop in time") == (
-        "flow at stop detectors in some stretch of time"
-    )
+    assert set(STATISTICS) == {name for name, _, _ in FEATURES} | {"occupied"}
+    assert statistic("count_stop in time") == ("flow at stop detectors in some stretch of time")
 
 
 @pytest.mark.parametrize(

@@ -105,12 +105,41 @@ def test_records_can_be_written(hypothesis: Hypothesis, values: tuple[float, ...
 
 
 def test_effects_in_words() -> None:
-    assert describe_effect(HEADWAY, (1.45,)) == "headway of 1.45 s"
-    assert describe_effect(SURGE, (1.8,)) == "demand surge at S_C from 300 s to 900 s of 1.8"
+    assert describe_effect(HEADWAY, (1.45,)) == "headway of 1.45 s (scenario: 1)"
+    assert describe_effect(SURGE, (1.8,)) == "demand surge at S_C from 0:05:00 to 0:15:00 × 1.8"
+    assert describe_effect(TURNING, (0.125,)) == "turning at a → b of 12.5 %"
     assert describe_effect(LATE, (2.0,)) == "late green of 2 s"
+    assert describe_effect(MODEL, ()) == "driver model IDM"
+    swapped = Hypothesis("swapped", (("one", "a"), ("other", "b")), (), ((),), None)
+    assert describe_effect(swapped, ()) == "swapped detectors at a → b"
     assert describe_members(((HEADWAY, (1.4,)), (LATE, (2.0,)))) == (
-        "headway of 1.4 s and late green of 2 s"
+        "headway of 1.4 s (scenario: 1) and late green of 2 s"
     )
+    three = ((HEADWAY, (1.4,)), (LATE, (2.0,)), (SURGE, (2.0,)))
+    assert describe_members(three).count(" and ") == 1
+    assert "(scenario: 1), late green of 2 s and demand surge" in describe_members(three)
+
+
+def test_units_are_written_as_people_write_them() -> None:
+    slow = Hypothesis("acceleration", (), ("mps2",), ((1.6,),), (2.6,))
+    assert describe_effect(slow, (0.497,)) == "acceleration of 0.497 m/s² (scenario: 2.6)"
+
+
+def test_what_to_measure_next_is_said_in_words() -> None:
+    z = np.zeros((1, len(FEATURES)))
+    z[0, [name for name, *_ in FEATURES].index("over2-3")] = 9.0
+    model = SimpleNamespace(
+        members=((HEADWAY, (1.4,)),), distance=SimpleNamespace(z={"network": z})
+    )
+    best: Any = SimpleNamespace(model=model, residual=SimpleNamespace(p=0.0, distance=90.0))
+    won: Any = SimpleNamespace(
+        before=SimpleNamespace(p=0.0, distance=1000.0), after=best.residual, shrink=0.9
+    )
+    selector: Any = None
+    found = conclude(best, Selection(best, (), complete=True), selector, won, 0.05, SITE)
+    assert found.verdict == "partially_explained"
+    assert found.next_measurement is not None
+    assert "time over detector, 2nd and 3rd (discharge)" in found.next_measurement
 
 
 @pytest.mark.parametrize("complete", [True, False])

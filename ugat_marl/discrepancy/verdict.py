@@ -18,6 +18,7 @@ from ugat_marl.discrepancy.select import Selection, Selector
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.verify import Verification
 from ugat_marl.effects import known_effects
+from ugat_marl.wording import amount, clock, listed, statistic
 
 Verdict = Literal[
     "no_discrepancy", "explained", "not_identifiable", "partially_explained", "unknown"
@@ -30,6 +31,8 @@ RIVALS_TESTED = 2
 FIT_LEVEL = 0.01
 """The fitted periods must not contradict the model more than this; the held-out ones decide."""
 PART = 0.5
+NOUNS = {"swapped": "swapped detectors", "stuck": "a stuck detector"}
+"""Effects whose names are no nouns, in a sentence."""
 CONFIRMED = 10.0
 """What the effects must take off the distance of the held-out periods."""
 
@@ -94,7 +97,8 @@ def conclude(
     if chance_only and selection.complete:
         return _sufficient(selection, selector, alpha, site)
     if shrink >= PART:
-        sentence = f"{names[:1].upper()}{names[1:]} explains {100 * shrink:.0f} % of the gap; " + (
+        verb = "explains" if len(best.model.members) == 1 else "explain"
+        sentence = f"{names[:1].upper()}{names[1:]} {verb} {100 * shrink:.0f} % of the gap; " + (
             "something else remains that the library does not have."
             if selection.complete
             else "the budget ended before the rest was examined."
@@ -122,12 +126,13 @@ def _sufficient(selection: Selection, selector: Selector, alpha: float, site: Si
         )  # fmt: skip
     rivals = _rivals(selection, selector, alpha)
     if rivals:
-        others = " or ".join(describe_members(rival.members) for rival in rivals)
-        sentence = f"The data fit {names} and {others} equally well."
+        others = "; or ".join(describe_members(rival.members) for rival in rivals)
+        sentence = f"The data fit either equally well: {names}; or {others}."
         return Conclusion(
             "not_identifiable", best, rivals, sentence, _separating(best.model, rivals[0])
         )
-    sentence = f"The street has {names}; with it, what is left is no more than chance."
+    them = "it" if len(best.model.members) == 1 else "them"
+    sentence = f"The street has {names}; with {them}, what is left is no more than chance."
     return Conclusion("explained", best, (), sentence, None)
 
 
@@ -188,8 +193,8 @@ def _look_at(selection: Selection) -> str | None:
         return None
     z = selection.best.model.distance.z["network"][0]
     strongest = [FEATURES[int(i)][:2] for i in np.argsort(-np.abs(z))[:3] if z[int(i)]]
-    listed = ", ".join(f"{name} ({regime})" for name, regime in strongest)
-    return f"trajectories or video where most is left over: {listed}"
+    told = ", ".join(f"{statistic(name)} ({regime})" for name, regime in strongest)
+    return f"trajectories or video where most is left over: {told}"
 
 
 def _separating(best: Fitted, rival: Fitted) -> str:
@@ -201,28 +206,31 @@ def _separating(best: Fitted, rival: Fitted) -> str:
     index = int(np.argmax(np.abs(z)))
     name, regime, _ = FEATURES[index]
     periods = int(np.ceil((5.0 / max(abs(float(z[index])), 0.05)) ** 2))
-    return f"{name} ({regime}) differs most between them: about {periods} periods would decide"
+    many = "one period" if periods == 1 else f"{periods} periods"
+    return f"{statistic(name)} ({regime}) differs most between them: about {many} would decide"
 
 
 def describe_members(members: Members) -> str:
     """Effects in words: name, place, window, values."""
-    return " and ".join(describe_effect(hypothesis, values) for hypothesis, values in members)
+    return listed([describe_effect(hypothesis, values) for hypothesis, values in members])
 
 
 def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
     """One effect in words."""
     place, window = place_and_window(hypothesis)
     ranges = known_effects()[hypothesis.name].ranges
-    numbers = [
-        f"{value:.3g} {ranges[name].unit}".rstrip()
-        for name, value in zip(hypothesis.free, values, strict=True)
-    ]
-    text = hypothesis.name.replace("_", " ")
+    text = NOUNS.get(hypothesis.name, hypothesis.name.replace("_", " "))
     if place and place != "*":
-        text += f" at {place}"
+        text += "" if hypothesis.name == "driver_model" else " at"
+        text += f" {place.replace('>', ' → ')}"
     if window:
-        text += f" from {window[0]:.0f} s to {window[1]:.0f} s"
-    return text + (f" of {', '.join(numbers)}" if numbers else "")
+        text += f" from {clock(window[0])} to {clock(window[1])}"
+    nominal = hypothesis.nominal or (0.0,) * len(values)
+    for name, value, own in zip(hypothesis.free, values, nominal, strict=True):
+        text += amount(name, value, ranges[name].unit)
+        if own and name not in ("factor", "share"):
+            text += f" (scenario: {own:.3g})"
+    return text
 
 
 def place_and_window(hypothesis: Hypothesis) -> tuple[str | None, list[float] | None]:

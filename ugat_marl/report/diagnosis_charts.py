@@ -8,6 +8,7 @@ from html import escape
 
 from ugat_marl.report import diagnosis_words as words
 from ugat_marl.report.diagnosis_words import Record
+from ugat_marl.wording import statistic
 
 BAND = 2.0
 """Half of the noise band, in standard deviations."""
@@ -46,7 +47,7 @@ def strips(rows: Sequence[Record], most: float, *, after: bool) -> str:
         text += f"\u00a0±\u00a0{words.number(row['noise'], 2)}"
         text += f"\u00a0{row['unit']}" if row["unit"] else ""
         parts.append(
-            f'<div class="strip"><div>{escape(words.statistic(row["statistic"]))}'
+            f'<div class="strip"><div>{escape(statistic(row["statistic"]))}'
             f"<small>{escape(row['regime'])} · {escape(text)}</small></div>"
             f"{_strip(row, scale, after=after)}</div>"
         )

@@ -86,8 +86,8 @@ def _head(record: Record) -> str:
     name = escape(words.VERDICTS.get(verdict, verdict))
     parts.append(f'<span class="badge {escape(verdict, quote=True)}">{name}</span>')
     parts.append(f"<h1>{escape(record['sentence'])}</h1>")
-    if record.get("complete", True) or record["effects"]:
-        parts.append(f'<p class="soft">{escape(words.MEANINGS.get(verdict, ""))}</p>')
+    if meaning := words.meaning(record):
+        parts.append(f'<p class="soft">{escape(meaning)}</p>')
     if record.get("next_measurement"):
         text = f"What would tell: {record['next_measurement']}."
         parts.append(f'<p class="note">{escape(text)}</p>')

@@ -9,6 +9,7 @@ from typing import Any
 
 from ugat_marl.report import diagnosis_words as words
 from ugat_marl.report.diagnosis_words import Record
+from ugat_marl.wording import statistic
 
 _PLACES = 10
 _NUMBERS = frozenset(
@@ -104,7 +105,7 @@ def _where(items: Sequence[Record]) -> str:
         (
             words.disagreement_place(item),
             item["regime"],
-            words.statistic(item["statistic"]),
+            statistic(item["statistic"]),
             f"{words.signed(item['size'])} {item['unit']}".rstrip(),
             words.signed(item["z"]),
             words.window(item.get("window")),

@@ -55,6 +55,7 @@ th { text-align: left; font-weight: 600; font-size: .85rem; vertical-align: bott
 th, td { padding: .3rem .7rem .3rem 0; border-bottom: 1px solid var(--line); }
 td { vertical-align: top; }
 td:not(.n, [data-label=rank]) { min-width: 5.6rem; }
+td[data-label=rank] { white-space: nowrap; }
 .n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 tr.best td { font-weight: 600; }
 details { margin: .6rem 0; }

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from ugat_marl.report import diagnosis_words as words
 from ugat_marl.report.diagnosis_words import Record
+from ugat_marl.wording import statistic
 
 _SHOWN = 3
 
@@ -66,7 +67,7 @@ def _where(record: Record) -> Table:
     table.add_column("z", justify="right", no_wrap=True)
     for item in words.strongest(record, _SHOWN):
         size = f"{words.signed(item['size'])} {item['unit']}".rstrip()
-        what = f"{item['regime']}: {words.statistic(item['statistic'])}"
+        what = f"{item['regime']}: {statistic(item['statistic'])}"
         if item.get("window"):
             what += f", {words.window(item['window'])}"
         row = (words.disagreement_place(item), what, size, words.signed(item["z"]))

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from ugat_marl.wording import clock
+
 Record = Mapping[str, Any]
 """The content of ``diagnosis.json``, or a part of it."""
 
@@ -20,72 +22,25 @@ VERDICTS = {
 MEANINGS = {
     "no_discrepancy": "The scenario as it is could have made these data. That does not say that it "
     "is right in what the data do not show.",
-    "explained": "With these effects the simulation could have made the held-out data, and no "
-    "other explanation of the library comes close.",
+    "explained": "With these effects the simulation could have made the data they were judged "
+    "on, and no other explanation of the library comes close.",
     "not_identifiable": "Several explanations fit equally well. The corrected scenario holds the "
     "one listed here; which one is true takes another measurement.",
-    "partially_explained": "These effects take off most of the gap, but what is left is more than "
-    "chance: something is missing that the library does not have.",
+    "partially_explained": "These effects take off most of the gap, and yet they are not the whole "
+    "explanation. What is missing may bend their values.",
     "unknown": "Simulation and measurement disagree, and nothing in the library accounts for it. "
-    "No effect is named, since any name would be a guess.",
+    "Any name would be a guess.",
 }
 
-STATISTICS = {
-    "lost": "green begins until 1st queued vehicle is across",
-    "lost_trend": "time to cross of 1st: change over the period",
-    "gap2": "gap, 1st to 2nd queued vehicle",
-    "gap3": "gap, 2nd to 3rd",
-    "gap4-5": "gaps before 4th and 5th",
-    "gap6-8": "gaps before 6th to 8th",
-    "gap9+": "gaps before 9th and later",
-    "gap_spread": "distance of queue gaps from 2 s",
-    "gap_short": "share of queue gaps below 1.7 s",
-    "gap_long": "share of queue gaps above 2.6 s",
-    "gap_permitted": "queue gaps where green yields",
-    "speed1": "speed of 1st queued vehicle",
-    "speed2": "speed of 2nd queued vehicle",
-    "speed3": "speed of 3rd queued vehicle",
-    "speed4-5": "speed of 4th and 5th",
-    "speed6-8": "speed of 6th to 8th",
-    "over1": "time over detector, 1st, from green",
-    "over2-3": "time over detector, 2nd and 3rd",
-    "over4+": "time over detector, 4th and later",
-    "queued": "share of greens that begin with a queue",
-    "discharged": "queued vehicles per green",
-    "platoon_gap": "gap in moving platoons",
-    "platoon_short": "share of platoon gaps below 1.6 s",
-    "platoon_middle": "share of platoon gaps below 2.2 s",
-    "platoon_time": "time over detector in platoons",
-    "free_speed": "free speed",
-    "free_speed_spread": "distance of free speeds from the limit",
-    "free_fast": "share of free vehicles 5 % above the limit",
-    "free_time": "time over detector, free vehicles",
-    "red_speed": "speed of those who approach red",
-    "red_slow": "share of slow ones who approach red",
-    "red_time": "time over detector, approaching red",
-    "yellow_crossings": "vehicles per yellow",
-    "late_crossings": "vehicles per change, first 2 s of red",
-    "red_crossings": "vehicles per change, later in red",
-    "last_crossing": "crossings after green: how late",
-    "vehicle_length": "length of vehicles",
-    "long_vehicles": "share of vehicles above 8 m",
-    "occupied_in_red": "advance detector occupied in red",
-    "occupied_in_green": "advance detector occupied in green",
-    "queue_over": "share of greens with queue on advance detector",
-    "count_advance": "flow at advance detectors",
-    "count_stop": "flow at stop detectors",
-    "count_exit": "flow at exit detectors",
-    "kept_to_stop": "vehicles at stop per vehicle at advance",
-    "kept_to_exit": "vehicles at exit per vehicle at stop",
-    "occupied": "occupied time of advance detector",
-}
-"""What the statistics are, in words; those in time have " in time" behind their names."""
 
-
-def statistic(name: str) -> str:
-    """A statistic in words; its own name where none are known."""
-    base = name.removesuffix(" in time")
-    return STATISTICS.get(base, base) + (" in some stretch of time" if base != name else "")
+def meaning(record: Record) -> str:
+    """What the verdict means; of a search that was cut short the sentence says it all."""
+    if not record.get("complete", True):
+        return ""
+    text = MEANINGS.get(str(record["verdict"]), "")
+    if record["verdict"] == "unknown" and record["effects"]:
+        text += " What is listed here stands in the log of the signals."
+    return text
 
 
 def effect_name(item: Record) -> str:
@@ -102,13 +57,6 @@ def place(item: Record) -> str:
 def window(span: Sequence[float] | None) -> str:
     """A stretch of time on the scenario's clock, as h:mm:ss."""
     return "" if span is None else f"{clock(span[0])} – {clock(span[1])}"
-
-
-def clock(seconds: float) -> str:
-    """A time of the scenario's clock as h:mm:ss."""
-    whole = round(seconds)
-    sign, whole = ("-" if whole < 0 else ""), abs(whole)
-    return f"{sign}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
 def values(item: Record, *, intervals: bool = True) -> str:
