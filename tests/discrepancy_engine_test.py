@@ -272,6 +272,19 @@ def test_progress_is_told_day_by_day(scenario: Scenario, site: Site) -> None:
     assert len(told) == 5
 
 
+def test_work_of_unknown_length_is_told_by_the_days_it_adds(scenario: Scenario, site: Site) -> None:
+    made, _ = an_engine(scenario, site, None)
+    made.replicates((), range(3))
+    told: list[int] = []
+    with made.watched(lambda: told.append(1), 4):
+        made.replicates((), range(5))  # three of them are known
+        assert len(told) == 2
+        made.prepare([(HEADWAY, range(9))])
+        assert len(told) == 4
+    made.replicates((), range(7))
+    assert len(told) == 4
+
+
 def test_measured_periods_are_tallied_under_their_own_signals(
     scenario: Scenario, site: Site
 ) -> None:

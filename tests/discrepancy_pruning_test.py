@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -12,6 +14,7 @@ from ugat_marl.discrepancy import residual
 from ugat_marl.discrepancy.fit import Fitted, Fitter, Members
 from ugat_marl.discrepancy.hypotheses import Hypothesis
 from ugat_marl.discrepancy.pruning import NEGLIGIBLE, pruned
+from ugat_marl.progress import Advance, Silent
 
 HEADWAY = (Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05), (1.5,))
 DEMAND = (Hypothesis("demand_level", (), ("factor",), ((1.2,),), (1.0,), 0.02), (0.95,))
@@ -131,3 +134,20 @@ def test_an_effect_too_weak_to_matter_is_dropped() -> None:
     both = ("headway", "demand_level")
     ledger = Ledger({both: 1000.0, ("headway",): 9000.0}, {both: 0.9, ("headway",): 0.0})
     assert ledger.left(HEADWAY, weak) == (HEADWAY,)
+
+
+def test_progress_is_told_of_every_smaller_set() -> None:
+    both = ("headway", "demand_level")
+    ledger = Ledger({both: 1000.0, ("headway",): 1900.0, ("demand_level",): 9000.0}, {both: 0.9})
+    best = ledger.with_chance(ledger.simulate((HEADWAY, DEMAND), 16))
+    notes: list[str] = []
+
+    class Heard(Silent):
+        @contextlib.contextmanager
+        def task(self, name: str, total: int) -> Iterator[Advance]:
+            assert (name, total) == ("without single effects", 2)
+            yield lambda note="": notes.append(note)
+
+    fitter = cast(Fitter, cast(object, ledger))
+    pruned(best, fitter, lambda model: model, ledger.test, 0.05, Heard())
+    assert sorted(notes) == ["demand_level", "headway"]

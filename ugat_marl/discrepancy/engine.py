@@ -11,7 +11,7 @@ import time
 import zipfile
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -113,6 +113,7 @@ class Engine:
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in site.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
+        self._known_by: Callable[[], None] | None = None
 
     @property
     def known(self) -> int:
@@ -122,6 +123,26 @@ class Engine:
     def measured(self, periods: Sequence[Period]) -> list[Tally]:
         """Tallies of measured periods."""
         return [tally(self.site, period, self.site.greens(period)) for period in periods]
+
+    @contextlib.contextmanager
+    def watched(self, advance: Callable[[], None], most: int) -> Iterator[None]:
+        """Tells of days as they become known, for work of which nobody knows how many it takes.
+
+        Args:
+            advance: Called after each of them.
+            most: How often at most.
+        """
+        calls = iter(range(most))
+
+        def known() -> None:
+            if next(calls, None) is not None:
+                advance()
+
+        self._known_by = known
+        try:
+            yield
+        finally:
+            self._known_by = None
 
     def first(self, count: int) -> list[int]:
         """The numbers of the first days; those that were set aside are passed over."""
@@ -225,6 +246,7 @@ class Engine:
 
     def _one(self, effects: tuple[Effect, ...], number: int) -> Replicate:
         key = self._key(effects, number)
+        new = key not in self._known
         found = self._known.get(key) or self._remembered(key)
         if found is None:
             others = tuple(effect for effect in effects if not isinstance(effect, WHEN))
@@ -234,6 +256,8 @@ class Engine:
                 found = self._counted(effects, number)
             self._remember(key, found)
         self._known[key] = found
+        if (tell := self._known_by) is not None and new:
+            tell()
         return found
 
     def _counted(self, effects: tuple[Effect, ...], number: int) -> Replicate:

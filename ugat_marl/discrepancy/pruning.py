@@ -8,8 +8,9 @@ import numpy as np
 
 from ugat_marl.discrepancy.fit import SETTLING_DAYS, Fitted, Fitter, cost_of
 from ugat_marl.discrepancy.intervals import HALF_INTERVAL
-from ugat_marl.discrepancy.members import each_left_out
+from ugat_marl.discrepancy.members import each_left_out, names_of
 from ugat_marl.discrepancy.residual import Tested
+from ugat_marl.progress import Reporter, Silent
 
 NEGLIGIBLE = 150.0
 """Cost up to which a smaller set of effects is tested in the place of a larger one. Whether it
@@ -22,6 +23,7 @@ def pruned(
     kept: Callable[[Fitted], Fitted],
     test: Callable[[Fitted], Tested],
     alpha: float,
+    reporter: Reporter | None = None,
 ) -> Tested:
     """Drops effects that do not matter, or that the others can do without.
 
@@ -35,7 +37,9 @@ def pruned(
         kept: Remembers what was fitted.
         test: Tests what a model leaves.
         alpha: Level of the tests.
+        reporter: Shows progress.
     """
+    reporter = reporter or Silent()
 
     def settled(model: Fitted) -> Fitted:
         return fitter.simulate(model.members, SETTLING_DAYS)
@@ -44,10 +48,11 @@ def pruned(
     if members and len(members) < len(best.model.members):
         best = test(fitter.refine(fitter.simulate(members), 2))
     while len(best.model.members) > 1:
-        fewer = [
-            kept(settled(fitter.refine(fitter.simulate(part), 2)))
-            for part in each_left_out(best.model.members)
-        ]
+        fewer: list[Fitted] = []
+        with reporter.task("without single effects", len(best.model.members)) as advance:
+            for part in each_left_out(best.model.members):
+                fewer.append(kept(settled(fitter.refine(fitter.simulate(part), 2))))
+                advance(note=names_of(part))
         doubtful = [fewer[place] for place in _doubtful(best)]
         least = min(fewer, key=cost_of)
         if least.cost - settled(best.model).cost > NEGLIGIBLE:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from ugat_marl.discrepancy.engine import OutOfTime
 from ugat_marl.discrepancy.features import Tally
 from ugat_marl.discrepancy.fit import (
+    SETTLING_DAYS,
     WIDE,
     Fitted,
     Fitter,
@@ -37,6 +38,8 @@ KINDS_OF_PLACES = 5
 TOLERANCE = 0.02
 """Share of the first difference in a statistic that a model may leave: parameters are known, and
 simulation steps resolved, no better."""
+MOVES_OF_A_VALUE = 8
+"""How often a value is moved, about, until its model is tested; a bar shows how far that is."""
 _MOST = 0.25
 """Places and windows are looked at if effects on the whole network would leave more than this."""
 _LITTLE = 2.0
@@ -145,7 +148,7 @@ class Selector:
                 best = found
                 if best.residual.p > self._alpha:
                     break
-            best = pruned(best, self._fitter, self._kept, self.test, self._alpha)
+            best = pruned(best, self._fitter, self._kept, self.test, self._alpha, self._reporter)
         except OutOfTime:
             complete = False
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
@@ -155,6 +158,16 @@ class Selector:
 
     def test(self, model: Fitted) -> Tested:
         """Simulates more days of a model and tests what it leaves."""
+        fitter = self._fitter
+        moves = len(model.values) * MOVES_OF_A_VALUE * fitter.days
+        days = SETTLING_DAYS + self._effort.test + moves
+        with (
+            self._reporter.task("is what is left chance", days) as advance,
+            fitter.engine.watched(advance, days),
+        ):
+            return self._tested(model)
+
+    def _tested(self, model: Fitted) -> Tested:
         fitter = self._fitter
         model = self._kept(fitter.settled(model, uncertainty(fitter, model)[0]))
         days = self._days(model)
