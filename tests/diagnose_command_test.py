@@ -263,6 +263,29 @@ def test_every_verdict_is_explained_in_the_manual() -> None:
     assert set(re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE)) == set(VERDICTS)
 
 
+def test_the_steps_in_the_manual_run_one_by_one(
+    street: Street, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parent.parent / "docs" / "diagnosis.md").read_text()
+    (text,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    names = {"FEW": FEW, "LEFT_OUT": LEFT_OUT, "CACHE": street.cache}
+    for old, new in (
+        ('"single-v1"', repr(str(street.scenario))),
+        ('"measured"', repr(str(street.measured))),
+        ('"by-hand"', repr(str(tmp_path / "by-hand"))),
+        ("budget_s=900", "effort=FEW, leave_out=LEFT_OUT, cache=CACHE"),
+    ):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    exec(text, names)  # the page's own words
+    *places, fitted, verified, sentence = capsys.readouterr().out.splitlines()
+    assert places[0].split()[0] == "C"
+    assert fitted.startswith("late_green=*,4")
+    assert "'shrink': " in verified
+    assert sentence.startswith("The street has late green of 4 s")
+    assert load(tmp_path / "by-hand").hash != load(street.scenario).hash
+
+
 # ---------------------------------------------------------------- stopping and going on
 
 

@@ -256,9 +256,9 @@ class Study:
         """Finds places and windows."""
         return Proposer(self.site, Routes.of(self.scenario), self.allowed)
 
-    def selector(self, base: Tested, reporter: Reporter) -> Selector:
-        """Searches for effects."""
-        fitter = Fitter(
+    def fitter(self, base: Tested) -> Fitter:
+        """Simulates and fits single models; `selector` tries the whole library."""
+        return Fitter(
             self.engine,
             self.pools,
             base.model.reference,
@@ -268,8 +268,11 @@ class Study:
             price=PRICE,
             speeds=self.speeds,
         )
+
+    def selector(self, base: Tested, reporter: Reporter) -> Selector:
+        """Searches for effects."""
         return Selector(
-            fitter,
+            self.fitter(base),
             self.proposer,
             self.hypotheses,
             self.measured.of("fit"),
