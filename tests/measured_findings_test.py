@@ -556,6 +556,16 @@ def test_wrong_counts_are_refused(
         read_measured(directory, scenario, network)
 
 
+def test_a_day_without_counts_is_no_day_without_vehicles(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    directory = counted(tmp_path)
+    frame = counts()
+    frame.filter(pl.col("period_id") != "day2").write_csv(directory / "counts.csv")
+    with pytest.raises(MeasuredDataError, match="counts.csv: no counts in period 'day2'; was the"):
+        read_measured(directory, scenario, network)
+
+
 def test_every_name_that_is_ruled_out_is_an_effect() -> None:
     names = {
         name

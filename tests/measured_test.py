@@ -349,7 +349,10 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
         {"detectors.csv": replaced("S_C_0", "S_C_1")},
         r"S_C_1.*mean 'S_C_0'",
     ),
-    "detector twice": ({"detectors.csv": added("a,S_C_0,10,0,stop")}, r"line 2.*'a' occurs twice"),
+    "detector twice": (
+        {"detectors.csv": added("a,S_C_0,10,0,stop")},
+        r"line 2.*'a' occurs twice .and 1 row more.",
+    ),
     "detector beyond the lane": ({"detectors.csv": replaced("90.0", "900")}, r"position_m 900"),
     "zone beyond the lane": ({"detectors.csv": replaced("40.0,2.0", "40,460")}, r"at most"),
     "unknown kind": ({"detectors.csv": replaced("advance", "advanced")}, r"advance, stop, exit"),
@@ -381,6 +384,10 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
     "no signals in a period": (
         {"signals.csv": lambda text: "\n".join(x for x in text.split("\n") if "day1" not in x)},
         r"no signals .* period 'day1'",
+    ),
+    "no detections in a period": (
+        {"detections.csv": lambda text: text[: text.index("day1")]},  # cut short, at a row's end
+        r"no detections in period 'day1', 'day2'.*cut short.*leave the period out",
     ),
     "unknown event": ({"detections.csv": replaced(",on,", ",enter,")}, r"'enter' is unknown"),
     "negative speed": ({"detections.csv": added("day0,100,s,off,-3,")}, r"-3.0' is negative"),

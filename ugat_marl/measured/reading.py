@@ -69,6 +69,9 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
             raise MeasuredDataError(f"{path}: no detections; write one row per on and off")
         frame = with_period(path, frame, periods, found)
         passages, broken = passages_of(path, frame, periods, detectors, found)
+        _refuse_empty(
+            path, "detections", [p.id for p, x in zip(periods, passages, strict=True) if not x]
+        )
         detectors = tuple(detector for detector in detectors if detector.id not in broken)
     periods = tuple(
         replace(period, signals=shown, passages=seen)
@@ -83,7 +86,9 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
         periods,
         extra(tables.LANES),
         extra(tables.TRAJECTORIES),
-        None if paths["counts"] is None else _counts(*rows(tables.COUNTS), periods, detectors),
+        None
+        if paths["counts"] is None
+        else _counts(*rows(tables.COUNTS), periods, detectors, counts_only),
     )
     found += coverage(measured, scenario, network)
     return replace(measured, findings=tuple(found))
@@ -140,6 +145,7 @@ def _counts(
     frame: pl.DataFrame,
     periods: tuple[Period, ...],
     detectors: tuple[Detector, ...],
+    alone: bool,
 ) -> pl.DataFrame:
     """Counts per detector and interval, all of known detectors and within their periods."""
     names = [detector.id for detector in detectors]
@@ -176,4 +182,16 @@ def _counts(
         ),
     ):
         refuse(path, frame.filter(bad), column, complaint, "correct the row")
+    if alone:
+        counted = set(frame["period_id"])
+        _refuse_empty(path, "counts", [period.id for period in periods if period.id not in counted])
     return frame.select(*tables.COUNTS.columns)
+
+
+def _refuse_empty(path: Path, what: str, periods: list[str]) -> None:
+    """A period of which a file holds nothing is no period without vehicles."""
+    if periods:
+        raise MeasuredDataError(
+            f"{path}: no {what} in period {', '.join(map(repr, periods[:6]))}; was the file cut "
+            "short? Add them, or leave the period out of periods.csv"
+        )

@@ -195,7 +195,8 @@ def refuse(path: Path, bad: pl.DataFrame, column: str, complaint: str, way_out: 
         return
     value = str(bad[column][0])
     shown = value if len(value) <= 60 else f"{value[:57]}..."
-    more = f" (and {bad.height - 1} rows more)" if bad.height > 1 else ""
+    rows = "row" if bad.height == 2 else "rows"
+    more = f" (and {bad.height - 1} {rows} more)" if bad.height > 1 else ""
     raise MeasuredDataError(
         f"{place(path, int(bad[ROW][0]))}: {column} {shown!r} {complaint}{more}; {way_out}"
     )
