@@ -16,6 +16,7 @@ from typing import Any, get_type_hints
 from rich.console import Console
 
 from ugat_marl.errors import UgatMarlError, UnknownNameError, nearest
+from ugat_marl.progress import Bars, showing
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("commands.train:Train", "train by UGAT across the gap, print what was won"),
@@ -105,8 +106,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     console = Console(highlight=False)
+    shown = console if console.is_terminal else Console(stderr=True, highlight=False)
     try:
-        return _run(given, console)
+        with showing(Bars(shown)):
+            return _run(given, console)
     except UgatMarlError as error:
         print(f"ugat-marl: error: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR
@@ -222,8 +225,6 @@ def _one_line(box: str) -> str:
 
 
 def _bench(command: Any, console: Console) -> int:
-    from ugat_marl.progress import Bars
-
     reports = command.run(Bars(console))
     reports = reports if isinstance(reports, list) else [reports]
     for report in reports:

@@ -1,7 +1,7 @@
 """Files that are whole or absent, and XML that cannot do anything but be read.
 
 Everything the suite writes goes through `write_whole`: a killed run leaves the old file or the new
-one, never half of either. Everything it reads as XML goes through `parse_xml`, which refuses
+one, never half of either. Everything it reads as XML goes through one parser, which refuses
 entities and document types.
 """
 
@@ -9,18 +9,28 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import io
 import os
+import shutil
 import tempfile
 import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 from xml.parsers import expat
 
 from ugat_marl.errors import OutputError, ScenarioError
+from ugat_marl.own_directory import OwnDirectory
+from ugat_marl.progress import Reporter, Silent, usual, watched
 
 _PIECE = 1 << 20
+_KEPT = 8 << 20
+"""Bytes of an edited document from which it is kept in a file and not in memory."""
+_INDENT = "    "
+_END = "\0"
+"""Stands behind the children of an element while it is written; no XML holds it."""
 
 
 @contextlib.contextmanager
@@ -108,16 +118,20 @@ class Tag(NamedTuple):
     line: int
 
 
-def chunks_of(path: Path) -> Iterator[bytes]:
+def chunks_of(path: Path, reporter: Reporter | None = None) -> Iterator[bytes]:
     """The content of `path` piece by piece, unpacked if its name ends in ``.gz``.
+
+    Args:
+        path: The file.
+        reporter: Shows progress where that takes long.
 
     Raises:
         ScenarioError: As for `read_bytes`.
     """
     try:
-        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            while piece := file.read(_PIECE):
-                yield piece
+        with path.open("rb") as raw, gzip.open(raw) if path.suffix == ".gz" else raw as file:
+            pieces = iter(lambda: file.read(_PIECE), b"")
+            yield from watched(pieces, raw, reporter or Silent())
     except FileNotFoundError:
         raise ScenarioError(f"{path}: no such file") from None
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
@@ -163,21 +177,50 @@ def parse_xml(content: bytes, name: str) -> ET.Element:
     Raises:
         ScenarioError: Not well-formed (a truncated file, say), or declares a document type.
     """
+    parser, builder = _building_parser(name)
+    _parse(parser, content, True, name)
+    return builder.close()
+
+
+def parts_of_xml(pieces: Iterable[bytes], name: str) -> Iterator[ET.Element]:
+    """A document of any length as trees: its root again and again, each time with more children.
+
+    Every child stands whole in one of the parts, of which there is at least one.
+
+    Args:
+        pieces: The document, cut anywhere.
+        name: What to call it in errors, usually its path.
+
+    Raises:
+        ScenarioError: As for `parse_xml`.
+    """
+    parser, builder = _building_parser(name)
+    root: list[ET.Element] = []
+
+    def first(tag: str, attributes: dict[str, str]) -> None:
+        root.append(builder.start(tag, attributes))
+        parser.StartElementHandler = builder.start
+
+    parser.StartElementHandler = first
+    for piece in pieces:
+        _parse(parser, piece, False, name)
+        if root and len(root[0]) > 1:  # the last child may go on
+            part = ET.Element(root[0].tag, root[0].attrib)
+            part[:] = root[0][:-1]
+            del root[0][:-1]
+            yield part
+    _parse(parser, b"", True, name)
+    yield builder.close()
+
+
+def _building_parser(name: str) -> tuple[expat.XMLParserType, ET.TreeBuilder]:
     builder = ET.TreeBuilder()
     parser = _refusing_parser(name)
     parser.buffer_text = True
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        builder.start(tag, attributes)
-
-    def end(tag: str) -> None:
-        builder.end(tag)
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
     parser.CharacterDataHandler = builder.data
-    _parse(parser, content, True, name)
-    return builder.close()
+    return parser, builder
 
 
 def _refusing_parser(name: str) -> expat.XMLParserType:
@@ -209,3 +252,129 @@ def xml_bytes(root: ET.Element) -> bytes:
     """Serialises an element tree as an indented UTF-8 document."""
     ET.indent(root, "    ")
     return ET.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
+
+
+def child_texts(root: ET.Element) -> list[str]:
+    """The children of an element as `xml_bytes` writes them, each without what is around it."""
+    root.text = None
+    for child in root:
+        child.tail = _END
+    ET.indent(root, _INDENT)
+    text = ET.tostring(root, "unicode")
+    return text[text.index(">") + 1 :].lstrip().split(_END)[:-1]
+
+
+@dataclass(frozen=True)
+class Document:
+    """One SUMO input file: on disk as it was found, or edited.
+
+    Attributes:
+        name: File name, without directories.
+        path: Where it lies, or None if it exists only in memory.
+        content: The edited bytes, or None if the file on disk is meant.
+        home: Holds the file of an edited document too long for memory, which goes with it.
+    """
+
+    name: str
+    path: Path | None = None
+    content: bytes | None = None
+    home: OwnDirectory | None = field(default=None, compare=False, repr=False)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self.home is None:
+            return Document, (self.name, self.path, self.content)
+        return Document, (self.name, None, self.read())  # the file may be gone before the copy is
+
+    @property
+    def source(self) -> str:
+        """What to call the document in errors."""
+        return self.name if self.path is None or self.home is not None else str(self.path)
+
+    def read(self) -> bytes:
+        """The (unpacked) bytes."""
+        if self.content is not None:
+            return self.content
+        assert self.path is not None
+        return read_bytes(self.path)
+
+    def pieces(self, reporter: Reporter | None = None) -> Iterator[bytes]:
+        """The (unpacked) bytes piece by piece, in little memory.
+
+        Args:
+            reporter: Shows progress where the document is a long file.
+        """
+        if self.content is not None:
+            yield self.content
+            return
+        assert self.path is not None
+        yield from chunks_of(self.path, reporter)
+
+    def scan(self, reporter: Reporter | None = None) -> Iterator[Tag]:
+        """The starts of its elements with their lines, in little memory.
+
+        Args:
+            reporter: Shows progress where the document is a long file; by default as the program
+                does it everywhere.
+        """
+        return scan_xml(self.pieces(reporter or usual()), self.source)
+
+    def parse(self) -> ET.Element:
+        """The document as an element tree, a fresh one at each call."""
+        return parse_xml(self.read(), self.source)
+
+    def parts(self) -> Iterator[ET.Element]:
+        """The document as trees, see `parts_of_xml`; shows progress where it is a long file."""
+        return parts_of_xml(self.pieces(usual()), self.source)
+
+    def edited(self, content: bytes) -> Document:
+        """The same document with other content."""
+        return Document(self.name.removesuffix(".gz"), None, content)
+
+    def write(self, path: Path) -> None:
+        """Puts the document at `path`, packed as it was found."""
+        with replacing(path) as temporary:
+            if self.content is not None:
+                temporary.write_bytes(self.content)
+            else:
+                assert self.path is not None
+                shutil.copyfile(self.path, temporary)
+
+
+class Draft:
+    """An XML document that is being written: in memory, or once it is long, in a file of its own.
+
+    Args:
+        name: File name.
+        root: Its root, whose children are not looked at.
+    """
+
+    def __init__(self, name: str, root: ET.Element) -> None:
+        self._name, self._tag = name, root.tag
+        self._start = ET.tostring(ET.Element(root.tag, root.attrib), "unicode")
+        self._empty = True
+        self._home: OwnDirectory | None = None
+        self._path: Path | None = None
+        self._file: BinaryIO = io.BytesIO()
+        self._file.write(b"<?xml version='1.0' encoding='UTF-8'?>\n")
+
+    def add(self, *children: str) -> None:
+        """Writes children, see `child_texts`."""
+        if not children:
+            return
+        start = f"{self._start.removesuffix(' />')}>" if self._empty else ""
+        self._empty = False
+        self._file.write("".join((start, *(f"\n{_INDENT}{text}" for text in children))).encode())
+        if isinstance(self._file, io.BytesIO) and self._file.tell() > _KEPT:
+            begun, self._home = self._file.getvalue(), OwnDirectory()
+            self._path = self._home.fresh() / self._name
+            self._path.parent.mkdir(mode=0o700)
+            self._file = self._path.open("wb")
+            self._file.write(begun)
+
+    def document(self) -> Document:
+        """What has been written, as a document."""
+        end = self._start if self._empty else f"\n</{self._tag}>"
+        self._file.write(f"{end}\n".encode())
+        content = self._file.getvalue() if isinstance(self._file, io.BytesIO) else None
+        self._file.close()
+        return Document(self._name, self._path, content, self._home)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 from rich.console import Console
 from rich.progress import (
@@ -21,12 +23,8 @@ from rich.table import Column
 Advance = Callable[..., None]
 """Called as ``advance()`` or ``advance(note="...")`` when a unit of work is done."""
 
-
-Pieces = Iterable[bytes]
-"""A file, cut anywhere."""
-
-_LONG = 8 << 20
-"""Bytes from which reading a file is worth a bar."""
+_PATIENCE_S = 1.0
+"""Seconds after which reading a file is worth a bar."""
 
 
 class Reporter(Protocol):
@@ -95,23 +93,39 @@ class Bars:
         self._console.print(text, highlight=False, markup=False)
 
 
+_shown: list[Reporter] = [Silent()]
+
+
+def usual() -> Reporter:
+    """What shows long work that nobody passed a reporter to: nothing, but for `showing`."""
+    return _shown[-1]
+
+
 @contextlib.contextmanager
-def reading(path: Path, reporter: Reporter) -> Iterator[Callable[[Pieces], Pieces]]:
-    """A bar over the pieces of a long file, each of a mebibyte; nothing for a short one.
+def showing(reporter: Reporter) -> Iterator[None]:
+    """Makes a reporter the usual one of the whole program for a while."""
+    _shown.append(reporter)
+    try:
+        yield
+    finally:
+        _shown.pop()
+
+
+def watched(pieces: Iterable[bytes], file: IO[bytes], reporter: Reporter) -> Iterator[bytes]:
+    """The pieces of a file, with a bar as soon as they take longer than a second.
 
     Args:
-        path: The file.
+        pieces: What is read from the file, perhaps unpacked.
+        file: Where it stands says how much of it has been read.
         reporter: Shows the bar.
     """
-    size = path.stat().st_size if path.is_file() else 0
-    if size < _LONG or path.suffix == ".gz":  # how long a packed file is shows only at its end
-        yield lambda pieces: pieces
-        return
-    with reporter.task(f"reading {path.name}, MiB", size >> 20) as advance:
-
-        def counted(pieces: Pieces) -> Pieces:
-            for piece in pieces:
-                yield piece
+    size, name = os.fstat(file.fileno()).st_size, Path(file.name).name
+    begun, done, advance = time.monotonic(), 0, None
+    with contextlib.ExitStack() as stack:
+        for piece in pieces:
+            yield piece
+            if advance is None and size and time.monotonic() - begun > _PATIENCE_S:
+                advance = stack.enter_context(reporter.task(f"MiB of {name}", size >> 20))
+            while advance is not None and done < file.tell() >> 20:
                 advance()
-
-        yield counted
+                done += 1

@@ -14,6 +14,7 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -68,7 +69,7 @@ def ways(scenario: Scenario) -> Iterator[tuple[str, ...]]:
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
     for document in explicit(scenario).routes:
-        for vehicle in parse_xml(document.read(), document.source).iter("vehicle"):
+        for vehicle in chain.from_iterable(part.iter("vehicle") for part in document.parts()):
             route = vehicle.find("route")
             edges = () if route is None else tuple(route.get("edges", "").split())
             if edges and begin <= seconds_of(vehicle.get("depart", "0")) < end:
@@ -130,7 +131,7 @@ def _is_explicit(document: Document) -> bool:
     if document.path is None or document.content is not None:
         return _explicit_content(document, 0, 0)
     state = document.path.stat()
-    return _explicit_content(document, state.st_size, state.st_mtime_ns)
+    return _explicit_content(replace(document, home=None), state.st_size, state.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=8)

@@ -13,23 +13,13 @@ import importlib.util
 import json
 import re
 import tomllib
-import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError, UnknownNameError
-from ugat_marl.files import (
-    Tag,
-    chunks_of,
-    parse_xml,
-    read_bytes,
-    scan_xml,
-    write_whole,
-    xml_bytes,
-)
-from ugat_marl.progress import Reporter, reading
+from ugat_marl.files import Document, parse_xml, read_bytes, write_whole, xml_bytes
 from ugat_marl.scenario_settings import (
     ControlSettings,
     ScenarioFile,
@@ -37,59 +27,6 @@ from ugat_marl.scenario_settings import (
     seconds_of,
     validated,
 )
-
-
-@dataclass(frozen=True)
-class Document:
-    """One SUMO input file: on disk as it was found, or edited in memory.
-
-    Attributes:
-        name: File name, without directories.
-        path: Where it lies, or None if it exists only in memory.
-        content: The edited bytes, or None if the file on disk is meant.
-    """
-
-    name: str
-    path: Path | None = None
-    content: bytes | None = None
-
-    @property
-    def source(self) -> str:
-        """What to call the document in errors."""
-        return str(self.path or self.name)
-
-    def read(self) -> bytes:
-        """The (unpacked) bytes."""
-        if self.content is not None:
-            return self.content
-        assert self.path is not None
-        return read_bytes(self.path)
-
-    def pieces(self) -> Iterable[bytes]:
-        """The (unpacked) bytes piece by piece, in little memory."""
-        if self.path is not None and self.content is None:
-            return chunks_of(self.path)
-        return [self.read()]
-
-    def scan(self, reporter: Reporter | None = None) -> Iterator[Tag]:
-        """The starts of its elements with their lines, in little memory.
-
-        Args:
-            reporter: Shows progress where the document is a long file.
-        """
-        if self.path is None or self.content is not None or reporter is None:
-            yield from scan_xml(self.pieces(), self.source)
-            return
-        with reading(self.path, reporter) as counted:
-            yield from scan_xml(counted(self.pieces()), self.source)
-
-    def parse(self) -> ET.Element:
-        """The document as an element tree, a fresh one at each call."""
-        return parse_xml(self.read(), self.source)
-
-    def edited(self, content: bytes) -> Document:
-        """The same document with other content."""
-        return Document(self.name.removesuffix(".gz"), None, content)
 
 
 @dataclass(frozen=True)
@@ -166,7 +103,7 @@ class Scenario:
                 "directory cannot hold; rename one of them"
             )
         for document in self.documents:
-            write_whole(directory / document.name, _as_found(document))
+            document.write(directory / document.name)
         settings = self.settings.model_dump(mode="json", exclude_defaults=True)
         settings |= {
             "network": self.network.name,
@@ -333,12 +270,6 @@ def _resco_configuration(name: str) -> Path:
     if name not in maps:
         raise UnknownNameError("RESCO map", name, maps)
     return maps[name]
-
-
-def _as_found(document: Document) -> bytes:
-    if document.content is None and document.path is not None:
-        return document.path.read_bytes()
-    return document.read()
 
 
 def _quiet(document: Document) -> Document:

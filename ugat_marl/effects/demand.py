@@ -21,7 +21,7 @@ from ugat_marl.effects.documents import (
     is_demand,
     mentions,
     seconds_text,
-    sort_departures,
+    windows,
 )
 from ugat_marl.effects.places import places_of
 from ugat_marl.scenario import Scenario
@@ -36,7 +36,7 @@ TWIN_S = 15.0
 _FACTOR = Parameter("", 0.0, 20.0)
 _TIME = Parameter("s", 0.0, 1e7)
 _EXPONENTIAL = re.compile(r"\s*exp\((.*)\)\s*")
-_TWIN = rb"(?:\d+|surge|after)[\"']"
+_TWIN = re.compile(rb"(\++)(?:\d+|surge|after)[\"']")
 
 
 @dataclass
@@ -60,11 +60,12 @@ class Routes:
             return found
         distributions: list[ET.Element] = []
         for document in documents:
-            if mentions(document, "<route "):
-                root = document.parse()
-                named = (item for item in root.iter("route") if "id" in item.attrib)
+            if not mentions(document, "<route "):
+                continue
+            for part in document.parts():
+                named = (item for item in part.iter("route") if "id" in item.attrib)
                 found.edges |= {x.get("id", ""): _edges(x) for x in named}
-                distributions += list(root.iter("routeDistribution"))
+                distributions += part.iter("routeDistribution")
         found.first = {name: edges[0] for name, edges in found.edges.items() if edges}
         for item in distributions:
             inner = [_edges(x) for x in item.iter("route")]
@@ -206,12 +207,10 @@ def replace_departing(
                 children += becomes(item)
             else:
                 children.append(item)
-        if found:
-            root[:] = children
-            sort_departures(root)
+        root[:] = children
         return found
 
-    return edit_scenario(scenario, change, *TAGS, applied=str(effect))
+    return edit_scenario(scenario, change, *TAGS, applied=str(effect), in_order=True)
 
 
 def scaled_flow(item: ET.Element, factor: float, end_s: float) -> ET.Element | None:
@@ -308,11 +307,9 @@ def _scaled(
 
 def _mark(scenario: Scenario) -> str:
     """What stands in the ids of twins, and in none so far: demand may grow more than once."""
-    mark = "+"
-    contents = [document.read() for document in (*scenario.additional, *scenario.routes)]
-    while any(re.search(re.escape(mark).encode() + _TWIN, content) for content in contents):
-        mark += "+"
-    return mark
+    documents = (*scenario.additional, *scenario.routes)
+    found = (_TWIN.finditer(window) for document in documents for window in windows(document))
+    return "+" * (1 + max((len(match[1]) for matches in found for match in matches), default=0))
 
 
 def _scaled_window(

@@ -1,13 +1,19 @@
-"""Editing a scenario's files: each is parsed once, and only if it can hold what is looked for."""
+"""Editing a scenario's files: part by part, and only those that can hold what is looked for."""
 
 from __future__ import annotations
 
+import heapq
+import json
 import math
+import sys
+import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
+from typing import IO
 
-from ugat_marl.files import xml_bytes
+from ugat_marl.files import Draft, child_texts, xml_bytes
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.scenario_settings import seconds_of
 
@@ -24,53 +30,89 @@ BLOCKERS = ("closure.", "parking.")
 """How the ids of vehicles begin that stand on the street and are no part of the demand."""
 
 _SORTED = DEPARTING | {"person", "personFlow", "container", "containerFlow"}
+_OVERLAP = 256
+"""Bytes no text that is looked for is longer than."""
+_RUN = 16 << 20
+"""Characters of vehicles that are sorted in memory."""
+_AT_ONCE = 1000
 
 Root = ET.Element
+Change = Callable[[Root], bool]
+"""Edits some of a document's elements, below a root like its own, and says whether it did."""
+
+
+def windows(document: Document) -> Iterator[bytes]:
+    """The bytes piece by piece, each with the end of the one before it."""
+    window = b""
+    for piece in document.pieces():
+        window = window[-_OVERLAP:] + piece
+        yield window
 
 
 def mentions(document: Document, *texts: str) -> bool:
     """Whether any of the texts occurs; also True where that cannot be told without parsing."""
-    content = document.read()
-    if b"\0" in content[:4] or content[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return True
-    return any(text.encode() in content for text in texts)
+    wanted = [text.encode() for text in texts]
+    return any(
+        window[:2] in (b"\xff\xfe", b"\xfe\xff")
+        or b"\0" in window[:4]
+        or any(text in window for text in wanted)
+        for window in windows(document)
+    )
 
 
 def edit(
-    documents: Iterable[Document], change: Callable[[Root], bool], *texts: str
+    documents: Iterable[Document], change: Change, *texts: str, in_order: bool = False
 ) -> tuple[Document, ...]:
     """Applies `change` to every document that mentions one of `texts`.
 
     Args:
-        documents: What may be edited.
-        change: Edits a document in place and says whether it did.
+        documents: What may be edited, however long.
+        change: Called with the elements below the root, a part of them at a time.
         *texts: Documents without any of these are not even parsed.
+        in_order: Whether vehicles may depart at other times now, and have to be sorted: SUMO leaves
+            out those that stand behind a later one.
     """
-    edited: list[Document] = []
-    for document in documents:
-        if mentions(document, *texts):
-            root = document.parse()
-            if change(root):
-                document = document.edited(xml_bytes(root))
-        edited.append(document)
-    return tuple(edited)
+    return tuple(
+        _edited(document, change, in_order) if mentions(document, *texts) else document
+        for document in documents
+    )
+
+
+def _edited(document: Document, change: Change, in_order: bool) -> Document:
+    draft, changed = None, False
+    departure, rows = _clock(), _Sorted()
+    for part in document.parts():
+        draft = draft or Draft(document.name.removesuffix(".gz"), part)
+        changed |= change(part)
+        if in_order:
+            rows.add(zip(map(departure, part), child_texts(part), strict=True))
+        else:
+            draft.add(*child_texts(part))
+    assert draft is not None
+    if not changed:
+        return document
+    texts = iter(rows)
+    while some := tuple(islice(texts, _AT_ONCE)):
+        draft.add(*some)
+    return draft.document()
 
 
 def edit_scenario(
-    scenario: Scenario, change: Callable[[Root], bool], *texts: str, applied: str
+    scenario: Scenario, change: Change, *texts: str, applied: str, in_order: bool = False
 ) -> Scenario:
     """Applies `change` to additional files and routes, as `edit` does.
 
     Args:
         scenario: It does not change itself.
-        change: Edits a document in place and says whether it did.
+        change: As for `edit`.
         *texts: Documents without any of these are not even parsed.
         applied: What to note as applied.
+        in_order: As for `edit`.
     """
     return replace(
         scenario,
-        additional=edit(scenario.additional, change, *texts),
-        routes=edit(scenario.routes, change, *texts),
+        additional=edit(scenario.additional, change, *texts, in_order=in_order),
+        routes=edit(scenario.routes, change, *texts, in_order=in_order),
         applied=(*scenario.applied, applied),
     )
 
@@ -84,10 +126,11 @@ def with_default_types(scenario: Scenario) -> Scenario:
     for document in (*scenario.additional, *scenario.routes):
         if not mentions(document, "DEFAULT_"):
             continue
-        for item in document.parse().iter():
-            if item.tag == "vType":
-                declared.add(item.get("id", ""))
-            named |= {item.get("type", ""), *item.get("vTypes", "").split()}
+        for item in document.scan():
+            if item.name == "vType":
+                declared.add(item.attributes.get("id", ""))
+            named.add(item.attributes.get("type", ""))
+            named.update(item.attributes.get("vTypes", "").split())
     root = ET.Element("additional")
     for name in DEFAULT_TYPES:
         if name in named and name not in declared:
@@ -116,21 +159,50 @@ def depart_s(item: Root) -> float:
 def sort_departures(root: Root) -> None:
     """Puts definitions first and then everything that departs, in order of time.
 
-    SUMO leaves out vehicles that stand behind a later one. One whose departure is triggered stays
-    behind its predecessor.
+    One whose departure is triggered stays behind its predecessor.
     """
-    first: list[Root] = []
-    timed: list[tuple[float, int, Root]] = []
-    latest = -math.inf
-    for place, item in enumerate(root):
+    root[:] = sorted(root, key=_clock())
+
+
+def _clock() -> Callable[[Root], float]:
+    """When each of a document's elements departs, asked one after the other; -inf if it is none."""
+    latest = -sys.float_info.max
+
+    def departure(item: Root) -> float:
+        nonlocal latest
         if item.tag not in _SORTED:
-            first.append(item)
-            continue
+            return -math.inf
         time = depart_s(item)
         latest = latest if math.isnan(time) else time
-        timed.append((latest, place, item))
-    timed.sort(key=lambda entry: entry[:2])
-    root[:] = [*first, *(item for _, _, item in timed)]
+        return latest
+
+    return departure
+
+
+class _Sorted:
+    """Texts in the order of their times, however many: in runs that are kept in files."""
+
+    def __init__(self) -> None:
+        self._run: list[tuple[float, int, str]] = []
+        self._runs: list[IO[str]] = []
+        self._count = self._length = 0
+
+    def add(self, rows: Iterable[tuple[float, str]]) -> None:
+        """Takes times and texts; of those of one time, the first stays first."""
+        for time, text in rows:
+            self._run.append((time, self._count, text))
+            self._count += 1
+            self._length += len(text)
+        if self._length > _RUN:
+            file = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115 - read later
+            file.writelines(f"{json.dumps(row)}\n" for row in sorted(self._run))
+            file.seek(0)
+            self._runs.append(file)
+            self._run, self._length = [], 0
+
+    def __iter__(self) -> Iterator[str]:
+        runs = [map(tuple[float, int, str], map(json.loads, file)) for file in self._runs]
+        return (text for _, _, text in heapq.merge(*runs, sorted(self._run)))
 
 
 def seconds_text(value: float) -> str:

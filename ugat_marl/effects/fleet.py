@@ -14,13 +14,13 @@ from ugat_marl.effects.base import Effect, Parameter, draw
 from ugat_marl.effects.demand import TAGS, scaled_flow
 from ugat_marl.effects.documents import (
     DEFAULT_TYPES,
-    edit,
     edit_scenario,
     is_demand,
     mentions,
     with_default_types,
 )
 from ugat_marl.effects.vehicles import driven_types
+from ugat_marl.files import xml_bytes
 from ugat_marl.scenario import Scenario
 
 _LEAST, _GREATEST = 0.2, 2.0
@@ -167,34 +167,39 @@ class HeavyShare(Effect):
 
         scenario = edit_scenario(scenario, change, *TAGS, applied=str(self))
 
-        def with_trucks(root: ET.Element) -> bool:
-            present = {item.get("id") for item in root.iter("vType")}
-            trucks = [_truck(used[name], name) for name in sorted(set(used) - present)]
-            root.extend(trucks)
-            return bool(trucks)
-
         types, *others = scenario.additional
-        return replace(scenario, additional=(*edit((types,), with_trucks, ""), *others))
+        root = types.parse()
+        present = {item.get("id") for item in root.iter("vType")}
+        root.extend(_truck(used[name], name) for name in sorted(set(used) - present))
+        return replace(scenario, additional=(types.edited(xml_bytes(root)), *others))
+
+
+def _types(scenario: Scenario) -> tuple[dict[str, ET.Element], dict[str, list[str]]]:
+    """All vehicle types, and the names of the types in each distribution."""
+    types: dict[str, ET.Element] = {}
+    members: dict[str, list[str]] = {}
+    for document in (*scenario.additional, *scenario.routes):
+        if not mentions(document, "<vType"):
+            continue
+        for part in document.parts():
+            types |= {item.get("id", ""): item for item in part.iter("vType")}
+            for item in part.iter("vTypeDistribution"):
+                inner = [x.get("id", "") for x in item.iter("vType")]
+                members[item.get("id", "")] = inner + item.get("vTypes", "").split()
+    return types, members
 
 
 def _cars(scenario: Scenario) -> dict[str, ET.Element]:
     """Types and distributions of passenger cars; a distribution with the first of its cars."""
-    found: dict[str, ET.Element] = {}
-    distributions: list[ET.Element] = []
-    for document in (*scenario.additional, *scenario.routes):
-        if mentions(document, "<vType"):
-            root = document.parse()
-            for item in root.iter("vType"):
-                name = item.get("id", "")
-                car = item.get("vClass", "passenger") == "passenger"
-                if car and not name.startswith(_HEAVY):
-                    found[name] = item
-            distributions += list(root.iter("vTypeDistribution"))
-    for item in distributions:
-        members = [x.get("id", "") for x in item.iter("vType")] + item.get("vTypes", "").split()
-        cars = [found[name] for name in members if name in found]
-        if cars:
-            found[item.get("id", "")] = cars[0]
+    types, members = _types(scenario)
+    found = {
+        name: item
+        for name, item in types.items()
+        if item.get("vClass", "passenger") == "passenger" and not name.startswith(_HEAVY)
+    }
+    for distribution, names in members.items():
+        if cars := [found[name] for name in names if name in found]:
+            found[distribution] = cars[0]
     return found
 
 
@@ -239,18 +244,11 @@ def _with_speeds(
 
 def _speeds(scenario: Scenario, general: float | None) -> dict[str, Speeds]:
     """Type to its speeds, and distribution of types to the mean of theirs."""
-    found: dict[str, Speeds] = {}
-    distributions: list[ET.Element] = []
-    for document in (*scenario.additional, *scenario.routes):
-        if mentions(document, "<vType"):
-            root = document.parse()
-            for item in root.iter("vType"):
-                found[item.get("id", "")] = Speeds.of(item, general)
-            distributions += list(root.iter("vTypeDistribution"))
-    for item in distributions:
-        members = [x.get("id", "") for x in item.iter("vType")] + item.get("vTypes", "").split()
-        if inner := [found[name] for name in members if name in found]:
-            found[item.get("id", "")] = Speeds(
+    types, members = _types(scenario)
+    found = {name: Speeds.of(item, general) for name, item in types.items()}
+    for distribution, names in members.items():
+        if inner := [found[name] for name in names if name in found]:
+            found[distribution] = Speeds(
                 fmean(x.mean for x in inner), fmean(x.deviation for x in inner)
             )
     return found

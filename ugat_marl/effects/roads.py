@@ -14,7 +14,7 @@ from itertools import chain, count
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, Parameter, Text, draw
-from ugat_marl.effects.documents import seconds_text, sort_departures
+from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import xml_bytes
@@ -23,7 +23,7 @@ from ugat_marl.seeding import numpy_generator
 
 _LENGTH_M = 5.0
 _LAST_M = 60.0
-_PARKED = b"parking."
+_PARKED = "parking."
 """How the ids of vehicles that park begin."""
 _TIME = Parameter("s", 0.0, 1e7)
 
@@ -167,18 +167,14 @@ def parked_at_other_times(scenario: Scenario, seed: int) -> Scenario:
     begin, duration = scenario.settings.begin_s, scenario.settings.duration_s
     shift = numpy_generator(seed).uniform(0, duration)
 
-    def later(document: Document) -> Document:
-        if _PARKED not in document.read():
-            return document
-        root = document.parse()
-        parked = [x for x in root.iter("vehicle") if x.get("id", "").startswith(_PARKED.decode())]
+    def later(root: ET.Element) -> bool:
+        parked = [x for x in root.iter("vehicle") if x.get("id", "").startswith(_PARKED)]
         for item in parked:
             time = (float(item.get("depart", "0")) - begin + shift) % duration
             item.set("depart", f"{begin + time:.2f}")
-        sort_departures(root)
-        return document.edited(xml_bytes(root))
+        return bool(parked)
 
-    return replace(scenario, routes=tuple(map(later, scenario.routes)))
+    return replace(scenario, routes=edit(scenario.routes, later, _PARKED, in_order=True))
 
 
 def _with_blockers(

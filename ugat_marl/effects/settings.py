@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,9 @@ from ugat_marl.effects.vehicles import (
     ReactionStep,
     RedRunning,
     StartupDelay,
+    VehicleEffect,
     YellowRunning,
+    apply_together,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
 from ugat_marl.scenario import Scenario, load_scenario
@@ -221,8 +224,13 @@ def describe(domain: Domain) -> str:
 
 def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
     """Applies effects one after the other."""
-    for effect in effects:
-        scenario = effect.apply(scenario)
+    for _, group in groupby(effects, lambda effect: isinstance(effect, VehicleEffect)):
+        some = list(group)
+        if alike := [effect for effect in some if isinstance(effect, VehicleEffect)]:
+            scenario = apply_together(scenario, alike)
+        else:
+            for effect in some:
+                scenario = effect.apply(scenario)
     return scenario
 
 

@@ -8,12 +8,12 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+from itertools import accumulate, chain, pairwise
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, Parameter, Text, draw
 from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
-from ugat_marl.effects.documents import edit_scenario, is_demand, mentions, sort_departures
+from ugat_marl.effects.documents import edit_scenario, is_demand, mentions
 from ugat_marl.effects.places import Places, places_of
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenario import Scenario
@@ -68,12 +68,10 @@ class Turning(Effect):
             changed = len(children) != len(root) or any(
                 a is not b for a, b in zip(children, root, strict=True)
             )
-            if changed:
-                root[:] = children
-                sort_departures(root)
+            root[:] = children
             return changed
 
-        return edit_scenario(scenario, change, *TAGS, applied=str(self))
+        return edit_scenario(scenario, change, *TAGS, applied=str(self), in_order=True)
 
     def _tails(
         self, scenario: Scenario, way: Callable[[ET.Element], Way], places: Places
@@ -83,7 +81,7 @@ class Turning(Effect):
         for document in (*scenario.additional, *scenario.routes):
             if not mentions(document, *TAGS):
                 continue
-            for item in document.parse():
+            for item in chain.from_iterable(document.parts()):
                 edges = way(item) if is_demand(item) else ()
                 for index, pair in enumerate(pairwise(edges)):
                     if pair == (self.from_edge, self.to_edge):

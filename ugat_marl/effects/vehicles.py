@@ -8,7 +8,8 @@ silently ignored when it is set through TraCI.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, Parameter, Text
@@ -43,21 +44,31 @@ class VehicleEffect(Effect):
 
     def apply(self, scenario: Scenario) -> Scenario:
         """Sets the attribute in every vehicle type, SUMO's default type included."""
-        number: float = getattr(self, fields(self)[0].name)
+        return apply_together(scenario, (self,))
 
-        def change(root: ET.Element) -> bool:
-            types = driven_types(root)
-            for item in types:
-                self._write(item, number, scenario.settings.step_length_s)
-            return bool(types)
-
-        scenario = with_default_types(scenario)
-        return edit_scenario(scenario, change, "<vType", applied=str(self))
+    def write(self, item: ET.Element, step_s: float) -> None:
+        """Puts the effect into one type, of a scenario with this step length."""
+        self._write(item, getattr(self, fields(self)[0].name), step_s)
 
     def _write(self, item: ET.Element, number: float, step_s: float) -> None:
-        """Puts the number into one type, of a scenario with this step length."""
+        """The same, of the effect's number."""
         del step_s
         _set(item, self.attribute, number)
+
+
+def apply_together(scenario: Scenario, effects: Sequence[VehicleEffect]) -> Scenario:
+    """The scenario with one such effect after the other; its files are gone through once."""
+    step_s = scenario.settings.step_length_s
+
+    def change(root: ET.Element) -> bool:
+        types = driven_types(root)
+        for item in types:
+            for effect in effects:
+                effect.write(item, step_s)
+        return bool(types)
+
+    edited = edit_scenario(with_default_types(scenario), change, "<vType", applied="")
+    return replace(edited, applied=(*scenario.applied, *map(str, effects)))
 
 
 def _set(item: ET.Element, attribute: str, number: float) -> None:

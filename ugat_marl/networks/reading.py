@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import Tag, chunks_of, read_bytes, scan_xml
-from ugat_marl.progress import Reporter, reading
+from ugat_marl.progress import Reporter
 
 _MOST = 32 << 20
 """Characters of a single object; more are a file that is broken in the middle."""
@@ -24,8 +24,7 @@ def scan(path: Path, reporter: Reporter) -> Iterator[Tag]:
     Raises:
         ScenarioError: As for `ugat_marl.files.scan_xml`.
     """
-    with reading(path, reporter) as counted:
-        yield from scan_xml(counted(chunks_of(path)), str(path))
+    return scan_xml(chunks_of(path, reporter), str(path))
 
 
 def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], int]]:
@@ -36,35 +35,34 @@ def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], in
     """
     decoder = json.JSONDecoder()
     text, line, opened = "", 1, False
-    with reading(path, reporter) as counted:
-        pieces = _texts(counted(chunks_of(path)), path)
-        while True:
-            rest = text.lstrip(" \t\r\n" if not opened else " \t\r\n,")
-            line += text[: len(text) - len(rest)].count("\n")
-            text = rest
-            if text and not opened:
-                if text[0] != "[":
-                    raise ScenarioError(f"{path}, line {line}: a list of vehicles begins with [")
-                text, opened = text[1:], True
-                continue
-            if text.startswith("]"):
-                return
-            try:
-                found, end = decoder.raw_decode(text)
-            except json.JSONDecodeError as error:
-                piece = next(pieces, "")
-                if not piece or len(text) > _MOST:
-                    raise ScenarioError(
-                        f"{path}, line {line + text.count(chr(10), 0, error.pos)}: not valid JSON "
-                        f"({error.msg}); the file may have been cut short"
-                    ) from None
-                text += piece
-                continue
-            if not isinstance(found, dict):
-                raise ScenarioError(f"{path}, line {line}: an object in braces was expected here")
-            yield cast("dict[str, Any]", found), line
-            line += text.count("\n", 0, end)
-            text = text[end:]
+    pieces = _texts(chunks_of(path, reporter), path)
+    while True:
+        rest = text.lstrip(" \t\r\n" if not opened else " \t\r\n,")
+        line += text[: len(text) - len(rest)].count("\n")
+        text = rest
+        if text and not opened:
+            if text[0] != "[":
+                raise ScenarioError(f"{path}, line {line}: a list of vehicles begins with [")
+            text, opened = text[1:], True
+            continue
+        if text.startswith("]"):
+            return
+        try:
+            found, end = decoder.raw_decode(text)
+        except json.JSONDecodeError as error:
+            piece = next(pieces, "")
+            if not piece or len(text) > _MOST:
+                raise ScenarioError(
+                    f"{path}, line {line + text.count(chr(10), 0, error.pos)}: not valid JSON "
+                    f"({error.msg}); the file may have been cut short"
+                ) from None
+            text += piece
+            continue
+        if not isinstance(found, dict):
+            raise ScenarioError(f"{path}, line {line}: an object in braces was expected here")
+        yield cast("dict[str, Any]", found), line
+        line += text.count("\n", 0, end)
+        text = text[end:]
 
 
 def read_json(path: Path) -> tuple[Any, str]:
