@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from ugat_marl.discrepancy.fit import Fitted, Fitter
 from ugat_marl.discrepancy.hypotheses import Hypothesis, global_hypotheses, library
 from ugat_marl.discrepancy.local import Proposer
 from ugat_marl.discrepancy.matched import Directions
+from ugat_marl.discrepancy.reach import unreached
 from ugat_marl.discrepancy.replay import Replay
 from ugat_marl.discrepancy.residual import Directed, Null, Tested
 from ugat_marl.discrepancy.select import Effort, Selector
@@ -127,10 +128,13 @@ class Study:
         """Prepares a diagnosis; nothing is simulated yet.
 
         Raises:
-            MeasuredDataError: The data hold nothing to compare.
+            MeasuredDataError: The data hold nothing to compare, or nothing that vehicles of the
+                scenario could.
         """
         network = Network.read(scenario)
         detectors = heard(measured)
+        noted = (*measured.findings, *unreached(scenario, measured, detectors))
+        measured = replace(measured, findings=noted)
         site = Site.of(network, detectors)
         ruled_out = frozenset(name for item in measured.findings for name in item.rules_out)
         allowed = library(config.leave_out) - ruled_out

@@ -67,7 +67,7 @@ def diagnose(
     config = config or DiagnosisConfig()
     reporter = reporter or Silent()
     study = Study.of(scenario, measured, config)
-    for item in measured.findings:
+    for item in study.measured.findings:
         reporter.say(f"note: {item.text}")
     read = timing_effects(scenario, study.network, measured)
     timing = tuple(effect for effect in read if effect.name not in config.leave_out)
