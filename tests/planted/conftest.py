@@ -72,7 +72,8 @@ class Street:
         config = DiagnosisConfig(
             leave_out=tuple(sorted(library() - set(among))),
             effort=effort or Effort(base=32, bank=2, fit=5, test=16),
-            **{"cache": self.cache, **options},
+            # The answer is tested, not the time: on a busy computer ten minutes may not do.
+            **{"cache": self.cache, "budget_s": 3600.0, **options},
         )
         return diagnose(self.scenario, measured, out, config)
 
