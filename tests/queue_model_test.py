@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -112,6 +113,24 @@ def test_who_stays_longer_than_the_way_takes_halts() -> None:
     assert not look.look(40.0, LIMITS)[:2].any()
 
 
+def test_of_a_queue_that_drives_off_as_many_move_as_have_left() -> None:
+    """Six wait, SUMO lists them from the end of the queue; the first of them is held up or not."""
+    api = FakeApi()
+    look = QueueLook(api, LANES, 500.0)
+    for name in "fedcba":
+        api.enter(name, "in", "right")
+    api.held_s["a"] = 30.0
+    look.look(0.0, LIMITS)
+    assert look.look(50.0, LIMITS)[:, 0].tolist() == [6, 6, 0, 6 * 40.0], "in since -10 s"
+    for gone, halting in (("ab", 2), ("c", 0)):
+        api.held_s = {}
+        for name in gone:
+            del api.routes[name]
+        assert look.look(50.0, LIMITS)[1, 0] == halting
+    api.held_s["d"] = 1.0
+    assert look.look(51.0, LIMITS)[1, 0] == 3, "red again: all of them stand"
+
+
 # --- in the running simulation
 
 
@@ -126,7 +145,8 @@ class PlainLook:
             self.of.setdefault(lane[:-2], []).append(place)
         self.segment_m = segment_m
         self.known: dict[str, tuple[str, float, float, int]] = {}
-        self.asked, self.looked_s = 0, -1e9
+        self.left = [0] * len(lanes)
+        self.asked, self.moving, self.looked_s = 0, 0, -1e9
 
     def look(self, time_s: float, limits: Any) -> Any:
         ask, rows = libsumo.vehicle, np.zeros((4, len(self.lanes)))
@@ -135,6 +155,7 @@ class PlainLook:
             metres = libsumo.lane.getLength(edge + "_0")
             pieces = max(1, int(metres / self.segment_m + 0.5))
             needs_s = metres / pieces / libsumo.lane.getMaxSpeed(edge + "_0")
+            queues: dict[int, list[tuple[str, float]]] = {lane: [] for lane in own}
             for name in libsumo.edge.getLastStepVehicleIDs(edge):
                 self.asked += 1
                 at_m = ask.getLanePosition(name)
@@ -150,14 +171,35 @@ class PlainLook:
                 if was[0] == edge and was[3] in fit:
                     lane = was[3]
                 lane = next((x for x in fit if self.lanes[x] == queue), lane)
-                waited = time_s - since_s - needs_s
-                waited = waited if waited > 0 else ask.getWaitingTime(name)
-                speed = 0.0 if waited > 0 else ask.getSpeed(name)
-                rows[:, lane] += (1.0, speed < 0.1, speed, waited)
+                rows[0, lane] += 1.0
+                queues[lane].append((name, time_s - since_s - needs_s))
                 self.known[name] = edge, at_m, since_s, lane
+            for name, was in before.items():
+                if was[0] == edge and self.known.get(name, ("",))[0] != edge:
+                    self.left[was[3]] += 1
+            for lane, queue in queues.items():
+                self.queue(lane, queue, needs_s, limits[lane], rows)
         self.looked_s = time_s
         rows[2] = np.where(rows[0] > 0, rows[2] / np.maximum(rows[0], 1.0), limits)
         return rows
+
+    def queue(self, lane: int, names: Any, needs_s: float, limit: float, rows: Any) -> None:
+        """Adds the vehicles of one lane, the one at the stop line last."""
+        ask = libsumo.vehicle
+        wait = [name for name, waited in names if waited > 0]
+        if wait and ask.getWaitingTime(names[-1][0]) > 0:
+            self.left[lane] = 0
+        start = wait[::-1][: self.left[lane]]
+        self.moving += len(start)
+        for name, waited in names:
+            if name not in wait:
+                speed, held = ask.getSpeed(name), ask.getWaitingTime(name)
+                rows[1:, lane] += (speed < 0.1, speed, held)
+            elif name not in start:
+                rows[1:, lane] += (1.0, 0.0, waited)
+        for name, waited in names:
+            if name in start:
+                rows[2, lane] += limit * needs_s / (needs_s + waited)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +213,7 @@ class PlainLook:
 def test_what_is_not_asked_again_has_not_changed(
     scenario: str, domain: str, seconds: float, least: int
 ) -> None:
-    """Equal to the bit, at every decision of an episode with random phases."""
+    """At every decision of an episode with random phases."""
     env = ugat_marl.parallel_env(
         scenario, domain, observation="waiting", duration_s=seconds, simulator="inprocess"
     )
@@ -179,7 +221,7 @@ def test_what_is_not_asked_again_has_not_changed(
     table = env.network.lane_table()
     try:
         env.reset(seed=2)
-        plain = PlainLook(table.ids, 30.0 if "30" in domain else 100.0)
+        plain = PlainLook(table.ids, 30.0 if "30" in domain else 500.0)
         limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in table.ids])
         actions: dict[str, int] = {}
         for step in range(int(seconds) // 10):
@@ -188,13 +230,13 @@ def test_what_is_not_asked_again_has_not_changed(
             for row, ours in zip(
                 rows, (got.vehicles, got.halting, got.mean_speed_mps, got.waiting_s), strict=True
             ):
-                assert row.tolist() == ours.tolist(), (step, got.time_s)
+                assert row.tolist() == pytest.approx(ours.tolist(), rel=1e-12), (step, got.time_s)
             if step % 2 == 0:
                 actions = {
                     agent: int(choose.integers(env.action_space(agent).n)) for agent in env.agents
                 }
             env.step(actions)
-        assert plain.asked > least
+        assert plain.asked > least and plain.moving > least / 100
     finally:
         env.close()
 
@@ -203,7 +245,7 @@ def test_the_engine_is_an_effect_no_diagnosis_looks_for(tmp_path: Path) -> None:
     assert "queue_model" not in known_effects()
     scenario = load("single-v1")
     changed = in_domain(scenario, "meso")
-    assert parse_domain("meso") == parse_domain("queue_model=100")
+    assert parse_domain("meso") == parse_domain("queue_model=500")
     assert changed.hash != scenario.hash and changed.documents == scenario.documents
     assert load(changed.write(tmp_path / "written")).hash == changed.hash
 
@@ -224,6 +266,86 @@ def test_queues_do_not_drive_on_in_yellow() -> None:
     finally:
         env.close()
     assert "y" not in shown
+
+
+def approach(directory: Path, **flows: float) -> tuple[Path, dict[str, list[int]]]:
+    """single-v1 with flows from the west alone, in veh/h by edge; phases green for each."""
+    scenario = load("single-v1")
+    scenario.write(directory)
+    demand = directory / "demand.rou.xml"
+    root = ET.parse(demand).getroot()
+    kept = [ET.tostring(item, "unicode") for item in root.iter("vType")]
+    kept += [
+        f'<flow id="{to}" type="car" begin="0" end="3600" vehsPerHour="{vph}" departLane="best" '
+        f'departSpeed="max"><route edges="west1_A1 {to}"/></flow>'
+        for to, vph in flows.items()
+    ]
+    demand.write_text("".join(["<routes>", *kept, "</routes>"]))
+    item = Network.read(load(directory)).intersections[0]
+    greens: dict[str, list[int]] = {to: [] for to in flows}
+    for link in item.links:
+        for number, phase in enumerate(item.phases):
+            if (
+                link.from_edge == "west1_A1"
+                and link.to_lane[:-2] in flows
+                and phase[link.index] == "G"
+            ):
+                greens[link.to_lane[:-2]].append(number)
+    return directory, greens
+
+
+def served(scenario: Path, domain: str, phases: Sequence[int], to: str) -> list[int]:
+    """Vehicles that have come to an edge by each decision, under one phase after the other."""
+    env = ugat_marl.parallel_env(scenario, domain, simulator="inprocess")
+    seen: set[str] = set()
+    counts: list[int] = []
+    try:
+        env.reset(seed=1)
+        for phase in phases:
+            env.step({"signal_0": phase})
+            seen.update(libsumo.edge.getLastStepVehicleIDs(to))
+            counts.append(len(seen))
+    finally:
+        env.close()
+    return counts
+
+
+@pytest.mark.parametrize(("decisions", "expected"), [(1, 2), (2, 7), (3, 12)])
+def test_a_green_serves_what_it_does_in_car_following(
+    tmp_path: Path, decisions: int, expected: int
+) -> None:
+    """A green of g s serves 1 + (g - 2) / h, rounded down; h = 1.4 s + 7.5 m / 13.9 m/s.
+
+    The lane is full whenever its green begins. SUMO looks at a red light once in a second, so that
+    queues may start up to 1 s late: that changes no number here.
+    """
+    path, greens = approach(tmp_path / "west-v1", A1_east1=3600.0)
+    green = greens["A1_east1"][0]
+    red = next(x for x in range(8) if x not in greens["A1_east1"])
+    length = 10 * decisions - 5
+    bounds = [1 + int((length - 2 - late) / (1.4 + 7.5 / 13.9)) for late in (0.0, 0.999)]
+    assert bounds == [expected, expected]
+    cycle = [green] * decisions + [red] * 6
+    means = {}
+    for domain in ("sim", "meso"):
+        counts = served(path, domain, [red] * 6 + cycle * 8, "A1_east1")
+        ends = counts[5 :: len(cycle)]
+        means[domain] = (ends[-1] - ends[1]) / 7
+    assert means["meso"] == expected
+    assert means["sim"] == pytest.approx(expected, abs=0.7)
+
+
+def test_a_full_turning_lane_blocks_no_other(tmp_path: Path) -> None:
+    """Left-turners see red for ten minutes: 30 fit on their lane, but not in its last 100 m."""
+    path, greens = approach(tmp_path / "west-v1", A1_east1=600.0, A1_northA=180.0)
+    straight = next(x for x in greens["A1_east1"] if x not in greens["A1_northA"])
+    street, whole, short = (
+        served(path, domain, [straight] * 60, "A1_east1")[-1]
+        for domain in ("sim", "meso", "queue_model=100")
+    )
+    assert street == pytest.approx(600 / 6, abs=10)
+    assert whole == pytest.approx(street, abs=3)
+    assert short < street - 20
 
 
 def test_lanes_hold_all_vehicles_that_go_their_way() -> None:
@@ -295,10 +417,10 @@ def test_a_policy_fits_both_engines_and_a_seed_repeats() -> None:
 
 
 def test_queues_are_about_those_of_car_following() -> None:
-    """The same signals: a fixed cycle through eight phases, half an hour, as many vehicles."""
+    """The same signals: a fixed cycle through eight phases, an hour, as many vehicles."""
     scores: list[Any] = []
     for domain in ("sim", "meso"):
-        env = ugat_marl.parallel_env("single-v1", domain, duration_s=1800)
+        env = ugat_marl.parallel_env("single-v1", domain)
         try:
             cycle = lambda step, *_: {"signal_0": (step // 3) % 8}  # noqa: E731
             scores.append(play(env, 1, cycle, 999).scores)
@@ -307,7 +429,7 @@ def test_queues_are_about_those_of_car_following() -> None:
     street, queues = scores
     assert queues.due == street.due
     assert queues.queue == pytest.approx(street.queue, rel=0.25)
-    assert queues.att_s == pytest.approx(street.att_s, rel=0.25)
+    assert queues.att_s == pytest.approx(street.att_s, rel=0.15)
 
 
 @pytest.mark.parametrize(

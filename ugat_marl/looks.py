@@ -62,9 +62,13 @@ class QueueLook:
     """Looks at the vehicles of a running mesoscopic simulation.
 
     A vehicle counts on the lane that leads to the next edge of its route; where several do, on the
-    one in whose queue SUMO has it, or else on the one with the fewest vehicles. It halts when it
+    one in whose queue SUMO has it, or else on the one with the fewest vehicles. It waits when it
     has been in its segment for longer than that takes at the speed limit: as SUMO counts it, only
     the first of a queue is held up. When it got there is known to within the time of two looks.
+
+    Who waits halts, but for those near the stop line while the queue drives off. In car following a
+    queue starts at about one vehicle in the second that drivers keep, and serves one in two: so
+    many move behind the line as have left since the first one was last seen held up.
 
     A call to SUMO takes longer than all else here, so a vehicle is asked for what may have changed
     alone: its route when it enters an edge, its queue when it enters a segment, nothing more while
@@ -91,6 +95,7 @@ class QueueLook:
             road.segment_s = length / segments / api.lane.getMaxSpeed(lane)
             road.last_m = length * (1 - 1.5 / segments)
         self._looked_s = -math.inf
+        self._left = [0] * self._count  # since the first vehicle of the lane was last held up
 
     def look(self, time_s: float, limits: NDArray[np.float64]) -> NDArray[np.float64]:
         """Vehicles, halting ones, mean speed and waiting time of all lanes, ``(4, lanes)``.
@@ -107,6 +112,8 @@ class QueueLook:
             segment_s, last_m = road.segment_s, road.last_m
             entered_s = time_s - min(passed_s, segment_s) / 2
             before, road.stays = road.stays, {}
+            waiting: dict[int, list[float]] = {}
+            first: dict[int, str] = {}
             for name in names_on(road.edge):
                 stay = before.get(name)
                 if stay is None:
@@ -118,16 +125,26 @@ class QueueLook:
                 road.stays[name] = stay
                 lane = stay.lane
                 vehicles[lane] += 1.0
+                first[lane] = name  # SUMO lists queues from their ends
                 waited = time_s - stay.since_s - segment_s
                 if waited > 0:
-                    halting[lane] += 1.0
-                    waits[lane] += waited
+                    waiting.setdefault(lane, []).append(waited)
                     continue
                 speed = speed_mps(name)
                 speeds[lane] += speed
                 halting[lane] += speed < HALTING_MPS
                 if speed == 0:  # as SUMO has it, whoever it holds up has no speed
                     waits[lane] += waiting_s(name)
+            for name, stay in before.items():
+                self._left[stay.lane] += name not in road.stays
+            for lane, waited_s in waiting.items():
+                if waiting_s(first[lane]) > 0:
+                    self._left[lane] = 0
+                standing = max(len(waited_s) - self._left[lane], 0)
+                halting[lane] += standing
+                waits[lane] += sum(waited_s[:standing])
+                for waited in waited_s[standing:]:
+                    speeds[lane] += limits[lane] * segment_s / (segment_s + waited)
         self._looked_s = time_s
         measured = np.array([vehicles, halting, speeds, waits])
         there = measured[0] > 0

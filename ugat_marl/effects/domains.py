@@ -153,7 +153,7 @@ def _transition() -> list[NamedDomain]:
         NamedDomain(name, "transition", effects, note=_ASSUMED) for name, effects in others.items()
     ]
     engine = "SUMO's mesoscopic model: an engine to train in, --sim meso"
-    return [*found, NamedDomain("meso", "transition", "queue_model=100", note=engine)]
+    return [*found, NamedDomain("meso", "transition", "queue_model=500", note=engine)]
 
 
 def _reward() -> list[NamedDomain]:
