@@ -15,7 +15,7 @@ import pytest
 
 from ugat_marl.blind.outside import BusStops, Driveway
 from ugat_marl.effects import apply_effects, in_domain, load, parked_at_other_times, parse_domain
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import OutputError, ScenarioError
 from ugat_marl.progress import Silent, showing
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import parallel_env
@@ -192,6 +192,17 @@ def test_entities_are_refused_with_their_line(start: str, crossing: Crossing) ->
     (directory / "demand.rou.xml").write_text(text)
     with pytest.raises(ScenarioError, match=r"demand\.rou\.xml: .* entities .* \(line 2\)"):
         in_domain(load(directory), "V4")
+
+
+@pytest.mark.parametrize("limit", ["files._KEPT", "effects.documents._RUN"])
+def test_no_room_for_temporary_files(
+    limit: str, crossing: Crossing, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(f"ugat_marl.{limit}", 1000)
+    scenario = load(long(crossing()))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
+    with pytest.raises(OutputError, match=r"none: cannot hold .* \(No such file.*TMPDIR"):
+        in_domain(scenario, "demand_level=*,1.15")
 
 
 def test_long_work_is_shown(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) -> None:

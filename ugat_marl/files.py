@@ -74,6 +74,22 @@ def write_whole(path: Path, content: bytes | str) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+@contextlib.contextmanager
+def scratch() -> Iterator[None]:
+    """What is written here goes to the folder for temporary files.
+
+    Raises:
+        OutputError: That is full, or missing.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"{tempfile.gettempdir()}: cannot hold what is made of a long file "
+            f"({error.strerror}); make room, or name another folder in TMPDIR"
+        ) from None
+
+
 def user_cache(name: str) -> Path:
     """Where results of the kind `name` are remembered between runs: the user's cache folder."""
     base = os.environ.get("XDG_CACHE_HOME")
@@ -363,18 +379,20 @@ class Draft:
             return
         start = f"{self._start.removesuffix(' />')}>" if self._empty else ""
         self._empty = False
-        self._file.write("".join((start, *(f"\n{_INDENT}{text}" for text in children))).encode())
-        if isinstance(self._file, io.BytesIO) and self._file.tell() > _KEPT:
-            begun, self._home = self._file.getvalue(), OwnDirectory()
-            self._path = self._home.fresh() / self._name
-            self._path.parent.mkdir(mode=0o700)
-            self._file = self._path.open("wb")
-            self._file.write(begun)
+        with scratch():
+            self._file.write("".join((start, *(f"\n{_INDENT}{x}" for x in children))).encode())
+            if isinstance(self._file, io.BytesIO) and self._file.tell() > _KEPT:
+                begun, self._home = self._file.getvalue(), OwnDirectory()
+                self._path = self._home.fresh() / self._name
+                self._path.parent.mkdir(mode=0o700)
+                self._file = self._path.open("wb")
+                self._file.write(begun)
 
     def document(self) -> Document:
         """What has been written, as a document."""
         end = self._start if self._empty else f"\n</{self._tag}>"
-        self._file.write(f"{end}\n".encode())
-        content = self._file.getvalue() if isinstance(self._file, io.BytesIO) else None
-        self._file.close()
+        with scratch():
+            self._file.write(f"{end}\n".encode())
+            content = self._file.getvalue() if isinstance(self._file, io.BytesIO) else None
+            self._file.close()
         return Document(self._name, self._path, content, self._home)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.files import parse_xml, write_whole, xml_bytes
+from ugat_marl.files import parse_xml, replacing, xml_bytes
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.scenario_settings import seconds_of
 from ugat_marl.seeding import numpy_generator
@@ -186,7 +186,8 @@ def _for_sumo(document: Document, directory: Path) -> Path:
     if path is not None and plain and "," not in str(path.resolve()):  # it ends a name for SUMO
         return path.resolve()
     copy = directory / document.name.removesuffix(".gz").replace(",", "_")
-    write_whole(copy, document.read())
+    with replacing(copy) as temporary, temporary.open("wb") as file:
+        file.writelines(document.pieces())
     return copy
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from itertools import islice
 from typing import IO
 
-from ugat_marl.files import Draft, child_texts, xml_bytes
+from ugat_marl.files import Draft, child_texts, scratch, xml_bytes
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.scenario_settings import seconds_of
 
@@ -194,9 +194,10 @@ class _Sorted:
             self._count += 1
             self._length += len(text)
         if self._length > _RUN:
-            file = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115 - read later
-            file.writelines(f"{json.dumps(row)}\n" for row in sorted(self._run))
-            file.seek(0)
+            with scratch():
+                file = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115 - read later
+                file.writelines(f"{json.dumps(row)}\n" for row in sorted(self._run))
+                file.seek(0)
             self._runs.append(file)
             self._run, self._length = [], 0
 
