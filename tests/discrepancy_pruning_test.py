@@ -111,6 +111,7 @@ def test_no_time_is_lost_on_sets_that_plainly_do_not_suffice() -> None:
 
 def test_one_after_the_other_is_left_out() -> None:
     every = ("headway", "demand_level", "desired_speed")
+    costs: dict[tuple[str, ...], float]
     costs = {every: 1000.0, every[:2]: 1010.0, ("headway", "desired_speed"): 1020.0}
     costs |= {every[1:]: 9000.0, ("headway",): 1030.0, ("demand_level",): 9000.0}
     ledger = Ledger(costs, dict.fromkeys(costs, 0.6))

@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.discrepancy.features import BIN_FEATURES, EVENT_FEATURES, FEATURES, INDEX, Tally
-from ugat_marl.discrepancy.statistics import Pools, Reference, locked_up, shrunk, softened
+from ugat_marl.discrepancy.standstill import locked_up
+from ugat_marl.discrepancy.statistics import Pools, Reference, shrunk, softened
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from ugat_marl.discrepancy.arrivals import Due, corrected
 from ugat_marl.discrepancy.features import FEATURES, Tally, tally
 from ugat_marl.discrepancy.replay import WHEN, Day, Replay
 from ugat_marl.discrepancy.site import Greens, Site
-from ugat_marl.discrepancy.statistics import locked_up
+from ugat_marl.discrepancy.standstill import locked_up
 from ugat_marl.discrepancy.unmeasured import Unmeasured
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect

@@ -32,11 +32,6 @@ SINGLE = ("lane", "time")
 there are chance: those are left as they were."""
 CERTAIN = 6.0
 """Squared standardised difference beyond which one is not chance."""
-LOCKED_UP = 5.0
-"""Robust standard deviations by which a day's counts are those of no ordinary day."""
-RARE = 0.1
-"""Share of days up to which such days are not part of a model: five measured days rather have none.
-The test of what is left does not hang on one of them."""
 SOFT = {"network": np.inf, "intersection": np.inf, "lane": 5.0, "time": 4.0}
 """Standardised differences beyond this count less: queues reach a place or they do not, and single
 lanes and minutes have heavy tails."""
@@ -259,31 +254,6 @@ def added(tallies: Sequence[Tally]) -> Tally:
     for item in tallies[1:]:
         total = total + item
     return total
-
-
-def day_to_day(tallies: Sequence[Tally]) -> float:
-    """Robust standard deviation of the vehicles counted on a day."""
-    counts = _counts(tallies)
-    return 1.4826 * float(np.median(np.abs(counts - np.median(counts)))) + 1e-9
-
-
-def locked_up(tallies: Sequence[Tally], usual: float = 0.0) -> list[int]:
-    """Places of the few days on which traffic came to a standstill and on others did not.
-
-    One of them widens the noise of everything. Where they are common they are part of the model.
-
-    Args:
-        tallies: Days of one model.
-        usual: Least `day_to_day`, where few days hardly tell it.
-    """
-    counts = _counts(tallies)
-    spread = max(day_to_day(tallies), usual)
-    found = np.flatnonzero(np.abs(counts - np.median(counts)) > LOCKED_UP * spread)
-    return found.tolist() if len(found) <= max(1.0, RARE * len(tallies)) else []
-
-
-def _counts(tallies: Sequence[Tally]) -> Array:
-    return np.array([item.bins[:3].sum() for item in tallies])
 
 
 def _smoothed(mean: Array, variance: Array) -> Array:

@@ -22,14 +22,13 @@ from ugat_marl.discrepancy.replay import Replay
 from ugat_marl.discrepancy.residual import Directed, Null, Tested
 from ugat_marl.discrepancy.select import Effort, Selector
 from ugat_marl.discrepancy.site import Site
+from ugat_marl.discrepancy.standstill import day_to_day, locked_up
 from ugat_marl.discrepancy.statistics import (
     Array,
     Distance,
     Pools,
     Reference,
     added,
-    day_to_day,
-    locked_up,
     shift,
 )
 from ugat_marl.discrepancy.volume import Routes
