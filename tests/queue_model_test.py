@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,8 @@ import pytest
 
 import ugat_marl
 from ugat_marl.effects import in_domain, known_effects, load, parse_domain
-from ugat_marl.errors import OptionError
+from ugat_marl.effects.signals import late_greens, with_late_programmes
+from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.looks import QueueLook
 from ugat_marl.network import Network
 from ugat_marl.testing.episodes import play, random_actions
@@ -346,6 +347,26 @@ def test_a_full_turning_lane_blocks_no_other(tmp_path: Path) -> None:
     assert street == pytest.approx(600 / 6, abs=10)
     assert whole == pytest.approx(street, abs=3)
     assert short < street - 20
+
+
+@pytest.mark.parametrize("domain", ["meso+late_green=*,1", "late_green=*,1+meso"])
+def test_a_late_green_comes_on_top_of_that_of_queues(domain: str) -> None:
+    assert late_greens(in_domain(load("single-v1"), "meso")) == {"A1": 2.0}
+    assert late_greens(in_domain(load("single-v1"), domain)) == {"A1": 3.0}
+
+
+def test_a_programme_that_jumps_is_an_error_only_where_lateness_was_asked_for(
+    crossing: Callable[..., Path],
+) -> None:
+    path = crossing(edit=lambda text: text.replace("<phase ", '<phase next="0" '))
+    scenario = in_domain(load(path), "meso")
+    before, after = (
+        [phase.attrib for phase in item.network.parse().iter("phase")]
+        for item in (scenario, with_late_programmes(scenario))
+    )
+    assert before == after and before
+    with pytest.raises(ScenarioError, match="next="):
+        with_late_programmes(in_domain(load(path), "meso+late_green=*,1"))
 
 
 def test_lanes_hold_all_vehicles_that_go_their_way() -> None:
