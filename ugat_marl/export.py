@@ -59,7 +59,8 @@ def export_policy(policy: DQNPolicy, path: Path, env: AnyParallelEnv | None = No
         The path of the JSON file.
 
     Raises:
-        OptionError: Unknown suffix, missing extra, or the environment has other agents.
+        OptionError: Unknown suffix, missing extra, the environment has other agents, or a network
+            with structure for another format than ``.ts``.
         CheckpointError: An option of the environment is not plain data.
         OutputError: Not writable.
     """
@@ -78,7 +79,16 @@ def export_policy(policy: DQNPolicy, path: Path, env: AnyParallelEnv | None = No
 
 
 def layers_of(policy: DQNPolicy) -> list[Layer]:
-    """The policy's network as affine maps with ReLU between them; of one kind, shared or not."""
+    """The policy's network as affine maps with ReLU between them; of one kind, shared or not.
+
+    Raises:
+        OptionError: It is a network with structure, which is more than that.
+    """
+    if policy.structure is not None:
+        raise OptionError(
+            f"a policy with network {policy.structure.network!r} is more than layers of matrices, "
+            "which is what .npz and .onnx hold here; export it to .ts"
+        )
     found: list[Layer] = []
     parameters = [p.numpy().copy() for p in policy._network.parameters()]
     for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):

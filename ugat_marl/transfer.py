@@ -379,7 +379,7 @@ def _other_env(
 def _identity(
     config: TransferConfig, scenario: Scenario, env: TrafficEnv, controls: Sequence[Control]
 ) -> dict[str, Any]:
-    settings = asdict(config)
+    settings = {**asdict(config), "dqn": config.dqn.identity}
     for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", *ADDED):
         settings.pop(other)
     if config.placebo == "none":  # runs from before there were any can be resumed

@@ -87,6 +87,7 @@ class StrengthBench:
         tuning_seeds: Episodes behind the choice of the rule.
         duration_s: Simulated seconds per episode; default: the scenario's own.
         observation: What agents see.
+        reward: What agents want; they are judged by travel time.
         neighbours: How many roads away intersections are seen too.
         dqn: Settings of the learner.
         out: JSON file to write.
@@ -103,6 +104,7 @@ class StrengthBench:
     tuning_seeds: int = 2
     duration_s: float | None = None
     observation: str = "count"
+    reward: str = "queue"
     neighbours: int = 0
     dqn: DQNConfig = field(default_factory=DQNConfig)
     out: Path | None = None
@@ -195,6 +197,7 @@ class StrengthBench:
             scenario,
             self.domain,
             observation=self.observation,
+            reward=self.reward,
             neighbours=self.neighbours,
             duration_s=self.duration_s,
         )

@@ -26,6 +26,7 @@ from ugat_marl.learners.dqn_policy import DQNPolicy, header, parse_header
 from ugat_marl.learners.exploration import StickyExploration
 from ugat_marl.learners.q_network import flatten_parameters, greedy_actions, q_network
 from ugat_marl.learners.replay import Replay
+from ugat_marl.learners.structure import Structure, structure_in
 from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
@@ -57,6 +58,10 @@ class DQN:
         config: Settings.
         seed: Seed of the initial weights.
         env_options: Options of the environment the learned policy relies on.
+        structure: What a network other than "mlp" knows of the intersections; `DQN.of` reads it.
+
+    Raises:
+        OptionError: The network of `config` is not that of `structure`.
     """
 
     def __init__(
@@ -65,16 +70,24 @@ class DQN:
         config: DQNConfig | None = None,
         seed: int = 0,
         env_options: Mapping[str, Any] | None = None,
+        structure: Structure | None = None,
     ) -> None:
         self.agents = agents
         self.config = config if config is not None else DQNConfig()
+        self.structure = structure
+        if self.config.network != _network_of(structure):
+            raise OptionError(
+                f"network = {self.config.network!r} with the structure of "
+                f"{_network_of(structure)!r}; DQN.of(env, config) reads the right one"
+            )
         self.env_options: Mapping[str, Any] = dict(env_options or {})
         self.episodes = 0
         self.decisions = 0
         self.updates = 0
         hidden, shared = self.config.hidden, self.config.shared
-        self._online = q_network(agents, hidden, shared, torch_generator(seed, "dqn", "weights"))
-        self._target = q_network(agents, hidden, shared, torch.Generator())
+        weights = torch_generator(seed, "dqn", "weights")
+        self._online = q_network(agents, hidden, shared, weights, structure)
+        self._target = q_network(agents, hidden, shared, torch.Generator(), structure)
         self._weights = flatten_parameters(self._online)
         self._target_weights = flatten_parameters(self._target)
         self._target_weights.data.copy_(self._weights.data)
@@ -95,11 +108,13 @@ class DQN:
         """A learner for the agents of `env`; its options come along if it declares them.
 
         Raises:
-            OptionError: `env` has a space this learner cannot use.
+            OptionError: `env` has a space this learner cannot use, or no road network where the
+                network needs one.
         """
         if env_options is None:
             env_options = getattr(env.unwrapped, "env_options", {})
-        return cls(AgentSet.of(env), config, seed, env_options)
+        network = config.network if config is not None else "mlp"
+        return cls(AgentSet.of(env), config, seed, env_options, Structure.of(env, network))
 
     def learn(
         self,
@@ -147,7 +162,8 @@ class DQN:
         26 s of mean travel time worse).
         """
         hidden, shared = self.config.hidden, self.config.shared
-        return DQNPolicy(self.agents, hidden, self._target_weights, self.env_options, shared)
+        weights, options = self._target_weights, self.env_options
+        return DQNPolicy(self.agents, hidden, weights, options, shared, self.structure)
 
     def _episode(self, env: AnyParallelEnv, seed: int) -> dict[str, float]:
         number = self.episodes
@@ -251,8 +267,9 @@ class DQN:
         Raises:
             CheckpointError: The networks have diverged (NaN); a file at `path` stays as it was.
         """
+        own = self.structure
         content = {
-            **header(self.agents, self.config.hidden, self.env_options, self.config.shared),
+            **header(self.agents, self.config.hidden, self.env_options, self.config.shared, own),
             "counters": {name: getattr(self, name) for name in _COUNTERS}
             | {"added": self._replay.added},
             "tensors": {name: tensor.clone() for name, tensor in self._tensors().items()},
@@ -262,7 +279,7 @@ class DQN:
         write_checkpoint(path, _KIND, content)
 
     def load(self, path: Path) -> None:
-        """Restores what `save` wrote; settings but `hidden` and `shared` remain this learner's own.
+        """Restores what `save` wrote; settings but those of the network remain this learner's own.
 
         Raises:
             CheckpointError: Missing, cut short, not finite, or of other agents or sizes. The
@@ -274,6 +291,13 @@ class DQN:
             _require_same(path, "agents", agents, self.agents)
             _require_same(path, "hidden sizes", hidden, self.config.hidden)
             _require_same(path, "settings 'shared'", shared, self.config.shared)
+            structure = structure_in(content, agents)
+            _require_same(path, "network", _network_of(structure), self.config.network)
+            if structure != self.structure:
+                raise CheckpointError(
+                    f"{path}: its intersections have other movements or phases than this "
+                    "learner's; give the checkpoint of this scenario, or train a new one"
+                )
             counters = {name: int(content["counters"][name]) for name in (*_COUNTERS, "added")}
             tensors = _like(path, content["tensors"], self._tensors())
             stored = _like(path, content["replay"], self._replay.rows(counters["added"]))
@@ -297,6 +321,10 @@ class DQN:
             "centre": self._centre,
             "scale": self._scale,
         }
+
+
+def _network_of(structure: Structure | None) -> str:
+    return "mlp" if structure is None else structure.network
 
 
 def _require_same(path: Path, what: str, found: object, own: object) -> None:

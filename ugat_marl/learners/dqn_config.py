@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
 
 from ugat_marl.errors import OptionError
+
+NetworkName = Literal["mlp", "frap"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,9 @@ class DQNConfig:
         reward_scale: Factor on all rewards; None measures it per agent.
         shared: One network for all agents, told for which of them it computes, instead of one for
             each; it learns from the transitions of all.
+        network: What computes Q. "mlp": layers over an agent's observation. "frap": phases that
+            compete with the demand of their movements (Zheng et al. 2019), one network for all
+            intersections; `hidden` is the size of a demand and that of a pair of phases.
     """
 
     hidden: tuple[int, ...] = (48, 48)
@@ -57,6 +63,7 @@ class DQNConfig:
     huber_delta: float = 1.0
     reward_scale: float | None = None
     shared: bool = False
+    network: NetworkName = "mlp"
 
     def __post_init__(self) -> None:
         # a list, as JSON has it, would differ from the tuple of a checkpoint
@@ -79,11 +86,28 @@ class DQNConfig:
         self._require("huber_delta", 0 < self.huber_delta < float("inf"), "above 0")
         scale = self.reward_scale
         self._require("reward_scale", scale is None or 0 < scale < float("inf"), "above 0, or None")
+        self._require_network()
         self._require(
             "warmup_decisions",
             self.warmup_decisions <= self.replay_capacity,
             f"at most replay_capacity ({self.replay_capacity})",
         )
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The settings by which trainings are told apart; later ones only if they are used."""
+        settings = asdict(self)
+        if self.network == "mlp":  # runs from before there were others can be resumed
+            settings.pop("network")
+        return settings
+
+    def _require_network(self) -> None:
+        known = get_args(NetworkName)
+        self._require("network", self.network in known, f"one of {', '.join(known)}")
+        if self.network == "frap":
+            self._require("hidden", len(self.hidden) == 2, "two sizes with network = 'frap'")
+        alone = f"left away: network = {self.network!r} is one for all agents in any case"
+        self._require("shared", self.network == "mlp" or not self.shared, alone)
 
     def _require(self, name: str, holds: bool, allowed: str) -> None:
         if not holds:

@@ -16,6 +16,7 @@ from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.q_network import greedy_actions, q_network
+from ugat_marl.learners.structure import Structure, structure_in
 from ugat_marl.policy import Actions, Infos, Observations
 
 _KIND = "ugat_marl.dqn_policy"
@@ -30,6 +31,7 @@ class DQNPolicy:
         parameters: All parameters as one vector, as `flatten_parameters` orders them; copied.
         env_options: Options of the environment the policy relies on.
         shared: Whether all agents share one network.
+        structure: What a network other than "mlp" knows of the intersections.
 
     Raises:
         ValueError: `parameters` are those of other networks.
@@ -42,12 +44,14 @@ class DQNPolicy:
         parameters: Tensor | NDArray[np.float32],
         env_options: Mapping[str, Any],
         shared: bool = False,
+        structure: Structure | None = None,
     ) -> None:
         self.agents = agents
         self.hidden = hidden
         self.shared = shared
+        self.structure = structure
         self.env_options: Mapping[str, Any] = dict(env_options)
-        self._network = q_network(agents, hidden, shared, torch.Generator())
+        self._network = q_network(agents, hidden, shared, torch.Generator(), structure)
         vector = torch.as_tensor(parameters).detach().clone()
         needed = sum(parameter.numel() for parameter in self._network.parameters())
         if vector.shape != (needed,):
@@ -81,7 +85,7 @@ class DQNPolicy:
 
     def save(self, path: Path) -> None:
         """Writes the policy to one file; `load` reads it."""
-        content = header(self.agents, self.hidden, self.env_options, self.shared)
+        content = header(self.agents, self.hidden, self.env_options, self.shared, self.structure)
         parameters = torch.from_numpy(self.parameters)
         write_checkpoint(path, _KIND, {**content, "parameters": parameters})
 
@@ -95,18 +99,23 @@ class DQNPolicy:
         content = read_checkpoint(path, _KIND)
         try:
             agents, hidden, env_options, shared = parse_header(content)
-            return cls(agents, hidden, content["parameters"], env_options, shared)
+            structure = structure_in(content, agents)
+            return cls(agents, hidden, content["parameters"], env_options, shared, structure)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{path}: not a whole policy ({error}); save it again") from None
 
     def __reduce__(self) -> tuple[type[DQNPolicy], tuple[Any, ...]]:
         # numpy, since torch would send tensors between processes through shared memory
         own = (self.agents, self.hidden, self.parameters, self.env_options, self.shared)
-        return DQNPolicy, own
+        return DQNPolicy, (*own, self.structure)
 
 
 def header(
-    agents: AgentSet, hidden: tuple[int, ...], env_options: Mapping[str, Any], shared: bool
+    agents: AgentSet,
+    hidden: tuple[int, ...],
+    env_options: Mapping[str, Any],
+    shared: bool,
+    structure: Structure | None = None,
 ) -> dict[str, Any]:
     """What a checkpoint says about itself.
 
@@ -126,6 +135,7 @@ def header(
         "hidden": list(hidden),
         "env_options": options,
         "shared": shared,
+        **({} if structure is None else {"structure": structure.written()}),
     }
 
 

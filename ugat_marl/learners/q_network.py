@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 from ugat_marl.batched import BatchedLinear, BatchedMLP
 from ugat_marl.learners.agents import AgentSet
+from ugat_marl.learners.frap import FRAP
+from ugat_marl.learners.structure import Structure
 
 
 class SharedMLP(nn.Module):
@@ -55,9 +57,15 @@ class SharedMLP(nn.Module):
 
 
 def q_network(
-    agents: AgentSet, hidden: Sequence[int], shared: bool, generator: torch.Generator
+    agents: AgentSet,
+    hidden: Sequence[int],
+    shared: bool,
+    generator: torch.Generator,
+    structure: Structure | None = None,
 ) -> nn.Module:
     """Observations ``(agents, batch, widest_observation)`` to the values of actions, padded."""
+    if structure is not None:
+        return FRAP(agents, structure.junctions, hidden, generator)
     if shared:
         n_in, n_out = agents.widest_observation, agents.most_actions
         return SharedMLP(len(agents), n_in, hidden, n_out, generator)

@@ -166,7 +166,7 @@ def _made_with(scenario: Scenario, name: str, learner: Any) -> dict[str, Any]:
     return {
         "scenario": scenario.hash,
         "library": library_of(name),
-        "settings": asdict(learner.config),
+        "settings": getattr(learner.config, "identity", None) or asdict(learner.config),
         "versions": {key: version_of(key) for key in ("eclipse-sumo", "torch")},
     }
 

@@ -87,7 +87,7 @@ class Job:
     @property
     def identity(self) -> dict[str, Any]:
         """What decides the policy: a job with the same is the same job."""
-        settings = asdict(self)
+        settings = {**asdict(self), "dqn": self.dqn.identity}
         for judging in ("domains", "evaluation_seeds", "scenario"):
             settings.pop(judging)
         worlds = sorted({world for world in (self.sim, self.target, self.world) if world})
