@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
 import pytest
 
-from ugat_marl.discrepancy.counted import counts_tally
+from ugat_marl.discrepancy.counted import bins_together, counts_tally, without_gaps
 from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, INDEX
 from ugat_marl.discrepancy.signal_timing import timing_effects
 from ugat_marl.discrepancy.site import Site
+from ugat_marl.discrepancy.statistics import Pools
 from ugat_marl.discrepancy.workflow import DiagnosisConfig, diagnose
 from ugat_marl.effects import load
 from ugat_marl.loops import standard_detectors
@@ -150,7 +152,7 @@ def test_counts_stand_where_detections_would(site: Site) -> None:
         ("day2", 0.0, 900.0, "stop:S_C_0", 999),
         ("day1", 0.0, 900.0, "nowhere", 999),
     )
-    found = counts_tally(site, PERIOD, table)
+    found = counts_tally(site, PERIOD, table, without_gaps(table, [PERIOD]))
     lane = next(i for i, item in enumerate(site.lanes) if item.id == "S_C_0")
     behind = next(i for i, item in enumerate(site.exits) if item[1] == "C_E_0")
     assert found.sums[INDEX["count_stop"], lane].tolist() == [60.0, 15.0]
@@ -164,12 +166,44 @@ def test_counts_stand_where_detections_would(site: Site) -> None:
 
 
 def test_a_count_across_bins_is_shared_out(site: Site) -> None:
-    found = counts_tally(site, PERIOD, counts(("day1", 200.0, 600.0, "stop:S_C_0", 40)))
+    table = counts(
+        ("day1", 0.0, 200.0, "stop:S_C_0", 20),
+        ("day1", 200.0, 600.0, "stop:S_C_0", 40),
+        ("day1", 600.0, 900.0, "stop:S_C_0", 5),
+    )
+    found = counts_tally(site, PERIOD, table, without_gaps(table, [PERIOD]))
     lane = next(i for i, item in enumerate(site.lanes) if item.id == "S_C_0")
-    assert found.bins[BIN_FEATURES.index("count_stop"), lane] == pytest.approx([10.0, 30.0, 0.0])
+    assert found.bins[BIN_FEATURES.index("count_stop"), lane] == pytest.approx([30.0, 30.0, 5.0])
+    assert bins_together(table) == 2, "nobody knows when in 400 s they came"
+    pooled = Pools.of(site, 2).pool(found)["time"]
+    row = BIN_FEATURES.index("count_stop") * len(site.places) + lane
+    assert pooled[row].tolist() == [[60.0, 1.0]], "what is left at the end is not used"
+
+
+def test_what_was_not_counted_is_no_count_of_zero(site: Site) -> None:
+    table = counts(
+        ("day1", 0.0, 300.0, "stop:S_C_0", 10),
+        ("day1", 600.0, 900.0, "stop:S_C_0", 30),
+        ("day1", 0.0, 900.0, "exit:C_E_0", 90),
+    )
+    whole = without_gaps(table, [PERIOD])
+    assert whole == {"exit:C_E_0"}
+    assert not without_gaps(table, [PERIOD, replace(PERIOD, id="day2")])
+    found = counts_tally(site, PERIOD, table, whole)
+    lane = next(i for i, item in enumerate(site.lanes) if item.id == "S_C_0")
+    line = BIN_FEATURES.index("count_stop"), lane
+    assert found.bins[line].tolist() == [10.0, 0.0, 30.0]
+    assert found.counted[line].tolist() == [1.0, 0.0, 1.0]
+    assert not found.counted[BIN_FEATURES.index("occupied")].any()
+    assert not found.sums[:, lane].any(), "the mean of some hours is not that of all"
+    twice = found + found
+    assert twice.counted[line].tolist() == [2.0, 0.0, 2.0]
+    events = replace(found, known=None)
+    assert (found + events).counted[line].tolist() == [2.0, 1.0, 2.0]
 
 
 def test_no_counts_no_weight(site: Site) -> None:
-    found = counts_tally(site, PERIOD, counts().cast({"period_id": pl.String}))
+    found = counts_tally(site, PERIOD, counts().cast({"period_id": pl.String}), frozenset())
     assert not found.sums.any()
+    assert not found.counted.any()
     assert found.bins.shape[-1] == 3

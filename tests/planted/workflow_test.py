@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 
@@ -103,22 +104,57 @@ def test_what_data_rule_out_is_not_examined(street, measured: Measured, tmp_path
     assert all(effect["name"] == "swapped" for effect in found["effects"])
 
 
-def test_counts_alone_can_show_a_detector_that_misses_vehicles(street, tmp_path: Path) -> None:
-    measured = street.measure("undercount=stop:S_C_0,0.6")
+def counts_of(measured: Measured, every_s: float) -> Measured:
+    """The same data as counts of all detectors, and nothing else."""
     rows = [
-        (period.id, period.begin_s, period.end_s, name, len(passages))
+        (
+            period.id,
+            begin,
+            begin + every_s,
+            name,
+            int(((on >= begin) & (on < begin + every_s)).sum()),
+        )
         for period in measured.periods
-        for name, passages in period.passages.items()
+        for begin in np.arange(period.begin_s, period.end_s, every_s)
+        for name, on in ((name, item.on_s) for name, item in period.passages.items())
     ]
     schema = ("period_id", "begin_s", "end_s", "detector_id", "count")
-    counts = pl.DataFrame(rows, schema=schema, orient="row")
-    alone = replace(
+    return replace(
         measured,
         periods=tuple(replace(period, passages={}) for period in measured.periods),
-        counts=counts,
+        counts=pl.DataFrame(rows, schema=schema, orient="row"),
     )
+
+
+@pytest.mark.parametrize("every_s", [300.0, 600.0])
+def test_counts_alone_can_show_a_detector_that_misses_vehicles(
+    every_s: float, street, tmp_path: Path
+) -> None:
+    alone = counts_of(street.measure("undercount=stop:S_C_0,0.6"), every_s)
     found = run(street, alone, tmp_path)
     assert [(e["name"], e["place"]) for e in found["effects"]] == [("undercount", "stop:S_C_0")]
+
+
+@pytest.mark.parametrize("every_s", [300.0, 600.0])
+def test_counts_of_the_scenario_itself_do_not_contradict_it(
+    every_s: float, street, tmp_path: Path
+) -> None:
+    alone = counts_of(street.measure("sim"), every_s)
+    assert run(street, alone, tmp_path / "all")["verdict"] == "no_discrepancy"
+    assert alone.counts is not None
+    some = alone.counts.filter(
+        (pl.col("begin_s") != 300.0) | (pl.col("detector_id") != "stop:S_C_0")
+    )
+    gap = replace(alone, counts=some)
+    assert run(street, gap, tmp_path / "gap")["verdict"] == "no_discrepancy"
+
+
+def test_counts_alone_can_show_a_surge(street, tmp_path: Path) -> None:
+    alone = counts_of(street.measure("demand_surge=S_C,300,900,0.3"), 300.0)
+    found = run(street, alone, tmp_path, among={"demand_level", "demand_surge", "dropout"})
+    (surge,) = found["effects"]
+    assert (surge["name"], surge["place"]) == ("demand_surge", "S_C")
+    assert surge["window"] == pytest.approx([300.0, 900.0], abs=150.0)
 
 
 def test_data_without_a_single_vehicle_are_refused_or_named(

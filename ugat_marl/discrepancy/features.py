@@ -103,18 +103,27 @@ class Tally:
             lane, or behind them an outgoing one.
         bins: Counts and occupied seconds in time, ``(bin features, places, bins)``.
         days: Number of periods that were added up.
+        known: In how many of these every one of the bins was counted; None for all.
     """
 
     sums: Array
     bins: Array
     days: int = 1
+    known: Array | None = None
+
+    @property
+    def counted(self) -> Array:
+        """In how many periods every one of the bins was counted."""
+        return np.full_like(self.bins, self.days) if self.known is None else self.known
 
     def __add__(self, other: Tally) -> Tally:
         bins = min(self.bins.shape[-1], other.bins.shape[-1])
+        every = self.known is None and other.known is None
         return Tally(
             self.sums + other.sums,
             self.bins[..., :bins] + other.bins[..., :bins],
             self.days + other.days,
+            None if every else self.counted[..., :bins] + other.counted[..., :bins],
         )
 
 

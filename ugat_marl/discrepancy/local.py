@@ -72,7 +72,7 @@ class Proposer:
         found: list[Hypothesis] = []
         found += self._volume.hypotheses(distance)
         found += self._timing(reference, distance)
-        found += self._windows(reference, periods)
+        found += self._windows(reference, distance, periods)
         found += self._places(reference, distance)
         found += fault_hypotheses(self._site, reference, distance, periods)
         return [item for item in found if item.name in self._allowed]
@@ -100,6 +100,7 @@ class Proposer:
         block = reference.blocks["time"]
         found: list[tuple[float, str, float]] = []
         first = BIN_FEATURES.index("count_advance") * len(self._edges)
+        width = BIN_S * reference.pools.together
         for origin in self._routes.passing:
             rows = [
                 first + index
@@ -112,7 +113,7 @@ class Proposer:
             mean = np.where(np.isfinite(block.mean[rows]), block.mean[rows], 0.0)
             noise = np.where(known, difference[rows] / np.where(known, z[rows], 1.0), np.inf)
             for shift in _SHIFTS_S:
-                ray = (_later(mean, shift / BIN_S) - mean) / np.abs(noise)
+                ray = (_later(mean, shift / width) - mean) / np.abs(noise)
                 size = float((ray**2).sum())
                 strength = float((ray * z[rows]).sum()) / max(size, 1e-9)
                 if 0.5 < strength < 2.0 and strength**2 * size > _SUSPECT:
@@ -127,14 +128,18 @@ class Proposer:
             for origin, shift in list(chosen.items())[:2]
         ]
 
-    def _windows(self, reference: Reference, periods: Sequence[Period]) -> list[Hypothesis]:
+    def _windows(
+        self, reference: Reference, distance: Distance, periods: Sequence[Period]
+    ) -> list[Hypothesis]:
         """Surges and closures in the stretches that depart most."""
         if len({(p.begin_s, p.end_s) for p in periods}) > 1:
             return []
         found: list[tuple[float, Hypothesis]] = []
         for origin in self._routes.passing:
             members = [i for i, edge in enumerate(self._edges) if edge == origin]
-            window = self._scan(reference, periods, members, "count_advance", "count_exit")
+            window = self._scan(
+                reference, distance, periods, members, "count_advance", "count_exit"
+            )
             if window is not None:
                 z, begin, end, factor = window
                 fixed = (("edge", origin), ("begin_s", begin), ("end_s", end))
@@ -144,7 +149,7 @@ class Proposer:
         for index, lane in enumerate(self._site.lanes):
             # What comes after a closure, the queue that is let go, is more unusual than itself.
             for kind, side in (("occupied", 1), ("count_stop", -1), ("count_advance", -1)):
-                option = self._scan(reference, periods, [index], kind, kind, side)
+                option = self._scan(reference, distance, periods, [index], kind, kind, side)
                 if option is not None:
                     z, begin, end, _ = option
                     fixed = (("lane", lane.id), ("begin_s", begin), ("end_s", end))
@@ -158,6 +163,7 @@ class Proposer:
     def _scan(
         self,
         reference: Reference,
+        distance: Distance,
         periods: Sequence[Period],
         members: Sequence[int],
         kind: str,
@@ -186,7 +192,11 @@ class Proposer:
         per_bin = np.bincount(which, minlength=bins)
         expected = (block.mean[rows].sum(axis=0) / np.maximum(per_bin, 1))[which]
         variance = (block.variance[rows].sum(axis=0) / np.maximum(per_bin, 1))[which] / len(periods)
-        measured = self._minutes(periods, members, kind, other, minutes)
+        if any(period.passages for period in periods):
+            measured = self._minutes(periods, members, kind, other, minutes)
+        else:  # counts alone say no more than how many came in each bin
+            more = distance.difference["time"][rows].sum(axis=0) / np.maximum(per_bin, 1)
+            measured = expected + more[which]
         return most_unusual(measured, expected, variance, begin, side)
 
     def _minutes(

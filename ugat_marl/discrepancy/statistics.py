@@ -39,12 +39,18 @@ lanes and minutes have heavy tails."""
 
 @dataclass(frozen=True)
 class Pools:
-    """How places pool: block name to a matrix ``(members, places)`` of zeros and ones."""
+    """How places pool.
+
+    Attributes:
+        blocks: Block name to a matrix ``(members, places)`` of zeros and ones.
+        together: How many bins of time make one; what is left at the end is not used.
+    """
 
     blocks: dict[str, Array]
+    together: int = 1
 
     @classmethod
-    def of(cls, site: Site) -> Pools:
+    def of(cls, site: Site, together: int = 1) -> Pools:
         """The network, every intersection if there are several, every lane."""
         places = len(site.places)
         owners = [owner for owner, _, _ in site.places]
@@ -57,7 +63,7 @@ class Pools:
                 ]
             )
         blocks["lane"] = np.eye(places)
-        return cls(blocks)
+        return cls(blocks, together)
 
     def pool(self, item: Tally) -> dict[str, Array]:
         """Sums and weights ``(members, features, 2)`` of every block.
@@ -69,8 +75,14 @@ class Pools:
             name: np.einsum("mp,fpc->mfc", matrix, item.sums)
             for name, matrix in self.blocks.items()
         }
-        bins = item.bins.reshape(-1, item.bins.shape[-1])
-        pooled["time"] = np.stack([bins, np.full_like(bins, item.days)], axis=-1)
+        groups = max(1, item.bins.shape[-1] // self.together)
+        width = min(self.together, item.bins.shape[-1])
+
+        def gathered(values: Array) -> Array:
+            return values[..., : groups * width].reshape(-1, groups, width)
+
+        bins, counted = gathered(item.bins).sum(axis=-1), gathered(item.counted).min(axis=-1)
+        pooled["time"] = np.stack([bins, counted], axis=-1)
         return pooled
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ugat_marl.discrepancy.counted import counts_tally
+from ugat_marl.discrepancy.counted import bins_together, counts_tally, without_gaps
 from ugat_marl.discrepancy.engine import Engine, default_cache
 from ugat_marl.discrepancy.features import Tally
 from ugat_marl.discrepancy.fit import Fitted, Fitter
@@ -163,7 +163,7 @@ class Study:
             config,
             site,
             engine,
-            Pools.of(site),
+            Pools.of(site, 1 if measured.has_events else bins_together(measured.counts)),
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
             config.effort or effort_for(len(site.intersections)),
@@ -218,8 +218,13 @@ class Study:
             periods: Periods in a data set.
             directions: Where single effects would show; None to look at the whole only.
         """
-        data = added(self.fit).sums[..., 1] > 0
-        seen = [Tally(day.sums * data[..., None], day.bins, day.days) for day in tallies]
+        data = added(self.fit)
+        counted, known = data.sums[..., 1:] > 0, data.counted >= data.days
+        width = min(known.shape[-1], *(day.bins.shape[-1] for day in tallies))
+        seen = [
+            Tally(day.sums * counted, day.bins[..., :width] * known[..., :width], day.days)
+            for day in tallies
+        ]
 
         def directed(reference: Reference) -> Directed:
             filters = {} if directions is None else directions.filters(reference, self.fit)
@@ -308,4 +313,5 @@ def _tallies(
 ) -> tuple[Tally, ...]:
     if measured.has_events or measured.counts is None:
         return tuple(engine.measured(periods))
-    return tuple(counts_tally(site, period, measured.counts) for period in periods)
+    whole = without_gaps(measured.counts, measured.periods)
+    return tuple(counts_tally(site, period, measured.counts, whole) for period in periods)
