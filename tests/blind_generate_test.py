@@ -17,7 +17,6 @@ from ugat_marl.blind.busy import Busy, busy_places, telling
 from ugat_marl.blind.cases import Case, read_label, read_plan
 from ugat_marl.blind.consequence import Consequences, differing
 from ugat_marl.blind.drawing import (
-    IN_THE_LOG,
     OUTSIDE,
     Drawn,
     Task,
@@ -30,6 +29,7 @@ from ugat_marl.blind.outside import BusStops, Driveway
 from ugat_marl.blind.run import run_cases
 from ugat_marl.blind.strengths import KINDS
 from ugat_marl.discrepancy.hypotheses import library
+from ugat_marl.discrepancy.signal_timing import IN_THE_LOG
 from ugat_marl.discrepancy.volume import Routes
 from ugat_marl.effects import effect_from, known_effects, load
 from ugat_marl.errors import BlindTestError, OptionError, UnknownNameError

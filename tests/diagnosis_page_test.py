@@ -183,6 +183,11 @@ def test_a_partial_result_says_so_first(verdict: str, network: Network) -> None:
     assert "Partial result" not in "".join(page.texts[:1])
     lines = " ".join(printed(record).split())
     assert lines.startswith("Partial result: the budget of 600 s ended")
+    assert "Not examined" not in lines
+    names = [f"effect_{number}" for number in range(words.UNTRIED + 2)]
+    lines = " ".join(printed({**record, "untried": names}).split())
+    assert "Not examined yet: effect 0, effect 1, " in lines
+    assert f", … ({words.UNTRIED + 2} in all)." in lines
     assert "The same command goes on" in lines
 
 

@@ -70,6 +70,7 @@ def test_a_budget_that_is_too_small_for_anything_says_so(
     assert not found["complete"]
     assert found["effects"] == []
     assert found["corrected"] is None
+    assert found["untried"] == sorted(DETECTORS)
     assert "budget" in found["sentence"]
 
 
@@ -91,8 +92,11 @@ def test_when_the_budget_ends_half_way_the_answer_says_so(
     assert found["effects"] == []
     assert not found["complete"]
     assert found["where"], "what is known is said"
+    assert found["untried"] == ["dropout", "swapped"], "and what is not"
     monkeypatch.undo()
-    assert run(street, measured, tmp_path)["verdict"] == "explained"
+    whole_search = run(street, measured, tmp_path)
+    assert whole_search["verdict"] == "explained"
+    assert whole_search["untried"] == []
 
 
 def test_what_data_rule_out_is_not_examined(street, measured: Measured, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from ugat_marl.blind.busy import Busy
 from ugat_marl.blind.outside import BusStops, Driveway
 from ugat_marl.blind.strengths import KINDS, MODELS, SCALE, STRENGTHS, nominal_of
+from ugat_marl.discrepancy.signal_timing import IN_THE_LOG
 from ugat_marl.effects import SETTINGS, Effect, effect_from, known_effects
 from ugat_marl.effects.base import EVERYWHERE
 from ugat_marl.errors import UnknownNameError
@@ -31,9 +32,6 @@ that leaving out says nothing."""
 
 MARGIN_S = 600.0
 """Nothing with a window begins or ends closer to the ends of a period."""
-
-IN_THE_LOG = ("yellow_time", "all_red_time")
-"""Effects that the log of the signals tells by itself; a replay has them without knowing."""
 
 ALSO_OUT: Mapping[str, tuple[str, ...]] = {"demand_level": ("demand_surge",)}
 """What else says the same as an effect, and is left out with it."""

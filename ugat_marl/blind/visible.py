@@ -23,8 +23,8 @@ from ugat_marl.blind.cases import (
     read_json,
     read_label,
 )
-from ugat_marl.blind.drawing import IN_THE_LOG
 from ugat_marl.discrepancy.features import Tally
+from ugat_marl.discrepancy.signal_timing import IN_THE_LOG
 from ugat_marl.discrepancy.statistics import Reference, added, shift
 from ugat_marl.discrepancy.study import DiagnosisConfig, Study
 from ugat_marl.discrepancy.whitening import groups_of, independent

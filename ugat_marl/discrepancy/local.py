@@ -55,7 +55,7 @@ class Proposer:
     def __init__(self, site: Site, routes: Routes, allowed: Collection[str]) -> None:
         self._site = site
         self._routes = routes
-        self._allowed = frozenset(allowed)
+        self.allowed = frozenset(allowed)
         self._edges = [edge for _, edge, _ in site.places]
         self._volume = Volume(site, routes)
 
@@ -75,7 +75,7 @@ class Proposer:
         found += self._windows(reference, distance, periods)
         found += self._places(reference, distance)
         found += fault_hypotheses(self._site, reference, distance, periods)
-        return [item for item in found if item.name in self._allowed]
+        return [item for item in found if item.name in self.allowed]
 
     def everywhere(self) -> list[Hypothesis]:
         """What may be wrong at any of the places, if there are few: parking on each lane.
@@ -84,7 +84,7 @@ class Proposer:
         neither pools nor single statistics show it, and no other effect leads there.
         """
         lanes = self._site.lanes
-        if len(lanes) > _MOST_LANES or "parking" not in self._allowed:
+        if len(lanes) > _MOST_LANES or "parking" not in self.allowed:
             return []
         return [_parking(lane.id) for lane in lanes]
 

@@ -98,6 +98,9 @@ class Selector:
         alpha: Level of the tests.
         null: Makes the test of a model of its days.
         reporter: Shows progress.
+
+    Attributes:
+        examined: Effects that were simulated, or for which no place came into question.
     """
 
     def __init__(
@@ -123,6 +126,7 @@ class Selector:
         self._seen: dict[str, Fitted] = {}
         self._rays: tuple[Ray, ...] = ()
         self._places: tuple[Ray, ...] = ()
+        self.examined: set[str] = set()
 
     def looked_closer(self, base: Tested) -> Tested:
         """The test of the scenario as it is once it is known where single effects would show.
@@ -253,6 +257,7 @@ class Selector:
         added += known
         proposals = propose([*rays, *added], self._whitener(model, None), self._fitter.price)
         places |= {item.key for item in local}
+        self.examined |= self._proposer.allowed
         alone = [item for item in proposals if len(item.members) == 1]
         best: dict[str, Members] = {}
         for item in alone:
@@ -295,6 +300,7 @@ class Selector:
         with self._reporter.task(f"round {number + 1}: {what}", len(jobs)) as advance:
             prepared = [(effects_of(members), numbers) for members in models]
             self._fitter.engine.prepare(prepared, advance)
+        self.examined |= {hypothesis.name for hypothesis, _, _ in jobs}
         for (hypothesis, level, origin), members in zip(jobs, models, strict=True):
             try:
                 difference, variance = self._fitter.difference(model, members, days)

@@ -12,6 +12,8 @@ from ugat_marl.network import Network
 from ugat_marl.scenario import Scenario
 from ugat_marl.signals import GREEN
 
+IN_THE_LOG = ("yellow_time", "all_red_time")
+"""Effects that the log of the signals tells by itself; a replay has them without knowing."""
 _AMBER = frozenset("yY")
 _LEAST = 20
 """Clearances that must have been seen."""
@@ -34,10 +36,8 @@ def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> 
                     (yellow if kind == "y" else red)[round(duration, 1)] += 1
     found: list[Effect] = []
     control = scenario.control
-    for name, seen, now in (
-        ("yellow_time", yellow, control.yellow_s),
-        ("all_red_time", red, control.all_red_s),
-    ):
+    clearances = (yellow, control.yellow_s), (red, control.all_red_s)
+    for name, (seen, now) in zip(IN_THE_LOG, clearances, strict=True):
         total = sum(seen.values())
         if total >= _LEAST:
             value, count = seen.most_common(1)[0]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,9 @@ from ugat_marl.discrepancy.fit import Fitted
 from ugat_marl.discrepancy.locate import Disagreement, locate
 from ugat_marl.discrepancy.residual import Tested
 from ugat_marl.discrepancy.select import Selection, Selector
-from ugat_marl.discrepancy.signal_timing import timing_effects
+from ugat_marl.discrepancy.signal_timing import IN_THE_LOG, timing_effects
 from ugat_marl.discrepancy.study import DiagnosisConfig, Study
-from ugat_marl.discrepancy.verdict import Conclusion, conclude, effect_record
+from ugat_marl.discrepancy.verdict import Conclusion, conclude, describe_members, effect_record
 from ugat_marl.discrepancy.verify import (
     Verification,
     courtesy,
@@ -105,8 +106,16 @@ def _compared(
         except OutOfTime:
             complete = False
     if base.residual.p > alpha:
-        return _nothing(study, base, timing, complete)
-    return _search(study, base, selector, timing, reporter)
+        record = _nothing(study, base, timing, complete)
+    else:
+        record = _search(study, base, selector, timing, reporter)
+    left = [] if record["complete"] else _untried(study, selector.examined)
+    return record | {"untried": left}
+
+
+def _untried(study: Study, examined: Collection[str]) -> list[str]:
+    """Effects that were not examined; those of the signal log are read off it at once."""
+    return sorted(study.allowed.difference(examined, IN_THE_LOG))
 
 
 def where(study: Study, model: Tested) -> list[Disagreement]:
@@ -171,6 +180,7 @@ def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> dict[str, An
         "best": None,
         "next_measurement": None,
         "complete": False,
+        "untried": _untried(study, ()),
         "_effects": timing,
     }
 
@@ -236,9 +246,11 @@ def _search(
 def _unverified(base: Tested, selection: Selection) -> tuple[Verification, Conclusion]:
     """What can be said when the budget ended before the model was verified."""
     verification = Verification(base.residual, base.residual, None)
+    members = selection.best.model.members
+    nearest = f" The nearest so far is {describe_members(members)}." if members else ""
     sentence = (
-        "Simulation and measurement disagree; the budget ended before an explanation was verified. "
-        "Run the same command again to go on."
+        "Simulation and measurement disagree; the budget ended before an explanation was verified."
+        f"{nearest} Run the same command again to go on."
     )
     return verification, Conclusion("unknown", selection.best, (), sentence, None)
 

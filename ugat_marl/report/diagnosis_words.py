@@ -11,6 +11,9 @@ from ugat_marl.wording import clock
 Record = Mapping[str, Any]
 """The content of ``diagnosis.json``, or a part of it."""
 
+UNTRIED = 8
+"""Effects named that were not examined; of more, their number is told."""
+
 VERDICTS = {
     "no_discrepancy": "no discrepancy",
     "explained": "explained",
@@ -144,9 +147,12 @@ def partial(record: Record) -> str | None:
     """What to say of a diagnosis that is not complete; None if it is."""
     if record.get("complete", True):
         return None
+    untried = list(record.get("untried") or ())
+    rest = f", … ({len(untried)} in all)" if len(untried) > UNTRIED else ""
+    left = f" Not examined yet: {joined(untried[:UNTRIED])}{rest}." if untried else ""
     return (
         f"Partial result: the budget of {number(record.get('budget_s'))} s ended before the search "
-        "did. The same command goes on where this one stopped."
+        f"did.{left} The same command goes on where this one stopped."
     )
 
 
