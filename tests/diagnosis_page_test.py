@@ -97,9 +97,11 @@ def record_of(verdict: str = "explained", *, complete: bool = True, **more: Any)
         ],
         "courtesy": {
             "before": {"geh_below_5": 1.0, "geh_largest": 1.4, "within_1_sigma": 0.6,
-                       "within_2_sigma": 0.98, "saturation_headway_s": 2.03},
+                       "within_2_sigma": 0.98, "absolute_error": 0.9, "systematic_error": 0.5,
+                       "saturation_headway_s": 2.03},
             "after": {"geh_below_5": 1.0, "geh_largest": 1.1, "within_1_sigma": 0.7,
-                      "within_2_sigma": 0.97, "saturation_headway_s": None},
+                      "within_2_sigma": 0.97, "absolute_error": None, "systematic_error": None,
+                      "saturation_headway_s": None},
             "measured": {"saturation_headway_s": 2.25},
         },
         "travel_time": {"before_s": 102.5, "after_s": 133.6},

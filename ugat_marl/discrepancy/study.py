@@ -122,6 +122,11 @@ class Study:
     other_days: Engine | None = None
     ruled_out: frozenset[str] = field(default=frozenset())
 
+    @property
+    def all_days(self) -> tuple[Tally, ...]:
+        """Tallies of every measured period, each once."""
+        return self.fit + self.heldout if self.measured.of("heldout") else self.fit
+
     @classmethod
     def of(cls, scenario: Scenario, measured: Measured, config: DiagnosisConfig) -> Study:
         """Prepares a diagnosis; nothing is simulated yet.

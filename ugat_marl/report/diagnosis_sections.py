@@ -179,8 +179,10 @@ def courtesy(record: Record) -> str:
     for name, key, say in (
         ("counts with GEH below 5 (usual: 85 %)", "geh_below_5", words.share),
         ("largest GEH", "geh_largest", words.number),
-        ("counts within 1 σ (FHWA: two thirds)", "within_1_sigma", words.share),
-        ("counts within 2 σ (FHWA: 95 %)", "within_2_sigma", words.share),
+        ("FHWA I: 15 min within 1.96 σ of the typical day (95 %)", "within_2_sigma", words.share),
+        ("FHWA II: within 1 σ (two thirds)", "within_1_sigma", words.share),
+        ("FHWA III: detectors with bounded absolute error (all)", "absolute_error", words.share),
+        ("FHWA IV: with bounded systematic error (all)", "systematic_error", words.share),
     ):
         rows.append((name, "", say(before.get(key)), say(after.get(key))))
     headway = [(found.get(k) or {}).get("saturation_headway_s") for k in ("measured",)]
