@@ -278,6 +278,27 @@ def test_files_cut_short(name: str, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flow.json", "roadnet.json"]
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[" * 200_000, "line 1: nested too deeply"),
+        ('[\n{"a": ' + "[" * 200_000, "line 2: nested too deeply"),
+        ('[\n{"a": ' + "9" * 10_000 + "}]", "line 2: a number is far too long"),
+    ],
+)
+def test_flows_no_reader_takes(
+    text: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = write(tmp_path, crossroads())
+    (tmp_path / "flow.json").write_text(text)
+    assert main(["scenario", "new", str(tmp_path / "city"), *words]) == 2
+    assert f"flow.json, {says}" in capsys.readouterr().err
+    (tmp_path / "roadnet.json").write_text(text.replace("\n", ""))
+    assert main(["scenario", "new", str(tmp_path / "city"), *words]) == 2
+    assert f"roadnet.json: {says.partition(': ')[2]}" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["flow.json", "roadnet.json"]
+
+
 # --- Hangzhou in both forms -----------------------------------------------------------------------
 
 

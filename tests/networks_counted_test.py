@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.__main__ import main
+from ugat_marl.errors import ScenarioError
 from ugat_marl.networks.counted import read_rows
+from ugat_marl.progress import Silent
 from ugat_marl.scenario import load_scenario
 
 
@@ -68,6 +70,9 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
     ("option", "text", "says"),
     [
         ("--counts", "road,count\na,1\n", "t.csv, line 1: the columns count and edge, or"),
+        ("--counts", f"edge,count\n{'x' * 200_000},1\n", "line 2: not CSV (field larger than"),
+        ("--counts", "edge,count\nwest1_A1,6e6\n", "line 2: more than 5000000 vehicles; keep"),
+        ("--od", "from,to,count\nwest1_A1,B1_east1,1e18\n", "line 2: more than 5000000 veh"),
         ("--od", "edge,count\na,1\n", "t.csv, line 1: the columns from, to and count are needed"),
         ("--counts", "edge,count\nwest1_A1,many\n", "line 2: count = 'many' is not a number"),
         ("--counts", "edge,count\nwest1_A1,-1\n", "line 2: count = '-1' is not a number of at"),
@@ -101,9 +106,25 @@ def test_a_table_that_is_no_text(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "gone.csv: no such file" in capsys.readouterr().err
 
 
+def test_long_tables_are_read_row_by_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ugat_marl.files._PIECE", 7)
+    text = "edge,count\r\n" + "".join(f'"ä {i}",{i}\r\n' for i in range(40)) + "\r\nz,1"
+    (tmp_path / "t.csv").write_bytes(text.encode())
+    rows = read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
+    assert [(row.roads, row.count) for row in rows[:-1]] == [((f"ä {i}",), i) for i in range(40)]
+    assert (rows[-1].roads, rows[-1].count, rows[-1].line) == (("z",), 1, 43)
+    monkeypatch.setattr("ugat_marl.networks.counted._MOST_ROWS", 9)
+    with pytest.raises(ScenarioError, match=r"t\.csv, line 11: more than 9 rows"):
+        read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
+    monkeypatch.setattr("ugat_marl.networks.reading._MOST", 100)
+    (tmp_path / "t.csv").write_bytes(b"edge,count\n" + b"x" * 200)
+    with pytest.raises(ScenarioError, match=r"t\.csv, line 2: is longer than a line of a table"):
+        read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
+
+
 def test_rows_are_for_the_episode_unless_they_say_more(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("edge,count,begin_s,end_s\na,1,,\nb,2,100,200\n")
-    rows = read_rows(tmp_path / "t.csv", 60, 660, pairs=False)
+    rows = read_rows(tmp_path / "t.csv", 60, 660, Silent(), pairs=False)
     assert [(r.roads, r.begin_s, r.end_s, r.line) for r in rows] == [
         (("a",), 60, 660, 2),
         (("b",), 100, 200, 3),

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import gzip
 import os
+import re
 import shlex
+import signal
+import subprocess
+import tracemalloc
 import xml.etree.ElementTree as ET
 from collections import Counter
 from contextlib import AbstractContextManager
@@ -12,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+import ugat_marl
 from ugat_marl.__main__ import main
 from ugat_marl.demand import check_demand
 from ugat_marl.errors import OptionError, ScenarioError
@@ -22,7 +27,7 @@ from ugat_marl.networks.making import Fleet, make_scenario
 from ugat_marl.networks.reading import scan
 from ugat_marl.networks.regular import rectangle
 from ugat_marl.networks.streets import Streets
-from ugat_marl.networks.walks import Drive, route_file, walked
+from ugat_marl.networks.walks import Drive, walked, write_drives
 from ugat_marl.progress import Advance, Reporter, Silent
 from ugat_marl.scenario import load_scenario, shipped_scenarios
 
@@ -138,9 +143,9 @@ def test_a_ring_has_no_entry() -> None:
         walked(ring, 100, (1, 1, 1), 600, 1)
 
 
-def test_names_are_quoted_in_route_files() -> None:
-    content = route_file([Drive('a"<&', 1.0, ("ü", "b"))])
-    vehicle = parse_xml(content, "routes").find("vehicle")
+def test_names_are_quoted_in_route_files(tmp_path: Path) -> None:
+    write_drives(tmp_path / "routes", [Drive('a"<&', 1.0, ("ü", "b"))])
+    vehicle = parse_xml((tmp_path / "routes").read_bytes(), "routes").find("vehicle")
     assert vehicle is not None
     assert vehicle.get("id") == 'a"<&'
     assert ET.tostring(vehicle).count(b"route") == 1
@@ -185,8 +190,6 @@ def test_a_configuration_becomes_a_scenario(link: bool, files: Path, tmp_path: P
 
 
 def test_such_a_scenario_is_driven(files: Path, tmp_path: Path) -> None:
-    import ugat_marl
-
     target = tmp_path / "Łódź, Śródmieście 2"
     assert made(target, "--sumo", files / "city.sumocfg") == 0
     env = ugat_marl.parallel_env(target, duration_s=60)
@@ -297,6 +300,23 @@ def test_routes_that_cannot_be_driven(
     assert left_over(tmp_path) == ["cars.rou.xml"]
 
 
+def test_errors_name_the_files_a_configuration_names(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    routes, network = files / "cars.rou.xml", files / "Netz 1.net.xml"
+    sound = routes.read_text()
+    routes.write_text(sound.replace("A1_east1", "A1_gone", 1))
+    words = ["--sumo", files / "city.sumocfg"]
+    error = refused(capsys, tmp_path / "a", *words)
+    assert f"{routes}, line " in error
+    assert f"which {network} does not have" in error
+    routes.write_text(sound)
+    network.write_text(BOMB)
+    error = refused(capsys, tmp_path / "a", *words)
+    assert f"{network}: document types and entities" in error
+    assert left_over(tmp_path) == [files.name]
+
+
 def test_nothing_is_overwritten_by_accident(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -332,6 +352,49 @@ def test_a_failed_replacement_leaves_the_old_one(tmp_path: Path) -> None:
         stop_with(KeyboardInterrupt(), tmp_path / "b")
     assert load_scenario(tmp_path / "a").hash == before
     assert left_over(tmp_path) == ["a"]
+
+
+def run_apart(
+    python: list[str], tmp_path: Path, code: str, *words: str | Path
+) -> subprocess.Popen[str]:
+    """`scenario new` in a process of its own, after some code."""
+    line = f"import sys; {code}; from ugat_marl.__main__ import main; sys.exit(main())"
+    return subprocess.Popen(
+        [*python, "-c", line, "scenario", "new", *map(str, words)],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_a_full_disk_is_said_in_words(python: list[str], tmp_path: Path) -> None:
+    limit = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (40000, 40000))"
+    words = ["--sumo", SINGLE / "network.net.xml", "--routes", SINGLE / "demand.rou.xml"]
+    process = run_apart(python, tmp_path, limit, "city", *words)
+    _, err = process.communicate()
+    assert process.returncode == 2
+    assert re.search(r"city/\S+: cannot be written \(File too large\); make room", err), err
+    assert "Traceback" not in err
+    assert left_over(tmp_path) == []
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_whoever_stops_it_finds_nothing_left(
+    number: int, code: int, python: list[str], tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / "cars.rou.xml")  # reading waits until somebody writes
+    words = ["--sumo", SINGLE / "network.net.xml", "--routes", "cars.rou.xml"]
+    process = run_apart(python, tmp_path, "pass", "city", *words)
+    with (tmp_path / "cars.rou.xml").open("w") as pipe:
+        pipe.write("<routes>")
+        pipe.flush()
+        assert len(left_over(tmp_path)) == 2, "a folder that is being filled"
+        process.send_signal(number)
+    _, err = process.communicate()
+    assert process.returncode == code
+    assert "Traceback" not in err
+    assert left_over(tmp_path) == ["cars.rou.xml"]
 
 
 @pytest.mark.parametrize("place", ["/proc/nowhere/city", "/dev/null/city"])
@@ -372,6 +435,33 @@ def nobody(folder: Path, network: Path, reporter: Reporter) -> Fleet:
     del network, reporter
     (folder / "none.rou.xml").write_text("<routes/>")
     return Fleet(("none.rou.xml",))
+
+
+def test_a_long_additional_file_is_never_in_memory(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its outputs are cut out piece by piece, and what is left is copied even with --link."""
+    for limit in ("files._PIECE", "files._KEPT"):
+        monkeypatch.setattr(f"ugat_marl.{limit}", 1 << 14)
+    loops = "".join(
+        f'<inductionLoop id="d{i}" lane="A1_east1_0" pos="{i % 50}" freq="9" file="{i}.xml"/>\n'
+        for i in range(6000)
+    )
+    (files / "loops.add.xml").write_text(f"<additional>\n{loops}</additional>")
+    size = (files / "loops.add.xml").stat().st_size
+    tracemalloc.start()
+    try:
+        scenario = load_scenario(files / "city.sumocfg")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < size
+    assert any(document.home for document in scenario.additional)
+    assert made(tmp_path / "a", "--sumo", files / "city.sumocfg", "--link") == 0
+    (written,) = (tmp_path / "a").glob("*.add.xml")
+    root = parse_xml(written.read_bytes(), "additional")
+    assert [item.get("file") for item in root] == ["NUL"] * 6000
+    assert not {item.name for item in load_scenario(tmp_path / "a").additional} - {written.name}
 
 
 def test_roads_of_any_source_are_checked(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -355,7 +356,8 @@ def _shape(text: str) -> tuple[tuple[float, float], ...]:
 def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[float, str], ...]]:
     """The programme SUMO runs: the last one defined, additional files after the network."""
     programmes: dict[str, tuple[tuple[float, str], ...]] = {}
-    for tree in (root, *(document.parse() for document in scenario.additional)):
+    parts = chain.from_iterable(document.parts() for document in scenario.additional)
+    for tree in chain((root,), parts):
         for logic in tree.iter("tlLogic"):
             phases = tuple(
                 (float(phase.get("duration", "0")), phase.get("state", ""))

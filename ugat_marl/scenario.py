@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError, UnknownNameError
-from ugat_marl.files import Document, parse_xml, read_bytes, write_whole, xml_bytes
+from ugat_marl.files import Document, Draft, child_texts, parse_xml, read_bytes, write_whole
 from ugat_marl.scenario_settings import (
     ControlSettings,
     ScenarioFile,
@@ -274,13 +274,17 @@ def _resco_configuration(name: str) -> Path:
 
 def _quiet(document: Document) -> Document:
     """The document without outputs: detectors and edge data would write beside the user's files."""
-    root = document.parse()
-    writers = [element for element in root.iter() if "file" in element.attrib]
-    if not writers:
+    if not any("file" in tag.attributes for tag in document.scan()):
         return document
-    for element in writers:
-        element.set("file", "NUL")
-    return document.edited(xml_bytes(root))
+    draft = None
+    for part in document.parts():
+        for element in part.iter():
+            if "file" in element.attrib:
+                element.set("file", "NUL")
+        draft = draft or Draft(document.name.removesuffix(".gz"), part)
+        draft.add(*child_texts(part))
+    assert draft is not None
+    return draft.document()
 
 
 def _quoted(value: Any) -> str:

@@ -13,15 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.files import write_whole
 from ugat_marl.networks.cityflow import Roadnet
 from ugat_marl.networks.reading import objects
-from ugat_marl.networks.walks import Drive, route_file
+from ugat_marl.networks.walks import MOST_VEHICLES, Drive, write_drives
 from ugat_marl.progress import Reporter
 
 _VEHICLE = ("length", "width", "maxPosAcc", "maxNegAcc", "usualPosAcc", "usualNegAcc", "minGap",
             "maxSpeed", "headwayTime")  # fmt: skip
-MOST_VEHICLES = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ def write_routes(
     if not drives:
         raise ScenarioError(f"{path}: no vehicle in it")
     drives.sort(key=lambda drive: drive.depart_s)  # stable: as in the file within a second
-    write_whole(out, route_file(drives, types.values()))
+    write_drives(out, drives, types.values())
     return Flows(len(drives), drives[-1].depart_s)
 
 

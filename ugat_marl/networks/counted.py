@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import csv
+import functools
 import math
 import tempfile
 import xml.etree.ElementTree as ET
+from bisect import bisect_left
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +21,9 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
 from ugat_marl.networks.making import ROUTES, Fleet, Vehicles
 from ugat_marl.networks.programs import run, tool
+from ugat_marl.networks.reading import lines
 from ugat_marl.networks.streets import Streets
-from ugat_marl.networks.walks import CAR, Drive, route_file, walked
+from ugat_marl.networks.walks import CAR, MOST_VEHICLES, Drive, walked, write_drives
 from ugat_marl.progress import Reporter
 from ugat_marl.redraw import sumo_program
 from ugat_marl.seeding import numpy_generator
@@ -26,9 +31,11 @@ from ugat_marl.seeding import numpy_generator
 _CANDIDATES_VPH = 400.0
 """Random drives from each entry among which the counts are met."""
 _GOOD_GEH = 5.0
+_MOST_ROWS = 1_000_000
+"""As many as a thousand roads have in ten days of quarters of an hour."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Row:
     """One line of a table of demand.
 
@@ -47,7 +54,9 @@ class Row:
     line: int
 
 
-def read_rows(path: Path, begin_s: float, end_s: float, *, pairs: bool) -> list[Row]:
+def read_rows(
+    path: Path, begin_s: float, end_s: float, reporter: Reporter, *, pairs: bool
+) -> list[Row]:
     """A CSV file with the columns ``count`` and ``edge``, or ``from`` and ``to``.
 
     The columns ``begin_s`` and ``end_s`` may be added; without them a row is for the whole episode.
@@ -56,17 +65,15 @@ def read_rows(path: Path, begin_s: float, end_s: float, *, pairs: bool) -> list[
         path: The file.
         begin_s: Start of the episode.
         end_s: Its end.
+        reporter: Shows progress in a long file.
         pairs: Whether every row has to have ``from`` and ``to``.
 
     Raises:
         ScenarioError: A column is missing, or a value is none; names file and line.
     """
-    try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path}: is not UTF-8: {error}") from None
-    first = text.partition("\n")[0]
-    reader = csv.DictReader(text.splitlines(), delimiter=";" if ";" in first else ",")
+    texts = lines(path, reporter)
+    first = next(texts, "")
+    reader = csv.DictReader(chain((first,), texts), delimiter=";" if ";" in first else ",")
     columns = [name.strip() for name in reader.fieldnames or ()]
     reader.fieldnames = columns
     turns = {"from", "to"} <= set(columns)
@@ -76,7 +83,8 @@ def read_rows(path: Path, begin_s: float, end_s: float, *, pairs: bool) -> list[
             f"{path}, line 1: the columns {wanted} are needed; there are: {', '.join(columns)}"
         )
     found: list[Row] = []
-    for values in reader:
+    total = 0.0
+    for values in _whole(reader, path):
         where = f"{path}, line {reader.line_num}"
         roads = tuple(
             (values[key] or "").strip() for key in (("from", "to") if turns else ("edge",))
@@ -94,9 +102,23 @@ def read_rows(path: Path, begin_s: float, end_s: float, *, pairs: bool) -> list[
                 f"{where}: end_s ({row.end_s:g}) is not after begin_s ({row.begin_s:g})"
             )
         found.append(row)
-    if not any(row.count > 0 for row in found):
+        total += count
+        if len(found) > _MOST_ROWS or total > MOST_VEHICLES:
+            raise ScenarioError(
+                f"{where}: more than "
+                + (f"{MOST_VEHICLES} vehicles" if total > MOST_VEHICLES else f"{_MOST_ROWS} rows")
+                + "; keep those of the episode, or sum them up"
+            )
+    if not total:
         raise ScenarioError(f"{path}: no row counts a vehicle")
     return found
+
+
+def _whole(reader: csv.DictReader[str], path: Path) -> Iterator[dict[str, str]]:
+    try:
+        yield from reader
+    except csv.Error as error:
+        raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
 
 
 def _number(text: str | None, key: str, where: str) -> float:
@@ -116,15 +138,14 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
     """
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
-        del reporter
-        rows = read_rows(path, begin_s, begin_s + length_s, pairs=False)
+        rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=False)
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         _require_roads(rows, streets, path, network)
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             work = Path(name)
             drives = walked(streets, _CANDIDATES_VPH, (1.0, 1.0, 1.0), 3600.0, seed)
             _require_reached(rows, drives, path)
-            write_whole(work / "candidates.rou.xml", route_file(drives))
+            write_drives(work / "candidates.rou.xml", drives)
             options = _counts_for_sumo(rows, work)
             out = work / "sampled.rou.xml"
             begin, end = min(row.begin_s for row in rows), max(row.end_s for row in rows)
@@ -136,7 +157,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             sampled = list(_sampled(out))
         if not sampled:
             raise ScenarioError(f"{path}: SUMO's routeSampler found no vehicle for these counts")
-        write_whole(folder / ROUTES, route_file(sorted(sampled, key=lambda d: (d.depart_s, d.id))))
+        write_drives(folder / ROUTES, sorted(sampled, key=lambda d: (d.depart_s, d.id)))
         return Fleet((ROUTES,), (_fit(rows, sampled, path),))
 
     return vehicles
@@ -197,12 +218,10 @@ def _sampled(path: Path) -> Iterator[Drive]:
 def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
     """How well the counts are met, by the traffic engineers' GEH."""
     good = 0
+    passed = _passages(drives)
     for row in rows:
-        made = sum(
-            _passes(drive.route, row.roads)
-            for drive in drives
-            if row.begin_s <= drive.depart_s < row.end_s
-        )
+        departs = passed.get(row.roads, [])
+        made = bisect_left(departs, row.end_s) - bisect_left(departs, row.begin_s)
         hours = (row.end_s - row.begin_s) / 3600
         wanted, got = row.count / hours, made / hours
         geh = math.sqrt(2 * (got - wanted) ** 2 / (got + wanted)) if got + wanted else 0.0
@@ -210,23 +229,25 @@ def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
     return f"{good} of {len(rows)} counts of {path.name} are met within a GEH of {_GOOD_GEH:g}"
 
 
-def _passes(route: Sequence[str], roads: Sequence[str]) -> int:
-    """How often a drive comes by a road, or makes a turn."""
-    length = len(roads)
-    places = range(len(route) - length + 1)
-    return sum(tuple(route[i : i + length]) == tuple(roads) for i in places)
+def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
+    """Roads, and turns from one to the next, to the departures of all that come by, in order."""
+    found: dict[tuple[str, ...], list[float]] = defaultdict(list)
+    for drive in sorted(drives, key=lambda drive: drive.depart_s):
+        for passed in chain(zip(drive.route, strict=True), pairwise(drive.route)):
+            found[passed].append(drive.depart_s)
+    return found
 
 
 def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> Vehicles:
     """Vehicles from origins to destinations, on the fastest ways through the empty network."""
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
-        del reporter
-        rows = read_rows(path, begin_s, begin_s + length_s, pairs=True)
+        rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=True)
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         _require_roads(rows, streets, path, network)
+        reachable = functools.cache(partial(_reachable, streets))
         for row in rows:
-            if row.roads[1] not in _reachable(streets, row.roads[0]):
+            if row.roads[1] not in reachable(row.roads[0]):
                 raise ScenarioError(
                     f"{path}, line {row.line}: there is no way from {row.roads[0]!r} to "
                     f"{row.roads[1]!r}"

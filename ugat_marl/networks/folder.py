@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import signal
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -33,17 +35,41 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
         ) from None
     made = folder / target.name
     try:
-        made.mkdir()
-        yield made
-        require_free(target, force=force)  # it may have appeared meanwhile
-        _put(made, target, folder / "before")
+        with _stopped_in_order():
+            made.mkdir()
+            yield made
+            require_free(target, force=force)  # it may have appeared meanwhile
+            _put(made, target, folder / "before")
     except ScenarioError as error:
         # Files are checked where they are made; what is said of them is about where they belong.
         if str(made) not in str(error):
             raise
         raise ScenarioError(str(error).replace(str(made), str(target))) from None
+    except OSError as error:
+        where = str(error.filename2 or error.filename or made).replace(str(made), str(target))
+        raise OutputError(
+            f"{where}: cannot be written ({error.strerror}); make room, or give another place"
+        ) from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _stopped_in_order() -> Iterator[None]:
+    """Whoever ends the program (``kill``, a system that shuts down) finds nothing left behind."""
+
+    def stop(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
+
+    main_thread = threading.current_thread() is threading.main_thread()
+    if not main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _put(made: Path, target: Path, before: Path) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.demand import Demand, check_demand
+from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
 from ugat_marl.network import Network
 from ugat_marl.networks.folder import new_folder
@@ -31,6 +33,7 @@ class Draft:
         settings: Further values of its ``scenario.toml``.
         derive: Whether the phases of each light are derived as its lanes allow.
         notes: What was noticed on the way, for the README and for whoever waits.
+        copied: Files in the folder that are copies, to where they come from.
     """
 
     description: str
@@ -41,6 +44,7 @@ class Draft:
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
     derive: bool = False
     notes: tuple[str, ...] = ()
+    copied: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
 
 Roads = Callable[[Path, Reporter], Draft]
@@ -54,10 +58,12 @@ class Fleet:
     Attributes:
         routes: Its route files: names in the folder, or absolute paths of files left in place.
         notes: What was noticed on the way.
+        copied: Files in the folder that are copies, to where they come from.
     """
 
     routes: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    copied: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
 
 Vehicles = Callable[[Path, Path, Reporter], Fleet]
@@ -129,12 +135,25 @@ def make_scenario(
         }
         content = {key: value for key, value in content.items() if value not in ([], {})}
         write_whole(folder / "scenario.toml", scenario_toml(content))
-        scenario = load_scenario(folder)
-        network = Network.read(scenario)
-        demand = check_demand(scenario, network, reporter)
+        with _errors_about({**draft.copied, **fleet.copied}, folder):
+            scenario = load_scenario(folder)
+            network = Network.read(scenario)
+            demand = check_demand(scenario, network, reporter)
         made = Made(scenario, network, demand, notes)
         write_whole(folder / "README.md", _readme(made, draft, command))
     return Made(load_scenario(target), network, demand, made.notes)
+
+
+@contextlib.contextmanager
+def _errors_about(copied: Mapping[str, Path], folder: Path) -> Iterator[None]:
+    """Errors name the files the user has, not copies that are gone when they are read."""
+    try:
+        yield
+    except ScenarioError as error:
+        text = str(error)
+        for name, source in copied.items():
+            text = text.replace(str(folder / name), str(source))
+        raise ScenarioError(text) from None
 
 
 def _readme(made: Made, draft: Draft, command: str) -> str:

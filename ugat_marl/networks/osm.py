@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.files import Tag, chunks_of, parse_xml, read_bytes, write_whole
+from ugat_marl.files import Tag, chunks_of, parse_xml, read_bytes, scratch, write_whole
 from ugat_marl.junctions import crossings_of, foes_of, links_of
 from ugat_marl.networks.making import NETWORK, Draft, Roads
 from ugat_marl.networks.osm_pbf import pbf_to_xml
@@ -111,8 +111,8 @@ def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
         return plain
     if path.suffix != ".gz" and "," not in str(path):  # ends a name for netconvert
         return path
-    with plain.open("wb") as file:
-        for piece in chunks_of(path):
+    with scratch(), plain.open("wb") as file:
+        for piece in chunks_of(path, reporter):
             file.write(piece)
     return plain
 

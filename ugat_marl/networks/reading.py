@@ -58,11 +58,33 @@ def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], in
                 ) from None
             text += piece
             continue
+        except (RecursionError, ValueError) as error:
+            raise _strange(f"{path}, line {line}", error) from None
         if not isinstance(found, dict):
             raise ScenarioError(f"{path}, line {line}: an object in braces was expected here")
         yield cast("dict[str, Any]", found), line
         line += text.count("\n", 0, end)
         text = text[end:]
+
+
+def lines(path: Path, reporter: Reporter) -> Iterator[str]:
+    """The lines of a text file of any length, with what ends them.
+
+    Raises:
+        ScenarioError: Not UTF-8, or a line no table has.
+    """
+    rest, count = "", 0
+    for text in _texts(chunks_of(path, reporter), path):
+        *whole, rest = (rest + text).splitlines(keepends=True) or [""]
+        count += len(whole)
+        yield from whole
+        if len(rest) > _MOST:
+            raise ScenarioError(
+                f"{path}, line {count + 1}: is longer than a line of a table can be; the file may "
+                "be of another kind"
+            )
+    if rest:
+        yield rest
 
 
 def read_json(path: Path) -> tuple[Any, str]:
@@ -81,8 +103,14 @@ def read_json(path: Path) -> tuple[Any, str]:
             f"{path}, line {error.lineno}: not valid JSON ({error.msg}); the file may have been "
             "cut short"
         ) from None
-    except RecursionError:
-        raise ScenarioError(f"{path}: nested too deeply for a road network") from None
+    except (RecursionError, ValueError) as error:
+        raise _strange(str(path), error) from None
+
+
+def _strange(where: str, error: Exception) -> ScenarioError:
+    """What Python's reader gives up on although it is JSON."""
+    what = "nested too deeply" if isinstance(error, RecursionError) else "a number is far too long"
+    return ScenarioError(f"{where}: {what}; no file of CityFlow's is like that")
 
 
 def _texts(pieces: Pieces, path: Path) -> Iterator[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ugat_marl.demand import edges_used
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.files import Tag, parse_xml, read_bytes, write_whole
+from ugat_marl.files import Tag, parse_xml, read_bytes
 from ugat_marl.networks.making import Draft, Fleet, Roads, Vehicles
 from ugat_marl.networks.reading import scan
 from ugat_marl.progress import Reporter
@@ -38,7 +38,12 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
         if not configuration:
             _require_root(path, ("net",), "SUMO network", reporter)
             name = _placed(path, folder, link)
-            return Draft(f"SUMO network {path.name}", _origin([path], link), network=name)
+            return Draft(
+                f"SUMO network {path.name}",
+                _origin([path], link),
+                network=name,
+                copied={path.name: path},
+            )
         return _configured(path, folder, link, own_vehicles, reporter)
 
     return roads
@@ -55,7 +60,8 @@ def given_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
                     _require_known(tag, leads, path)
                 if tag.name == "route":
                     _require_connected(tag, leads, path, network)
-        return Fleet(tuple(_placed(path, folder, link) for path in paths))
+        placed = tuple(_placed(path, folder, link) for path in paths)
+        return Fleet(placed, copied={path.name: path for path in paths})
 
     return vehicles
 
@@ -83,6 +89,11 @@ def _configured(
         routes=placed(routes),
         additional=placed(additional),
         settings=kept,
+        copied={
+            item.name: item.path
+            for item in (network, *routes, *additional)
+            if item.path is not None and item.home is None
+        },
     )
 
 
@@ -98,9 +109,10 @@ def _network_of(path: Path) -> Document:
 
 
 def _put(document: Document, folder: Path, link: bool) -> str:
-    if document.path is not None:
+    if document.path is not None and document.home is None:
         return _placed(document.path, folder, link)
-    write_whole(folder / document.name, document.read())  # read without the files it would write
+    _require_new(folder / document.name)
+    document.write(folder / document.name)  # without the files it would write
     return document.name
 
 
@@ -108,12 +120,16 @@ def _placed(path: Path, folder: Path, link: bool) -> str:
     """The name under which the scenario finds the file: in its folder, or where it is."""
     if link:
         return str(path.resolve())
-    if (folder / path.name).exists():
+    _require_new(folder / path.name)
+    shutil.copyfile(path, folder / path.name)
+    return path.name
+
+
+def _require_new(path: Path) -> None:
+    if path.exists():
         raise ScenarioError(
             f"two files are called {path.name!r}, which one directory cannot hold; rename one"
         )
-    shutil.copyfile(path, folder / path.name)
-    return path.name
 
 
 def _leads(network: Path) -> dict[str, set[str]]:

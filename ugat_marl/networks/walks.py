@@ -8,7 +8,7 @@ twice is drawn again.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -16,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.files import parse_xml, read_bytes, write_whole
+from ugat_marl.files import parse_xml, read_bytes, replacing
 from ugat_marl.networks.making import ROUTES, Fleet, Vehicles
 from ugat_marl.networks.streets import Streets
 from ugat_marl.progress import Reporter
@@ -29,11 +29,13 @@ CAR = {
 }  # fmt: skip
 """SUMO's passenger car, spelled out."""
 
+MOST_VEHICLES = 5_000_000
+"""More make no scenario that anybody could drive."""
 _TRIES = 200
 """Walks that may end in a circle before a vehicle is given up."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Drive:
     """One vehicle.
 
@@ -82,6 +84,11 @@ def walked(
         raise ScenarioError(
             "no road leads into the network from outside, so --vph has nowhere to let vehicles "
             "in; give routes (--routes) or origins and destinations (--od)"
+        )
+    if vph / 3600 * length_s * len(streets.entries) > MOST_VEHICLES:
+        raise OptionError(
+            f"--vph {vph:g} at {len(streets.entries)} entries for {length_s:g} s makes more than "
+            f"{MOST_VEHICLES} vehicles; lower --vph or --duration-s"
         )
     left, straight, right = shares
     table = {"l": left, "s": straight, "r": right}
@@ -149,23 +156,33 @@ def pick(shares: Mapping[str, float], random: np.random.Generator) -> str:
     return next(reversed(list(shares)))
 
 
-def route_file(drives: Iterable[Drive], types: Iterable[Mapping[str, str]] = (CAR,)) -> bytes:
-    """The vehicles as a route file.
+def write_drives(
+    path: Path, drives: Iterable[Drive], types: Iterable[Mapping[str, str]] = (CAR,)
+) -> None:
+    """Writes the vehicles as a route file, one after the other.
 
     Args:
+        path: The file.
         drives: In the order of their departures.
         types: Attributes of the vehicle types they name.
     """
-    lines = ["<?xml version='1.0' encoding='UTF-8'?>", "<routes>"]
-    lines += [f"    <vType{_attributes(kind)}/>" for kind in types]
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in _route_file(drives, types))
+
+
+def _route_file(drives: Iterable[Drive], types: Iterable[Mapping[str, str]]) -> Iterator[str]:
+    yield "<?xml version='1.0' encoding='UTF-8'?>"
+    yield "<routes>"
+    for kind in types:
+        yield f"    <vType{_attributes(kind)}/>"
     for drive in drives:
         head = {"id": drive.id, "depart": f"{drive.depart_s:.2f}"}
         if drive.type:
             head["type"] = drive.type
         head |= {"departLane": "best", "departSpeed": drive.speed}
         edges = quoteattr(" ".join(drive.route))
-        lines.append(f"    <vehicle{_attributes(head)}><route edges={edges}/></vehicle>")
-    return ("\n".join([*lines, "</routes>"]) + "\n").encode()
+        yield f"    <vehicle{_attributes(head)}><route edges={edges}/></vehicle>"
+    yield "</routes>"
 
 
 def _attributes(values: Mapping[str, str]) -> str:
@@ -182,7 +199,7 @@ def turning(
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         drives = walked(streets, vph, shares, length_s, seed)
         later = (replace(drive, depart_s=begin_s + drive.depart_s) for drive in drives)
-        write_whole(folder / ROUTES, route_file(later))
+        write_drives(folder / ROUTES, later)
         return Fleet((ROUTES,))
 
     return vehicles
