@@ -424,11 +424,14 @@ class Listening(Silent):
         return super().task(name, total)
 
 
-def test_long_files_are_read_with_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_files_are_read_with_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ugat_marl.progress._PATIENCE_S", -1)
     reporter = Listening()
     assert next(tag.name for tag in list(scan(SINGLE / "network.net.xml", reporter))) == "net"
-    assert reporter.heard == ["MiB of network.net.xml"]
+    assert not reporter.heard, "less than a MiB is not long"
+    (tmp_path / "long.net.xml").write_text(f"<net>{' ' * (1 << 20)}</net>")
+    assert [tag.name for tag in scan(tmp_path / "long.net.xml", reporter)] == ["net"]
+    assert reporter.heard == ["MiB of long.net.xml"]
 
 
 def nobody(folder: Path, network: Path, reporter: Reporter) -> Fleet:

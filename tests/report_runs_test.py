@@ -108,7 +108,10 @@ def make_run(directory: Path, *, seed: int = 0, real: str = "V4", **changes: Any
     config = TransferConfig("grid2x2-v1", real, seed=seed, ugat=ugat, **changes)
     directory.mkdir(parents=True)
     (directory / "checkpoint").mkdir()
-    hashes = {"sim": load("grid2x2-v1").hash, "real": "r" * 64}
+    scenario = load("grid2x2-v1")
+    if config.duration_s is not None:
+        scenario = scenario.with_duration(config.duration_s)
+    hashes = {"sim": scenario.hash, "real": "r" * 64}
     identity = {**asdict(config), "scenario_hash": hashes, "domains": ["sim", real]}
     (directory / "run.json").write_text(json.dumps(identity))
     write_settings(directory, asdict(config))
@@ -316,7 +319,13 @@ def test_what_only_an_objective_measures_is_shown_with_its_unit(run: Path) -> No
     assert [row[-1] for row in rows] == ["–", "250"]
 
 
+def test_an_episode_of_another_length_is_no_change_of_the_scenario(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "first", duration_s=600.0)
+    assert "The scenario has changed since" not in page_of(run)[1].text
+
+
 def test_a_scenario_that_is_gone_or_changed_is_said(run: Path) -> None:
+    assert "The scenario has changed since" not in page_of(run)[1].text
     settings = json.loads((run / "settings.json").read_text())
     identity = json.loads((run / "run.json").read_text())
     identity["scenario_hash"]["sim"] = "0" * 64
@@ -678,6 +687,7 @@ def test_a_run_leaves_all_that_its_page_wants(tmp_path: Path) -> None:
     found = transfer(config, tmp_path / "run")
     made, page = page_of(tmp_path / "run")
     assert "Missing here" not in page.text and "whole" in page.text
+    assert "The scenario has changed since" not in page.text
     record = read_records([tmp_path / "run"])[0]
     assert isinstance(record, RunRecord) and record.evaluation == found
     assert record.queues is not None and set(record.queues["domain"]) == {"sim", "V4"}

@@ -124,7 +124,7 @@ def watched(pieces: Iterable[bytes], file: IO[bytes], reporter: Reporter) -> Ite
     with contextlib.ExitStack() as stack:
         for piece in pieces:
             yield piece
-            if advance is None and size and time.monotonic() - begun > _PATIENCE_S:
+            if advance is None and size >> 20 and time.monotonic() - begun > _PATIENCE_S:
                 advance = stack.enter_context(reporter.task(f"MiB of {name}", size >> 20))
             while advance is not None and done < file.tell() >> 20:
                 advance()

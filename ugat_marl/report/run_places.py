@@ -36,7 +36,9 @@ def places_of(record: RunRecord) -> Places | str:
     options: Any = record.settings.get("options") if record.job else record.settings
     options = options if isinstance(options, Mapping) else {}
     try:
-        network, own_hash = _network(record.scenario, record.sim)
+        # A job notes the scenario itself, a training the one it drove, with its own duration.
+        duration_s = None if record.job else options.get("duration_s")
+        network, own_hash = _network(record.scenario, record.sim, duration_s)
         neighbours = int(options.get("neighbours") or 0)
         agents = Observer(network, str(options.get("observation") or "count"), neighbours).agents
     except (UgatMarlError, OSError, ValueError, TypeError) as error:
@@ -50,6 +52,8 @@ def places_of(record: RunRecord) -> Places | str:
 
 
 @functools.lru_cache(maxsize=8)
-def _network(scenario: str, sim: str) -> tuple[Network, str]:
+def _network(scenario: str, sim: str, duration_s: float | None) -> tuple[Network, str]:
     found = in_domain(load(scenario), sim)
+    if duration_s is not None:
+        found = found.with_duration(duration_s)
     return Network.read(found), found.hash
