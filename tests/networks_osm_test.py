@@ -6,6 +6,7 @@ import gzip
 import math
 import re
 import struct
+import tracemalloc
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from ugat_marl.files import parse_xml
 from ugat_marl.junctions import foes_of
 from ugat_marl.network import Network
 from ugat_marl.networks.osm_pbf import pbf_to_xml
+from ugat_marl.networks.osm_roads import items, write_roads
 from ugat_marl.networks.osm_walks import utm
 from ugat_marl.networks.phasing import suited
 from ugat_marl.networks.survey import survey
@@ -119,6 +121,59 @@ def test_packed_extracts_make_the_same_network(town: Scenario, tmp_path: Path) -
     packed.write_bytes(gzip.compress(TOWN.read_bytes()))
     assert made(tmp_path / "a", packed) == 0
     assert load_scenario(tmp_path / "a").network.read() == town.network.read()
+
+
+def with_buildings(folder: Path, count: int) -> Path:
+    """The town, most of its extract being buildings, as of any town."""
+    nodes = "".join(
+        f'<node id="{90_000 + i}" lat="48.0{i:05d}" lon="11.0{i:05d}"/>\n' for i in range(4 * count)
+    )
+    ways = "".join(
+        f'<way id="{90_000 + i}"><nd ref="{90_000 + 4 * i}"/><nd ref="{90_001 + 4 * i}"/>'
+        f'<tag k="building" v="yes"/><tag k="name" v="&lt;Café &quot;{i}&quot;&gt;"/></way>\n'
+        for i in range(count)
+    )
+    head, ways_of_town = TOWN.read_text().split("<way", 1)
+    path = folder / "built.osm"
+    path.write_text(f"{head}{nodes}<way{ways_of_town}".replace("</osm>", f"{ways}</osm>"))
+    return path
+
+
+def test_buildings_are_neither_in_memory_nor_in_the_way(
+    town: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, out = with_buildings(tmp_path, 3000), tmp_path / "roads.osm"
+    assert made(tmp_path / "a", path) == 0
+    assert load_scenario(tmp_path / "a").network.read() == town.network.read()
+    monkeypatch.setattr("ugat_marl.files._PIECE", 1 << 14)
+    tracemalloc.start()
+    try:
+        nodes = {node for item in items(path, path, Silent()) for node in item.way_nodes}
+        write_roads(path, path, nodes, out, Silent())
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < path.stat().st_size / 2
+    assert out.stat().st_size < 2 * TOWN.stat().st_size
+    assert "building" not in out.read_text()
+
+
+@pytest.mark.parametrize(("key", "left"), [("railway", (1, 2)), ("building", ())])
+def test_what_roads_are_made_of_stays_as_it_is(
+    key: str, left: tuple[int, ...], tmp_path: Path
+) -> None:
+    source, out = tmp_path / "a.osm", tmp_path / "b.osm"
+    tag = f'<tag k="{key}" v="Ł &lt;&amp;"/>'
+    way = f'<way id="7" version="2"><nd ref="1"/><nd ref="2"/>{tag}</way>\n'
+    rest = '<relation id="9"><member type="way" ref="7" role="from"/></relation>\n'
+    nodes = [f'<node id="{i}" lat="4{i}.5" lon="-1.25">{tag}</node>\n' for i in range(4)]
+    text = f"<osm>{way}<bounds/>{rest}{''.join(nodes)}</osm>"
+    source.write_text(text, encoding="utf-8")
+    refs = {node for item in items(source, source, Silent()) for node in item.way_nodes}
+    write_roads(source, source, refs, out, Silent())
+    kept = (way if left else "") + rest + "".join(nodes[i] for i in left)
+    head = "<?xml version='1.0' encoding='UTF-8'?>\n<osm version=\"0.6\">\n"
+    assert out.read_text(encoding="utf-8") == f"{head}{kept}</osm>\n"
 
 
 # --- protocol buffers -----------------------------------------------------------------------------

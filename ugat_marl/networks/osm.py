@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.files import Tag, chunks_of, parse_xml, read_bytes, scratch, write_whole
+from ugat_marl.files import Tag, parse_xml, read_bytes, write_whole
 from ugat_marl.junctions import crossings_of, foes_of, links_of
 from ugat_marl.networks.making import NETWORK, Draft, Roads
 from ugat_marl.networks.osm_pbf import pbf_to_xml
+from ugat_marl.networks.osm_roads import items, write_roads
 from ugat_marl.networks.osm_walks import crossings_for, has_light
 from ugat_marl.networks.programs import netconvert
-from ugat_marl.networks.reading import scan
 from ugat_marl.phases import are_foes
 from ugat_marl.progress import Reporter
 from ugat_marl.redraw import sumo_program
@@ -55,6 +55,7 @@ class _Extract:
         walks: Those of them that are a crossing for people on foot, by their ids.
         crossings: Longitude and latitude of crossings that may have a light.
         unlit: Crossings without one.
+        nodes: Nodes of roads and railways.
     """
 
     roads: int
@@ -62,6 +63,7 @@ class _Extract:
     walks: frozenset[str]
     crossings: tuple[tuple[float, float], ...] = ()
     unlit: int = 0
+    nodes: frozenset[str] = frozenset()
 
 
 def from_osm(path: Path, *, guess: bool) -> Roads:
@@ -90,7 +92,14 @@ def from_osm(path: Path, *, guess: bool) -> Roads:
                     f"{path}: no traffic light in it (no node with highway=traffic_signals); "
                     "--guess-signals puts some at large junctions"
                 )
-            notes = _convert(source, extract, folder / NETWORK, Path(name), guess=guess)
+            plain = Path(name) / "extract.osm"
+            write_roads(source, path, extract.nodes, plain, reporter)
+            notes = _convert(plain, extract, folder / NETWORK, Path(name), guess=guess)
+            if not notes:
+                raise ScenarioError(
+                    f"{path}: none of its lights is at a road for cars; --guess-signals puts some "
+                    "at large junctions"
+                )
         return Draft(
             f"OpenStreetMap extract {path.name}",
             f"Converted from `{path.name}` by SUMO's netconvert. © OpenStreetMap contributors; the "
@@ -104,59 +113,34 @@ def from_osm(path: Path, *, guess: bool) -> Roads:
 
 
 def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
-    """The extract as XML that any program may read: unpacked, and under a plain name."""
-    plain = work / "extract.osm"
-    if path.name.lower().endswith(".pbf"):
-        pbf_to_xml(path, plain, reporter)
-        return plain
-    if path.suffix != ".gz" and "," not in str(path):  # ends a name for netconvert
+    """The extract as XML."""
+    if not path.name.lower().endswith(".pbf"):
         return path
-    with scratch(), plain.open("wb") as file:
-        for piece in chunks_of(path, reporter):
-            file.write(piece)
-    return plain
+    pbf_to_xml(path, work / "unpacked.osm", reporter)
+    return work / "unpacked.osm"
 
 
 def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
     """Counts roads and lights; refuses entities before any other program sees the file."""
     roads = signals = unlit = 0
     walks: set[str] = set()
+    nodes: set[str] = set()
     crossings: list[tuple[float, float]] = []
-    item: Tag | None = None
-    tags: dict[str, str] = {}
-
-    def close() -> None:
-        nonlocal signals, unlit
-        if item is None or item.name != "node" or not tags:
-            return
+    for item in items(source, path, reporter):
+        tags = item.tags
+        nodes.update(item.way_nodes)
+        roads += item.start.name == "way" and tags.get("highway") in _FOR_CARS
+        if item.start.name != "node" or not tags:
+            continue
         light = "traffic_signals" in (tags.get("highway"), tags.get("crossing"))
         signals += light
         if light and ("crossing" in tags or tags.get("highway") == "crossing"):
-            walks.add(item.attributes.get("id", ""))
+            walks.add(item.start.attributes.get("id", ""))
         if has_light(tags):
-            crossings.append(_place(item, path))
+            crossings.append(_place(item.start, path))
         else:
             unlit += tags.get("highway") == "crossing"
-
-    try:
-        for tag in scan(source, reporter):
-            if item is None and tag.name != "osm":
-                raise ScenarioError(
-                    f"{path}, line {tag.line}: an OpenStreetMap extract begins with <osm>, this "
-                    f"with <{tag.name}>"
-                )
-            if tag.name in ("osm", "node", "way", "relation"):
-                close()
-                item, tags = tag, {}
-            elif tag.name == "tag" and item is not None:
-                key, value = tag.attributes.get("k", ""), tag.attributes.get("v", "")
-                roads += item.name == "way" and key == "highway" and value in _FOR_CARS
-                if item.name == "node" and key.startswith(("highway", "crossing")):
-                    tags[key] = value
-        close()
-    except ScenarioError as error:
-        raise ScenarioError(str(error).replace(str(source), str(path))) from None
-    return _Extract(roads, signals, frozenset(walks), tuple(crossings), unlit)
+    return _Extract(roads, signals, frozenset(walks), tuple(crossings), unlit, frozenset(nodes))
 
 
 def _place(node: Tag, path: Path) -> tuple[float, float]:
@@ -188,6 +172,8 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
     write_whole(out, made.read_bytes())
     root = parse_xml(read_bytes(out), str(out))
     lights = len(links_of(root))
+    if not lights:
+        return []
     notes = [
         f"{extract.signals} lights in the extract make {lights} in the network, since those of one "
         "junction share a controller"
@@ -200,11 +186,6 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
         notes.append(f"{walked} crossings for people on foot have a light; roads have sidewalks")
     if left:
         notes.append(f"{left} crossings that have no light, or are at no road, were left out")
-    if not lights:
-        raise ScenarioError(
-            f"{source}: none of its lights is at a road for cars; --guess-signals puts some at "
-            "large junctions"
-        )
     return notes
 
 
