@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
@@ -31,6 +31,7 @@ class Ledger:
     chances: dict[tuple[str, ...], float]
     luck: dict[tuple[str, ...], float] = field(default_factory=dict)
     tested: list[tuple[str, ...]] = field(default_factory=list)
+    refined: dict[tuple[str, ...], Members] = field(default_factory=dict)
 
     def simulate(self, members: Members, days: int | None = None) -> Fitted:
         cost = self.costs[names(members)]
@@ -41,7 +42,8 @@ class Ledger:
 
     def refine(self, start: Fitted, rounds: int) -> Fitted:
         del rounds
-        return start
+        members = self.refined.get(names(start.members), start.members)
+        return replace(start, members=members)
 
     def test(self, model: Fitted) -> residual.Tested:
         self.tested.append(names(model.members))
@@ -56,7 +58,9 @@ class Ledger:
     def left(self, *members: tuple[Hypothesis, tuple[float, ...]], errors: float = 0.0) -> Members:
         best = self.with_chance(self.simulate(members, 16), errors)
         fitter = cast(Fitter, cast(object, self))
-        return pruned(best, fitter, lambda model: model, self.test, 0.05).model.members
+        blank = cast(Any, None)
+        base = residual.Tested(Fitted((), {}, blank, blank, 0.0), blank, blank, np.empty(0), {})
+        return pruned(best, base, fitter, lambda model: model, self.test, 0.05).model.members
 
 
 @dataclass
@@ -137,6 +141,17 @@ def test_an_effect_too_weak_to_matter_is_dropped() -> None:
     assert ledger.left(HEADWAY, weak) == (HEADWAY,)
 
 
+def test_an_effect_that_is_fitted_to_nothing_is_not_named() -> None:
+    both, nothing = ("headway", "demand_level"), (DEMAND[0], (1.0,))
+    ledger = Ledger(
+        {both: 1000.0, ("headway",): 9000.0, ("demand_level",): 900.0},
+        {both: 0.0, ("headway",): 0.0, ("demand_level",): 0.0},
+        refined={("demand_level",): (nothing,)},
+    )
+    assert ledger.left(HEADWAY, DEMAND) == ()
+    assert ledger.left(nothing) == ()
+
+
 def test_progress_is_told_of_every_smaller_set() -> None:
     both = ("headway", "demand_level")
     ledger = Ledger({both: 1000.0, ("headway",): 1900.0, ("demand_level",): 9000.0}, {both: 0.9})
@@ -150,5 +165,5 @@ def test_progress_is_told_of_every_smaller_set() -> None:
             yield lambda note="": notes.append(note)
 
     fitter = cast(Fitter, cast(object, ledger))
-    pruned(best, fitter, lambda model: model, ledger.test, 0.05, Heard())
+    pruned(best, best, fitter, lambda model: model, ledger.test, 0.05, Heard())
     assert sorted(notes) == ["demand_level", "headway"]

@@ -99,3 +99,14 @@ def test_an_effect_outside_the_library_is_not_explained_away(street, tmp_path: P
     assert found["heldout"]["p_before"] < 0.05
     assert found["next_measurement"]
     assert found["where"]
+
+
+def test_where_nothing_helps_the_answer_is_unknown(street, tmp_path: Path) -> None:
+    # Drivers of another kind again, of whom faults of detectors are no description.
+    among = {"undercount", "dropout", "stuck", "swapped"}
+    found = street.diagnose(street.measure("driver_model=EIDM"), tmp_path, among=among)
+    assert found["verdict"] == "unknown", found["sentence"]
+    assert found["effects"] == []
+    assert found["corrected"] is None
+    assert found["where"]
+    assert found["next_measurement"]

@@ -8,7 +8,7 @@ import numpy as np
 
 from ugat_marl.discrepancy.fit import SETTLING_DAYS, Fitted, Fitter, cost_of
 from ugat_marl.discrepancy.intervals import HALF_INTERVAL
-from ugat_marl.discrepancy.members import each_left_out, names_of
+from ugat_marl.discrepancy.members import each_left_out, merged, names_of
 from ugat_marl.discrepancy.residual import Tested
 from ugat_marl.progress import Reporter, Silent
 
@@ -19,6 +19,7 @@ suffices the test says; this only saves the time of those that plainly do not.""
 
 def pruned(
     best: Tested,
+    base: Tested,
     fitter: Fitter,
     kept: Callable[[Fitted], Fitted],
     test: Callable[[Fitted], Tested],
@@ -33,6 +34,7 @@ def pruned(
 
     Args:
         best: The set to begin with.
+        base: The scenario as it is, which is left if every effect is fitted to nothing.
         fitter: Simulates and fits.
         kept: Remembers what was fitted.
         test: Tests what a model leaves.
@@ -66,7 +68,10 @@ def pruned(
         if least.cost > best.model.cost and not enough and not vain:
             break
         best = tested
-    return best
+    something = merged((), best.model.members)
+    if len(something) == len(best.model.members):
+        return best
+    return test(fitter.simulate(something)) if something else base
 
 
 def _doubtful(tested: Tested) -> list[int]:

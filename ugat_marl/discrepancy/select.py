@@ -152,7 +152,9 @@ class Selector:
                 best = found
                 if best.residual.p > self._alpha:
                     break
-            best = pruned(best, self._fitter, self._kept, self.test, self._alpha, self._reporter)
+            best = pruned(
+                best, base, self._fitter, self._kept, self.test, self._alpha, self._reporter
+            )
         except OutOfTime:
             complete = False
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
