@@ -1,4 +1,4 @@
-"""The tutorial, command by command as it stands on its page: a quarter of an hour of two cores."""
+"""The tutorial, command by command as it stands on its page: some four minutes of one core."""
 
 from __future__ import annotations
 
