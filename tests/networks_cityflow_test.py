@@ -12,10 +12,13 @@ import pytest
 
 from ugat_marl.__main__ import main
 from ugat_marl.effects import load
+from ugat_marl.errors import ScenarioError
 from ugat_marl.evaluation import evaluate, rule_factory
 from ugat_marl.files import xml_bytes
 from ugat_marl.network import Network
 from ugat_marl.networks.cityflow_flow import MOST_VEHICLES
+from ugat_marl.networks.reading import objects
+from ugat_marl.progress import Silent
 from ugat_marl.scenario import Scenario, load_scenario
 
 
@@ -297,6 +300,20 @@ def test_flows_no_reader_takes(
     assert main(["scenario", "new", str(tmp_path / "city"), *words]) == 2
     assert f"roadnet.json: {says.partition(': ')[2]}" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flow.json", "roadnet.json"]
+
+
+@pytest.mark.parametrize("piece", [1, 7, 1 << 20])
+def test_flows_are_read_piece_by_piece(
+    piece: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ugat_marl.files._PIECE", piece)
+    path = tmp_path / "f.json"
+    path.write_text(' \n[\n{"a": [1,\n"ü]}"]} ,\n\n{"b": -1.5e3}\n, {}]', encoding="utf-8")
+    found = [({"a": [1, "ü]}"]}, 3), ({"b": -1500.0}, 6), ({}, 7)]
+    assert list(objects(path, Silent())) == found
+    path.write_text('[{"a": 1},\n{"b": \n2')
+    with pytest.raises(ScenarioError, match=r"f\.json, line 3: not valid JSON"):
+        list(objects(path, Silent()))
 
 
 # --- Hangzhou in both forms -----------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import json
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -14,6 +15,7 @@ from ugat_marl.progress import Reporter
 
 _MOST = 32 << 20
 """Characters of a single object; more are a file that is broken in the middle."""
+_BEFORE, _BETWEEN = re.compile(r"[ \t\r\n]*"), re.compile(r"[ \t\r\n,]*")
 
 Pieces = Iterable[bytes]
 
@@ -34,37 +36,38 @@ def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], in
         ScenarioError: Not JSON, or not a list of objects.
     """
     decoder = json.JSONDecoder()
-    text, line, opened = "", 1, False
+    text, at, line, opened = "", 0, 1, False
     pieces = _texts(chunks_of(path, reporter), path)
     while True:
-        rest = text.lstrip(" \t\r\n" if not opened else " \t\r\n,")
-        line += text[: len(text) - len(rest)].count("\n")
-        text = rest
-        if text and not opened:
-            if text[0] != "[":
+        blank = (_BETWEEN if opened else _BEFORE).match(text, at)
+        assert blank is not None
+        line += text.count("\n", at, blank.end())
+        at = blank.end()
+        if at < len(text) and not opened:
+            if text[at] != "[":
                 raise ScenarioError(f"{path}, line {line}: a list of vehicles begins with [")
-            text, opened = text[1:], True
+            at, opened = at + 1, True
             continue
-        if text.startswith("]"):
+        if text.startswith("]", at):
             return
         try:
-            found, end = decoder.raw_decode(text)
+            found, end = decoder.raw_decode(text, at)
         except json.JSONDecodeError as error:
             piece = next(pieces, "")
-            if not piece or len(text) > _MOST:
+            if not piece or len(text) - at > _MOST:
                 raise ScenarioError(
-                    f"{path}, line {line + text.count(chr(10), 0, error.pos)}: not valid JSON "
+                    f"{path}, line {line + text.count(chr(10), at, error.pos)}: not valid JSON "
                     f"({error.msg}); the file may have been cut short"
                 ) from None
-            text += piece
+            text, at = text[at:] + piece, 0
             continue
         except (RecursionError, ValueError) as error:
             raise _strange(f"{path}, line {line}", error) from None
         if not isinstance(found, dict):
             raise ScenarioError(f"{path}, line {line}: an object in braces was expected here")
         yield cast("dict[str, Any]", found), line
-        line += text.count("\n", 0, end)
-        text = text[end:]
+        line += text.count("\n", at, end)
+        at = end
 
 
 def lines(path: Path, reporter: Reporter) -> Iterator[str]:
@@ -114,10 +117,12 @@ def _strange(where: str, error: Exception) -> ScenarioError:
 
 
 def _texts(pieces: Pieces, path: Path) -> Iterator[str]:
+    """What the pieces say, never nothing."""
     decoder = codecs.getincrementaldecoder("utf-8-sig")()
     try:
         for piece in pieces:
-            yield decoder.decode(piece)
-        yield decoder.decode(b"", final=True)
+            if text := decoder.decode(piece):
+                yield text
+        decoder.decode(b"", final=True)
     except UnicodeDecodeError as error:
         raise ScenarioError(f"{path}: is not UTF-8: {error}") from None
