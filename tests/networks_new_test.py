@@ -314,6 +314,8 @@ def test_errors_name_the_files_a_configuration_names(
     network.write_text(BOMB)
     error = refused(capsys, tmp_path / "a", *words)
     assert f"{network}: document types and entities" in error
+    error = refused(capsys, tmp_path / "a", *words, "--vph", "100")
+    assert f"{network}: document types and entities" in error
     assert left_over(tmp_path) == [files.name]
 
 
@@ -395,6 +397,11 @@ def test_whoever_stops_it_finds_nothing_left(
     assert process.returncode == code
     assert "Traceback" not in err
     assert left_over(tmp_path) == ["cars.rou.xml"]
+
+
+def test_a_name_no_folder_can_have(capsys: pytest.CaptureFixture[str]) -> None:
+    error = refused(capsys, "x" * 300, "--grid", "1x1", "--vph", "100")
+    assert "x: cannot be written (File name too long); give another place" in error
 
 
 @pytest.mark.parametrize("place", ["/proc/nowhere/city", "/dev/null/city"])

@@ -95,7 +95,13 @@ def require_free(target: Path, *, force: bool) -> None:
         raise OutputError(
             f"{str(target)!r} is the name of a scenario of the suite; choose another one"
         )
-    if target.is_symlink() or (target.exists() and not target.is_dir()):
+    try:
+        occupied = target.is_symlink() or (target.exists() and not target.is_dir())
+    except OSError as error:  # a name that is too long, say
+        raise OutputError(
+            f"{target!s:.80}: cannot be written ({error.strerror}); give another place"
+        ) from None
+    if occupied:
         raise OutputError(f"{target} exists and is not a folder; choose another name")
     if not target.is_dir() or not any(target.iterdir()):
         return

@@ -114,34 +114,44 @@ def make_scenario(
     """
     with new_folder(target, force=force) as folder:
         draft = roads(folder, reporter)
-        fleet = Fleet(draft.routes)
-        if vehicles:
-            fleet = vehicles(folder, folder / draft.network, reporter)
-        own = dict(draft.settings)
-        notes = (*draft.notes, *fleet.notes)
-        if draft.derive and "phases" not in settings.get("control", {}):
-            kinds, more = suited(folder / draft.network)
-            notes += tuple(more)
-            own["intersections"] = {tls: {"phases": kind} for tls, kind in kinds.items()}
-        control = {**own.pop("control", {}), **settings.get("control", {})}
-        content: dict[str, Any] = {
-            "description": draft.description,
-            "network": draft.network,
-            "routes": list(fleet.routes),
-            "additional": list(draft.additional),
-            **own,
-            **{key: value for key, value in settings.items() if key != "control"},
-            "control": control,
-        }
-        content = {key: value for key, value in content.items() if value not in ([], {})}
-        write_whole(folder / "scenario.toml", scenario_toml(content))
-        with _errors_about({**draft.copied, **fleet.copied}, folder):
+        copied = dict(draft.copied)
+        with _errors_about(copied, folder):
+            fleet = Fleet(draft.routes)
+            if vehicles:
+                fleet = vehicles(folder, folder / draft.network, reporter)
+                copied |= fleet.copied
+            notes = _write_settings(folder, draft, fleet, settings)
             scenario = load_scenario(folder)
             network = Network.read(scenario)
             demand = check_demand(scenario, network, reporter)
         made = Made(scenario, network, demand, notes)
         write_whole(folder / "README.md", _readme(made, draft, command))
     return Made(load_scenario(target), network, demand, made.notes)
+
+
+def _write_settings(
+    folder: Path, draft: Draft, fleet: Fleet, settings: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """Writes ``scenario.toml``; returns all that was noticed."""
+    own = dict(draft.settings)
+    notes = (*draft.notes, *fleet.notes)
+    if draft.derive and "phases" not in settings.get("control", {}):
+        kinds, more = suited(folder / draft.network)
+        notes += tuple(more)
+        own["intersections"] = {tls: {"phases": kind} for tls, kind in kinds.items()}
+    control = {**own.pop("control", {}), **settings.get("control", {})}
+    content: dict[str, Any] = {
+        "description": draft.description,
+        "network": draft.network,
+        "routes": list(fleet.routes),
+        "additional": list(draft.additional),
+        **own,
+        **{key: value for key, value in settings.items() if key != "control"},
+        "control": control,
+    }
+    content = {key: value for key, value in content.items() if value not in ([], {})}
+    write_whole(folder / "scenario.toml", scenario_toml(content))
+    return notes
 
 
 @contextlib.contextmanager

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.files import Tag, parse_xml, read_bytes, write_whole
+from ugat_marl.files import parse_xml, read_bytes, write_whole
 from ugat_marl.junctions import crossings_of, foes_of, links_of
 from ugat_marl.networks.making import NETWORK, Draft, Roads
 from ugat_marl.networks.osm_pbf import pbf_to_xml
-from ugat_marl.networks.osm_roads import items, write_roads
+from ugat_marl.networks.osm_roads import items, place_of, write_roads
 from ugat_marl.networks.osm_walks import crossings_for, has_light
 from ugat_marl.networks.programs import netconvert
 from ugat_marl.phases import are_foes
@@ -94,7 +94,10 @@ def from_osm(path: Path, *, guess: bool) -> Roads:
                 )
             plain = Path(name) / "extract.osm"
             write_roads(source, path, extract.nodes, plain, reporter)
-            notes = _convert(plain, extract, folder / NETWORK, Path(name), guess=guess)
+            try:
+                notes = _convert(plain, extract, folder / NETWORK, Path(name), guess=guess)
+            except ScenarioError as error:  # netconvert names no file
+                raise ScenarioError(f"{path}: {error}") from None
             if not notes:
                 raise ScenarioError(
                     f"{path}: none of its lights is at a road for cars; --guess-signals puts some "
@@ -137,21 +140,10 @@ def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
         if light and ("crossing" in tags or tags.get("highway") == "crossing"):
             walks.add(item.start.attributes.get("id", ""))
         if has_light(tags):
-            crossings.append(_place(item.start, path))
+            crossings.append(place_of(item.start, path))
         else:
             unlit += tags.get("highway") == "crossing"
     return _Extract(roads, signals, frozenset(walks), tuple(crossings), unlit, frozenset(nodes))
-
-
-def _place(node: Tag, path: Path) -> tuple[float, float]:
-    """Longitude and latitude."""
-    try:
-        return float(node.attributes["lon"]), float(node.attributes["lat"])
-    except (KeyError, ValueError):
-        name = node.attributes.get("id", "")
-        raise ScenarioError(
-            f"{path}, line {node.line}: the node {name!r} has no lon and lat in degrees"
-        ) from None
 
 
 def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: bool) -> list[str]:

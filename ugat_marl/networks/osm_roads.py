@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -86,16 +87,16 @@ def write_roads(
 
     Raises:
         OutputError: No room for it.
+        ScenarioError: A node of a road is nowhere on earth.
     """
     with scratch(), out.open("w", encoding="utf-8") as file:
         file.write("<?xml version='1.0' encoding='UTF-8'?>\n<osm version=\"0.6\">\n")
         for item in items(source, path, reporter):
             start = item.start
-            if (
-                start.name == "relation"
-                or item.way_nodes
-                or (start.name == "node" and start.attributes.get("id") in nodes)
-            ):
+            corner = start.name == "node" and start.attributes.get("id") in nodes
+            if corner:
+                place_of(start, path)  # netconvert would complain without a line
+            if corner or start.name == "relation" or item.way_nodes:
                 inside = "".join(f"{_open(tag)}/>" for tag in item.inside)
                 file.write(f"{_open(start)}>{inside}</{start.name}>\n")
         file.write("</osm>\n")
@@ -104,3 +105,21 @@ def write_roads(
 def _open(tag: Tag) -> str:
     values = "".join(f" {key}={quoteattr(value)}" for key, value in tag.attributes.items())
     return f"<{tag.name}{values}"
+
+
+def place_of(node: Tag, path: Path) -> tuple[float, float]:
+    """Longitude and latitude of a node, degrees.
+
+    Raises:
+        ScenarioError: It has none; names the line.
+    """
+    try:
+        longitude, latitude = (float(node.attributes[key]) for key in ("lon", "lat"))
+    except (KeyError, ValueError):
+        longitude = latitude = math.nan
+    if not (abs(longitude) <= 180 and abs(latitude) <= 90):
+        name = node.attributes.get("id", "")
+        raise ScenarioError(
+            f"{path}, line {node.line}: the node {name!r} has no lon and lat in degrees"
+        )
+    return longitude, latitude
