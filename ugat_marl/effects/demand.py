@@ -59,12 +59,15 @@ class Routes:
         if not any(mentions(document, "route=", "route =") for document in documents):
             return found
         distributions: list[ET.Element] = []
+        shared: dict[tuple[str, ...], tuple[str, ...]] = {}  # many routes go the same way
         for document in documents:
             if not mentions(document, "<route "):
                 continue
             for part in document.parts():
-                named = (item for item in part.iter("route") if "id" in item.attrib)
-                found.edges |= {x.get("id", ""): _edges(x) for x in named}
+                for item in part.iter("route"):
+                    if "id" in item.attrib:
+                        edges = _edges(item)
+                        found.edges[item.get("id", "")] = shared.setdefault(edges, edges)
                 distributions += part.iter("routeDistribution")
         found.first = {name: edges[0] for name, edges in found.edges.items() if edges}
         for item in distributions:
