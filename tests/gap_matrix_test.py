@@ -120,6 +120,15 @@ def test_domains_a_network_does_not_allow_are_left_out(
         "barrier-leading", "barrier-lagging", "barrier-both",
     }  # fmt: skip
     assert "barrier-both is left out: phase order" in capture.get()
+    command = Evaluate("single-v1", domains=("sim", "transition"), duration_s=300)
+    with console.capture() as capture:
+        left = command._domains(load("single-v1"), console)
+    late = {name for name, item in NAMED.items() if "demand_timing=*,300" in item.effects}
+    assert late and {name for name in NAMED if NAMED[name].gap == "transition"} - set(left) == {
+        *late, "meso",
+    }  # fmt: skip
+    assert all(f"{name} is left out: " in capture.get() for name in late)
+    assert "no vehicle departs between 0 s and 300 s" in capture.get()
     named = ["--domains", "sim", "barrier-both", "--seeds", "1", "--policies", "max-pressure"]
     assert main(["evaluate", str(scenario), *named]) == 2, "what one names has to fit"
     assert "have no barrier" in capsys.readouterr().err

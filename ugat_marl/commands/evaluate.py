@@ -110,8 +110,12 @@ class Evaluate:
 
 
 def _may_not_fit(name: str) -> bool:
-    """Whether a named domain asks for something not every network has: a barrier, a long lane."""
-    return any(word in NAMED[name].effects for word in ("phase_order=barrier", "incident="))
+    """Whether a named domain asks for something not every network has: a barrier, a long lane.
+
+    Or not every episode: vehicles that come later may all come too late for a short one.
+    """
+    words = ("phase_order=barrier", "incident=", "demand_timing=")
+    return any(word in NAMED[name].effects for word in words)
 
 
 def names_of(policies: Sequence[str]) -> list[str]:
