@@ -153,6 +153,10 @@ class Evaluation:
             return cls(str(content["scenario"]), str(content["scenario_hash"]), results, notes)
         except OSError as error:
             raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from None
+        except json.JSONDecodeError as error:
+            raise CheckpointError(
+                f"{path}: no JSON at line {error.lineno} ({error.msg}); it may have been cut short"
+            ) from None
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise CheckpointError(
                 f"{path}: not the table of a run ({error!r}); it may have been cut short"
