@@ -592,3 +592,14 @@ def test_nothing_is_written_among_the_measured_data(
     assert main(street.arguments(street.measured / inside)) == 2
     assert "never written to" in capsys.readouterr().err
     assert hashes(street.measured) == before
+
+
+def test_a_cache_that_cannot_be_written_is_named_before_anything_runs(
+    street: Street, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    arguments = [*street.arguments(tmp_path / "out"), "--cache", str(tmp_path / "file" / "cache")]
+    assert main(arguments) == 2
+    said = capsys.readouterr()
+    assert "by --cache" in " ".join(said.err.split())
+    assert "measured" not in said.out

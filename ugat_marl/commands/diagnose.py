@@ -12,9 +12,10 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.commands.arguments import Ray, Workers, workers_of
+from ugat_marl.discrepancy.engine import default_cache
 from ugat_marl.discrepancy.workflow import CORRECTED, FILE, DiagnosisConfig, diagnose
 from ugat_marl.effects import DetectorEffect, known_effects, load
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import require_writable
 from ugat_marl.measured.data import Measured
 from ugat_marl.measured.reading import read_measured
@@ -75,6 +76,7 @@ class Diagnose:
         network = Network.read(scenario)
         measured = read_measured(self.measured, scenario, network)
         require_writable(self.out / FILE)
+        self._check_cache()
         _say_what_cannot_be_seen(measured, console)
         try:
             with workers_of(self.workers, self.ray) as workers:
@@ -107,6 +109,17 @@ class Diagnose:
                 f"--out {str(self.out)!r} lies in the measured data, which are never written to; "
                 "give another directory"
             )
+
+    def _check_cache(self) -> None:
+        """Better now than after the first simulated day."""
+        place = self.cache or default_cache()
+        try:
+            require_writable(place / "writable")
+        except OutputError:
+            raise OutputError(
+                f"{place}: simulated days cannot be remembered there; give another folder by "
+                "--cache"
+            ) from None
 
     def _commands(self, record: Mapping[str, Any]) -> list[str]:
         """The command itself, and what comes next."""
