@@ -116,8 +116,8 @@ dt { color: var(--soft); } dd { margin: 0; }
   html { font-size: 9.5pt; }
   body { max-width: none; padding: 0; }
   * { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-  tr, figure, .big, .note, pre { break-inside: avoid; }
-  h2, h3, h2 + p, h3 + p { break-after: avoid; }
+  tr, figure, p, .big, .note, .key, pre { break-inside: avoid; }
+  h2, h3, h2 + p, h3 + p, .key { break-after: avoid; }
   details::details-content { content-visibility: visible; block-size: auto; }
   summary { list-style: none; }
 }
