@@ -84,7 +84,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "bench.scale:ScaleBench",
         "many simulations, large networks, processes that die",
     ),
-    "bench all": ("bench.everything:AllBench", "all but strength and scale"),
+    "bench device": (
+        "bench.device:DeviceBench",
+        "from how many intersections on a GPU pays for learning",
+    ),
+    "bench all": ("bench.everything:AllBench", "all but strength, scale and device"),
 }
 
 SHORT: dict[str, tuple[str, ...]] = {

@@ -35,8 +35,10 @@ def answer_with_noise(model: ForwardModel, seed: int) -> None:
 
     def noise(inputs: Tensor) -> Tensor:
         answer = learnt(inputs)
-        asked = zlib.crc32(inputs.numpy().tobytes())
+        asked = zlib.crc32(inputs.cpu().numpy().tobytes())
         drawn = torch.randn(answer.shape, generator=torch_generator(seed, "placebo", asked))
-        return 0.0 * answer + drawn * model.valid_outputs  # training goes on, and shows nowhere
+        return (
+            0.0 * answer + drawn.to(answer.device) * model.valid_outputs
+        )  # training goes on, and shows nowhere
 
     model.read = noise  # every way of asking f leads through it, and its network is made anew

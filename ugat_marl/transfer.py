@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from ugat_marl.controllers import STANDARD_RULES
+from ugat_marl.devices import require_device_name
 from ugat_marl.effects import describe, in_domain, load
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.evaluation import (
@@ -97,6 +98,7 @@ class TransferConfig:
         learner: What learns: dqn, the suite's own; or a baseline (docs/learner.md).
         learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; the
             parts of a tuple are divided by commas.
+        device: Where dqn's updates and the fits of f and h are computed: cpu, cuda, or cuda:N.
         ugat: Settings of the algorithm.
         dqn: Settings of dqn.
     """
@@ -123,6 +125,7 @@ class TransferConfig:
     placebo: Placebo = "none"
     learner: str = DQN_NAME
     learner_settings: tuple[str, ...] = ()
+    device: str = "cpu"
     ugat: Annotated[UgatConfig, arg(name="")] = field(default_factory=UgatConfig)
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
@@ -150,6 +153,7 @@ class TransferConfig:
 
     def _refuse_impossible_controls(self) -> None:
         require_known(self.learner)
+        require_device_name(self.device)
         if self.placebo not in PLACEBOS:
             raise UnknownNameError("placebo", self.placebo, PLACEBOS)
         if self.placebo == "same-world" and self.real_log is not None:
@@ -203,7 +207,7 @@ def transfer(
         workers: An executor for roll-outs and the search for rules; the rest is played here.
     """
     reporter = reporter or Silent()
-    make = learner_factory(config.learner, config.learner_settings, config.dqn)
+    make = learner_factory(config.learner, config.learner_settings, config.dqn, config.device)
     scenario = load(config.scenario)
     env = parallel_env(scenario, config.sim, **config.env_options)
     recorded: RecordedWorld | None = None
@@ -228,8 +232,7 @@ def transfer(
         policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
         direct = directory / DIRECT_LEARNER
         for control in controls:
-            trained = train_control(control, make, config.seed, run, direct)
-            policies[control.name] = trained
+            policies[control.name] = train_control(control, make, config.seed, run, direct)
     finally:
         for made in (env, *(control.env for control in controls)):
             made.close()
@@ -263,14 +266,13 @@ def judge(
 ) -> Evaluation:
     """Evaluates policies beside the rules that are best in each domain, which `workers` find."""
     seeds = [TUNING_SEED + k for k in range(config.tuning_seeds)]
-    options: dict[str, Any] = {"duration_s": config.duration_s, "reporter": reporter}
-    options["workers"], budget = workers, config.rule_budget
-    if budget is None:
+    options: Any = {"duration_s": config.duration_s, "reporter": reporter, "workers": workers}
+    if config.rule_budget is None:
         rules = best_rules(scenario, config.domains, seeds=seeds, **options)
         searched = ", ".join(STANDARD_RULES)
     else:
-        rules = tuned_rules(scenario, config.domains, budget, seeds=seeds, **options)
-        searched = f"{', '.join(TUNED_RULES)}; each tuned with up to {budget} episodes"
+        rules = tuned_rules(scenario, config.domains, config.rule_budget, seeds=seeds, **options)
+        searched = f"{', '.join(TUNED_RULES)}; each tuned with up to {config.rule_budget} episodes"
     factories: dict[str, PolicyFactory] = {
         name: fixed_policy(policy) for name, policy in policies.items()
     }
@@ -315,15 +317,15 @@ def _train(
         return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
 
     street = config.sim if config.placebo == "same-world" else config.real
-    options = config.env_options
     sim, street_world = simulated_worlds(
-        scenario, config.sim, street, config.ugat, options, workers
+        scenario, config.sim, street, config.ugat, config.env_options, workers
     )
     real: World = recorded or street_world
     if config.placebo == "shuffled":
         real = ShuffledWorld(real)
     try:
-        return train_ugat(state, env, sim, real, config.ugat, config.seed, run, probe)
+        how = config.ugat, config.seed, run, probe, config.device
+        return train_ugat(state, env, sim, real, *how)
     finally:
         sim.close()
         real.close()
@@ -341,8 +343,7 @@ def _controls(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> li
         title = "control: more plain sim"
         found.append(Control(CONTROL, env, whole, file="control-learner.pt", title=title))
     for domain in config.further:
-        name = f"further in {describe(domain)}"
-        found.append(Control(name, world("further", domain), whole))
+        found += [Control(f"further in {describe(domain)}", world("further", domain), whole)]
     if config.random_delay_s is not None:
         late = RandomDelays(world("sim", config.sim), config.random_delay_s)
         found.append(Control(f"{RANDOM_DELAY} 0-{config.random_delay_s} s", late, whole))
@@ -380,14 +381,13 @@ def _identity(
     config: TransferConfig, scenario: Scenario, env: TrafficEnv, controls: Sequence[Control]
 ) -> dict[str, Any]:
     settings = {**asdict(config), "dqn": config.dqn.identity}
-    for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", *ADDED):
+    for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", "device", "corrected", *ADDED):
         settings.pop(other)
     if config.placebo == "none":  # runs from before there were any can be resumed
         settings.pop("placebo")
     if config.learner == DQN_NAME:  # the same
         settings.pop("learner")
         settings.pop("learner_settings")
-    settings.pop("corrected")  # a scenario is the same if its hash is, wherever it lies
     log = config.real_log  # the same if its content is, wherever it lies
     settings["real_log"] = hashlib.sha256(log.read_bytes()).hexdigest() if log else None
     hashes = {"sim": env.scenario.hash}
@@ -396,5 +396,5 @@ def _identity(
     for control in controls:
         if control.name == CORRECTED:
             corrected: Any = control.env
-            hashes["corrected"] = corrected.scenario.hash
+            hashes["corrected"] = corrected.scenario.hash  # the same, wherever it lies
     return {**settings, "scenario_hash": hashes, "domains": [describe(d) for d in config.domains]}

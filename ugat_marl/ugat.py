@@ -13,6 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
+from ugat_marl.devices import device_of
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.grounding.delays import TimedConfig
 from ugat_marl.grounding.fit_config import FitConfig
@@ -160,6 +163,7 @@ def train_ugat(
     seed: int,
     run: Run,
     probe: Probe | None = None,
+    device: str = "cpu",
 ) -> Policy:
     """Algorithm 1: pre-train in sim, then iterate roll-outs, fitting and grounded training.
 
@@ -172,17 +176,19 @@ def train_ugat(
         seed: Root of every random choice.
         run: Where metrics and checkpoints go.
         probe: Measures the policy after every iteration.
+        device: Where f and h are fitted (`devices.device_of`); the learner has its own.
 
     Returns:
         The policy after the last iteration.
     """
+    place = device_of(device)
     _pretrain(state, env, config, seed, run, probe)
     grounded = GroundedEnv(env, state.transform)
     while state.iteration < config.iterations:
         i = state.iteration
         policy = state.learner.policy()
         _collect(state, sim, real, policy, i, seed, run)
-        report = _fit(state, config, derive_seed(seed, "fit", i), run, i)
+        report = _fit(state, config, derive_seed(seed, "fit", i), run, i, place)
         if config.least_accuracy is not None:
             state.transform.gate.trust(report.trusted(config.least_accuracy))
         state.transform.gate.begin(report.expected_u)
@@ -253,7 +259,12 @@ def _collect(
 
 
 def _fit(
-    state: State, config: UgatConfig, seed: int, run: Run, iteration: int
+    state: State,
+    config: UgatConfig,
+    seed: int,
+    run: Run,
+    iteration: int,
+    device: torch.device,
 ) -> FitReport | TimedReport:
     transform = state.transform
     real, simulated = (TransitionLog.concatenate(logs) for logs in (state.real, state.simulated))
@@ -264,11 +275,11 @@ def _fit(
             go(note=f"{model} {loss:.2g}")
 
         if isinstance(transform, TimedTransform):
-            report = fit_timed(transform, real, simulated, config.fit, seed, on_epoch)
+            report = fit_timed(transform, real, simulated, config.fit, seed, on_epoch, device)
         else:
             assert isinstance(transform, GroundedActionTransform)
             models = transform.forward, transform.inverse
-            report = fit(*models, real, simulated, config.fit, seed, on_epoch)
+            report = fit(*models, real, simulated, config.fit, seed, on_epoch, device)
     for warning in report.warnings:
         run.reporter.say(f"round {iteration + 1}: {warning}")
     return report

@@ -5,6 +5,7 @@ and what they were measured on. Ratios are taken between runs of the same round,
 in time, since a machine's speed drifts by more than what is measured.
 """
 
+from ugat_marl.bench.device import DeviceBench
 from ugat_marl.bench.everything import AllBench
 from ugat_marl.bench.fitting import FittingBench
 from ugat_marl.bench.learning import LearningBench
@@ -16,6 +17,7 @@ from ugat_marl.bench.strength import StrengthBench
 
 __all__ = [
     "AllBench",
+    "DeviceBench",
     "EnvBench",
     "FittingBench",
     "LearningBench",

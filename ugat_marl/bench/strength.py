@@ -13,6 +13,7 @@ from statistics import fmean
 from typing import Any
 
 from ugat_marl.bench.report import Report, Target, require_positive
+from ugat_marl.devices import device_of, require_device_name
 from ugat_marl.effects import describe, load
 from ugat_marl.errors import OptionError
 from ugat_marl.evaluation import TUNING_SEED, best_rules, evaluate, rule_factory
@@ -89,6 +90,7 @@ class StrengthBench:
         observation: What agents see.
         reward: What agents want; they are judged by travel time.
         neighbours: How many roads away intersections are seen too.
+        device: Where updates are computed: cpu, cuda, or cuda:N.
         dqn: Settings of the learner.
         out: JSON file to write.
     """
@@ -106,6 +108,7 @@ class StrengthBench:
     observation: str = "count"
     reward: str = "queue"
     neighbours: int = 0
+    device: str = "cpu"
     dqn: DQNConfig = field(default_factory=DQNConfig)
     out: Path | None = None
 
@@ -118,6 +121,7 @@ class StrengthBench:
             evaluation_seeds=self.evaluation_seeds,
             tuning_seeds=self.tuning_seeds,
         )
+        require_device_name(self.device)
         if not self.seeds:
             raise OptionError("bench strength: seeds is empty; give one seed of training or more")
 
@@ -134,6 +138,7 @@ class StrengthBench:
             reporter: Is told how far it has come.
         """
         reporter = reporter or Silent()
+        device_of(self.device)  # what is not there is said now, not after the search for the rule
         scenario = load(self.scenario)
         rule, rule_s = self._best_rule(scenario, reporter)
         curves = {seed: self._curve(scenario, seed, reporter) for seed in self.seeds}
@@ -179,7 +184,7 @@ class StrengthBench:
 
     def _curve(self, scenario: Scenario, seed: int, reporter: Reporter) -> Curve:
         training, judging = self._env(scenario), self._env(scenario)
-        learner = DQN.of(training, self.dqn, seed)
+        learner = DQN.of(training, self.dqn, seed, device=device_of(self.device))
         att_s: dict[int, float] = {}
         try:
             with reporter.task(f"training, seed {seed}", self.episodes) as advance:

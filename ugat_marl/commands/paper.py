@@ -13,6 +13,7 @@ from tyro.conf import arg
 from ugat_marl.bench.machine import machine_facts
 from ugat_marl.commands.arguments import Ray, workers_of
 from ugat_marl.comparison import Comparison
+from ugat_marl.devices import device_of
 from ugat_marl.errors import OptionError
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.paper.settings import GROUNDED_NAME
@@ -47,6 +48,12 @@ class _Paper:
         """Trains, plays, prints the table, writes it as Markdown, CSV and PNG."""
         if self.jobs is not None and self.jobs < 1:
             raise OptionError(f"jobs = {self.jobs}: must be at least 1")
+        if self.ray is not None and self.config.device != "cpu":
+            raise OptionError(
+                f"device = {self.config.device!r}: trainings on Ray have a core each and no GPU; "
+                "leave --ray or --device out"
+            )
+        device_of(self.config.device)  # what is not there is an error now, not in a job's log
         for scenario in self.config.scenario:
             folder = self.out / self._folder(scenario)
             require_writable(folder / "table.md")

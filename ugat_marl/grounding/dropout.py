@@ -136,7 +136,7 @@ class DropoutNet(AnswerNet):
             return self.head(torch.relu(self.encoders(inputs)))
         x = inputs
         for k, (layer, logit) in enumerate(zip(self._maps(), self._logits(), strict=True)):
-            draw = torch.rand(x.shape, generator=lesson.generator)
+            draw = torch.rand(x.shape, generator=lesson.generator).to(x.device)
             x = layer(thinned(x if k == 0 else torch.relu(x), logit, draw))
         return x
 

@@ -40,6 +40,10 @@ class Split:
     held_out: Tensor
     kind: str
 
+    def to(self, device: torch.device) -> Split:
+        """The same on a device."""
+        return Split(self.train.to(device), self.held_out.to(device), self.kind)
+
 
 def split(data: StackedTransitions, every: int, stack: Stack) -> Split:
     """Holds out episodes 1, 1 + every, ...; of a single episode, the last of `every` parts.
@@ -65,10 +69,10 @@ def split(data: StackedTransitions, every: int, stack: Stack) -> Split:
 class _Best:
     """The weights with the lowest held-out loss, each of `units` parts of the model for itself."""
 
-    def __init__(self, model: nn.Module, units: int) -> None:
+    def __init__(self, model: nn.Module, units: int, device: torch.device) -> None:
         self._model = model
         self._weights = {name: p.detach().clone() for name, p in model.named_parameters()}
-        self.loss = torch.full((units,), torch.inf)
+        self.loss = torch.full((units,), torch.inf, device=device)
 
     def offer(self, loss: Tensor) -> bool:
         """Keeps the model's current weights where `loss`, ``(units,)``, is lower than before."""
@@ -95,11 +99,14 @@ def train_model(
     generator: torch.Generator,
     on_epoch: EpochCallback | None,
 ) -> TrainingRecord:
-    """Trains until the held-out loss has stopped falling; the model keeps its best weights."""
+    """Trains until the held-out loss has stopped falling; the model keeps its best weights.
+
+    Model, columns of the data and `parts` are on one device; `generator` is on the CPU.
+    """
     # Agents of f and members of h share no weight, so each may keep its own best.
     h = model if isinstance(model, AnswerModel) else None
     members = h.net.members if h else 1
-    best = _Best(model, members if h else len(parts.train))
+    best = _Best(model, members if h else len(parts.train), parts.train.device)
 
     def held_out() -> Tensor:
         found = _mean_loss(loss, parts.held_out, members)
@@ -142,7 +149,8 @@ def taken(data: Tensor, columns: Tensor) -> Tensor:
 def _shuffled(columns: Tensor, members: int, generator: torch.Generator) -> Tensor:
     """Columns in random order, ``(n,)``; of several members each in its own, ``(members, n)``."""
     orders = [torch.randperm(len(columns), generator=generator) for _ in range(members)]
-    return columns[orders[0] if members == 1 else torch.stack(orders)]
+    order = orders[0] if members == 1 else torch.stack(orders)
+    return columns[order.to(columns.device)]
 
 
 def _epoch(
@@ -153,7 +161,7 @@ def _epoch(
     optimiser: torch.optim.Optimizer,
 ) -> float:
     """One pass over the batches of columns; the mean loss over agents, members and batches."""
-    total = 0.0
+    found: list[Tensor] = []
     for batch in batches:
         own = taken(weight, batch)
         # Each agent's mean, summed: an agent learns as fast among many as it would alone.
@@ -161,15 +169,16 @@ def _epoch(
         optimiser.zero_grad(set_to_none=True)
         mean.sum().backward()
         optimiser.step()
-        total += float(mean.detach().mean())
-    return total / len(batches)
+        found.append(mean.detach().mean())
+    # Read once at the end: a GPU would be waited for at every batch.
+    return sum(torch.stack(found).cpu().tolist()) / len(batches)
 
 
 @torch.no_grad()
 def _mean_loss(loss: RowLoss, weight: Tensor, members: int) -> Tensor:
     """Mean loss over the rows with weight, ``(agents,)`` or, of several, ``(agents, members)``."""
     chunk = rows_at_once(len(weight) * members)
-    total, rows = torch.zeros(()), torch.zeros(())
+    total, rows = weight.new_zeros(()), weight.new_zeros(())
     for batch in weight.any(0).nonzero()[:, 0].split(chunk):
         columns = batch if members == 1 else batch.expand(members, -1)
         own = taken(weight, columns)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ugat_marl.batched import one_thread
+from ugat_marl.devices import CPU, placed
 from ugat_marl.errors import LogError
 from ugat_marl.grounding.evidential import annealing
 from ugat_marl.grounding.fit_config import FitConfig
@@ -41,6 +42,7 @@ def fit(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None = None,
+    device: torch.device = CPU,
 ) -> FitReport:
     """Fits f on the real log, h on the simulated log, and measures both.
 
@@ -52,6 +54,7 @@ def fit(
         config: How to train.
         seed: Decides fresh weights, the order of batches, and the states drawn off the data.
         on_epoch: Called after every epoch.
+        device: Where the models are trained; they come from the CPU and end there.
 
     Raises:
         LogError: A log is of other agents, or too short to be split, or the logs differ in
@@ -60,10 +63,10 @@ def fit(
     refuse_mismatch(real, simulated)
     refuse_other_agents(real, inverse.stack)
     ours, theirs = stack_log(simulated, inverse.stack), stack_log(real, forward.stack)
-    f = _fit_forward(forward, theirs, config, seed, on_epoch)
-    means = _expected(forward, ours, config, seed, on_epoch)
+    f = _fit_forward(forward, theirs, config, seed, on_epoch, device)
+    means = _expected(forward, ours, config, seed, on_epoch, device)
     pairs = means if config.pairs == "smoothed" else None
-    h = _fit_inverse(inverse, ours, config, seed, on_epoch, pairs)
+    h = _fit_inverse(inverse, ours, config, seed, on_epoch, pairs, device)
     held_out = split(ours, config.held_out_every, inverse.stack).held_out
     held_out_real = split(theirs, config.held_out_every, inverse.stack).held_out
     agreement, u_on_predictions = on_predictions(forward, inverse, ours, held_out)
@@ -87,13 +90,14 @@ def _expected(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None,
+    device: torch.device,
 ) -> Tensor:
     """What the simulation makes of its states and actions on average, ``(agents, n, outputs)``."""
     generator, seen = torch_generator(seed, "simulated"), forward.view.of(data)
     model = ForwardModel(forward.stack, forward.config, generator, view=forward.view)
     lesson = Changes("simulated", seen, data.next_observation, data.executed)
     parts = split(data, config.held_out_every, forward.stack)
-    fit_changes(model, lesson, parts, config, seed, on_epoch)
+    fit_changes(model, lesson, parts, config, seed, on_epoch, device)
     with torch.no_grad():
         return model.predict(seen, data.executed)
 
@@ -116,9 +120,10 @@ def fit_forward(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None = None,
+    device: torch.device = CPU,
 ) -> ForwardReport:
     """Fits f by least squares on the change of the features, each agent on its own rows."""
-    return _fit_forward(model, stack_log(log, model.stack), config, seed, on_epoch)
+    return _fit_forward(model, stack_log(log, model.stack), config, seed, on_epoch, device)
 
 
 def _fit_forward(
@@ -127,10 +132,11 @@ def _fit_forward(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None,
+    device: torch.device,
 ) -> ForwardReport:
     parts = split(data, config.held_out_every, model.stack)
     lesson = Changes("forward", model.view.of(data), data.next_observation, data.asked)
-    return fit_changes(model, lesson, parts, config, seed, on_epoch)
+    return fit_changes(model, lesson, parts, config, seed, on_epoch, device)
 
 
 @dataclass(frozen=True)
@@ -159,24 +165,27 @@ def fit_changes(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None,
+    device: torch.device = CPU,
 ) -> ForwardReport:
     """Fits a model of changes by least squares."""
     change = model.change(asked.observation, asked.outcome)
     if not (bool(model.fitted) and config.warm_start):
         model.renew(torch_generator(seed, asked.name, "weights"))
         model.fit_scale(asked.observation, change, parts.train)
-    outputs = model.valid_outputs.sum(-1)
-
-    inputs, truth = model.inputs(asked.observation, asked.acted, asked.extra), change / model.scale
+    outputs = model.valid_outputs.sum(-1).to(device)
+    inputs = model.inputs(asked.observation, asked.acted, asked.extra).to(device)
+    truth = (change / model.scale).to(device)
 
     def loss(columns: Tensor, _epoch: int) -> Tensor:
         error = model.read(taken(inputs, columns)) - taken(truth, columns)
         return (error**2).sum(-1) / outputs
 
     generator = torch_generator(seed, asked.name, "batches")
-    record = train_model(asked.name, model, loss, parts, config, generator, on_epoch)
-    with torch.no_grad():
-        found = model.read_all(inputs) * model.scale
+    with placed(device, model):
+        there = parts.to(device)
+        record = train_model(asked.name, model, loss, there, config, generator, on_epoch)
+        with torch.no_grad():
+            found = (model.read_all(inputs) * model.scale).to(CPU)
     followed = asked.observation[..., : change.shape[-1]] * model.valid_outputs + change
     share = (parts.train / parts.train.sum(1, keepdim=True))[..., None]
     off_mean = followed - (followed * share).sum(1, keepdim=True)
@@ -191,6 +200,7 @@ def fit_inverse(
     seed: int,
     on_epoch: EpochCallback | None = None,
     outcome: Tensor | None = None,
+    device: torch.device = CPU,
 ) -> InverseReport:
     """Fits h with the loss of the method asked for; the head learns from all agents at once.
 
@@ -198,7 +208,7 @@ def fit_inverse(
     next observation.
     """
     data = stack_log(log, model.stack)
-    return _fit_inverse(model, data, config, seed, on_epoch, outcome)
+    return _fit_inverse(model, data, config, seed, on_epoch, outcome, device)
 
 
 def _fit_inverse(
@@ -208,13 +218,14 @@ def _fit_inverse(
     seed: int,
     on_epoch: EpochCallback | None,
     outcome: Tensor | None,
+    device: torch.device,
 ) -> InverseReport:
     parts = split(data, config.held_out_every, model.stack)
     then = data.next_observation if outcome is None else outcome
     inputs = model.inputs(model.view.of(data), then)
     off_data = OffData.around(inputs, parts.train, model.view)
     record = fit_answers(
-        model, Questions(inputs, data.executed, off_data), parts, config, seed, on_epoch
+        model, Questions(inputs, data.executed, off_data), parts, config, seed, on_epoch, device
     )
     drawn = torch_generator(seed, "inverse", "off data")
     return inverse_report(model, data, parts.train, parts.held_out, record, drawn)
@@ -242,6 +253,7 @@ def fit_answers(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None,
+    device: torch.device = CPU,
 ) -> TrainingRecord:
     """Fits a model that answers with a class, with the loss of the method asked for."""
     fresh = not (bool(model.fitted) and config.warm_start and model.method == config.method)
@@ -249,16 +261,19 @@ def fit_answers(
         model.renew(config.method, torch_generator(seed, "inverse", "weights"))
         model.standardise.fit(asked.inputs, parts.train)
     generator = torch_generator(seed, "inverse", "batches")
-    standardised, rows = model.standardise(asked.inputs), parts.train.sum(1)
+    standardised, answers = model.standardise(asked.inputs).to(device), asked.answers.to(device)
+    parts, off_data = parts.to(device), asked.off_data.to(device)
+    rows = parts.train.sum(1)
 
     def invent(count: int) -> Tensor:
-        return model.standardise(asked.off_data.draw(count, generator, state_share=0.5))
+        return model.standardise(off_data.draw(count, generator, state_share=0.5))
 
     def loss(columns: Tensor, epoch: int) -> Tensor:
         # Annealing lets a fresh model gather evidence before it is punished for misleading some.
         share = annealing(epoch, config.kl_epochs) if fresh and epoch >= 0 else 1.0
         weights = config.kl_weight, config.off_data_weight
         lesson = Lesson(epoch < 0, generator, rows, share, *weights, invent)
-        return model.net.loss(taken(standardised, columns), taken(asked.answers, columns), lesson)
+        return model.net.loss(taken(standardised, columns), taken(answers, columns), lesson)
 
-    return train_model("inverse", model, loss, parts, config, generator, on_epoch)
+    with placed(device, model):
+        return train_model("inverse", model, loss, parts, config, generator, on_epoch)

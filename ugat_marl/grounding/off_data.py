@@ -8,7 +8,7 @@ stay valid ones, or they alone would give the invented rows away.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -65,18 +65,23 @@ class OffData:
             candidates = weight.bool().any(0).nonzero()[:, 0]
         return cls(inputs, candidates, centre - reach, centre + reach, kept, change)
 
+    def to(self, device: torch.device) -> OffData:
+        """The same on a device."""
+        return replace(self, **{name: part.to(device) for name, part in vars(self).items()})
+
     def draw(self, count: int, generator: torch.Generator, state_share: float) -> Tensor:
         """Invented inputs ``(agents, count, width)``.
 
         Args:
             count: Rows per agent.
-            generator: Source of the draws.
+            generator: Source of the draws, on the CPU wherever the inputs are.
             state_share: Share of rows in which the state is drawn, too; in the others it is an
                 observed one with a change that it never had.
         """
-        rows = torch.randint(len(self.candidates), (count,), generator=generator)
+        device = self.inputs.device
+        rows = torch.randint(len(self.candidates), (count,), generator=generator).to(device)
         observed = self.inputs.index_select(1, self.candidates[rows])
-        noise = torch.rand(observed.shape, generator=generator)
+        noise = torch.rand(observed.shape, generator=generator).to(device)
         drawn = torch.addcmul(self.low, self.high - self.low, noise)
-        whole = torch.rand(1, count, 1, generator=generator) < state_share
+        whole = torch.rand(1, count, 1, generator=generator).to(device) < state_share
         return torch.where((self.change | whole) & ~self.kept, drawn, observed)

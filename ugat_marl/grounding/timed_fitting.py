@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ugat_marl.batched import one_thread
+from ugat_marl.devices import CPU
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.fit_loop import EpochCallback, Split, split
 from ugat_marl.grounding.fit_report import TrainingRecord
@@ -35,6 +36,7 @@ def fit_timed(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None = None,
+    device: torch.device = CPU,
 ) -> TimedReport:
     """Fits all models of a timed grounding, and measures them.
 
@@ -45,6 +47,7 @@ def fit_timed(
         config: How to train.
         seed: Decides fresh weights, the order of batches, and what is drawn.
         on_epoch: Called after every epoch.
+        device: Where the models are trained; they come from the CPU and end there.
 
     Raises:
         LogError: As `fitting.fit`.
@@ -54,11 +57,11 @@ def fit_timed(
     street, data = _alike(stack_log(real, stack), stack_log(simulated, stack))
     parts = split(street, config.held_out_every, stack)
     lesson = Changes("forward", transform.forward.view.of(street), street.outcome, street.asked)
-    f = fit_changes(transform.forward, lesson, parts, config, seed, on_epoch)
+    f = fit_changes(transform.forward, lesson, parts, config, seed, on_epoch, device)
     parts = split(data, config.held_out_every, stack)
     extra = model.extra(data.delay_s)
     lesson = Changes("simulated", model.view.of(data), data.outcome, data.executed, extra)
-    g = fit_changes(model, lesson, parts, config, seed, on_epoch)
+    g = fit_changes(model, lesson, parts, config, seed, on_epoch, device)
     begins = _begins(data, stack)
     known = Means.of(model, replace(data, weight=parts.train * begins))
     street = replace(street, weight=street.weight * _begins(street, stack))
@@ -68,7 +71,14 @@ def fit_timed(
     transform.constants.delay_s.copy_(lost.phase_s * learnt[:, None])
     data = replace(data, weight=data.weight * begins)
     h = _fit_delays(
-        transform, data, _where(begins, parts), known.spread[:, None], config, seed, on_epoch
+        transform,
+        data,
+        _where(begins, parts),
+        known.spread[:, None],
+        config,
+        seed,
+        on_epoch,
+        device,
     )
     return TimedReport(stack.agents, f, g, lost, h, transform.timed.most_s)
 
@@ -109,6 +119,7 @@ def _fit_delays(
     config: FitConfig,
     seed: int,
     on_epoch: EpochCallback | None,
+    device: torch.device,
 ) -> DelayReport:
     """Fits h to what the model of the simulation makes of every state under some delay.
 
@@ -128,7 +139,7 @@ def _fit_delays(
     inputs = model.inputs(seen, data.executed, change)
     off_data = OffData.around(inputs, parts.train, model.view, model.action_columns)
     asked = Questions(inputs, answers, off_data)
-    record = fit_answers(model, asked, parts, config, seed, on_epoch)
+    record = fit_answers(model, asked, parts, config, seed, on_epoch, device)
     return _report(transform, data, parts, asked, record, torch_generator(seed, "off data"))
 
 

@@ -86,7 +86,7 @@ class Lesson:
 
     Attributes:
         held_out: Whether the rows are held out: the loss only ranks weights then.
-        generator: Source of all that is drawn.
+        generator: Source of all that is drawn; on the CPU wherever the rows are.
         rows: ``(agents,)`` rows each agent is trained on in all.
         share: How far terms that would keep fresh weights from learning are annealed in, 0 to 1.
         kl_weight: Final weight of the divergence of misleading evidence.

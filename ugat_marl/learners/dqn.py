@@ -19,12 +19,13 @@ from torch import Tensor, nn
 
 from ugat_marl.batched import one_thread
 from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
+from ugat_marl.devices import CPU
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy, header, parse_header
 from ugat_marl.learners.exploration import StickyExploration
-from ugat_marl.learners.q_network import flatten_parameters, greedy_actions, q_network
+from ugat_marl.learners.q_network import Acting, flatten_parameters, greedy_actions, q_network
 from ugat_marl.learners.replay import Replay
 from ugat_marl.learners.structure import Structure, structure_in
 from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
@@ -59,6 +60,7 @@ class DQN:
         seed: Seed of the initial weights.
         env_options: Options of the environment the learned policy relies on.
         structure: What a network other than "mlp" knows of the intersections; `DQN.of` reads it.
+        device: Where updates are computed; actions are chosen, and transitions kept, on the CPU.
 
     Raises:
         OptionError: The network of `config` is not that of `structure`.
@@ -71,6 +73,7 @@ class DQN:
         seed: int = 0,
         env_options: Mapping[str, Any] | None = None,
         structure: Structure | None = None,
+        device: torch.device = CPU,
     ) -> None:
         self.agents = agents
         self.config = config if config is not None else DQNConfig()
@@ -86,16 +89,19 @@ class DQN:
         self.updates = 0
         hidden, shared = self.config.hidden, self.config.shared
         weights = torch_generator(seed, "dqn", "weights")
-        self._online = q_network(agents, hidden, shared, weights, structure)
-        self._target = q_network(agents, hidden, shared, torch.Generator(), structure)
+        self.device = device
+        self._online = q_network(agents, hidden, shared, weights, structure).to(device)
+        self._target = q_network(agents, hidden, shared, torch.Generator(), structure).to(device)
         self._weights = flatten_parameters(self._online)
         self._target_weights = flatten_parameters(self._target)
         self._target_weights.data.copy_(self._weights.data)
         self._target.requires_grad_(False)
         self._adam = torch.optim.Adam([self._weights], lr=self.config.learning_rate, fused=True)
         self._replay = Replay(agents, self.config.replay_capacity)
-        self._centre = torch.zeros(len(agents), 1)
-        self._scale = torch.full((len(agents), 1), self.config.reward_scale or 1.0)
+        self._centre = torch.zeros(len(agents), 1, device=device)
+        scale = self.config.reward_scale or 1.0
+        self._scale = torch.full((len(agents), 1), scale, device=device)
+        self._acting = Acting(self._online, self._weights)
 
     @classmethod
     def of(
@@ -104,6 +110,7 @@ class DQN:
         config: DQNConfig | None = None,
         seed: int = 0,
         env_options: Mapping[str, Any] | None = None,
+        device: torch.device = CPU,
     ) -> DQN:
         """A learner for the agents of `env`; its options come along if it declares them.
 
@@ -114,7 +121,8 @@ class DQN:
         if env_options is None:
             env_options = getattr(env.unwrapped, "env_options", {})
         network = config.network if config is not None else "mlp"
-        return cls(AgentSet.of(env), config, seed, env_options, Structure.of(env, network))
+        structure = Structure.of(env, network)
+        return cls(AgentSet.of(env), config, seed, env_options, structure, device)
 
     def learn(
         self,
@@ -178,7 +186,8 @@ class DQN:
         now, allowed = self.agents.stack(observations), self.agents.masks(infos)
         while env.agents:
             epsilon = self.config.epsilon(self.decisions)
-            greedy = greedy_actions(self._online, torch.from_numpy(now), torch.from_numpy(allowed))
+            acting = self._acting.network(self.updates)
+            greedy = greedy_actions(acting, torch.from_numpy(now), torch.from_numpy(allowed))
             actions = explore.choose(greedy, allowed, epsilon)
             observations, rewards, terminated, _, infos = env.step(self.agents.actions(actions))
             self._require_all_or_none(env)
@@ -216,12 +225,12 @@ class DQN:
 
     def _measure_rewards(self) -> None:
         deviation, mean = torch.std_mean(self._replay.rewards(), dim=1, keepdim=True, correction=0)
-        self._centre = mean
-        self._scale = torch.where(deviation > 1e-6, 1.0 / deviation.clamp_min(1e-6), 1.0)
+        scale = torch.where(deviation > 1e-6, 1.0 / deviation.clamp_min(1e-6), 1.0)
+        self._centre, self._scale = mean.to(self.device), scale.to(self.device)
 
     def _update(self, generator: torch.Generator) -> tuple[float, float]:
         """One gradient step of all agents; returns mean loss and mean Q before it."""
-        batch = self._replay.sample(self.config.batch_size, generator)
+        batch = self._replay.sample(self.config.batch_size, generator).to(self.device)
         with torch.no_grad():
             best = self._online(batch.next_observation)
             best = best.masked_fill_(~batch.next_allowed, -torch.inf).argmax(-1, keepdim=True)
@@ -272,8 +281,10 @@ class DQN:
             **header(self.agents, self.config.hidden, self.env_options, self.config.shared, own),
             "counters": {name: getattr(self, name) for name in _COUNTERS}
             | {"added": self._replay.added},
-            "tensors": {name: tensor.clone() for name, tensor in self._tensors().items()},
-            "adam": dict(self._adam.state.get(self._weights, {})),
+            "tensors": {name: x.to(CPU, copy=True) for name, x in self._tensors().items()},
+            "adam": {
+                name: x.to(CPU) for name, x in self._adam.state.get(self._weights, {}).items()
+            },
             "replay": self._replay.state(),
         }
         write_checkpoint(path, _KIND, content)
@@ -301,7 +312,8 @@ class DQN:
             counters = {name: int(content["counters"][name]) for name in (*_COUNTERS, "added")}
             tensors = _like(path, content["tensors"], self._tensors())
             stored = _like(path, content["replay"], self._replay.rows(counters["added"]))
-            moments = {name: content["adam"][name] for name in _MOMENTS if content["adam"]}
+            adam = content["adam"]
+            moments = {name: adam[name].to(self.device) for name in _MOMENTS if adam}
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"{path}: not a whole checkpoint ({error!r})") from None
         self.env_options = env_options
@@ -313,6 +325,7 @@ class DQN:
         self._adam.state.clear()
         if moments:
             self._adam.state[self._weights] = moments
+        self._acting.forget()
 
     def _tensors(self) -> dict[str, Tensor]:
         return {

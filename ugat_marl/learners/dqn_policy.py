@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
+from ugat_marl.devices import CPU
 from ugat_marl.errors import CheckpointError
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.q_network import greedy_actions, q_network
@@ -28,7 +29,8 @@ class DQNPolicy:
     Args:
         agents: The agents it acts for.
         hidden: Sizes of the hidden layers of each network.
-        parameters: All parameters as one vector, as `flatten_parameters` orders them; copied.
+        parameters: All parameters as one vector, as `flatten_parameters` orders them; copied, to
+            the CPU.
         env_options: Options of the environment the policy relies on.
         shared: Whether all agents share one network.
         structure: What a network other than "mlp" knows of the intersections.
@@ -52,7 +54,7 @@ class DQNPolicy:
         self.structure = structure
         self.env_options: Mapping[str, Any] = dict(env_options)
         self._network = q_network(agents, hidden, shared, torch.Generator(), structure)
-        vector = torch.as_tensor(parameters).detach().clone()
+        vector = torch.as_tensor(parameters).detach().to(CPU, copy=True)
         needed = sum(parameter.numel() for parameter in self._network.parameters())
         if vector.shape != (needed,):
             raise ValueError(f"parameters of shape {tuple(vector.shape)}, needed: ({needed},)")

@@ -91,7 +91,10 @@ BASELINES: Mapping[str, Baseline] = {
 
 
 def learner_factory(
-    name: str, settings: Sequence[str] = (), dqn: DQNConfig | None = None
+    name: str,
+    settings: Sequence[str] = (),
+    dqn: DQNConfig | None = None,
+    device: str = "cpu",
 ) -> LearnerFactory:
     """What makes the learners a user names; its library is imported here.
 
@@ -99,18 +102,23 @@ def learner_factory(
         name: "dqn", or one of `BASELINES`.
         settings: Of a baseline, as ``NAME=VALUE``; the parts of a tuple are divided by commas.
         dqn: Settings of "dqn".
+        device: Where "dqn" computes its updates (`devices.device_of`); baselines stay on the CPU.
 
     Raises:
         UnknownNameError: No such learner, or no such setting.
-        OptionError: A value is impossible, or the library is not installed.
+        OptionError: A value is impossible, or the library is not installed, or there is no such
+            device.
     """
+    from ugat_marl.devices import device_of
+
     require_known(name)
+    place = device_of(device)
     if name == DQN_NAME:
         if settings:
             raise OptionError(f"learner settings {' '.join(settings)}: those of dqn are --dqn.*")
         from ugat_marl.learners.dqn import DQN
 
-        return lambda env, seed: DQN.of(env, dqn, seed)
+        return lambda env, seed: DQN.of(env, dqn, seed, device=place)
     baseline = BASELINES[name]
     module = load_baseline(name)
     config = _configured(getattr(module, baseline.config), baseline.settings, settings, name)

@@ -33,9 +33,18 @@ class Batch:
     next_observation: Tensor
     next_allowed: Tensor
 
+    def to(self, device: torch.device) -> Batch:
+        """The same on a device; itself if it is there."""
+        if self.reward.device == device:
+            return self
+        return Batch(**{name: column.to(device) for name, column in vars(self).items()})
+
 
 class Replay:
-    """A ring of the last `capacity` decisions of all agents, layout ``(agents, capacity, ...)``."""
+    """A ring of the last `capacity` decisions of all agents, layout ``(agents, capacity, ...)``.
+
+    It stays on the CPU wherever is learnt: it is large, and an update needs little of it.
+    """
 
     def __init__(self, agents: AgentSet, capacity: int) -> None:
         n, width, actions = len(agents), agents.widest_observation, agents.most_actions

@@ -20,6 +20,7 @@ from typing import Any
 from pydantic import TypeAdapter
 from rich.console import Console
 
+from ugat_marl.devices import device_of
 from ugat_marl.effects import in_domain, load
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.evaluation import evaluate, fixed_policy, rule_factory
@@ -67,6 +68,7 @@ class Job:
         rule_budget: Most episodes in which each rule is tuned, for "rule".
         domains: Where the policy is played; not part of the job's identity.
         evaluation_seeds: When it is played; not part of the identity either.
+        device: Where it is trained; nor is that, as results agree within tolerance.
     """
 
     kind: Kind
@@ -83,13 +85,14 @@ class Job:
     rule_budget: int
     domains: tuple[str, ...] = ()
     evaluation_seeds: tuple[int, ...] = field(default=())
+    device: str = "cpu"
 
     @property
     def identity(self) -> dict[str, Any]:
         """What decides the policy: a job with the same is the same job."""
         settings = {**asdict(self), "dqn": self.dqn.identity}
-        for judging in ("domains", "evaluation_seeds", "scenario"):
-            settings.pop(judging)
+        for other in ("domains", "evaluation_seeds", "scenario", "device"):
+            settings.pop(other)
         worlds = sorted({world for world in (self.sim, self.target, self.world) if world})
         hashes = {world: _hash(self.scenario, world) for world in worlds}
         versions = {name: importlib.metadata.version(name) for name in ("eclipse-sumo", "torch")}
@@ -187,7 +190,7 @@ def _plain(job: Job, folder: Path, reporter: Reporter) -> DQN:
     assert job.seed is not None
     env = _world(job)
     try:
-        learner = DQN.of(env, job.dqn, job.seed)
+        learner = DQN.of(env, job.dqn, job.seed, device=device_of(job.device))
         progress = folder / LEARNER
         before = _start(job, folder)
         if progress.exists():
@@ -211,14 +214,14 @@ def _grounded(job: Job, folder: Path, reporter: Reporter) -> DQN:
     run = Run(folder, job.identity, resume=True, reporter=reporter)
     sim, real = simulated_worlds(scenario, job.sim, job.target, job.ugat, options)
     try:
-        learner = DQN.of(env, job.dqn, job.seed)
+        learner = DQN.of(env, job.dqn, job.seed, device=device_of(job.device))
         before = _start(job, folder)
         assert before is not None
         learner.load(before)
         transform = job.ugat.transform(env.layouts, job.seed, neighbours_of(env))
         state = State(learner, transform, learner.policy(), pretrained=job.ugat.pretrain_episodes)
         restore(state, run, DQNPolicy.load)
-        train_ugat(state, env, sim, real, job.ugat, job.seed, run)
+        train_ugat(state, env, sim, real, job.ugat, job.seed, run, device=job.device)
     finally:
         for made in (env, sim, real, run):
             made.close()

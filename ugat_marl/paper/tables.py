@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ugat_marl.comparison import Comparison, Trial
+from ugat_marl.devices import require_device_name
 from ugat_marl.effects import describe, in_domain, load
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.executors import Workers
@@ -45,6 +46,7 @@ class PaperConfig:
         reward: What agents want.
         neighbours: How many roads away intersections are seen too.
         duration_s: Length of an episode in s; default: the scenario's own.
+        device: Where updates and fits are computed: cpu, cuda, or cuda:N; all trainings share it.
         dqn: Settings of the learner.
     """
 
@@ -67,6 +69,7 @@ class PaperConfig:
     reward: str = "queue"
     neighbours: int = 0
     duration_s: float | None = None
+    device: str = "cpu"
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
     def __post_init__(self) -> None:
@@ -75,6 +78,7 @@ class PaperConfig:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
         if self.rule_budget < LEAST_BUDGET:
             raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
+        require_device_name(self.device)
         if not self.scenario:
             raise OptionError("scenario is empty; name one, such as single-v1")
         names = [describe(domain) for domain in self.domains]
@@ -210,6 +214,7 @@ class Planner:
             rule_budget=config.rule_budget if row.kind == "rule" else 0,
             domains=(config.sim, target) if target else (config.sim, *self._targets),
             evaluation_seeds=tuple(EVALUATION_SEED + k for k in range(config.evaluation_seeds)),
+            device=config.device,
         )
         return Planned.of(job)
 

@@ -1,0 +1,68 @@
+"""Where learning computes: on the processor, or on a GPU where torch sees one.
+
+A GPU does the sums of an update or a fit and nothing else. What is drawn at random is drawn on the
+CPU, so that a GPU learns from the same draws; transitions, policies, roll-outs and checkpoints stay
+on the CPU, so that a run goes on with or without the GPU it was begun with.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator
+
+import torch
+from torch import nn
+
+from ugat_marl.errors import OptionError
+
+CPU = torch.device("cpu")
+_NAMES = re.compile(r"cpu|cuda(?::(0|[1-9]\d*))?")
+
+
+def require_device_name(name: str) -> None:
+    """Refuses what is no device's name, whether this machine has the device or not.
+
+    Raises:
+        OptionError: Neither "cpu", "cuda" nor "cuda:N".
+    """
+    if not _NAMES.fullmatch(name):
+        raise OptionError(f"device = {name!r}: must be cpu, cuda, or cuda:N for one GPU of several")
+
+
+def device_of(name: str) -> torch.device:
+    """The device of that name.
+
+    Args:
+        name: "cpu", "cuda" (torch's current GPU) or "cuda:N".
+
+    Raises:
+        OptionError: No device's name, or torch sees no such GPU.
+    """
+    require_device_name(name)
+    if name == "cpu":
+        return CPU
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if count == 0:
+        built = torch.backends.cuda.is_built()
+        why = "finds no GPU it can use" if built else "was built without CUDA"
+        raise OptionError(f"device = {name!r}: torch {torch.__version__} {why}; leave it at cpu")
+    number = name.partition(":")[2]
+    if number and int(number) >= count:
+        known = ", ".join(f"cuda:{index}" for index in range(count))
+        raise OptionError(
+            f"device = {name!r}: torch sees {count} GPU{'s' * (count > 1)} here; name {known}"
+        )
+    return torch.device(name)
+
+
+@contextlib.contextmanager
+def placed(device: torch.device, *modules: nn.Module) -> Iterator[None]:
+    """Has modules on a device for a while; whatever happens, they end on the CPU."""
+    try:
+        for module in modules:
+            module.to(device)
+        yield
+    finally:
+        for module in modules:
+            module.to(CPU)
