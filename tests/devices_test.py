@@ -260,6 +260,7 @@ def test_checkpoints_go_on_on_either_device(
         # as many updates as the checkpoint has: what acts must change with the weights all the same
         second.learn(env, 1, 5)
         assert second.updates == first.updates
+        second._acting.network(second.updates)
         second.load(path)
         policy = second.learn(env, 1, 0)
         assert_same(policy.parameters, unbroken.policy().parameters, device)
