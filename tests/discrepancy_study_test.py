@@ -1,13 +1,21 @@
-"""Which detectors a diagnosis compares."""
+"""Which detectors a diagnosis compares, over how many days, and what stays in doubt."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
 import polars as pl
 import pytest
 
+from ugat_marl.discrepancy.engine import Engine
+from ugat_marl.discrepancy.features import BIN_FEATURES, FEATURES, INDEX, Tally
 from ugat_marl.discrepancy.select import Effort
-from ugat_marl.discrepancy.study import effort_for, heard
+from ugat_marl.discrepancy.statistics import Pools
+from ugat_marl.discrepancy.study import OPEN, Study, effort_for, heard
+from ugat_marl.effects import Effect, Headway
 from ugat_marl.measured.data import Detector, Measured, Passages, Period
 
 NAMES = ("one", "two", "three", "four")
@@ -75,3 +83,58 @@ def test_larger_networks_are_simulated_for_fewer_days() -> None:
         for name in ("base", "bank", "fit", "test"):
             assert getattr(fewer, name) <= getattr(more, name)
     assert all(effort.test <= effort.base for effort in efforts)
+
+
+@dataclass
+class Days:
+    """Simulated days by hand.
+
+    Attributes:
+        counts: Vehicles a minute at the one stop line, with effects and without.
+        aside: Days on which traffic stood still.
+        asked: How often days were asked for.
+    """
+
+    counts: dict[bool, float]
+    aside: tuple[int, ...] = ()
+    asked: list[tuple[Effect, ...]] = field(default_factory=list)
+
+    def ordinary(self, effects: Sequence[Effect], numbers: Sequence[int]) -> dict[int, Any]:
+        self.asked.append(tuple(effects))
+        found: dict[int, Any] = {}
+        for number in numbers:
+            sums = np.zeros((len(FEATURES), 1, 2))
+            # What is set aside would show: on those days there was ten times as much.
+            much = 10.0 if number in (2, 3) else 1.0
+            sums[INDEX["count_stop"], 0] = 60.0 * much * self.counts[bool(effects)], 60.0
+            if number not in self.aside:
+                tally = Tally(sums, np.zeros((len(BIN_FEATURES), 1, 2)))
+                found[number] = cast(Any, type("Replicate", (), {"tally": tally}))
+        return found
+
+
+def study(own: Days, other: Days | None) -> Study:
+    blank = cast(Any, None)
+    pools = Pools({"lane": np.eye(1)})
+    engines = [cast(Engine, cast(object, days)) for days in (own, other)]
+    return Study(
+        blank, blank, blank, blank, blank, engine=engines[0], pools=pools, allowed=frozenset(),
+        hypotheses=(), effort=Effort(base=6), fit=(), heldout=(), other_days=engines[1],
+    )  # fmt: skip
+
+
+def test_what_measured_arrivals_leave_open_is_a_matter_of_the_model() -> None:
+    own = Days({False: 8.0, True: 6.0}, aside=(2,))
+    other = Days({False: 8.0, True: 9.0}, aside=(3,))
+    found = study(own, other)
+    place = 0, INDEX["count_stop"]
+    without, within = found.doubt(), found.doubt((Headway(1.5),))
+    assert without is not None and within is not None
+    assert without["lane"][place] == 0.0
+    assert within["lane"][place] == pytest.approx((OPEN * 3.0) ** 2)
+    found.doubt((Headway(1.5),))
+    assert own.asked == other.asked == [(), (Headway(1.5),)]
+
+
+def test_where_signals_answered_nobody_nothing_is_left_open() -> None:
+    assert study(Days({False: 8.0}), None).doubt() is None

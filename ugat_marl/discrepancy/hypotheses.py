@@ -109,7 +109,9 @@ _GLOBAL: dict[str, _Entry] = {
     "acceleration": _Entry("mps2", (0.8, 1.6), 2.6, 0.1, attribute="accel", both=True),
     "deceleration": _Entry("mps2", (2.0, 3.2), 4.5, 0.2, attribute="decel", both=True),
     "emergency_deceleration": _Entry("mps2", (3.0, 6.0), 9.0, 0.5, attribute="emergencyDecel"),
-    "startup_delay": _Entry("seconds", (0.3, 0.6, 0.8, 1.2), 0.0, 0.05, attribute="startupDelay"),
+    "startup_delay": _Entry(
+        "seconds", (0.3, 0.6, 0.8, 1.2, 2.4), 0.0, 0.05, attribute="startupDelay"
+    ),
     "headway": _Entry("seconds", (1.3, 1.7), 1.0, 0.05, attribute="tau"),
     "min_gap": _Entry("metres", (1.2, 1.8, 3.1, 3.8, 4.7), 2.5, 0.2, attribute="minGap"),
     "imperfection": _Entry("sigma", (0.15, 0.85), 0.5, 0.05, attribute="sigma"),

@@ -26,6 +26,7 @@ from ugat_marl.discrepancy.pruning import pruned
 from ugat_marl.discrepancy.residual import Null, Tested
 from ugat_marl.discrepancy.search import Ray, between, promising, propose, squared_gap
 from ugat_marl.discrepancy.whitening import Whitener
+from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
 from ugat_marl.measured.data import Period
 from ugat_marl.progress import Reporter
@@ -111,7 +112,7 @@ class Selector:
         periods: Sequence[Period],
         effort: Effort,
         alpha: float,
-        null: Callable[[Sequence[Tally], int, Directions], Null],
+        null: Callable[[Sequence[Tally], int, Directions, tuple[Effect, ...]], Null],
         reporter: Reporter,
     ) -> None:
         self._fitter = fitter
@@ -137,7 +138,7 @@ class Selector:
         data = self._fitter.data
         self._places = tuple(self._bank(base.model, self._proposer.everywhere(), 0, "places"))
         directions = Directions((*self._library_rays(base.model, 0), *self._places))
-        null = self._null(base.model.tallies, len(data), directions)
+        null = self._null(base.model.tallies, len(data), directions, ())
         return replace(base, null=null, residual=null.test(data))
 
     def select(self, base: Tested) -> Selection:
@@ -182,7 +183,7 @@ class Selector:
             extra[name] = extra[name] + (TOLERANCE * difference) ** 2
         fitted = tuple(change for change, _ in fitter.changes(model))
         directions = Directions((*self._rays, *self._places), extra, fitted)
-        null = self._null(days, len(fitter.data), directions)
+        null = self._null(days, len(fitter.data), directions, model.effects)
         return Tested(model, null, null.test(fitter.data, extra), errors, extra)
 
     def _days(self, model: Fitted) -> list[Tally]:

@@ -32,6 +32,7 @@ from ugat_marl.discrepancy.statistics import (
     shift,
 )
 from ugat_marl.discrepancy.volume import Routes
+from ugat_marl.effects import Effect
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.executors import Workers
 from ugat_marl.measured.coverage import follows_traffic
@@ -121,6 +122,7 @@ class Study:
     heldout: tuple[Tally, ...]
     other_days: Engine | None = None
     ruled_out: frozenset[str] = field(default=frozenset())
+    _doubts: dict[tuple[Effect, ...], Mapping[str, Array]] = field(default_factory=dict, init=False)
 
     @property
     def all_days(self) -> tuple[Tally, ...]:
@@ -201,7 +203,7 @@ class Study:
         known = {number: day.tally for number, day in enumerate(days) if number not in aside}
         tallies = list(known.values())
         self.engine.day_to_day = day_to_day(tallies)
-        reference = Reference(self.pools, tallies, speeds=self.speeds, doubt=self.doubt)
+        reference = Reference(self.pools, tallies, speeds=self.speeds, doubt=self.doubt())
         counts = sum(float(day.bins[:3].sum()) for day in tallies) / len(tallies)
         if counts < 1.0:
             raise MeasuredDataError(
@@ -214,7 +216,11 @@ class Study:
         return Tested(model, null, null.test(self.fit), np.empty(0), {})
 
     def null(
-        self, tallies: Sequence[Tally], periods: int, directions: Directions | None = None
+        self,
+        tallies: Sequence[Tally],
+        periods: int,
+        directions: Directions | None = None,
+        effects: tuple[Effect, ...] = (),
     ) -> Null:
         """What chance makes of a model's own days, seen as far as the data see.
 
@@ -222,6 +228,10 @@ class Study:
             tallies: The model's days.
             periods: Periods in a data set.
             directions: Where single effects would show; None to look at the whole only.
+            effects: The model's.
+
+        Raises:
+            OutOfTime: The budget does not suffice for what is in `doubt`.
         """
         data = added(self.fit)
         counted, known = data.sums[..., 1:] > 0, data.counted >= data.days
@@ -241,28 +251,38 @@ class Study:
             return statistics
 
         return Null(
-            self.pools, seen, periods, speeds=self.speeds, directed=directed, doubt=self.doubt
+            self.pools,
+            seen,
+            periods,
+            speeds=self.speeds,
+            directed=directed,
+            doubt=self.doubt(effects),
         )
 
-    @functools.cached_property
-    def doubt(self) -> Mapping[str, Array] | None:
+    def doubt(self, effects: tuple[Effect, ...] = ()) -> Mapping[str, Array] | None:
         """Variances for what measured arrivals leave open, by block; None where none are used.
 
         Detectors see arrivals near the lights and not where queues end. What days with other
-        vehicles would have in other places is known only as far as that.
+        vehicles would have in other places is known only as far as that. Queues are long under one
+        model and short under another, so that every model has doubts of its own.
+
+        Args:
+            effects: The model's; none for the scenario as it is.
 
         Raises:
             OutOfTime: The budget does not suffice.
         """
         if self.other_days is None:
             return None
-        numbers = range(min(DOUBT_DAYS, self.effort.base))
-        found = [
-            [day.tally for day in engine.replicates([], numbers)]
-            for engine in (self.engine, self.other_days)
-        ]
-        apart, _ = shift(self.pools, *found)
-        return {name: (OPEN * values) ** 2 for name, values in apart.items()}
+        if effects not in self._doubts:
+            numbers = range(min(DOUBT_DAYS, self.effort.base))
+            own = self.engine.ordinary(effects, numbers)
+            other = self.other_days.ordinary(effects, numbers)
+            both = [number for number in own if number in other]
+            days = [[found[number].tally for number in both] for found in (own, other)]
+            apart, _ = shift(self.pools, *days)
+            self._doubts[effects] = {name: (OPEN * values) ** 2 for name, values in apart.items()}
+        return self._doubts[effects]
 
     @functools.cached_property
     def proposer(self) -> Proposer:

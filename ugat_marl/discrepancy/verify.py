@@ -53,7 +53,7 @@ def verify(study: Study, base: Tested, best: Tested) -> Verification:
             numbers = study.engine.first(study.effort.test)
             found = study.engine.ordinary(model.model.effects, numbers)
             days = tuple(day.tally for day in found.values())
-        return study.null(days, count)
+        return study.null(days, count, effects=model.model.effects)
 
     before = null(base).test(study.heldout)
     after = null(best).test(study.heldout, best.extra or None) if best.model.members else before
