@@ -32,7 +32,7 @@ def test_the_ranges_are_the_hull_of_the_worlds_the_simulation_and_the_library() 
         "acceleration": (0.5, 2.6),  # V4 and sim
         "deceleration": (1.5, 4.5),  # V4 and sim
         "emergency_deceleration": (2.0, 9.0),  # V4 and sim
-        "startup_delay": (0.0, 1.2),  # sim and the strongest that a diagnosis tries
+        "startup_delay": (0.0, 1.2),  # sim and the strongest a diagnosis reckons with
     }
     for effects in SETTINGS.values():
         for effect in effects:

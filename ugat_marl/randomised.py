@@ -62,7 +62,7 @@ def effect_ranges(scenario: Scenario) -> tuple[Range, ...]:
     settings = [effect for effects in SETTINGS.values() for effect in effects]
     found: list[Range] = []
     for item in global_hypotheses(scenario, {effect.name for effect in settings}):
-        values = [level[0] for level in item.levels]
+        values = [level[0] for level in item.levels if level not in item.extreme]
         values += [free_values(e, item)[0] for e in settings if e.name == item.name]
         values += item.nominal or ()
         found.append(Range(item, min(values), max(values)))

@@ -33,6 +33,7 @@ class Hypothesis:
         least: Distance from nominal below which it does not matter in practice.
         step: Values are multiples of it, if not 0.
         both: Whether the other side of nominal is the opposite of this one.
+        extreme: Those of `levels` that are looked at, but are no world to be reckoned with.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Hypothesis:
     least: float = 0.0
     step: float = 0.0
     both: bool = False
+    extreme: tuple[tuple[float, ...], ...] = ()
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -94,6 +96,7 @@ class _Entry:
     attribute: str = ""
     both: bool = False
     step: float = 0.0
+    extreme: tuple[float, ...] = ()
 
 
 CLOCK_S = (0.7, 1.4, 2.2, 3.1, 4.3)
@@ -110,7 +113,7 @@ _GLOBAL: dict[str, _Entry] = {
     "deceleration": _Entry("mps2", (2.0, 3.2), 4.5, 0.2, attribute="decel", both=True),
     "emergency_deceleration": _Entry("mps2", (3.0, 6.0), 9.0, 0.5, attribute="emergencyDecel"),
     "startup_delay": _Entry(
-        "seconds", (0.3, 0.6, 0.8, 1.2, 2.4), 0.0, 0.05, attribute="startupDelay"
+        "seconds", (0.3, 0.6, 0.8, 1.2), 0.0, 0.05, attribute="startupDelay", extreme=(2.4,)
     ),
     "headway": _Entry("seconds", (1.3, 1.7), 1.0, 0.05, attribute="tau"),
     "min_gap": _Entry("metres", (1.2, 1.8, 3.1, 3.8, 4.7), 2.5, 0.2, attribute="minGap"),
@@ -170,6 +173,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         if name not in allowed:
             continue
         nominal = _nominal(scenario, entry)
+        extreme = tuple((level,) for level in entry.extreme)
         levels = tuple((level,) for level in entry.levels if abs(level - nominal) > entry.least)
         if name == "reaction_step":
             nominal, levels = max(nominal, step), ((2 * max(nominal, step),),)
@@ -177,7 +181,15 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         grid = step if name == "reaction_step" else entry.step
         found.append(
             Hypothesis(
-                name, fixed, (entry.field,), levels, (nominal,), entry.least, grid, entry.both
+                name,
+                fixed,
+                (entry.field,),
+                levels + extreme,
+                (nominal,),
+                entry.least,
+                grid,
+                entry.both,
+                extreme,
             )
         )
     if "driver_model" in allowed:
