@@ -66,12 +66,11 @@ def fhwa(measured: Sequence[Tally], simulated: Sequence[Tally], together: int) -
     Returns:
         None where there are too few days, or no detector counts in all intervals of all days.
     """
-    bins = max(round(_INTERVAL_S / BIN_S), together)
-    length = min(day.bins.shape[-1] for day in (*measured, *simulated))
-    bins = min(bins, length)
-    real = [_intervals(day, bins, length) for day in measured]
+    shortest = min(day.bins.shape[-1] for day in (*measured, *simulated))
+    bins = min(max(round(_INTERVAL_S / BIN_S), together), shortest)
+    real = [_intervals(day, bins, shortest // bins) for day in measured]
     days = np.stack([counts for counts, _ in real])
-    model = np.mean([_intervals(day, bins, length)[0] for day in simulated], axis=0)
+    model = np.mean([_intervals(day, bins, shortest // bins)[0] for day in simulated], axis=0)
     whole = np.all([known for _, known in real], axis=(0, 2))
     used = whole & (days.sum(axis=(0, 2)) > 0)
     if len(measured) < LEAST_DAYS or not used.any():
@@ -101,12 +100,8 @@ def representative(days: Array) -> int:
     return int(relative.mean(axis=(1, 2)).argmin())
 
 
-def _intervals(day: Tally, bins: int, length: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Counts and whether they are complete, ``(detectors, intervals)``."""
+def _intervals(day: Tally, bins: int, count: int) -> tuple[Array, NDArray[np.bool_]]:
+    """The first counts and whether they are complete, ``(detectors, intervals)``."""
     rows = [BIN_FEATURES.index(name) for name in _COUNTED]
-    whole = length // bins * bins
-
-    def gathered(values: Array) -> Array:
-        return values[rows, :, :whole].reshape(-1, whole // bins, bins)
-
-    return gathered(day.bins).sum(axis=-1), gathered(day.counted).min(axis=-1) > 0
+    sums, known = (values[rows, :, :count].reshape(-1, count) for values in day.gathered(bins))
+    return sums, known > 0

@@ -116,6 +116,23 @@ class Tally:
         """In how many periods every one of the bins was counted."""
         return np.full_like(self.bins, self.days) if self.known is None else self.known
 
+    def gathered(self, together: int) -> tuple[Array, Array]:
+        """Bins put together, and in how many periods all of each were counted.
+
+        Args:
+            together: How many bins make one; what is left at the end is not used.
+
+        Returns:
+            Both ``(bin features, places, groups of bins)``.
+        """
+        width = min(together, self.bins.shape[-1])
+        groups = self.bins.shape[-1] // width
+        shape = (*self.bins.shape[:2], groups, width)
+        bins, counted = (
+            values[..., : groups * width].reshape(shape) for values in (self.bins, self.counted)
+        )
+        return bins.sum(axis=-1), counted.min(axis=-1)
+
     def __add__(self, other: Tally) -> Tally:
         bins = min(self.bins.shape[-1], other.bins.shape[-1])
         every = self.known is None and other.known is None

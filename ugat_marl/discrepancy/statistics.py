@@ -75,14 +75,9 @@ class Pools:
             name: np.einsum("mp,fpc->mfc", matrix, item.sums)
             for name, matrix in self.blocks.items()
         }
-        groups = max(1, item.bins.shape[-1] // self.together)
-        width = min(self.together, item.bins.shape[-1])
-
-        def gathered(values: Array) -> Array:
-            return values[..., : groups * width].reshape(-1, groups, width)
-
-        bins, counted = gathered(item.bins).sum(axis=-1), gathered(item.counted).min(axis=-1)
-        pooled["time"] = np.stack([bins, counted], axis=-1)
+        bins, counted = item.gathered(self.together)
+        time = np.stack([bins, counted], axis=-1)
+        pooled["time"] = time.reshape(-1, *time.shape[2:])
         return pooled
 
 
