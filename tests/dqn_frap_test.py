@@ -222,7 +222,7 @@ def test_what_cannot_be_read_is_refused_with_the_way_out():
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"network": "lstm"}, "network = 'lstm': must be one of mlp, frap"),
+        ({"network": "lstm"}, "network = 'lstm': must be one of mlp, frap, colight"),
         ({"network": "frap", "hidden": (8,)}, "hidden = .*two sizes"),
         ({"network": "frap", "shared": True}, "shared = True: must be left away"),
     ],
@@ -311,7 +311,7 @@ def test_checkpoints_of_other_networks_or_intersections_are_refused(tmp_path: Pa
     turned = toy_structure()
     first = replace(turned.junctions[0], greens=turned.junctions[0].greens[::-1])
     other = replace(turned, junctions=(first, *turned.junctions[1:]))
-    with pytest.raises(CheckpointError, match=r"other movements or phases"):
+    with pytest.raises(CheckpointError, match=r"other movements, phases or neighbours"):
         DQN(agents, QUICK, 0, structure=other).load(tmp_path / "frap.pt")
     assert np.array_equal(mine.policy().parameters, untouched)
 

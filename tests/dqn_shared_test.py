@@ -17,7 +17,8 @@ from ugat_marl.batched import BatchedMLP
 from ugat_marl.errors import CheckpointError
 from ugat_marl.learners import DQN, DQNConfig, DQNPolicy
 from ugat_marl.learners.agents import AgentSet
-from ugat_marl.learners.q_network import SharedMLP, q_network
+from ugat_marl.learners.q_network import q_network
+from ugat_marl.learners.shared_mlp import SharedMLP
 from ugat_marl.policy import Policy
 from ugat_marl.testing.toy import ToyTraffic
 

@@ -306,8 +306,8 @@ class DQN:
             _require_same(path, "network", _network_of(structure), self.config.network)
             if structure != self.structure:
                 raise CheckpointError(
-                    f"{path}: its intersections have other movements or phases than this "
-                    "learner's; give the checkpoint of this scenario, or train a new one"
+                    f"{path}: its intersections have other movements, phases or neighbours than "
+                    "this learner's; give the checkpoint of this scenario, or train a new one"
                 )
             counters = {name: int(content["counters"][name]) for name in (*_COUNTERS, "added")}
             tensors = _like(path, content["tensors"], self._tensors())

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from ugat_marl.errors import OptionError
 
-NetworkName = Literal["mlp", "frap"]
+NetworkName = Literal["mlp", "frap", "colight"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,9 @@ class DQNConfig:
             each; it learns from the transitions of all.
         network: What computes Q. "mlp": layers over an agent's observation. "frap": phases that
             compete with the demand of their movements (Zheng et al. 2019), one network for all
-            intersections; `hidden` is the size of a demand and that of a pair of phases.
+            intersections; `hidden` is the size of a demand and that of a pair of phases. "colight":
+            attention to the neighbours (Wei et al. 2019), one network for all intersections;
+            `hidden` is the size of an embedding and that of the layer after the attention.
     """
 
     hidden: tuple[int, ...] = (48, 48)
@@ -104,8 +106,9 @@ class DQNConfig:
     def _require_network(self) -> None:
         known = get_args(NetworkName)
         self._require("network", self.network in known, f"one of {', '.join(known)}")
-        if self.network == "frap":
-            self._require("hidden", len(self.hidden) == 2, "two sizes with network = 'frap'")
+        if self.network != "mlp":
+            two = f"two sizes with network = {self.network!r}"
+            self._require("hidden", len(self.hidden) == 2, two)
         alone = f"left away: network = {self.network!r} is one for all agents in any case"
         self._require("shared", self.network == "mlp" or not self.shared, alone)
 

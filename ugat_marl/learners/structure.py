@@ -1,12 +1,14 @@
-"""What networks with structure know of the intersections: movements and phases.
+"""What networks with structure know of the intersections: movements and phases, or neighbours.
 
 Plain numbers, so that a saved policy needs neither network file nor environment.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -21,8 +23,11 @@ from ugat_marl.policy import AnyParallelEnv
 from ugat_marl.signals import GREEN
 from ugat_marl.transitions import AgentLayout
 
+MOST_NEIGHBOURS = 5
+"""Intersections that one attends to beside itself, where more are a road away."""
+
 Places = tuple[int, ...]
-"""Places in an observation whose numbers are added up."""
+"""Places in an observation whose numbers are added up, or positions of agents."""
 
 
 @dataclass(frozen=True)
@@ -47,18 +52,21 @@ class Structure:
 
     Attributes:
         network: As in `DQNConfig`; "mlp" needs none.
-        junctions: One for each agent, in their order.
+        junctions: For "frap", one for each agent, in their order.
+        neighbours: For "colight", the positions of each agent's neighbours among the agents.
     """
 
     network: NetworkName
-    junctions: tuple[Junction, ...]
+    junctions: tuple[Junction, ...] = ()
+    neighbours: tuple[Places, ...] = ()
 
     @classmethod
     def of(cls, env: AnyParallelEnv, network: NetworkName) -> Structure | None:
         """The intersections of an environment of the suite; None for "mlp".
 
         Raises:
-            OptionError: Another environment, or observations put together by a wrapper.
+            OptionError: Another environment, or observations put together by a wrapper where
+                movements are looked for in them.
         """
         if network == "mlp":
             return None
@@ -66,12 +74,14 @@ class Structure:
         roads, observation = getattr(base, "network", None), getattr(base, "env_options", {})
         if not isinstance(roads, Network) or "observation" not in observation:
             raise OptionError(
-                f"network {network!r} reads movements and phases from the road network, which "
+                f"network {network!r} reads {_READ[network]} from the road network, which "
                 f"{base} does not have; use an environment of ugat_marl.parallel_env, or the "
                 "network 'mlp'"
             )
-        layouts: Mapping[str, AgentLayout] = base.layouts
         agents = AgentSet.of(env)
+        if network == "colight":
+            return cls(network, neighbours=_neighbours(agents, base.intersection_of, roads))
+        layouts: Mapping[str, AgentLayout] = base.layouts
         own = [layouts.get(name) for name in agents.names]
         for name, size, layout in zip(agents.names, agents.observation_sizes, own, strict=True):
             if layout is None or layout.size != size:
@@ -90,6 +100,22 @@ class Structure:
         Raises:
             ValueError: It is not one of these agents.
         """
+        if self.network == "mlp" or (self.junctions and self.neighbours):
+            raise ValueError(f"network {self.network!r} with movements or neighbours it has not")
+        if self.network == "colight":
+            self._check_neighbours(len(agents))
+        else:
+            self._check_junctions(agents)
+        return self
+
+    def _check_neighbours(self, agents: int) -> None:
+        if len(self.neighbours) != agents:
+            raise ValueError(f"neighbours of {len(self.neighbours)} agents for {agents}")
+        for position, near in enumerate(self.neighbours):
+            if len({position, *near}) != 1 + len(near) or not {*near} <= {*range(agents)}:
+                raise ValueError(f"agent {position} of {agents} has the neighbours {near}")
+
+    def _check_junctions(self, agents: AgentSet) -> None:
         if len(self.junctions) != len(agents):
             raise ValueError(f"{len(self.junctions)} intersections for {len(agents)} agents")
         kinds = {len(kinds) for junction in self.junctions for kinds in junction.movements}
@@ -108,7 +134,6 @@ class Structure:
                 or not all(0 <= share <= 1 for share in shares)
             ):
                 raise ValueError(f"{junction} is none of {size} numbers and {actions} phases")
-        return self
 
     def written(self) -> dict[str, Any]:
         """As plain lists, for a checkpoint."""
@@ -116,6 +141,7 @@ class Structure:
 
 
 _READER = TypeAdapter(Structure)
+_READ: Mapping[NetworkName, str] = {"frap": "movements and phases", "colight": "neighbours"}
 
 
 def structure_in(content: Mapping[str, Any], agents: AgentSet) -> Structure | None:
@@ -127,6 +153,27 @@ def structure_in(content: Mapping[str, Any], agents: AgentSet) -> Structure | No
     if "structure" not in content:
         return None
     return _READER.validate_python(content["structure"]).checked(agents)
+
+
+def _neighbours(
+    agents: AgentSet, light_of: Mapping[str, str], roads: Network
+) -> tuple[Places, ...]:
+    """The nearest intersections one road away from each agent's, as positions of agents."""
+    if {*light_of} != {*agents.names}:
+        raise OptionError(
+            f"network 'colight' does not know the intersections of {', '.join(agents.names[:4])}; "
+            "leave wrappers that rename agents away, or use the network 'mlp'"
+        )
+    at = {light_of[name]: position for position, name in enumerate(agents.names)}
+    items = [roads.intersection(light_of[name]) for name in agents.names]
+
+    def metres(item: Intersection, other: int) -> float:
+        return math.dist(item.position, items[other].position)
+
+    return tuple(
+        tuple(sorted((at[n] for n in item.neighbours), key=partial(metres, item))[:MOST_NEIGHBOURS])
+        for item in items
+    )
 
 
 def _junction(item: Intersection, layout: AgentLayout, halves: bool) -> Junction:
