@@ -27,7 +27,7 @@ from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_policy import DQNPolicy, header
-from ugat_marl.learners.q_network import SharedMLP, flatten_parameters
+from ugat_marl.learners.q_network import SharedMLP, flatten_parameters, reading_unscaled
 from ugat_marl.learners.scaling import InputScale, places
 from ugat_marl.policy import AnyParallelEnv as Env
 from ugat_marl.policy import EpisodeCallback as Callback
@@ -157,10 +157,7 @@ class IPPO:
 
         It is of DQN's class, with logits in place of Q, so that all of `ugat-marl` reads its files.
         """
-        named, factors = list(self._actor.named_parameters()), torch.from_numpy(self._seen.factors)
-        first = next(name for name, _ in named if name.endswith("weight"))  # (..., n_in, n_out)
-        scaled = [p * factors[:, None] if name == first else p for name, p in named]
-        parameters = nn.utils.parameters_to_vector(scaled).detach()
+        parameters = reading_unscaled(self._actor, torch.from_numpy(self._seen.factors))
         hidden, shared = self.config.hidden, self.config.shared
         return DQNPolicy(self.agents, hidden, parameters, self.env_options, shared)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -520,3 +521,46 @@ def test_sixteen_agents_cost_less_than_sixteen_times_one():
         return best
 
     assert seconds(16) < 6 * seconds(1)
+
+
+class FaintCueEnv(CueEnv):
+    """A cue as faint as a few vehicles on a long road."""
+
+    def _observe(self) -> dict[str, Any]:
+        return {agent: 0.02 * cue for agent, cue in super()._observe().items()}
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_the_policy_is_the_learner_on_plain_observations(shared: bool) -> None:
+    learner = DQN.of(FaintCueEnv(), replace(QUICK, shared=shared))
+    policy = learner.learn(FaintCueEnv(), 4, seed=1)
+    assert learner._inputs.max() > 10  # something is scaled
+    observations, _ = FaintCueEnv().reset(seed=3)
+    seen = torch.from_numpy(learner.agents.stack(observations))[:, None] * learner._inputs
+    expected = learner._target(seen)[:, 0]
+    for row, values in enumerate(policy.q_values(observations).values()):
+        assert values == pytest.approx(expected[row, : len(values)].numpy(), abs=1e-4)
+
+
+def test_faint_numbers_are_learnt_from_as_quickly_as_others() -> None:
+    def won(scale_inputs: bool) -> float:
+        config = replace(QUICK, scale_inputs=scale_inputs)
+        policy = DQN.of(FaintCueEnv(), config).learn(FaintCueEnv(), 25, seed=1)
+        return play(FaintCueEnv(length=100), policy, seed=99)
+
+    assert won(scale_inputs=True) > 0.97
+    assert won(scale_inputs=False) < 0.9  # what it is there for
+
+
+def test_factors_are_measured_once_and_kept_in_checkpoints(tmp_path: Path) -> None:
+    learner = DQN.of(FaintCueEnv(), QUICK)
+    assert torch.equal(learner._inputs, torch.ones_like(learner._inputs))
+    learner.learn(FaintCueEnv(), 2, seed=1)
+    measured = learner._inputs.clone()
+    learner.save(tmp_path / "learner.pt")
+    learner.learn(CueEnv(), 2, seed=1)  # brighter: what was learnt must keep its meaning
+    assert torch.equal(learner._inputs, measured)
+    other = DQN.of(FaintCueEnv(), QUICK)
+    other.load(tmp_path / "learner.pt")
+    assert torch.equal(other._inputs, measured)
+    assert np.array_equal(other.learn(CueEnv(), 2, seed=1).parameters, learner.policy().parameters)

@@ -25,8 +25,15 @@ from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy, header, parse_header
 from ugat_marl.learners.exploration import StickyExploration
-from ugat_marl.learners.q_network import Acting, flatten_parameters, greedy_actions, q_network
+from ugat_marl.learners.q_network import (
+    Acting,
+    flatten_parameters,
+    greedy_actions,
+    q_network,
+    reading_unscaled,
+)
 from ugat_marl.learners.replay import Replay
+from ugat_marl.learners.scaling import input_factors
 from ugat_marl.learners.structure import Structure, structure_in
 from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
@@ -101,6 +108,7 @@ class DQN:
         self._centre = torch.zeros(len(agents), 1, device=device)
         scale = self.config.reward_scale or 1.0
         self._scale = torch.full((len(agents), 1), scale, device=device)
+        self._inputs = torch.ones(len(agents), 1, agents.widest_observation, device=device)
         self._acting = Acting(self._online, self._weights)
 
     @classmethod
@@ -171,6 +179,9 @@ class DQN:
         """
         hidden, shared = self.config.hidden, self.config.shared
         weights, options = self._target_weights, self.env_options
+        if self.structure is None:
+            factors = self._inputs[0, 0] if shared else self._inputs[:, 0]
+            weights = reading_unscaled(self._target, factors)
         return DQNPolicy(self.agents, hidden, weights, options, shared, self.structure)
 
     def _episode(self, env: AnyParallelEnv, seed: int) -> dict[str, float]:
@@ -187,7 +198,8 @@ class DQN:
         while env.agents:
             epsilon = self.config.epsilon(self.decisions)
             acting = self._acting.network(self.updates)
-            greedy = greedy_actions(acting, torch.from_numpy(now), torch.from_numpy(allowed))
+            seen = torch.from_numpy(now) * self._inputs[:, 0].to(CPU)
+            greedy = greedy_actions(acting, seen, torch.from_numpy(allowed))
             actions = explore.choose(greedy, allowed, epsilon)
             observations, rewards, terminated, _, infos = env.step(self.agents.actions(actions))
             self._require_all_or_none(env)
@@ -216,14 +228,21 @@ class DQN:
         }
 
     def _is_time_to_update(self) -> bool:
-        if self.decisions == self.config.warmup_decisions and self.config.reward_scale is None:
-            self._measure_rewards()
+        if self.decisions == self.config.warmup_decisions:
+            self._measure()
         return (
             self.decisions >= self.config.warmup_decisions
             and self.decisions % self.config.update_every == 0
         )
 
-    def _measure_rewards(self) -> None:
+    def _measure(self) -> None:
+        """Scales rewards and observations by those of the decisions so far."""
+        config = self.config
+        if config.scale_inputs and self.structure is None:
+            factors = input_factors(self._replay.observations(), self.agents, config.shared)
+            self._inputs.copy_(factors.unsqueeze(1))
+        if config.reward_scale is not None:
+            return
         deviation, mean = torch.std_mean(self._replay.rewards(), dim=1, keepdim=True, correction=0)
         scale = torch.where(deviation > 1e-6, 1.0 / deviation.clamp_min(1e-6), 1.0)
         self._centre, self._scale = mean.to(self.device), scale.to(self.device)
@@ -231,16 +250,17 @@ class DQN:
     def _update(self, generator: torch.Generator) -> tuple[float, float]:
         """One gradient step of all agents; returns mean loss and mean Q before it."""
         batch = self._replay.sample(self.config.batch_size, generator).to(self.device)
+        now, then = batch.observation * self._inputs, batch.next_observation * self._inputs
         with torch.no_grad():
-            best = self._online(batch.next_observation)
+            best = self._online(then)
             best = best.masked_fill_(~batch.next_allowed, -torch.inf).argmax(-1, keepdim=True)
-            future = self._target(batch.next_observation).gather(-1, best).squeeze(-1)
+            future = self._target(then).gather(-1, best).squeeze(-1)
             # no reward for ever, in the centred and scaled unit
             nothing = -self._centre * self._scale / (1 - self.config.discount)
             future = torch.where(batch.terminal, nothing, future)
             reward = (batch.reward - self._centre) * self._scale
             wanted = reward + self.config.discount * future
-        chosen = self._online(batch.observation).gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
+        chosen = self._online(now).gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
         losses = nn.functional.huber_loss(
             chosen, wanted, reduction="none", delta=self.config.huber_delta
         )
@@ -333,6 +353,7 @@ class DQN:
             "target_weights": self._target_weights.data,
             "centre": self._centre,
             "scale": self._scale,
+            "inputs": self._inputs,
         }
 
 

@@ -62,6 +62,23 @@ def flatten_parameters(module: nn.Module) -> nn.Parameter:
     return flat
 
 
+def reading_unscaled(network: nn.Module, factors: Tensor) -> Tensor:
+    """Parameters with which `network` computes from x what its own make of ``x * factors``.
+
+    Args:
+        network: Of `BatchedMLP` or `SharedMLP`.
+        factors: ``(widest_observation,)`` or ``(agents, widest_observation)``; one for all agents
+            where they share a network.
+
+    Returns:
+        All of them as one vector, as `flatten_parameters` orders them.
+    """
+    named = list(network.named_parameters())
+    first = next(name for name, _ in named if name.endswith("weight"))  # (..., n_in, n_out)
+    factor = factors.unsqueeze(-1)
+    return nn.utils.parameters_to_vector(p * factor if name == first else p for name, p in named)
+
+
 class Acting:
     """The networks that choose actions in training, on the CPU wherever others learn.
 

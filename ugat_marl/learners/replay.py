@@ -90,6 +90,10 @@ class Replay:
         """All stored rewards, ``(agents, len(self))``."""
         return self._columns.reward[:, : len(self)]
 
+    def observations(self) -> Tensor:
+        """All stored observations, ``(agents, len(self), widest_observation)``."""
+        return self._columns.observation[:, : len(self)]
+
     def rows(self, added: int) -> dict[str, Tensor]:
         """Views of the rows that are in use once `added` decisions were added."""
         used = min(added, self.capacity)

@@ -8,7 +8,9 @@ needs long to find out that the small numbers are what matters.
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ugat_marl.learners.agents import AgentSet
 
@@ -66,6 +68,24 @@ class InputScale:
         squares = rows.astype(np.float64) ** 2
         exist = np.ones(rows.shape, dtype=np.bool_) if there is None else there
         self.sums += exist.sum(0), (squares * exist).sum(0)
+
+
+def input_factors(observations: Tensor, agents: AgentSet, pooled: bool) -> Tensor:
+    """One over the root mean square of each number of the agents' observations.
+
+    Args:
+        observations: ``(agents, n, widest_observation)``.
+        agents: Whose they are.
+        pooled: Whether all agents with a number at a place have one factor there.
+
+    Returns:
+        ``(agents, widest_observation)``; 1 where an agent has no number.
+    """
+    own = torch.from_numpy(places(agents))
+    square = observations.square().mean(1) * own
+    if pooled:
+        square = (square.sum(0) / own.sum(0)).expand_as(square)
+    return torch.where(own, 1 / square.sqrt().clamp_min(LEAST), 1.0)
 
 
 def places(agents: AgentSet) -> NDArray[np.bool_]:
