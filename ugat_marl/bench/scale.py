@@ -14,10 +14,11 @@ from ugat_marl.bench.measured import in_fresh_process
 from ugat_marl.bench.memory import growth_of
 from ugat_marl.bench.report import Report, Spread, Target, require_positive
 from ugat_marl.errors import MeasurementError, OptionError
+from ugat_marl.learners.registry import library_of, require_known
 from ugat_marl.progress import Reporter, Silent
 
 _PROGRAM = ["-m", "ugat_marl.bench.scale_work"]
-PARTS = ("workers", "grounded", "size", "decision", "leaks", "kills", "ray")
+PARTS = ("workers", "grounded", "size", "decision", "leaks", "kills", "learner", "ray")
 Run = dict[str, Any]
 
 
@@ -66,7 +67,7 @@ class ScaleBench:
         ugat-marl bench scale --parts size decision --sides 4 8
 
     Attributes:
-        parts: What to measure: workers, grounded, size, decision, leaks, kills, ray.
+        parts: What to measure: workers, grounded, size, decision, leaks, kills, learner, ray.
         scenario: A grid for all but size, decision, leaks and kills.
         small: A scenario for leaks and kills.
         rounds: Repetitions of what is compared.
@@ -78,6 +79,7 @@ class ScaleBench:
         resets: Their resets, in all.
         episodes: Episodes in which processes are killed.
         kills: How many.
+        learner: Whose training is divided into SUMO, torch and all else.
         seed: Of simulations and deaths.
         out: JSON file to write.
     """
@@ -94,12 +96,14 @@ class ScaleBench:
     resets: int = 500
     episodes: int = 500
     kills: int = 100
+    learner: str = "sb3-ppo"
     seed: int = 1
     out: Path | None = None
 
     def __post_init__(self) -> None:
         numbers = {name: getattr(self, name) for name in ("rounds", "decisions", "environments")}
         require_positive("scale", **numbers, sides=len(self.sides), episodes=self.episodes)
+        require_known(self.learner)
         for part in self.parts:
             if part not in PARTS:
                 raise OptionError(f"bench scale: parts holds {part!r}; allowed: {', '.join(PARTS)}")
@@ -121,6 +125,7 @@ class ScaleBench:
             "decision": self._decision,
             "leaks": self._leaks,
             "kills": self._kills,
+            "learner": self._learner,
             "ray": self._ray,
         }
         figures: list[Figure] = []
@@ -128,6 +133,9 @@ class ScaleBench:
         for part in self.parts:
             if part == "ray" and find_spec("ray") is None:
                 notes.append("Ray is not installed (pip install 'ugat-marl[ray]'): not measured.")
+                continue
+            if part == "learner" and library_of(self.learner).endswith(" -"):
+                notes.append(f"The library of {self.learner} is not installed: not measured.")
                 continue
             figures += measured[part](reporter)
         report = Report(
@@ -267,6 +275,23 @@ class ScaleBench:
         name = f"other results: {harmed['killed']} killed in {harmed['episodes']} episodes"
         slower = harmed["seconds"] / unharmed["seconds"]
         return [Figure(name, other, 0, 0, False), _told("the same, time / unharmed", slower)]
+
+    def _learner(self, reporter: Reporter) -> list[Figure]:
+        asked = {"scenario": self.scenario, "learner": self.learner, "episodes": 2}
+        with reporter.task(f"training of {self.learner}", self.rounds) as advance:
+            runs: list[Run] = []
+            for _ in range(self.rounds):
+                runs.append(self._ask("learner", **asked))
+                advance()
+        total = [sum(run.values()) for run in runs]
+        shares = {
+            owner: Spread.of_ratios([100 * run[owner] for run in runs], total) for owner in runs[0]
+        }
+        name = f"training of {self.learner}, CPU outside SUMO and torch [%]"
+        return [
+            Figure(name, shares.pop("rest"), 15.0, 7.0, False),
+            *(_told(f"the same, in {owner} [%]", share) for owner, share in shares.items()),
+        ]
 
     def _ray(self, reporter: Reporter) -> list[Figure]:
         asked: dict[str, Any] = {"scenario": self.scenario, "episodes": 8}

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.bench.cpu_shares import CpuShares, folder_of
 from ugat_marl.bench.memory_resets import family, look, processes
 from ugat_marl.policy import AnyParallelEnv
 from ugat_marl.seeding import numpy_generator
@@ -252,6 +253,19 @@ def ray(request: Request) -> dict[str, Any]:
     return {"seconds": seconds, "digest": hashlib.sha256(results.encode()).hexdigest()}
 
 
+def learner(request: Request) -> dict[str, Any]:
+    """Where the time of a training goes: SUMO, torch, or all else, in one process."""
+    from ugat_marl.learners.registry import learner_factory
+
+    env = parallel_env(request["scenario"], duration_s=request["duration_s"], simulator="inprocess")
+    learning = learner_factory(request["learner"])(env, request["seed"])
+    learning.learn(env, 1, seed=request["seed"])  # imports, and all that is done once
+    with CpuShares({name: folder_of(name) for name in ("libsumo", "torch")}) as shares:
+        learning.learn(env, request["episodes"], seed=request["seed"])
+    env.close()
+    return shares.seconds
+
+
 def _cpu_s(env: VectorEnv) -> float:
     """Seconds of CPU the simulations have used; nan where the system does not say."""
     total = 0.0
@@ -291,7 +305,7 @@ def _kill(env: VectorEnv, number: int) -> None:
 
 WORK: Mapping[str, Callable[[Request], dict[str, Any]]] = {
     "steps": steps, "split": split, "grounded": grounded, "leaks": leaks, "kills": kills,
-    "decide": decide, "ray": ray,
+    "decide": decide, "ray": ray, "learner": learner,
 }  # fmt: skip
 
 
