@@ -289,6 +289,18 @@ def test_resume_equals_an_unbroken_run_and_policies_survive(tmp_path: Path):
             assert np.array_equal(copy.q_values(observations)[agent], values)
 
 
+def test_a_policy_takes_plain_observations_and_the_learner_scaled_ones():
+    learner = DQN(AgentSet.of(OthersCoin()), QUICK, 5, structure=PAIRS)
+    policy = learner.learn(OthersCoin(), 3, seed=1)
+    assert learner._inputs.min() > 1.2  # a coin's root mean square is about 0.7
+    observations, _ = OthersCoin().reset(seed=7)
+    seen = torch.from_numpy(learner.agents.stack(observations))[:, None] * learner._inputs
+    for values, expected in zip(
+        policy.q_values(observations).values(), learner._target(seen)[:, 0], strict=True
+    ):
+        assert values == pytest.approx(expected.numpy(), abs=1e-4)
+
+
 def test_checkpoints_of_other_networks_or_neighbours_are_refused(tmp_path: Path):
     agents = AgentSet.of(OthersCoin())
     mine = DQN(agents, QUICK, 0, structure=PAIRS)

@@ -40,6 +40,9 @@ from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
 _KIND = "ugat_marl.dqn"
 _COUNTERS = ("episodes", "decisions", "updates")
+_SCALED = ("mlp", "colight")
+"""Networks whose first layer reads observations, and so can take over what they are scaled by."""
+
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -179,8 +182,8 @@ class DQN:
         """
         hidden, shared = self.config.hidden, self.config.shared
         weights, options = self._target_weights, self.env_options
-        if self.structure is None:
-            factors = self._inputs[0, 0] if shared else self._inputs[:, 0]
+        if self.config.network in _SCALED:
+            factors = self._inputs[0, 0] if self._is_one_network else self._inputs[:, 0]
             weights = reading_unscaled(self._target, factors)
         return DQNPolicy(self.agents, hidden, weights, options, shared, self.structure)
 
@@ -235,11 +238,16 @@ class DQN:
             and self.decisions % self.config.update_every == 0
         )
 
+    @property
+    def _is_one_network(self) -> bool:
+        return self.config.shared or self.config.network != "mlp"
+
     def _measure(self) -> None:
         """Scales rewards and observations by those of the decisions so far."""
         config = self.config
-        if config.scale_inputs and self.structure is None:
-            factors = input_factors(self._replay.observations(), self.agents, config.shared)
+        if config.scale_inputs and config.network in _SCALED:
+            seen = self._replay.observations()
+            factors = input_factors(seen, self.agents, pooled=self._is_one_network)
             self._inputs.copy_(factors.unsqueeze(1))
         if config.reward_scale is not None:
             return

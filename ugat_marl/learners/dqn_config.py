@@ -45,7 +45,7 @@ class DQNConfig:
             epsilon-greedy.
         huber_delta: Errors beyond this (in scaled reward) count linearly.
         reward_scale: Factor on all rewards; None measures it per agent.
-        scale_inputs: Whether observations are scaled; not those of a network other than "mlp".
+        scale_inputs: Whether observations are scaled; not those of "frap".
         shared: One network for all agents, told for which of them it computes, instead of one for
             each; it learns from the transitions of all.
         network: What computes Q. "mlp": layers over an agent's observation. "frap": phases that

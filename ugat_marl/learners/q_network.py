@@ -66,7 +66,7 @@ def reading_unscaled(network: nn.Module, factors: Tensor) -> Tensor:
     """Parameters with which `network` computes from x what its own make of ``x * factors``.
 
     Args:
-        network: Of `BatchedMLP` or `SharedMLP`.
+        network: Its first weights, ``(..., n_in, n_out)``, are those that observations meet.
         factors: ``(widest_observation,)`` or ``(agents, widest_observation)``; one for all agents
             where they share a network.
 
