@@ -196,6 +196,7 @@ KINDS = {
     "independent": DQNConfig(**SETTINGS),
     "shared": DQNConfig(**SETTINGS, shared=True),
     "frap": DQNConfig(**SETTINGS, network="frap"),
+    "colight": DQNConfig(**SETTINGS, network="colight"),
 }
 
 
@@ -215,6 +216,8 @@ def learner(kind: str, device: torch.device, *, greedy: bool, seed: int = 0) -> 
     structure = None
     if kind == "frap":
         structure = Structure("frap", tuple(junction(*sizes) for sizes in SIZES))
+    if kind == "colight":
+        structure = Structure("colight", neighbours=((1,), (0, 2), (1,)))
     config = dataclasses.replace(KINDS[kind], **end)
     return DQN(AgentSet.of(env), config, seed, {}, structure, device), env
 
