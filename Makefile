@@ -36,7 +36,7 @@ help:
 demo: environment
 	rm -rf runs/demo
 	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train grid2x2-v1 --real V4 --grounding timed --out runs/demo \
-		--pretrain-episodes 40 --iterations 3 --grounded-episodes 10 --sim-rollouts 2 --real-rollouts 2 \
+		--pretrain-episodes 20 --iterations 3 --grounded-episodes 6 --sim-rollouts 2 --real-rollouts 2 \
 		--evaluation-seeds 5 --tuning-seeds 1 $(ARGS)
 
 test: environment-dev
