@@ -168,6 +168,16 @@ def test_a_delay_longer_than_any_tried_is_pointed_out() -> None:
     )
 
 
+def test_a_street_with_too_few_greens_to_tell_is_pointed_out() -> None:
+    simulated = street(MOST_S, seed=6, episodes=2, steps=20)
+    _, report = fitted(street(PLANTED, seed=5), simulated, BRIEF)
+    assert (report.lost.low_s == 0.0).all() and (report.lost.high_s == MOST_S).all()
+    assert (
+        "too few greens begin to tell how late they are (0 to 4 s would all fit; give more "
+        "roll-outs or longer episodes) at 2 of 2 (a_0, b_0)"
+    ) in report.warnings
+
+
 @pytest.mark.parametrize("without", ["real", "simulated"])
 def test_logs_of_which_one_lacks_crossings_are_compared_by_what_follows(without: str) -> None:
     """Or a mean over the interval would be compared with what is left at its end."""

@@ -72,6 +72,12 @@ class TimedReport:
             *self.forward.doubts("f", self.agents),
             *self.simulated.doubts("the model of the simulation", self.agents),
             said_of(
+                f"too few greens begin to tell how late they are (0 to {self.most_s} s would all "
+                "fit; give more roll-outs or longer episodes)",
+                self.lost.high_s - self.lost.low_s > self.most_s - END_S,
+                self.agents,
+            ),
+            said_of(
                 f"the best delay is the longest tried ({self.most_s} s; raise timed most_s)",
                 self.lost.best_s > self.most_s - END_S,
                 self.agents,
