@@ -87,9 +87,25 @@ def test_a_report_of_the_leaks() -> None:
 
 
 def test_wrong_options() -> None:
-    assert set(WORK) == {"steps", "split", "grounded", "leaks", "kills", "decide", "ray"}
+    assert set(WORK) == {
+        "steps", "split", "grounded", "leaks", "kills", "decide", "learner", "ray",
+    }  # fmt: skip
     with pytest.raises(OptionError, match="parts holds 'speed'; allowed: workers, grounded"):
         ScaleBench(parts=("speed",))
     with pytest.raises(OptionError, match="rounds = 0"):
         ScaleBench(rounds=0)
     assert "ray" in PARTS
+
+
+@pytest.mark.slow
+def test_a_training_s_time_is_divided_between_sumo_torch_and_the_rest() -> None:
+    asked = {"scenario": "single-v1", "duration_s": 600.0, "learner": "ippo", "seed": 1}
+    shares = ask("learner", episodes=2, **asked)
+    assert set(shares) == {"libsumo", "torch", "rest"}
+    assert min(shares.values()) > 0
+
+
+def test_a_library_that_is_not_installed_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ugat_marl.bench.scale.library_of", lambda name: f"{name} -")
+    report = ScaleBench(parts=("learner",)).run()
+    assert report.rows == [] and "library of sb3-ppo is not installed" in report.notes[-1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import signal
 import sys
 import time
@@ -61,6 +62,6 @@ class CpuShares:
 
 def folder_of(package: str) -> Path:
     """Where an importable package lies."""
-    module = __import__(package)
+    module = importlib.import_module(package)
     assert module.__file__ is not None
     return Path(module.__file__).parent

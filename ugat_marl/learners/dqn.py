@@ -40,10 +40,9 @@ from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
 _KIND = "ugat_marl.dqn"
 _COUNTERS = ("episodes", "decisions", "updates")
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 _SCALED = ("mlp", "colight")
 """Networks whose first layer reads observations, and so can take over what they are scaled by."""
-
-_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 @dataclass
