@@ -209,8 +209,8 @@ def locked(directory: Path) -> IO[str]:
         except OSError:
             lock.close()
             raise OptionError(
-                f"{directory}: another process is training in this folder; wait for it, or use "
-                "another --out"
+                f"{directory}: another process is training in this folder; wait for it, or name "
+                "another one"
             ) from None
     return lock
 
