@@ -110,7 +110,7 @@ class DQN:
         self._centre = torch.zeros(len(agents), 1, device=device)
         scale = self.config.reward_scale or 1.0
         self._scale = torch.full((len(agents), 1), scale, device=device)
-        self._inputs = torch.ones(len(agents), 1, agents.widest_observation, device=device)
+        self._inputs = torch.ones(len(agents), 1, agents.widest_observation)
         self._acting = Acting(self._online, self._weights)
 
     @classmethod
@@ -183,7 +183,7 @@ class DQN:
         weights, options = self._target_weights, self.env_options
         if self.config.network in _SCALED:
             factors = self._inputs[0, 0] if self._is_one_network else self._inputs[:, 0]
-            weights = reading_unscaled(self._target, factors)
+            weights = reading_unscaled(self._target, factors.to(self.device))
         return DQNPolicy(self.agents, hidden, weights, options, shared, self.structure)
 
     def _episode(self, env: AnyParallelEnv, seed: int) -> dict[str, float]:
@@ -200,7 +200,7 @@ class DQN:
         while env.agents:
             epsilon = self.config.epsilon(self.decisions)
             acting = self._acting.network(self.updates)
-            seen = torch.from_numpy(now) * self._inputs[:, 0].to(CPU)
+            seen = torch.from_numpy(now) * self._inputs[:, 0]
             greedy = greedy_actions(acting, seen, torch.from_numpy(allowed))
             actions = explore.choose(greedy, allowed, epsilon)
             observations, rewards, terminated, _, infos = env.step(self.agents.actions(actions))
@@ -256,18 +256,18 @@ class DQN:
 
     def _update(self, generator: torch.Generator) -> tuple[float, float]:
         """One gradient step of all agents; returns mean loss and mean Q before it."""
-        batch = self._replay.sample(self.config.batch_size, generator).to(self.device)
-        now, then = batch.observation * self._inputs, batch.next_observation * self._inputs
+        batch = self._replay.sample(self.config.batch_size, generator)
+        batch = batch.scaled(self._inputs).to(self.device)
         with torch.no_grad():
-            best = self._online(then)
+            best = self._online(batch.next_observation)
             best = best.masked_fill_(~batch.next_allowed, -torch.inf).argmax(-1, keepdim=True)
-            future = self._target(then).gather(-1, best).squeeze(-1)
+            future = self._target(batch.next_observation).gather(-1, best).squeeze(-1)
             # no reward for ever, in the centred and scaled unit
             nothing = -self._centre * self._scale / (1 - self.config.discount)
             future = torch.where(batch.terminal, nothing, future)
             reward = (batch.reward - self._centre) * self._scale
             wanted = reward + self.config.discount * future
-        chosen = self._online(now).gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
+        chosen = self._online(batch.observation).gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
         losses = nn.functional.huber_loss(
             chosen, wanted, reduction="none", delta=self.config.huber_delta
         )

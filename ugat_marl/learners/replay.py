@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -32,6 +32,11 @@ class Batch:
     terminal: Tensor
     next_observation: Tensor
     next_allowed: Tensor
+
+    def scaled(self, factors: Tensor) -> Batch:
+        """The same with observations times ``factors``, ``(agents, 1, widest_observation)``."""
+        seen, then = self.observation * factors, self.next_observation * factors
+        return replace(self, observation=seen, next_observation=then)
 
     def to(self, device: torch.device) -> Batch:
         """The same on a device; itself if it is there."""
