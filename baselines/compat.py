@@ -20,9 +20,7 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import tyro
-from gymnasium import spaces
 from rich.console import Console
 from rich.table import Table
 
@@ -35,48 +33,12 @@ EPISODES = 3
 PATIENCE_S = 900.0
 
 
-class Toy(ToyTraffic):
-    """The toy environment, with intersections left out and phases forbidden at random.
-
-    Args:
-        equal: Only the two intersections that are alike.
-        masked: Whether phases are forbidden; one that is shown all the same ends the matter.
-    """
-
-    def __init__(self, equal: bool, masked: bool) -> None:
-        super().__init__(steps=30)
-        self._masked = masked
-        if equal:
-            for kept in (self.layouts, self.observation_spaces, self.action_spaces):
-                del kept["tee_0"]
-            self.possible_agents = list(self.layouts)
-            size = sum(layout.size for layout in self.layouts.values())
-            self.state_space = spaces.Box(0.0, 1.0, (size,), np.float32)
-
-    def step(self, actions: Any) -> Any:
-        """Refuses what is forbidden."""
-        for agent, action in actions.items():
-            mask = self._now[agent]
-            if not (0 <= action < len(mask) and mask[action]):
-                raise OptionError(f"{agent} showed the forbidden phase {action}")
-        return super().step(actions)
-
-    def _infos(self) -> dict[str, dict[str, Any]]:
-        infos = super()._infos()
-        for info in infos.values():
-            mask = info["action_mask"]
-            if self._masked:
-                gone = self._traffic.permutation(len(mask))[: self._traffic.integers(len(mask))]
-                mask[gone] = 0
-        self._now = {agent: info["action_mask"].copy() for agent, info in infos.items()}
-        return infos
-
-
 def environment(name: str) -> Any:
     """The environment of a column."""
     if name.endswith("-v1"):
         return parallel_env(name, duration_s=120)
-    return Toy("equal" in name.split(), "masks" in name)
+    words = name.split()
+    return ToyTraffic(30, equal="equal" in words, masked="masks" in words)
 
 
 COLUMNS = ("equal", "unequal", "equal masks", "unequal masks", "grid2x2-v1", "mixed-v1")

@@ -14,7 +14,7 @@ from ugat_marl.bench.measured import in_fresh_process
 from ugat_marl.bench.memory import growth_of
 from ugat_marl.bench.report import Report, Spread, Target, require_positive
 from ugat_marl.errors import MeasurementError, OptionError
-from ugat_marl.learners.registry import library_of, require_known
+from ugat_marl.learners.registry import is_installed, require_known
 from ugat_marl.progress import Reporter, Silent
 
 _PROGRAM = ["-m", "ugat_marl.bench.scale_work"]
@@ -134,7 +134,7 @@ class ScaleBench:
             if part == "ray" and find_spec("ray") is None:
                 notes.append("Ray is not installed (pip install 'ugat-marl[ray]'): not measured.")
                 continue
-            if part == "learner" and library_of(self.learner).endswith(" -"):
+            if part == "learner" and not is_installed(self.learner):
                 notes.append(f"The library of {self.learner} is not installed: not measured.")
                 continue
             figures += measured[part](reporter)

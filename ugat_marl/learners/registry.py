@@ -138,13 +138,24 @@ def require_known(name: str) -> None:
 
 def library_of(name: str) -> str:
     """The library that does a learner's work, with its version; "" for the suite's own learners."""
-    library = BASELINES[name].library if name in BASELINES else ""
-    if not library:
-        return ""
+    library = _library(name)
+    return library and f"{library} {_version(library) or '-'}"
+
+
+def is_installed(name: str) -> bool:
+    """Whether a learner's library is; the suite's own learners need none."""
+    return not _library(name) or bool(_version(_library(name)))
+
+
+def _library(name: str) -> str:
+    return BASELINES[name].library if name in BASELINES else ""
+
+
+def _version(library: str) -> str:
     try:
-        return f"{library} {importlib.metadata.version(library)}"
+        return importlib.metadata.version(library)
     except importlib.metadata.PackageNotFoundError:
-        return f"{library} -"
+        return ""
 
 
 def load_baseline(name: str) -> ModuleType:

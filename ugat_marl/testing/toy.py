@@ -31,6 +31,8 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         steps: Decisions in an episode.
         served: Vehicles that leave a green lane per decision; another value is another domain.
         arrivals: Mean arrivals per lane and decision.
+        equal: Leave the intersection of three lanes out.
+        masked: Forbid phases at random, by the masks; to show one is an `ActionError`.
     """
 
     observation_spaces: dict[str, Box]
@@ -44,15 +46,27 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
     decision_interval_s = 10.0
     domain = "sim"
 
-    def __init__(self, steps: int = 12, served: int = 3, arrivals: float = 1.0) -> None:
+    def __init__(
+        self,
+        steps: int = 12,
+        served: int = 3,
+        arrivals: float = 1.0,
+        *,
+        equal: bool = False,
+        masked: bool = False,
+    ) -> None:
         self.steps = steps
         self.served = served
         self.arrivals = arrivals
+        self.masked = masked
         self.render_mode: str | None = "rgb_array"
-        self.agent_groups = {"cross": ["cross_0", "cross_1"], "tee": ["tee_0"]}
-        self.possible_agents = ["cross_0", "tee_0", "cross_1"]
+        places = {"cross_0": "A", "tee_0": "B", "cross_1": "C"}
+        self.intersection_of = {a: b for a, b in places.items() if a != "tee_0" or not equal}
+        self.possible_agents = list(self.intersection_of)
         self.agents: list[str] = []
-        self.intersection_of = {"cross_0": "A", "tee_0": "B", "cross_1": "C"}
+        self.agent_groups = {"cross": ["cross_0", "cross_1"]} | (
+            {} if equal else {"tee": ["tee_0"]}
+        )
         self.layouts = {
             agent: AgentLayout(3, 2) if agent == "tee_0" else AgentLayout(4, 3)
             for agent in self.possible_agents
@@ -114,6 +128,8 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         for agent, action in actions.items():
             if not self.action_spaces[agent].contains(action):
                 raise ActionError(f"action of {agent} is {action!r}; see its action space")
+            if not self._masks[agent][action]:
+                raise ActionError(f"{agent} showed the forbidden phase {action}; see its mask")
         agents = self.agents
         for agent in agents:
             self._serve(agent, int(actions[agent]))
@@ -179,13 +195,17 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         return self._vectors()
 
     def _infos(self) -> dict[str, dict[str, Any]]:
+        self._masks = {a: self._allowed(layout.phases) for a, layout in self.layouts.items()}
         return {
-            agent: {
-                "action_mask": np.ones(layout.phases, np.int8),
-                "executed_action": self._phase[agent],
-            }
-            for agent, layout in self.layouts.items()
+            agent: {"action_mask": mask.copy(), "executed_action": self._phase[agent]}
+            for agent, mask in self._masks.items()
         }
+
+    def _allowed(self, phases: int) -> NDArray[np.int8]:
+        mask = np.ones(phases, np.int8)
+        if self.masked:
+            mask[self._traffic.permutation(phases)[: self._traffic.integers(phases)]] = 0
+        return mask
 
     def _measure(self) -> Scores:
         reward = float(np.mean(self._rewards))
