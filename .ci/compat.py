@@ -33,13 +33,17 @@ def torch_of(constraints: Path) -> str:
     return found.group()
 
 
-def make(folder: Path, requirements: list[str]) -> Path:
-    """An environment with torch, then the requirements; returns its interpreter."""
+def make(folder: Path, requirements: list[str], wheel: Path) -> Path:
+    """An environment with torch, then the requirements; returns its interpreter.
+
+    The wheel is installed once more by itself: of the same version, pip would keep the one there.
+    """
     python = folder / "bin" / "python"
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
     torch = torch_of(ROOT / "constraints-baselines.txt")
-    for wanted in ([torch], [torch, *requirements]):  # alone first: its build decides on GPUs
+    own = ["--no-deps", "--force-reinstall", str(wheel)]
+    for wanted in ([torch], [torch, *requirements], own):  # torch first: its build decides on GPUs
         subprocess.run([str(python), "-m", "pip", "install", "-q", *wanted], check=True)
     return python
 
@@ -62,7 +66,8 @@ def main() -> int:
     given = parser.parse_args()
     if not given.latest:
         constraints = ["-c", str(ROOT / "constraints-baselines.txt")]
-        python = make(given.into, [*constraints, f"{given.wheel}[baselines]"])
+        requirements = [*constraints, f"{given.wheel}[baselines]"]
+        python = make(given.into, requirements, given.wheel)
         return matrix(python, [name for extra in given.extras for name in LEARNERS[extra]])
     broken: list[str] = []
     for extra in given.extras:
@@ -70,7 +75,8 @@ def main() -> int:
         wheel = f"{given.wheel}[{extra}]" if extra else str(given.wheel)
         print(f"\n{extra or 'the suite alone'}:", flush=True)
         try:
-            python = make(folder, ["--upgrade", "--upgrade-strategy", "eager", wheel])
+            eager = ["--upgrade", "--upgrade-strategy", "eager", wheel]
+            python = make(folder, eager, given.wheel)
         except subprocess.CalledProcessError as error:
             broken.append(f"{extra}: cannot be installed ({error})")
             continue

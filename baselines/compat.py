@@ -45,7 +45,7 @@ COLUMNS = ("equal", "unequal", "equal masks", "unequal masks", "grid2x2-v1", "mi
 
 
 def attempt(learner: str, column: str) -> str:
-    """Trains, saves, and says how fast that was."""
+    """Trains, plays an episode, and says how fast the training was."""
     with contextlib.closing(environment(column)) as env:
         made = learner_factory(learner)(env, 0)
         lengths: list[int] = []
