@@ -26,7 +26,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from ugat_marl.bench.machine import machine_facts
+from ugat_marl.bench.machine import machine_facts, version_of
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.evaluation import rule_factory
@@ -35,6 +35,7 @@ from ugat_marl.learners.registry import BASELINES, DQN_NAME, require_known
 from ugat_marl.learning_curves.page import as_csv, page
 from ugat_marl.learning_curves.training import (
     DOMAIN,
+    Curve,
     Training,
     evaluation_seeds,
     found,
@@ -45,7 +46,7 @@ from ugat_marl.learning_curves.training import (
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.scenario import Scenario
 from ugat_marl.training import locked
-from ugat_marl.tuning import LEAST_BUDGET, tune, tuned_rules
+from ugat_marl.tuning import LEAST_BUDGET, VERSION, tune, tuned_rules
 
 JOB, LOG, RULES = "job.json", "job.log", "rules.json"
 
@@ -94,13 +95,19 @@ class Results:
         if self.only is not None:
             return one_of_them(self.only)
         console, failures = Console(), list[str]()
+        for name in self.scenarios:  # what is wrong is said before anything is trained
+            require_writable(self.out / f"{word(name)}.md")
+            load(name)
         for name in self.scenarios:
             where = self.out / f"{word(name)}.md"
-            require_writable(where)
             scenario, reporter = load(name), Bars(console)
             plan = self.plan(name)
             failures += perform_all(plan, self.runs, self.jobs, reporter)
-            curves = {one: curve for one in plan if (curve := found(one, self.runs))}
+            curves: dict[Training, Curve] = {}
+            for one in plan:
+                with contextlib.suppress(UgatMarlError):  # told by perform_all
+                    if curve := found(one, self.runs):
+                        curves[one] = curve
             if curves:
                 rules, best = self.rules(scenario, reporter)
                 text = page(scenario.id, curves, rules, best, machine_facts())
@@ -133,6 +140,7 @@ class Results:
         """
         file = self.runs / f"{word(scenario.id)}-{RULES}"
         made_with = [scenario.hash, self.rule_budget, self.evaluation_seeds]
+        made_with += [version_of("eclipse-sumo"), VERSION]
         with contextlib.suppress(OSError, ValueError, KeyError):
             told = json.loads(file.read_text())
             if told["made_with"] == made_with:
@@ -174,8 +182,11 @@ def perform_all(plan: Sequence[Training], runs: Path, jobs: int, reporter: Repor
 
     def one(training: Training) -> str:
         folder = runs.resolve() / training.name
-        if found(training, runs) is not None:
-            return ""
+        try:
+            if found(training, runs) is not None:
+                return ""
+        except UgatMarlError as error:
+            return f"{folder.name}: {' '.join(str(error).split())}"
         write_whole(folder / JOB, json.dumps(asdict(training)) + "\n")
         with (folder / LOG).open("wb") as log:
             done = subprocess.Popen(

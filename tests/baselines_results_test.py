@@ -13,7 +13,7 @@ import pytest
 
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.learners.registry import BASELINES, baselines_folder
-from ugat_marl.learning_curves.training import Curve, Training
+from ugat_marl.learning_curves.training import Curve, Training, made_now
 from ugat_marl.progress import Silent
 
 FILE = baselines_folder() / "results.py"
@@ -39,11 +39,15 @@ def test_all_learners_have_a_seed_before_one_has_two() -> None:
 
 def test_what_is_there_is_not_trained_again_and_failures_are_told(tmp_path: Path) -> None:
     done = Training("single-v1", "ippo", 0, 2, 2, 1)
-    Curve({}, {2: [80.0]}, 1, 1.0).write(tmp_path / done.name)
+    now = made_now("single-v1", "ippo")
+    Curve(now, {2: [80.0]}, 1, 1.0).write(tmp_path / done.name)
+    other = replace(done, seed=2)
+    Curve({**now, "settings": {}}, {2: [80.0]}, 1, 1.0).write(tmp_path / other.name)
     broken = replace(done, scenario=str(tmp_path / "nowhere.sumocfg"), seed=1)
-    lines = results.perform_all([done, broken], tmp_path, 2, Silent())
-    assert len(lines) == 1
+    lines = results.perform_all([done, broken, other], tmp_path, 2, Silent())
+    assert len(lines) == 2
     assert lines[0].startswith("nowhere-ippo-s1: exit code 2: ") and "nowhere" in lines[0][30:]
+    assert lines[1].startswith("single-v1-ippo-s2: ") and "was made with settings {}" in lines[1]
     assert not (tmp_path / done.name / "job.json").exists()
 
 

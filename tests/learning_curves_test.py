@@ -40,7 +40,10 @@ def test_it_is_judged_every_few_episodes_and_at_the_end() -> None:
     assert word("/there/mine.sumocfg") == "mine"
 
 
-def test_a_training_is_whole_when_it_has_all_its_evaluations(tmp_path: Path) -> None:
+def test_a_training_is_whole_when_it_has_all_its_evaluations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "made_now", lambda scenario, learner: MADE)
     folder = tmp_path / PLAN.name
     assert found(PLAN, tmp_path) is None
     curve([1.0, 2.0], [3.0, 4.0]).write(folder)
@@ -49,6 +52,11 @@ def test_a_training_is_whole_when_it_has_all_its_evaluations(tmp_path: Path) -> 
     assert found(replace(PLAN, episodes=6), tmp_path) is None
     own = found(replace(PLAN, evaluation_seeds=1, episodes=2), tmp_path)
     assert own is not None and own.means(replace(PLAN, evaluation_seeds=1)) == [1.0, 3.0]
+    monkeypatch.setattr(module, "made_now", lambda scenario, learner: {"library": "wonder 2.0"})
+    with pytest.raises(OptionError, match=r"was made with library wonder 1\.0 \(now wonder 2\.0\)"):
+        found(PLAN, tmp_path)
+    monkeypatch.setattr(module, "is_installed", lambda name: False)
+    assert found(PLAN, tmp_path) is not None
     (folder / "curve.json").write_text("{")
     with pytest.raises(CheckpointError, match=r"curve\.json: broken"):
         found(PLAN, tmp_path)

@@ -10,7 +10,7 @@ import importlib.metadata
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any, get_type_hints
@@ -119,11 +119,26 @@ def learner_factory(
         from ugat_marl.learners.dqn import DQN
 
         return lambda env, seed: DQN.of(env, dqn, seed, device=place)
-    baseline = BASELINES[name]
-    module = load_baseline(name)
-    config = _configured(getattr(module, baseline.config), baseline.settings, settings, name)
-    make = getattr(module, baseline.learner)
+    config = _baseline_config(name, settings)
+    make = getattr(load_baseline(name), BASELINES[name].learner)
     return lambda env, seed: make(env, config, seed)
+
+
+def settings_of(name: str) -> dict[str, Any]:
+    """The settings a learner has unless others are given.
+
+    Raises:
+        OptionError: Its library is not installed.
+    """
+    if name == DQN_NAME:
+        return DQNConfig().identity
+    return asdict(_baseline_config(name, ()))
+
+
+def _baseline_config(name: str, settings: Sequence[str]) -> Any:
+    baseline = BASELINES[name]
+    kind = getattr(load_baseline(name), baseline.config)
+    return _configured(kind, baseline.settings, settings, name)
 
 
 def require_known(name: str) -> None:

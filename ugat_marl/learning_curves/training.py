@@ -19,7 +19,12 @@ from ugat_marl.effects import load
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.evaluation import PolicyFactory, evaluate, fixed_policy
 from ugat_marl.files import write_whole
-from ugat_marl.learners.registry import learner_factory, library_of
+from ugat_marl.learners.registry import (
+    is_installed,
+    learner_factory,
+    library_of,
+    settings_of,
+)
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import parallel_env
 
@@ -131,13 +136,9 @@ def perform(training: Training, folder: Path) -> None:
     seeds = evaluation_seeds(training.evaluation_seeds)
     with contextlib.closing(parallel_env(scenario, domain=DOMAIN)) as env:
         learner: Any = learner_factory(name)(env, training.seed)
-        made_with = json.loads(json.dumps(_made_with(scenario, name, learner)))
+        made_with = made_now(training.scenario, name)
         curve = Curve.read(folder) or Curve(made_with)
-        if curve.made_with != made_with:
-            raise OptionError(
-                f"{folder} was made with {_differences(curve.made_with, made_with)}; remove it, "
-                "or name another --runs"
-            )
+        _require_same(folder, curve.made_with, made_with)
         if curve.learner:
             learner.load(folder / curve.learner)
         for mark in training.marks:
@@ -162,21 +163,27 @@ def perform(training: Training, folder: Path) -> None:
                 (folder / before).unlink(missing_ok=True)
 
 
-def _made_with(scenario: Scenario, name: str, learner: Any) -> dict[str, Any]:
-    return {
-        "scenario": scenario.hash,
-        "library": library_of(name),
-        "settings": getattr(learner.config, "identity", None) or asdict(learner.config),
+def made_now(scenario: str, learner: str) -> Mapping[str, Any]:
+    """What a training is made with today, as JSON has it; its library must be installed."""
+    made = {
+        "scenario": load(scenario).hash,
+        "library": library_of(learner),
+        "settings": settings_of(learner),
         "versions": {key: version_of(key) for key in ("eclipse-sumo", "torch")},
     }
+    return json.loads(json.dumps(made))
 
 
-def _differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    return ", ".join(
-        f"{key} {one.get(key)} (now {other.get(key)})"
-        for key in {**one, **other}
-        if one.get(key) != other.get(key)
+def _require_same(folder: Path, one: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    differences = ", ".join(
+        f"{key} {one.get(key)} (now {now.get(key)})"
+        for key in {**one, **now}
+        if one.get(key) != now.get(key)
     )
+    if differences:
+        raise OptionError(
+            f"{folder} was made with {differences}; remove it, or name another --runs"
+        )
 
 
 def evaluation_seeds(count: int) -> range:
@@ -191,9 +198,19 @@ def played(scenario: Scenario, policy: PolicyFactory, seeds: Sequence[int]) -> l
 
 
 def found(training: Training, runs: Path) -> Curve | None:
-    """A training that has all its evaluations."""
-    curve = Curve.read(runs / training.name)
-    return curve if curve is not None and curve.has(training) else None
+    """A training that has all its evaluations.
+
+    Raises:
+        OptionError: It was made with other settings or versions; not asked where the learner's
+            library is not installed.
+    """
+    folder = runs / training.name
+    curve = Curve.read(folder)
+    if curve is None or not curve.has(training):
+        return None
+    if is_installed(training.learner):
+        _require_same(folder, curve.made_with, made_now(training.scenario, training.learner))
+    return curve
 
 
 def word(text: str) -> str:
