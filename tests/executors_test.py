@@ -6,10 +6,12 @@ import contextlib
 import copy
 import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,11 +26,12 @@ from ugat_marl.effects import StartupDelay, load
 from ugat_marl.errors import OptionError, SimulatorCrashed
 from ugat_marl.evaluation import evaluate, rule_factory
 from ugat_marl.executors import (
+    RETRIES,
+    LocalProcesses,
     RayExecutor,
     Stop,
     as_done,
     executor_of,
-    local_processes,
     parts_at_a_time,
     usable_cores,
 )
@@ -100,9 +103,32 @@ def results(workers: Any, policies: Any = None) -> Any:
     ).results
 
 
+def dying(folder: Path, times: int) -> int:
+    """Its process is killed the first times it is called."""
+    marks = len(list(folder.iterdir()))
+    if marks < times:
+        (folder / str(marks)).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return marks
+
+
+@pytest.mark.slow
+def test_processes_that_die_are_replaced(tmp_path: Path) -> None:
+    with LocalProcesses(1) as processes:
+        assert [*as_done(processes, dying, [(tmp_path, 2)], Stop())] == [(0, 2)]
+        with pytest.raises(BrokenProcessPool):
+            processes.submit(dying, tmp_path, 100).result()
+        assert len(list(tmp_path.iterdir())) == 2 + 1 + RETRIES
+        with pytest.raises(ValueError, match="^invalid literal for int"):
+            processes.submit(int, "one").result()
+        assert processes.submit(int, "1").result() == 1
+    with pytest.raises(RuntimeError, match="shutdown"):
+        processes.submit(int, "1")
+
+
 @pytest.mark.slow
 def test_processes_give_what_threads_give() -> None:
-    with local_processes(2) as processes:
+    with LocalProcesses(2) as processes:
         assert results(processes) == results(2)
 
 
@@ -118,8 +144,7 @@ def test_roll_outs_are_in_the_order_of_their_seeds_whoever_plays_them() -> None:
     assert len({score.att_s for score in scores}) == 3
 
 
-@pytest.mark.slow
-def test_days_of_a_diagnosis_are_the_same_in_processes(data: Path) -> None:
+def engine_of(data: Path, workers: Any) -> Engine:
     scenario = load(data / "crossing")
     network = Network.read(scenario)
     detectors = standard_detectors(network)
@@ -127,10 +152,15 @@ def test_days_of_a_diagnosis_are_the_same_in_processes(data: Path) -> None:
     shown = ((0.0, "Gr"), (30.0, "rG"), (60.0, "Gr"), (90.0, "rG"))
     periods = [Period("day1", 0.0, 120.0, "fit", {"C": shown}, {})]
     replay = Replay(scenario, network, detectors, site.owner)
+    return Engine(scenario, site, replay, periods, 3, workers=workers)
+
+
+@pytest.mark.slow
+def test_days_of_a_diagnosis_are_the_same_in_processes(data: Path) -> None:
     found: list[Any] = []
-    with local_processes(1) as processes:
+    with LocalProcesses(1) as processes:
         for workers in (2, processes):
-            engine = Engine(scenario, site, replay, periods, 3, workers=workers)
+            engine = engine_of(data, workers)
             days = engine.replicates([StartupDelay(1.0)], [0, 1])
             found.append([(day.tally.sums.tolist(), day.travel_time_s) for day in days])
     assert found[0] == found[1]
@@ -138,6 +168,25 @@ def test_days_of_a_diagnosis_are_the_same_in_processes(data: Path) -> None:
 
 
 # --- simulators that die
+
+
+def test_a_day_of_a_diagnosis_whose_simulator_dies_is_simulated_again(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (expected,) = engine_of(data, 1).replicates([], [0])
+    run, ends = subprocess.run, [-9, -9, 0, *[-9] * 100]
+
+    def killed(command: Any, **given: Any) -> Any:
+        end = ends.pop(0) if Path(command[0]).stem == "sumo" else 0
+        return subprocess.CompletedProcess(command, end, "", "") if end else run(command, **given)
+
+    monkeypatch.setattr("ugat_marl.discrepancy.replay.subprocess.run", killed)
+    (found,) = engine_of(data, 1).replicates([], [0])
+    assert (found.tally.sums == expected.tally.sums).all()
+    assert len(ends) == 100
+    with pytest.raises(SimulatorCrashed, match="exit code -9"):
+        engine_of(data, 1).replicates([], [0])
+    assert len(ends) == 100 - ATTEMPTS
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ an executor here.
 from __future__ import annotations
 
 import contextlib
+import functools
+import multiprocessing
 import os
 import sys
 import threading
@@ -22,6 +24,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,7 +36,7 @@ Workers = int | Executor | None
 Done = TypeVar("Done")
 
 RETRIES = 3
-"""So often Ray takes up a part whose process died."""
+"""So often a part is taken up again whose process died."""
 
 
 class Stop(threading.Event):
@@ -107,16 +110,62 @@ def as_done(
                 future.cancel()
 
 
-def local_processes(workers: int | None = None) -> ProcessPoolExecutor:
+class LocalProcesses(Executor):
     """Interpreters of their own instead of threads: for many cores, where one would be too slow.
 
-    Each takes seconds to start and as much memory as the suite with torch. As with every pool of
-    processes, a script that makes one guards its code by ``if __name__ == "__main__":``.
-    """
-    import multiprocessing
+    Each takes seconds to start and as much memory as the suite with torch. A script that makes them
+    guards its code by ``if __name__ == "__main__":``. Where a process dies, another begins its part
+    anew; a pool of the standard library would be broken for good.
 
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(parts_at_a_time(workers), mp_context=context)
+    Args:
+        workers: Processes; None for one per usable core.
+    """
+
+    def __init__(self, workers: int | None = None) -> None:
+        self.parts_at_a_time = parts_at_a_time(workers)
+        self._threads = ThreadPoolExecutor(self.parts_at_a_time)  # each waits for one process
+        self._idle: list[ProcessPoolExecutor] = []
+        self._is_open = True
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Hands a part to a process.
+
+        The part raises `BrokenProcessPool` if its process died each time.
+        """
+        return self._threads.submit(self._persistently, functools.partial(fn, *args, **kwargs))
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Ends the processes once they have done what was submitted, or what they are at."""
+        self._threads.shutdown(wait, cancel_futures=cancel_futures)
+        self._is_open = False
+        while self._idle:
+            self._idle.pop().shutdown(wait)
+
+    def _persistently(self, part: Callable[[], Any]) -> Any:
+        for left in reversed(range(RETRIES + 1)):
+            try:
+                return self._done(part)
+            except BrokenProcessPool:
+                if not left:
+                    raise
+        raise AssertionError
+
+    def _done(self, part: Callable[[], Any]) -> Any:
+        try:
+            process = self._idle.pop()
+        except IndexError:
+            process = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+        is_alive = True
+        try:
+            return process.submit(part).result()
+        except BrokenProcessPool:
+            is_alive = False
+            raise
+        finally:
+            if is_alive and self._is_open:
+                self._idle.append(process)
+            else:
+                process.shutdown(wait=False)
 
 
 class RayExecutor(Executor):
@@ -161,6 +210,7 @@ class RayExecutor(Executor):
         self._task: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
         self._running: dict[Future[Any], Any] = {}
         self._lock = threading.Lock()
+        self._is_open = True
 
     @property
     def parts_at_a_time(self) -> int:
@@ -169,6 +219,8 @@ class RayExecutor(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Hands a part to the cluster."""
+        if not self._is_open:
+            raise RuntimeError("cannot schedule new futures after shutdown")
         future: Future[Any] = Future()
         reference = self._task.remote(fn, args, kwargs)
         with self._lock:
@@ -179,6 +231,7 @@ class RayExecutor(Executor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Waits for what was submitted, unless told not to; ends the Ray that was started here."""
+        self._is_open = False
         with self._lock:
             running = list(self._running)
         for future in running:

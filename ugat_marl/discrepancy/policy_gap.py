@@ -18,6 +18,7 @@ from typing import Any
 from ugat_marl.effects import Domain, describe, in_domain, load
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.evaluation import PolicyFactory, evaluate
+from ugat_marl.executors import Workers
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.results import Estimate, Evaluation
@@ -35,7 +36,7 @@ def policy_gap(
     reporter: Reporter | None = None,
     *,
     duration_s: float | None = None,
-    workers: int | None = None,
+    workers: Workers = None,
 ) -> dict[str, dict[str, Any]]:
     """Plays policies in the simulation, the corrected one and the real world.
 
@@ -50,7 +51,7 @@ def policy_gap(
         seeds: Seeds of the episodes.
         reporter: Shows progress.
         duration_s: Length of an episode in s; None for the scenario's own.
-        workers: Simulations at a time; None for the number of cores.
+        workers: Simulations at a time, or who plays them (`executors`).
 
     Returns:
         For each policy ``sim``, ``corrected`` and ``real``: ATT in s as mean with a 95 % bootstrap

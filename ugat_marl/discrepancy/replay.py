@@ -31,13 +31,14 @@ from ugat_marl.effects import (
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
 from ugat_marl.effects.signals import late_greens
-from ugat_marl.errors import MeasuredDataError, SimulatorError
+from ugat_marl.errors import MeasuredDataError, SimulatorCrashed, SimulatorError
 from ugat_marl.files import xml_bytes
 from ugat_marl.loops import loops_document, read_loops
 from ugat_marl.measured.data import Detector, Period, SignalLog
 from ugat_marl.measured.pairing import as_logged
 from ugat_marl.network import Network
 from ugat_marl.redraw import explicit, redrawn, sumo_program
+from ugat_marl.rollout import persistently
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.seeding import derive_seed
 from ugat_marl.signals import delayed_log
@@ -113,7 +114,7 @@ class Replay:
             seed: Which day, and SUMO's own seed.
 
         Raises:
-            SimulatorError: SUMO refused.
+            SimulatorError: SUMO refused, or its process died again and again.
         """
         day = self._day(seed)
         scenario, due = _with(day, effects), None
@@ -124,7 +125,7 @@ class Replay:
         scenario = parked_at_other_times(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)
-            done = self._run(scenario, period, seed, directory)
+            done = persistently(lambda: self._run(scenario, period, seed, directory))
         seen = done.period
         for effect in (*self._own, *effects):
             if isinstance(effect, DetectorEffect):
@@ -175,7 +176,8 @@ class Replay:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             said = one_line(done.stderr) or f"exit code {done.returncode}"
-            raise SimulatorError(f"SUMO failed in a replay of period {period.id!r}: {said}")
+            kind = SimulatorCrashed if done.returncode < 0 else SimulatorError  # by a signal
+            raise kind(f"SUMO failed in a replay of period {period.id!r}: {said}")
         trips = read_trips(directory / "trips.xml")
         seen = read_loops(loops, self._detectors, period.begin_s, period.end_s)
         travel = float(np.mean(trips.travel_time_s)) if len(trips.travel_time_s) else np.nan
