@@ -53,6 +53,22 @@ def test_it_is_the_one_over_plain_environments(masks_in_observation: bool) -> No
     two.close()
 
 
+def test_what_would_only_reach_this_process_is_refused() -> None:
+    env = SimulationsVecEnv(vector_env("grid2x2-v1", 1, wrap=WRAPS, duration_s=50))
+    env.reset()
+    for call in (
+        lambda: env.env_method("state"),
+        lambda: env.set_attr("reward", None),
+        lambda: env.set_options({"domain": "V4"}),
+    ):
+        with pytest.raises(OptionError):
+            call()
+    assert not env.has_attr("agents")
+    assert env.get_attr("render_mode", 0) == [None]
+    env.set_options()
+    env.close()
+
+
 def test_it_learns() -> None:
     masked = pytest.importorskip("sb3_contrib").MaskablePPO
     env = SimulationsVecEnv(vector_env("grid2x2-v1", 2, wrap=WRAPS, duration_s=100))

@@ -536,7 +536,7 @@ def test_wrong_calls(crossing: Crossing) -> None:
     with vector_env(directory, 2, duration_s=20) as env:
         with pytest.raises(EpisodeError, match="no episode under way; call reset"):
             env.step([[0], [0]])
-        for seed in (-1, [1], [1, 2, 3], [1, -2]):
+        for seed in (-1, [1], [1, 2, 3], [1, -2], 1.5, [1.5, 2.5], "ab"):
             with pytest.raises(OptionError, match="seed = .*from 0 on, or 2 of them"):
                 env.reset(seed)
         for where in ([2], [0, 0], [], [False, False], 1):

@@ -19,6 +19,11 @@ from ugat_marl.adapters.sb3 import AgentsVecEnv, Step
 from ugat_marl.errors import OptionError
 from ugat_marl.vector import Batch, VectorEnv
 
+_ELSEWHERE = (
+    "simulations are in processes of their own; give options to ugat_marl.vector_env, or use "
+    "ugat_marl.adapters.sb3.AgentsVecEnv"
+)
+
 
 class SimulationsVecEnv(AgentsVecEnv):
     """Each agent of each simulation is an environment of its own; the simulations step together.
@@ -71,6 +76,33 @@ class SimulationsVecEnv(AgentsVecEnv):
     def close(self) -> None:
         """Ends the simulations; may be called again."""
         self.simulations.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """``action_masks``, ``render_mode`` or ``metadata`` of each agent's environment.
+
+        Raises:
+            AttributeError: Another one; the environments are in processes of their own.
+        """
+        if attr_name not in ("action_masks", "render_mode", "metadata"):
+            raise AttributeError(f"{attr_name}: {_ELSEWHERE}")
+        return super().get_attr(attr_name, indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuses; the environments are in processes of their own."""
+        raise OptionError(f"set_attr({attr_name!r}): {_ELSEWHERE}")
+
+    def set_options(self, options: Any = None) -> None:
+        """Refuses; a reset of simulations takes seeds only."""
+        if options:
+            raise OptionError(f"set_options({options!r}): a reset of simulations takes seeds only")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """``action_masks``: one mask for each agent; others are refused."""
+        if method_name != "action_masks":
+            raise OptionError(f"env_method({method_name!r}): {_ELSEWHERE}")
+        return super().env_method(method_name, indices=indices)
 
     def _seen(self, batch: Batch) -> NDArray[np.float32]:
         """What all agents see, ``(rows, size)``; their masks are kept."""

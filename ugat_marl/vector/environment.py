@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import operator
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -277,15 +278,19 @@ class VectorEnv:
     def _seeds(self, seed: int | Sequence[int] | None, chosen: list[int]) -> dict[int, int | None]:
         if seed is None:
             return dict.fromkeys(chosen)
-        listed = (
-            [seed + i for i in range(self.n)] if isinstance(seed, int | np.integer) else [*seed]
-        )
-        if len(listed) != self.n or any(int(one) < 0 for one in listed):
+        try:
+            if isinstance(seed, int | np.integer):
+                listed = [int(seed) + i for i in range(self.n)]
+            else:
+                listed = [operator.index(one) for one in seed]
+        except TypeError:  # no sequence, or not of whole numbers
+            listed = []
+        if len(listed) != self.n or min(listed) < 0:
             raise OptionError(
                 f"seed = {seed!r}: must be a number from 0 on, or {self.n} of them, one for each "
                 "environment"
             )
-        return {index: int(listed[index]) for index in chosen}
+        return {index: listed[index] for index in chosen}
 
     def _checked(self, actions: ArrayLike) -> NDArray[np.int64]:
         asked = np.asarray(actions)
