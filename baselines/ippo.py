@@ -61,8 +61,9 @@ class IPPOConfig:
             whole = name in ("hidden", "update_every", "epochs", "minibatch")
             most = 1 if name in ("discount", "gae_lambda") else math.inf
             for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not (1 if whole else 0) <= number <= most:
-                    raise OptionError(f"{name} = {value}: must be from {int(whole)} to {most}")
+                least = 1 if whole else 0
+                if number is not None and (not least <= number <= most or number == math.inf):
+                    raise OptionError(f"{name} = {value}: must be from {least} to {most}")
         if self.discount == 1:
             raise OptionError("discount = 1: must be below 1, since traffic has no end")
 

@@ -364,7 +364,14 @@ def test_the_step_size_anneals_to_nothing() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"discount": 1.0}, {"gae_lambda": 1.1}, {"clip": -0.2}, {"epochs": 0}, {"hidden": (8, 0)}],
+    [
+        {"discount": 1.0},
+        {"gae_lambda": 1.1},
+        {"clip": -0.2},
+        {"epochs": 0},
+        {"hidden": (8, 0)},
+        {"clip": float("inf")},
+    ],
 )
 def test_settings_are_checked(wrong: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match=f"{next(iter(wrong))} = "):

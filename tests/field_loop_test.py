@@ -166,7 +166,11 @@ def failing(_counts: Counts) -> Counts:
     raise OSError("the cabinet does not answer")
 
 
-@pytest.mark.parametrize("spoil", [failing, lambda _: None, lambda _: {}, lambda _: 3])
+def leaving(_counts: Counts) -> Counts:
+    raise SystemExit("the driver has had enough")
+
+
+@pytest.mark.parametrize("spoil", [failing, leaving, lambda _: None, lambda _: {}, lambda _: 3])
 def test_no_counts_send_every_light_to_the_plan(spoil: Callable[[Counts], Any]) -> None:
     street = MadeUpStreet()
     loop = FieldLoop(SITE, Scripted(), street, QUICK)

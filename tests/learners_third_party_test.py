@@ -252,7 +252,14 @@ def test_global_generators_are_lent_only() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"discount": 1.0}, {"discount": 1.1}, {"epochs": 0}, {"hidden": (3, 0)}, {"rate": -1.0}],
+    [
+        {"discount": 1.0},
+        {"discount": 1.1},
+        {"epochs": 0},
+        {"hidden": (3, 0)},
+        {"rate": -1.0},
+        {"rate": float("inf")},
+    ],
 )
 def test_settings_are_checked(wrong: dict[str, Any]) -> None:
     class Settings:

@@ -251,7 +251,7 @@ class FieldLoop:
         try:
             counts = dict(self._street.read())
             wrong = self._watchdog.faults(counts, now, self._held)
-        except Exception as error:  # noqa: BLE001 - whatever a detector's driver raises
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a detector's driver raises
             reason = f"missing: no counts at all, {type(error).__name__}: {error}"
             return {}, dict.fromkeys(self.lights, reason)
         faults: dict[str, str] = {}

@@ -323,7 +323,7 @@ def check_settings(config: Any, *shares: str) -> None:
         least = 1 if isinstance(value, int | tuple) else 0
         most = 1 if name in ("discount", "gae_lambda", *shares) else math.inf
         for number in value if isinstance(value, tuple) else (value,):
-            if not least <= number <= most:
+            if not least <= number <= most or number == math.inf:
                 raise OptionError(f"{name} = {value}: must be from {least} to {most}")
     if config.discount == 1:
         raise OptionError("discount = 1: must be below 1, since traffic has no end")
