@@ -95,7 +95,8 @@ class TrafficTask(TaskClass):
     """A task of BenchMARL: ``Experiment(task=TrafficTask(make, decisions), ...)``.
 
     Args:
-        make: Makes an environment of the suite, one for each call.
+        make: Makes an environment of the suite, one for each call. BenchMARL pickles it: a function
+            of a module, or a `functools.partial` of one.
         decisions: In an episode.
     """
 

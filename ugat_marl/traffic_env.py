@@ -176,7 +176,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """Shows the chosen phases for one decision interval.
 
         Args:
-            actions: A green phase for every agent.
+            actions: A green phase for every agent. One that its mask forbids is not shown, as at a
+                real signal; ``executed_action`` of the infos says what is.
 
         Returns:
             Observations, rewards, terminations, truncations and infos of all agents.
