@@ -176,8 +176,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """Shows the chosen phases for one decision interval.
 
         Args:
-            actions: A green phase for every agent. One that its mask forbids is not shown, as at a
-                real signal; ``executed_action`` of the infos says what is.
+            actions: A green phase for every agent; forbidden by its mask, it is not shown.
 
         Returns:
             Observations, rewards, terminations, truncations and infos of all agents.
