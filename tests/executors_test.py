@@ -103,22 +103,25 @@ def results(workers: Any, policies: Any = None) -> Any:
     ).results
 
 
-def dying(folder: Path, times: int) -> int:
-    """Its process is killed the first times it is called."""
-    marks = len(list(folder.iterdir()))
-    if marks < times:
-        (folder / str(marks)).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return marks
+DIES = """
+import os, pathlib
+folder = pathlib.Path({folder!r})
+marks = len(list(folder.iterdir()))
+(folder / str(marks)).touch()
+if marks < {times}:
+    os.kill(os.getpid(), 9)
+"""
 
 
 @pytest.mark.slow
 def test_processes_that_die_are_replaced(tmp_path: Path) -> None:
+    twice, always = (DIES.format(folder=str(tmp_path), times=times) for times in (2, 100))
     with LocalProcesses(1) as processes:
-        assert [*as_done(processes, dying, [(tmp_path, 2)], Stop())] == [(0, 2)]
+        list(as_done(processes, exec, [(twice,)], Stop()))
+        assert len(list(tmp_path.iterdir())) == 3
         with pytest.raises(BrokenProcessPool):
-            processes.submit(dying, tmp_path, 100).result()
-        assert len(list(tmp_path.iterdir())) == 2 + 1 + RETRIES
+            processes.submit(exec, always).result()
+        assert len(list(tmp_path.iterdir())) == 3 + 1 + RETRIES
         with pytest.raises(ValueError, match="^invalid literal for int"):
             processes.submit(int, "one").result()
         assert processes.submit(int, "1").result() == 1
@@ -295,18 +298,8 @@ def test_ray_s_errors_are_the_parts_own(ray: Executor) -> None:
         list(as_done(ray, int, [("one",)], Stop()))
 
 
-DIES_TWICE = """
-import os, pathlib
-folder = pathlib.Path({folder!r})
-marks = len(list(folder.iterdir()))
-(folder / str(marks)).touch()
-if marks < 2:
-    os.kill(os.getpid(), 9)
-"""
-
-
 def test_ray_replaces_a_worker_that_dies(ray: Executor, tmp_path: Path) -> None:
-    list(as_done(ray, exec, [(DIES_TWICE.format(folder=str(tmp_path)),)], Stop()))
+    list(as_done(ray, exec, [(DIES.format(folder=str(tmp_path), times=2),)], Stop()))
     assert len(list(tmp_path.iterdir())) == 3
 
 
