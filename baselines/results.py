@@ -95,12 +95,11 @@ class Results:
         if self.only is not None:
             return one_of_them(self.only)
         console, failures = Console(), list[str]()
-        for name in self.scenarios:  # what is wrong is said before anything is trained
+        scenarios = {name: load(name) for name in self.scenarios}
+        for name in scenarios:  # what is wrong is said before anything is trained
             require_writable(self.out / f"{word(name)}.md")
-            load(name)
-        for name in self.scenarios:
-            where = self.out / f"{word(name)}.md"
-            scenario, reporter = load(name), Bars(console)
+        for name, scenario in scenarios.items():
+            where, reporter = self.out / f"{word(name)}.md", Bars(console)
             plan = self.plan(name)
             failures += perform_all(plan, self.runs, self.jobs, reporter)
             curves: dict[Training, Curve] = {}
