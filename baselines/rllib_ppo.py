@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -59,7 +60,7 @@ class RLlibConfig:
     value_weight: float = 0.5  # weight of the critic's squared error
     max_gradient: float = 0.5  # longer gradients are scaled down to this norm
     epochs: int = 8  # passes over each episode
-    minibatches: int = 8  # parts of an episode, one for each gradient step
+    minibatch: int = 30  # decisions (of the largest group of agents) in a gradient step
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -125,6 +126,7 @@ class RLlib(LibraryLearner):
 
     def _library_config(self, env: AnyParallelEnv, seed: int) -> Any:
         given, groups = self.config, dict(self._groups)
+        largest = max(Counter(groups.values()).values())  # RLlib counts each agent's decisions
         spaces = Spaces(self._wrapped(env))
         network = {
             "fcnet_hiddens": list(given.hidden),
@@ -161,7 +163,7 @@ class RLlib(LibraryLearner):
                 grad_clip=given.max_gradient,
                 grad_clip_by="global_norm",
                 train_batch_size_per_learner=self._decisions,
-                minibatch_size=max(1, self._decisions // given.minibatches),
+                minibatch_size=min(self._decisions, given.minibatch) * largest,
                 num_epochs=given.epochs,
                 shuffle_batch_per_epoch=True,
             )

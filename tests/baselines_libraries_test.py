@@ -55,7 +55,7 @@ SETTINGS = {
     "skrl-mappo": (*PPO, "update_every=20", "minibatches=2"),
     "qmix": (*VALUES, "update_every=10", "updates=10", "batch=32"),
     "vdn": (*VALUES, "update_every=10", "updates=10", "batch=32"),
-    "rllib-ppo": (*PPO, "minibatches=4"),
+    "rllib-ppo": (*PPO, "minibatch=2"),
 }
 NAMES = [
     pytest.param(
@@ -73,17 +73,17 @@ every = pytest.mark.parametrize("name", NAMES)
 
 
 class PaidEnv(ParallelEnv[str, Any, Any]):
-    """Four decisions, each paid 1; the agent sees which is next, in a circle."""
+    """Four decisions, each paid 1; agents see which is next, in a circle."""
 
     metadata: ClassVar = {"name": "paid", "is_parallelizable": True, "render_modes": []}
     render_mode = None
-    state_space = spaces.Box(0, 1, (4,), np.float32)
 
-    def __init__(self, reward: float = 1.0) -> None:
-        self.possible_agents, self.agents = ["signal_0"], list[str]()
+    def __init__(self, reward: float = 1.0, agents: int = 1) -> None:
+        self.possible_agents, self.agents = [f"signal_{i}" for i in range(agents)], list[str]()
         self.reward = reward
-        self.observation_spaces = {"signal_0": spaces.Box(0, 1, (4,), np.float32)}
-        self.action_spaces = {"signal_0": spaces.Discrete(2)}
+        self.state_space = spaces.Box(0, 1, (4 * agents,), np.float32)
+        self.observation_spaces = self._each(spaces.Box(0, 1, (4,), np.float32))
+        self.action_spaces = self._each(spaces.Discrete(2))
 
     def observation_space(self, agent: str) -> Any:
         return self.observation_spaces[agent]
@@ -92,22 +92,25 @@ class PaidEnv(ParallelEnv[str, Any, Any]):
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        self.agents, self.time = ["signal_0"], 0
-        return self._observe(), {"signal_0": {}}
+        self.agents, self.time = list(self.possible_agents), 0
+        return self._observe(), self._each({})
 
     def step(self, actions: dict[str, int]) -> Any:
         self.time += 1
-        over, one = self.time == 4, "signal_0"
+        over = self.time == 4
         if over:
             self.agents = []
-        ends = {one: False}, {one: over}
-        return self._observe(), {one: self.reward}, *ends, {one: {}}
+        ends = self._each(False), self._each(over)
+        return self._observe(), self._each(self.reward), *ends, self._each({})
 
     def state(self) -> Any:
-        return self._observe()["signal_0"]
+        return np.concatenate(list(self._observe().values()))
 
     def _observe(self) -> dict[str, Any]:
-        return {"signal_0": np.eye(4, dtype=np.float32)[self.time % 4]}
+        return self._each(np.eye(4, dtype=np.float32)[self.time % 4])
+
+    def _each(self, value: Any) -> dict[str, Any]:
+        return dict.fromkeys(self.possible_agents, value)
 
 
 def made(name: str, env: Any, *settings: str, seed: int = 0) -> Any:
@@ -316,6 +319,24 @@ def test_values_bootstrap_where_an_episode_is_cut_off(name: str) -> None:
     # paid for ever: 1 / (1 - 0.5); SuperSuit says that the end is the end
     wanted = [1.875, 1.75, 1.5, 1.0] if name == "supersuit-ppo" else [2.0, 2.0, 2.0, 2.0]
     assert value_of(name, learner) == pytest.approx(wanted, abs=0.2)
+
+
+# skrl updates agent by agent
+@pytest.mark.parametrize("name", [item for item in NAMES if "skrl" not in str(item.values[0])])
+def test_more_agents_are_no_more_gradient_steps(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    step, steps = torch.optim.Adam.step, list[int]()
+
+    def counted(*args: Any, **options: Any) -> Any:
+        steps[-1] += 1
+        return step(*args, **options)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", counted)
+    for agents in (1, 3):
+        env = PaidEnv(agents=agents)
+        learner = made(name, env)
+        steps.append(0)
+        learner.learn(env, 24, 1)  # more than the decisions for which DQN waits
+    assert steps[0] == steps[1] > 0
 
 
 @every
