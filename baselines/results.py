@@ -26,7 +26,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from ugat_marl.bench.machine import machine_facts, version_of
+from ugat_marl.bench.machine import machine_facts
 from ugat_marl.effects import load
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.evaluation import rule_factory
@@ -47,6 +47,7 @@ from ugat_marl.progress import Bars, Reporter
 from ugat_marl.scenario import Scenario
 from ugat_marl.training import locked
 from ugat_marl.tuning import LEAST_BUDGET, VERSION, tune, tuned_rules
+from ugat_marl.versions import version_of
 
 JOB, LOG, RULES = "job.json", "job.log", "rules.json"
 

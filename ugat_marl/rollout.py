@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from ugat_marl.observations import UNITS, Observer
 from ugat_marl.policy import Actions, AnyParallelEnv, Infos, Observations, Policy
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.transitions import Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.versions import version_of
 
 SIMULATING = ("libsumo", "numpy", "ugat-marl")
 """Packages whose version can change a trajectory; written into every log."""
@@ -174,16 +174,9 @@ def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Prove
         decision_interval_s=base.decision_interval_s,
         observation=observer.name,
         layouts=dict(zip(observer.agents, observer.layouts, strict=True)),
-        versions={name: _version(name) for name in SIMULATING},
+        versions={name: version_of(name) or "not installed" for name in SIMULATING},
         units={"observation": UNITS[observer.name], "reward": str(base.options.reward)},
     )
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
 
 
 class Exploring:

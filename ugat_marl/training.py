@@ -7,8 +7,6 @@ stage it repeats and ends with the same file as an unbroken one.
 
 from __future__ import annotations
 
-import contextlib
-import importlib.metadata
 import importlib.util
 import json
 import math
@@ -23,6 +21,7 @@ import polars as pl
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.files import replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
+from ugat_marl.versions import versions_of
 
 CHECKPOINT = "checkpoint"
 METRICS = "metrics.parquet"
@@ -186,11 +185,7 @@ def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
 
     ``run.json`` holds only what must be the same for `--resume`.
     """
-    versions: dict[str, str] = {}
-    for name in _VERSIONS:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    content = {"settings": settings, "versions": versions}
+    content = {"settings": settings, "versions": versions_of(*_VERSIONS)}
     write_whole(directory / SETTINGS, json.dumps(content, indent=1, default=str) + "\n")
 
 

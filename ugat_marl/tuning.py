@@ -9,7 +9,6 @@ on, with the same seeds for all.
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import itertools
 import json
 import math
@@ -27,6 +26,7 @@ from ugat_marl.files import user_cache, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.results import Trial, Tuned
 from ugat_marl.scenario import Scenario
+from ugat_marl.versions import version_of
 
 VERSION = 1
 """Rises whenever the rules or the race change, so that what was remembered no longer holds."""
@@ -198,7 +198,7 @@ def _place(
     world = in_domain(scenario, domain)
     if duration_s is not None:
         world = world.with_duration(duration_s)
-    sumo = importlib.metadata.version("eclipse-sumo")
+    sumo = version_of("eclipse-sumo")
     content = (VERSION, sumo, scenario.hash, world.hash, name, budget, TUNING_SEED, *specs)
     return user_cache("tuned") / f"{hashlib.sha256(repr(content).encode()).hexdigest()}.json"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import importlib.metadata
 import os
 import platform
 import shlex
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.executors import usable_cores
+from ugat_marl.versions import versions_of
 
 _LIBRARIES = (
     "ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch", "gymnasium", "pettingzoo",
@@ -27,7 +27,7 @@ def machine_facts() -> dict[str, Any]:
         "memory_gib": memory_gib(),
         "system": platform.platform(),
         "python": platform.python_version(),
-        "versions": {name: version_of(name) for name in _LIBRARIES},
+        "versions": versions_of(*_LIBRARIES),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": shlex.join([_program(), *sys.argv[1:]]),
     }
@@ -53,12 +53,4 @@ def memory_gib() -> float | None:
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
     except (AttributeError, ValueError, OSError):
-        return None
-
-
-def version_of(distribution: str) -> str | None:
-    """Installed version of a package, or None."""
-    try:
-        return importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
         return None

@@ -6,7 +6,6 @@ not installed beside the suite.
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
 import shutil
@@ -17,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.bench.machine import version_of
 from ugat_marl.errors import MeasurementError
 from ugat_marl.files import write_whole
+from ugat_marl.versions import version_of, versions_of
 
 SUMO_RL = "1.4.5"
 PETTINGZOO = "1.24.3"
@@ -63,7 +62,7 @@ def rival(cache: Path, say: Callable[[str], None]) -> Rival:
     Raises:
         MeasurementError: Installing failed; pip's words are in the message.
     """
-    libsumo = importlib.metadata.version("libsumo")
+    libsumo = version_of("libsumo")
     wanted = [f"sumo-rl=={SUMO_RL}", f"pettingzoo=={PETTINGZOO}", f"libsumo=={libsumo}"]
     python_version = ".".join(map(str, sys.version_info[:2]))
     folder = cache.resolve() / f"sumo-rl-{SUMO_RL}-libsumo-{libsumo}-py{python_version}"
@@ -81,7 +80,7 @@ def _install(folder: Path, python: Path, wanted: list[str]) -> None:
     shutil.rmtree(folder, ignore_errors=True)  # an interrupted run's
     folder.parent.mkdir(parents=True, exist_ok=True)
     _run([sys.executable, "-m", "venv", str(folder)], "no virtual environment could be made")
-    same = {name: version_of(name) for name in _OWN_VERSIONS}
+    same = versions_of(*_OWN_VERSIONS)
     constraints = folder / "constraints.txt"
     constraints.write_text("".join(f"{name}=={v}\n" for name, v in same.items() if v))
     options = ["--disable-pip-version-check", "--no-input", "--quiet", "-c", str(constraints)]

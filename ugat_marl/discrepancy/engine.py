@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib.metadata
 import io
 import itertools
 import time
@@ -33,6 +32,7 @@ from ugat_marl.files import user_cache, write_whole
 from ugat_marl.measured.data import Period
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed
+from ugat_marl.versions import version_of
 
 VERSION = 4
 """Of features and replays: a tally remembered under another version is not used."""
@@ -108,7 +108,8 @@ class Engine:
         self._days: OrderedDict[str, Day] = OrderedDict()
         self._known: dict[str, Replicate] = {}
         self._unmeasured = Unmeasured.of(periods)
-        head = (VERSION, FEATURES, scenario.hash, site.detectors, _versions(), seed)
+        versions = version_of("eclipse-sumo"), version_of("numpy")
+        head = (VERSION, FEATURES, scenario.hash, site.detectors, versions, seed)
         head += (self._unmeasured,) if self._unmeasured else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in site.places})
@@ -357,10 +358,6 @@ class Engine:
 def default_cache() -> Path:
     """Where tallies are remembered between runs: the user's cache folder."""
     return user_cache("replicates")
-
-
-def _versions() -> tuple[str, ...]:
-    return tuple(importlib.metadata.version(name) for name in ("eclipse-sumo", "numpy"))
 
 
 def _signals_hash(period: Period, answering: bool) -> str:

@@ -6,7 +6,6 @@ and one of the same scenario under the same signals needs few simulations.
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import shutil
 from collections.abc import Collection
@@ -34,6 +33,7 @@ from ugat_marl.files import write_whole
 from ugat_marl.measured.data import Measured
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenario import Scenario
+from ugat_marl.versions import versions_of
 
 __all__ = ["DiagnosisConfig", "Study", "corrected", "diagnose", "where"]
 
@@ -330,9 +330,7 @@ def _head(study: Study) -> dict[str, Any]:
         "verified_on_fitted_periods": not measured.of("heldout"),
         "policy_gap": None,
         "hashes": {"scenario": study.scenario.hash, "measured": measured.hash},
-        "versions": {
-            name: importlib.metadata.version(name) for name in ("ugat-marl", "eclipse-sumo")
-        },
+        "versions": versions_of("ugat-marl", "eclipse-sumo"),
     }
 
 

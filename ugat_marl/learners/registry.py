@@ -6,7 +6,6 @@ dataclass of its settings. Its policies are `DQNPolicy`, so that all of ``ugat-m
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.policy import AnyParallelEnv, Learner
+from ugat_marl.versions import version_of
 
 LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
 """Makes a fresh learner for the agents of an environment, its initial weights drawn from a seed."""
@@ -154,23 +154,16 @@ def require_known(name: str) -> None:
 def library_of(name: str) -> str:
     """The library that does a learner's work, with its version; "" for the suite's own learners."""
     library = _library(name)
-    return library and f"{library} {_version(library) or '-'}"
+    return library and f"{library} {version_of(library) or '-'}"
 
 
 def is_installed(name: str) -> bool:
     """Whether a learner's library is; the suite's own learners need none."""
-    return not _library(name) or bool(_version(_library(name)))
+    return not _library(name) or bool(version_of(_library(name)))
 
 
 def _library(name: str) -> str:
     return BASELINES[name].library if name in BASELINES else ""
-
-
-def _version(library: str) -> str:
-    try:
-        return importlib.metadata.version(library)
-    except importlib.metadata.PackageNotFoundError:
-        return ""
 
 
 def load_baseline(name: str) -> ModuleType:

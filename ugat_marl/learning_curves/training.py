@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.baseline import FIRST_SEED
-from ugat_marl.bench.machine import version_of
 from ugat_marl.effects import load
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.evaluation import PolicyFactory, evaluate, fixed_policy
@@ -27,6 +26,7 @@ from ugat_marl.learners.registry import (
 )
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import parallel_env
+from ugat_marl.versions import versions_of
 
 CURVE = "curve.json"
 DOMAIN = "sim"
@@ -169,7 +169,7 @@ def made_now(scenario: str, learner: str) -> Mapping[str, Any]:
         "scenario": load(scenario).hash,
         "library": library_of(learner),
         "settings": settings_of(learner),
-        "versions": {key: version_of(key) for key in ("eclipse-sumo", "torch")},
+        "versions": versions_of("eclipse-sumo", "torch"),
     }
     return json.loads(json.dumps(made))
 

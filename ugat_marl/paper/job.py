@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import importlib.metadata
 import json
 import os
 import sys
@@ -41,6 +40,7 @@ from ugat_marl.traffic_env import parallel_env
 from ugat_marl.training import Run
 from ugat_marl.tuning import tuned_rules
 from ugat_marl.ugat import State, UgatConfig, restore, train_ugat
+from ugat_marl.versions import versions_of
 
 JOB, SCORES, POLICY, LEARNER, RULE = (
     "job.json", "scores.json", "policy.pt", "learner.pt", "rule.txt",
@@ -95,7 +95,7 @@ class Job:
             settings.pop(other)
         worlds = sorted({world for world in (self.sim, self.target, self.world) if world})
         hashes = {world: _hash(self.scenario, world) for world in worlds}
-        versions = {name: importlib.metadata.version(name) for name in ("eclipse-sumo", "torch")}
+        versions = versions_of("eclipse-sumo", "torch")
         return {**settings, "worlds": hashes, "versions": versions}
 
     @property
