@@ -426,6 +426,15 @@ def test_other_agents_than_the_learners_are_refused():
         learner.policy().act(renamed, infos)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_observations_that_are_no_numbers_are_refused(value: float) -> None:
+    env = CueEnv((2, 3))
+    observations, infos = env.reset(seed=0)
+    observations["signal_1"][0] = value
+    with pytest.raises(OptionError, match="'signal_1' holds NaN or infinity"):
+        DQN.of(env, QUICK).policy().act(observations, infos)
+
+
 def test_masks_that_allow_nothing_or_have_the_wrong_length_are_errors():
     agents = AgentSet(("a", "b"), (1, 1), (2, 3))
     with pytest.raises(ActionError, match="'b' allows no action"):

@@ -60,7 +60,8 @@ class AgentSet:
         """Observations as one array ``(agents, widest_observation)``, padded with zeros.
 
         Raises:
-            OptionError: An agent is missing, unknown, or its vector has another length.
+            OptionError: An agent is missing, unknown, or its vector has another length or holds
+                what is not a number.
         """
         if len(observations) != len(self.names):
             raise OptionError(
@@ -78,6 +79,9 @@ class AgentSet:
                     "scenario and the observation this policy was trained with"
                 )
             stacked[row, :size] = vector
+        if not np.isfinite(stacked).all():
+            name = self.names[int(np.isfinite(stacked).all(axis=1).argmin())]
+            raise OptionError(f"the observation of agent {name!r} holds NaN or infinity")
         return stacked
 
     def masks(self, infos: Infos) -> Mask:

@@ -79,7 +79,8 @@ class DQNPolicy:
         """The greedy action of every agent.
 
         Raises:
-            OptionError: The observations are not of the agents this policy was trained for.
+            OptionError: The observations are not of the agents this policy was trained for, or not
+                finite.
         """
         stacked = torch.from_numpy(self.agents.stack(observations))
         allowed = torch.from_numpy(self.agents.masks(infos))
