@@ -60,12 +60,12 @@ class BenchMARLConfig:
     learning_rate: float = 1e-3  # step size of Adam
     discount: float = 0.8  # weight of the next decision's value (gamma)
     max_gradient: float = 5.0  # longer gradients are scaled down to this norm
-    replay: int = 20_000  # decisions it remembers
+    replay: int = 2_000  # decisions it remembers: the jams of the beginning drown what comes later
     batch: int = 64  # decisions in a gradient step
     update_every: int = 20  # decisions played between updates; the end of an episode ends one too
-    updates: int = 20  # gradient steps then
-    explore: int = 1_000  # decisions over which random actions get rare
-    least_exploration: float = 0.03  # share of random actions that stays
+    updates: int = 10  # gradient steps then
+    explore: int = 2_400  # decisions over which random actions get rare
+    least_exploration: float = 0.05  # share of random actions that stays
     target_rate: float = 0.01  # share by which the target network follows at each gradient step
 
     def __post_init__(self) -> None:
