@@ -22,6 +22,7 @@ from ugat_marl.discrepancy.hypotheses import (
 from ugat_marl.effects import SETTINGS, Domain, Effect, in_domain
 from ugat_marl.errors import ScenarioError
 from ugat_marl.learners.agents import AgentSet
+from ugat_marl.policy import Begun
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
@@ -103,9 +104,7 @@ class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
         self._agents = AgentSet.of(self.env)
         self._generator = numpy_generator(0, "worlds")
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
         """Starts an episode in a world of its own.
 
         Args:

@@ -19,7 +19,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.actions import checked_phases
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
-from ugat_marl.policy import AnyParallelEnv
+from ugat_marl.policy import AnyParallelEnv, Stepped
 
 Vectors = Mapping[str, NDArray[np.float32]]
 Infos = dict[str, dict[str, Any]]
@@ -134,15 +134,7 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
         told = self._told(infos)
         return self._seen(observations, told), told
 
-    def step(
-        self, actions: dict[str, Any]
-    ) -> tuple[
-        dict[str, Any],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
-    ]:
+    def step(self, actions: dict[str, Any]) -> Stepped:
         """Passes actions on, and observations back.
 
         Raises:

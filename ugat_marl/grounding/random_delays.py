@@ -6,7 +6,7 @@ from typing import Any
 
 from pettingzoo.utils import BaseParallelWrapper
 
-from ugat_marl.policy import AnyParallelEnv
+from ugat_marl.policy import AnyParallelEnv, Begun, Stepped
 from ugat_marl.seeding import numpy_generator
 
 LEAST_CHANCE = 0.5
@@ -28,24 +28,14 @@ class RandomDelays(BaseParallelWrapper[str, Any, Any]):
         self._most_s = most_s
         self._generator = numpy_generator(0, "delays")
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
         """Starts an episode; `seed` decides the delays, too."""
         if seed is not None:
             self._generator = numpy_generator(seed, "delays")
         self._chance = self._generator.uniform(LEAST_CHANCE, 1.0)
         return self.env.reset(seed=seed, options=options)
 
-    def step(
-        self, actions: dict[str, Any]
-    ) -> tuple[
-        dict[str, Any],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
-    ]:
+    def step(self, actions: dict[str, Any]) -> Stepped:
         """Executes the actions with delays."""
         agents = list(self.env.agents)
         if not agents:  # after the last step; the environment itself says so

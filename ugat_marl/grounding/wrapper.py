@@ -12,7 +12,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from ugat_marl.errors import ActionError, OptionError
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import Moment
-from ugat_marl.policy import AnyParallelEnv
+from ugat_marl.policy import AnyParallelEnv, Stepped
 
 Infos = dict[str, dict[str, Any]]
 
@@ -56,15 +56,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         self._notice(observations, infos)
         return observations, _extended(infos, self.env.agents)
 
-    def step(
-        self, actions: dict[str, Any]
-    ) -> tuple[
-        dict[str, Any],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
-    ]:
+    def step(self, actions: dict[str, Any]) -> Stepped:
         """Grounds the actions and executes the outcome.
 
         Raises:

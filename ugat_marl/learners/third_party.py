@@ -30,7 +30,7 @@ from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionE
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_policy import DQNPolicy, header, parse_header
 from ugat_marl.learners.scaling import InputScale, RewardScale, places
-from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
+from ugat_marl.policy import AnyParallelEnv, Begun, EpisodeCallback, Stepped
 from ugat_marl.seeding import derive_seed, numpy_generator
 
 
@@ -162,9 +162,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         self._places = places(self._agents)
         self._allowed: NDArray[np.bool_] | None = None
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
         """Starts the next episode; its number decides the seed, whatever is given."""
         seed = derive_seed(self._seed, "learner", "episode", self._learner.episodes)
         observations, infos = self.env.reset(seed=seed, options=options)
@@ -172,15 +170,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         self._return = 0.0
         return self._seen(observations), infos
 
-    def step(
-        self, actions: dict[str, Any]
-    ) -> tuple[
-        dict[str, Any],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
-    ]:
+    def step(self, actions: dict[str, Any]) -> Stepped:
         """Executes actions; rewards come back centred and scaled."""
         if not self.env.agents or self._allowed is None:  # the environment itself says so
             return self.env.step(actions)

@@ -16,6 +16,7 @@ from pettingzoo import ParallelEnv
 
 from ugat_marl.errors import ActionError, EpisodeError
 from ugat_marl.metrics import Scores
+from ugat_marl.policy import Stepped
 from ugat_marl.transitions import AgentLayout
 
 CAPACITY = 20
@@ -107,15 +108,7 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         self._queue = {a: np.zeros(self.layouts[a].features, np.int64) for a in self.agents}
         return self._observe(), self._infos()
 
-    def step(
-        self, actions: Mapping[str, int]
-    ) -> tuple[
-        dict[str, NDArray[np.float32]],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
-    ]:
+    def step(self, actions: Mapping[str, int]) -> Stepped:
         """Shows the chosen phases for one interval."""
         if not actions and self._scores is not None:
             return {}, {}, {}, {}, {}
