@@ -16,7 +16,6 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -43,6 +42,7 @@ from ugat_marl.learning_curves.training import (
     played,
     word,
 )
+from ugat_marl.lifeline import end_with_input
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.scenario import Scenario
 from ugat_marl.training import locked
@@ -160,7 +160,7 @@ class Results:
 
 def one_of_them(folder: Path) -> int:
     """Performs the training described in a folder; it ends when its standard input does."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_input()
     try:
         with warnings.catch_warnings(), contextlib.closing(locked(folder)):
             warnings.simplefilter("ignore")
@@ -169,12 +169,6 @@ def one_of_them(folder: Path) -> int:
         print(" ".join(str(error).split()), file=sys.stderr)
         return 2
     return 0
-
-
-def _end_with_parent() -> None:
-    while os.read(0, 1024):  # not sys.stdin, whose lock would be in the way of an orderly end
-        pass
-    os._exit(1)
 
 
 def perform_all(plan: Sequence[Training], runs: Path, jobs: int, reporter: Reporter) -> list[str]:

@@ -1,4 +1,4 @@
-"""How a simulation's process notices that nobody waits for it any more, and how it goes."""
+"""How a process notices that nobody waits for it any more, and how it goes."""
 
 from __future__ import annotations
 
@@ -24,6 +24,20 @@ def abandoned(parent: int, user: int) -> bool:
     except (ProcessLookupError, PermissionError):  # gone, or its number is somebody else's by now
         return True
     return False
+
+
+def end_with_input() -> None:
+    """Ends this process, with exit code 1, once standard input ends: whoever started it is gone.
+
+    It is read past `sys.stdin`, whose lock would be in the way of an orderly end.
+    """
+
+    def watch() -> None:
+        while os.read(0, 1024):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 class Lifeline:

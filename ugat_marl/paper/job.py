@@ -9,9 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import os
 import sys
-import threading
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,6 +27,7 @@ from ugat_marl.grounding.view import neighbours_of
 from ugat_marl.learners.dqn import DQN
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
+from ugat_marl.lifeline import end_with_input
 from ugat_marl.metrics import Scores
 from ugat_marl.paper.settings import Kind
 from ugat_marl.policy import AnyParallelEnv, Policy
@@ -244,7 +243,7 @@ def _world(job: Job) -> AnyParallelEnv:
 
 def main(folder: Path) -> int:
     """Performs the job in a folder; returns the exit code."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_input()
     try:
         job = TypeAdapter(Job).validate_json((folder / JOB).read_bytes())
         perform(job, folder, Bars(Console(width=100)))
@@ -252,12 +251,6 @@ def main(folder: Path) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0
-
-
-def _end_with_parent() -> None:
-    """Standard input ends when whoever started this program does."""
-    sys.stdin.buffer.read()
-    os._exit(1)
 
 
 if __name__ == "__main__":
