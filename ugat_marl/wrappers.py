@@ -19,7 +19,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.actions import checked_phases
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
-from ugat_marl.policy import AnyParallelEnv, Stepped
+from ugat_marl.policy import AnyParallelEnv, Begun, Stepped
 
 Vectors = Mapping[str, NDArray[np.float32]]
 Infos = dict[str, dict[str, Any]]
@@ -125,9 +125,7 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
         """The space of an agent's actions, the same object at each call."""
         return self.action_spaces[agent]
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], Infos]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
         """Starts an episode of the environment within."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._begin()

@@ -12,7 +12,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from ugat_marl.errors import ActionError, OptionError
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import Moment
-from ugat_marl.policy import AnyParallelEnv, Stepped
+from ugat_marl.policy import AnyParallelEnv, Begun, Stepped
 
 Infos = dict[str, dict[str, Any]]
 
@@ -46,9 +46,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         self.transform = transform
         self._earlier: deque[Moment] = deque(maxlen=transform.inputs.history - 1)
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], Infos]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
         """Starts an episode of the wrapped environment."""
         self.transform.gate.end_epoch()
         observations, infos = self.env.reset(seed=seed, options=options)
