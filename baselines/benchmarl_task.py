@@ -48,6 +48,10 @@ from ugat_marl.wrappers import agent_indicator, pad
 
 ALGORITHMS = ("qmix", "vdn")
 _GROUP = "agents"
+_STATE_DEPENDENCE = 0.1
+"""What is left of the drawn weights by which QMIX's mixing follows the state."""
+_LINEAR_DOWN_TO = 3.0
+"""Input of the mixing network's units where agents' values are 0; below 0 their ELU saturates."""
 
 
 @dataclass(frozen=True)
@@ -190,6 +194,27 @@ class BenchMARL(LibraryLearner):
         self._loss: Any = self._experiment.losses[_GROUP]
         self._buffer: Any = self._experiment.replay_buffers[_GROUP]
         self._decisions = 0
+        if config.algorithm == "qmix":
+            self._begin_as_a_sum()
+
+    def _begin_as_a_sum(self) -> None:
+        """Makes QMIX's first value the sum of its agents' values, as VDN's is, or nearly so.
+
+        As layers are drawn, the mixing network multiplies it by four or more: agents' networks then
+        have to learn what is a quarter as large, in the same noise.
+        """
+        weight = self.config.mixing**-0.5
+        with torch.no_grad():
+            for name, tensor in self._networks().items():
+                layer = name.partition("mixer_network_params.module.")[2]
+                if layer.startswith("hyper"):
+                    tensor.mul_(_STATE_DEPENDENCE)
+                if layer in ("hyper_w_1.bias", "hyper_w_final.bias"):
+                    tensor.add_(weight)
+                elif layer == "hyper_b_1.bias":
+                    tensor.add_(_LINEAR_DOWN_TO)
+                elif layer == "V.2.bias":
+                    tensor.sub_(_LINEAR_DOWN_TO / weight)
 
     def _made(self, env: AnyParallelEnv, seed: int) -> Any:
         given = self.config

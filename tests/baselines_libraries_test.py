@@ -321,6 +321,19 @@ def test_values_bootstrap_where_an_episode_is_cut_off(name: str) -> None:
     assert value_of(name, learner) == pytest.approx(wanted, abs=0.2)
 
 
+@pytest.mark.skipif(importlib.util.find_spec("benchmarl") is None, reason="no BenchMARL")
+def test_qmix_begins_as_a_sum_over_its_agents() -> None:
+    learner = made("qmix", PaidEnv(agents=16), "mixing=32")
+    loss, draws = learner._loss, torch.Generator().manual_seed(0)
+    values = torch.randn(200, 16, 1, generator=draws)
+    states = torch.randn(200, 64, generator=draws)
+    for parameters in (loss.mixer_network_params, loss.target_mixer_network_params):
+        with torch.no_grad(), parameters.to_module(loss.mixer_network):
+            mixed = loss.mixer_network.module(values, states).flatten()
+        line = np.polyfit(values.sum((1, 2)).numpy(), mixed.numpy(), 1)
+        assert line == pytest.approx([1.0, 0.0], abs=0.5), "slope and level"
+
+
 # skrl updates agent by agent
 @pytest.mark.parametrize("name", [item for item in NAMES if "skrl" not in str(item.values[0])])
 def test_more_agents_are_no_more_gradient_steps(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
