@@ -37,19 +37,22 @@ def radar_picture(found: Comparison, settings: Sequence[str], path: Path) -> Non
     with mpl.rc_context(_STYLE):
         count = len(found.targets)
         columns = min(count, 4)
-        figure = Figure(figsize=(3.3 * columns, 4.0 * math.ceil(count / columns)), dpi=120)
+        rows = math.ceil(count / columns)
+        width, height = max(3.3 * columns, 6.6), 3.4 * rows + 1.1
+        figure = Figure(figsize=(width, height), dpi=120)
         for place, target in enumerate(found.targets):
-            axes: Any = figure.add_subplot(
-                math.ceil(count / columns), columns, place + 1, projection="polar"
-            )
+            axes: Any = figure.add_subplot(rows, columns, place + 1, projection="polar")
             _radar(axes, found, [s for s in settings if found.has(s, target)], target)
         handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="lower center", ncols=min(columns, 2), frameon=False)
+        figure.legend(handles, labels, loc="lower center", ncols=2, frameon=False)
         figure.suptitle(
             f"{found.scenario}: simulation against real domain; the rim is the best value",
-            fontsize=11, x=0.01, ha="left",
+            fontsize=11, x=0.01, y=1 - 0.1 / height, ha="left", va="top",
         )  # fmt: skip
-        figure.subplots_adjust(left=0.06, right=0.94, top=0.80, bottom=0.24, wspace=0.55)
+        figure.subplots_adjust(  # inches for the title, the legend, and names around each circle
+            left=0.5 / width, right=1 - 0.5 / width, wspace=0.4,
+            top=1 - 1.1 / height, bottom=1.0 / height, hspace=0.45,
+        )  # fmt: skip
         with replacing(path) as temporary:
             figure.savefig(temporary, format="png")
 
