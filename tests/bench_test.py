@@ -22,6 +22,7 @@ from ugat_marl.bench import (
 )
 from ugat_marl.bench.episode import RecordingSimulator, random_actions
 from ugat_marl.bench.learning_episodes import Noise, Tape
+from ugat_marl.bench.machine import machine_facts
 from ugat_marl.bench.measured import in_fresh_process
 from ugat_marl.bench.memory import growth_of
 from ugat_marl.bench.memory_resets import family, look
@@ -101,6 +102,22 @@ def test_a_process_finds_itself() -> None:
     before = seen["open files"]
     with Path(__file__).open():
         assert look()["open files"] == before + 1
+
+
+@pytest.mark.parametrize(
+    ("program", "typed"),
+    [
+        ("/opt/lib/ugat_marl/__main__.py", "ugat-marl --seeds 2"),
+        ("/opt/bin/ugat-marl", "ugat-marl --seeds 2"),
+        ("baselines/results.py", "python baselines/results.py --seeds 2"),
+        ("/opt/work/baselines/results.py", "python results.py --seeds 2"),
+    ],
+)
+def test_the_command_is_what_one_would_type(
+    program: str, typed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", [program, "--seeds", "2"])
+    assert machine_facts()["command"] == typed
 
 
 def test_a_measured_program_that_fails_says_why(tmp_path: Path) -> None:

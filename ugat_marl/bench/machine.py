@@ -29,13 +29,18 @@ def machine_facts() -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": versions_of(*_LIBRARIES),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": shlex.join([_program(), *sys.argv[1:]]),
+        "command": shlex.join([*_program(), *sys.argv[1:]]),
     }
 
 
-def _program() -> str:
-    name = Path(sys.argv[0]).name
-    return "ugat-marl" if name == "__main__.py" else name
+def _program() -> list[str]:
+    """What to type for the running program; of an absolute path only the name."""
+    path = Path(sys.argv[0])
+    if path.name == "__main__.py":
+        return ["ugat-marl"]
+    if path.suffix == ".py":
+        return ["python", path.name if path.is_absolute() else path.as_posix()]
+    return [path.name]
 
 
 def cpu_model() -> str:
