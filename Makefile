@@ -2,7 +2,7 @@
 #
 #   make demo       trains a policy across the gap on a shipped network and prints the table
 #   make test       builds the wheel, installs it into .venv and tests it
-#   make test-all   the same, and small versions of the paper's tables (half an hour)
+#   make test-all   the same, and small versions of the paper's tables (an hour)
 #   make check      format, lint, types, architecture, tests
 #   make compat     the learners of other libraries: what runs where (LATEST=1: their newest releases)
 #   make bench      the figures of docs/, measured on this machine

@@ -1,7 +1,7 @@
 """Small versions of the paper's tables: does each show the direction its effect has?
 
-`make test-all` runs them; a quarter of an hour of two cores. All share their trainings, in a folder
-that is kept between runs of this file in one session.
+`make test-all` runs them; three quarters of an hour of two cores. All share their trainings, in a
+folder that is kept between runs of this file in one session.
 """
 
 from __future__ import annotations
