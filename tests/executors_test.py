@@ -33,13 +33,13 @@ from ugat_marl.executors import (
     as_done,
     executor_of,
     parts_at_a_time,
+    persistently,
     usable_cores,
 )
 from ugat_marl.loops import standard_detectors
 from ugat_marl.measured.data import Period
 from ugat_marl.network import Network
 from ugat_marl.policy import Policy
-from ugat_marl.rollout import ATTEMPTS, persistently
 from ugat_marl.traffic_env import TrafficEnv
 from ugat_marl.transitions import TransitionLog
 from ugat_marl.worlds import RollOut, roll_outs
@@ -121,7 +121,7 @@ def test_processes_that_die_are_replaced(tmp_path: Path) -> None:
         assert len(list(tmp_path.iterdir())) == 3
         with pytest.raises(BrokenProcessPool):
             processes.submit(exec, always).result()
-        assert len(list(tmp_path.iterdir())) == 3 + 1 + RETRIES
+        assert len(list(tmp_path.iterdir())) == 4 + RETRIES
         with pytest.raises(ValueError, match="^invalid literal for int"):
             processes.submit(int, "one").result()
         assert processes.submit(int, "1").result() == 1
@@ -189,7 +189,7 @@ def test_a_day_of_a_diagnosis_whose_simulator_dies_is_simulated_again(
     assert len(ends) == 100
     with pytest.raises(SimulatorCrashed, match="exit code -9"):
         engine_of(data, 1).replicates([], [0])
-    assert len(ends) == 100 - ATTEMPTS
+    assert len(ends) == 99 - RETRIES
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def test_an_episode_whose_simulator_dies_is_played_again(tmp_path: Path) -> None
     assert len(list(folder.iterdir())) == 2
     with pytest.raises(SimulatorCrashed, match="died"):
         results(1, {"rule": Killed(folder, 100)})
-    assert len(list(folder.iterdir())) == 2 + ATTEMPTS
+    assert len(list(folder.iterdir())) == 3 + RETRIES
 
 
 def test_other_errors_are_not_tried_again() -> None:

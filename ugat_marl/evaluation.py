@@ -18,13 +18,14 @@ from ugat_marl.executors import (
     as_done,
     in_this_process,
     parts_at_a_time,
+    persistently,
 )
 from ugat_marl.learners.agents import AgentSet
 from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.policy import Policy
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.results import Evaluation, Result, Trial
-from ugat_marl.rollout import StepCallback, persistently, roll_out, until
+from ugat_marl.rollout import StepCallback, roll_out, until
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 

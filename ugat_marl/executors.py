@@ -28,7 +28,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, SimulatorCrashed
 
 Workers = int | Executor | None
 """Parts at a time, None for the number of usable cores; or an executor."""
@@ -36,7 +36,21 @@ Workers = int | Executor | None
 Done = TypeVar("Done")
 
 RETRIES = 3
-"""So often a part is taken up again whose process died."""
+"""So often work is taken up again whose process died."""
+
+
+def persistently(work: Callable[[], Done], death: type[Exception] = SimulatorCrashed) -> Done:
+    """Does something; again, to the same result, if a process that it needs died meanwhile.
+
+    Args:
+        work: What to do; an episode, say.
+        death: What it raises when the process died; by default that of a simulator. Raised if it
+            died each time.
+    """
+    for _ in range(RETRIES):
+        with contextlib.suppress(death):
+            return work()
+    return work()
 
 
 class Stop(threading.Event):
@@ -132,7 +146,8 @@ class LocalProcesses(Executor):
 
         The part raises `BrokenProcessPool` if its process died each time.
         """
-        return self._threads.submit(self._persistently, functools.partial(fn, *args, **kwargs))
+        part = functools.partial(fn, *args, **kwargs)
+        return self._threads.submit(persistently, lambda: self._done(part), BrokenProcessPool)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Ends the processes once they have done what was submitted, or what they are at."""
@@ -140,15 +155,6 @@ class LocalProcesses(Executor):
         self._is_open = False
         while self._idle:
             self._idle.pop().shutdown(wait)
-
-    def _persistently(self, part: Callable[[], Any]) -> Any:
-        for left in reversed(range(RETRIES + 1)):
-            try:
-                return self._done(part)
-            except BrokenProcessPool:
-                if not left:
-                    raise
-        raise AssertionError
 
     def _done(self, part: Callable[[], Any]) -> Any:
         try:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.errors import SimulatorCrashed
 from ugat_marl.measurements import Snapshot
 from ugat_marl.observations import UNITS, Observer
 from ugat_marl.policy import Actions, AnyParallelEnv, Infos, Observations, Policy
@@ -53,27 +52,6 @@ def until(stop: threading.Event) -> StepCallback:
             raise Stopped
 
     return check
-
-
-Result = TypeVar("Result")
-
-ATTEMPTS = 4
-"""So often an episode is begun whose simulator dies."""
-
-
-def persistently(play: Callable[[], Result]) -> Result:
-    """Plays an episode; again, to the same result, if the simulator's process died meanwhile.
-
-    Raises:
-        SimulatorCrashed: It died each time.
-    """
-    for attempt in range(1, ATTEMPTS + 1):
-        try:
-            return play()
-        except SimulatorCrashed:
-            if attempt == ATTEMPTS:
-                raise
-    raise AssertionError
 
 
 def roll_out(

@@ -12,12 +12,12 @@ import polars as pl
 from ugat_marl.effects import Domain
 from ugat_marl.errors import LogError
 from ugat_marl.evaluation import PolicyFactory
-from ugat_marl.executors import Stop, Workers, as_done
+from ugat_marl.executors import Stop, Workers, as_done, persistently
 from ugat_marl.grounding.random_delays import RandomDelays
 from ugat_marl.metrics import Scores
 from ugat_marl.policy import AnyParallelEnv, Policy
 from ugat_marl.progress import Reporter, Silent
-from ugat_marl.rollout import Exploring, observer_of, persistently, roll_out, until
+from ugat_marl.rollout import Exploring, observer_of, roll_out, until
 from ugat_marl.scenario import Scenario
 from ugat_marl.seeding import derive_seed, numpy_generator
 from ugat_marl.traffic_env import TrafficEnv, parallel_env

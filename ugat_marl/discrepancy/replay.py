@@ -32,13 +32,13 @@ from ugat_marl.effects.base import Effect
 from ugat_marl.effects.detectors import DetectorEffect
 from ugat_marl.effects.signals import late_greens
 from ugat_marl.errors import MeasuredDataError, SimulatorCrashed, SimulatorError
+from ugat_marl.executors import persistently
 from ugat_marl.files import xml_bytes
 from ugat_marl.loops import loops_document, read_loops
 from ugat_marl.measured.data import Detector, Period, SignalLog
 from ugat_marl.measured.pairing import as_logged
 from ugat_marl.network import Network
 from ugat_marl.redraw import explicit, redrawn, sumo_program
-from ugat_marl.rollout import persistently
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.seeding import derive_seed
 from ugat_marl.signals import delayed_log
