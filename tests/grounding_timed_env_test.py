@@ -279,14 +279,17 @@ def test_the_kind_of_grounding_decides_what_is_made(env: TrafficEnv) -> None:
         replace(timely, forward=ForwardConfig(include_phase=True)).transform(env.layouts, 0)
 
 
-def test_a_run_with_timed_grounding_resumes_where_it_was(tmp_path: Path) -> None:
-    transfer(SMALL, tmp_path / "unbroken")
+@pytest.mark.parametrize("match", [False, True])
+def test_a_run_with_timed_grounding_resumes_where_it_was(match: bool, tmp_path: Path) -> None:
+    timed = replace(SMALL.ugat.timed, match=match)
+    small = replace(SMALL, ugat=replace(SMALL.ugat, timed=timed))
+    transfer(small, tmp_path / "unbroken")
     with pytest.raises(Killed):
-        transfer(SMALL, tmp_path / "run", reporter=KillAt("fitting f and h, round 2"))
-    other = replace(SMALL, ugat=replace(SMALL.ugat, grounding="phase"))
+        transfer(small, tmp_path / "run", reporter=KillAt("fitting f and h, round 2"))
+    other = replace(small, ugat=replace(small.ugat, grounding="phase"))
     with pytest.raises(CheckpointError, match="holds another run"):
         transfer(other, tmp_path / "run", resume=True)
-    transfer(SMALL, tmp_path / "run", resume=True)
+    transfer(small, tmp_path / "run", resume=True)
     one, two = (pl.read_parquet(tmp_path / n / "metrics.parquet") for n in ("run", "unbroken"))
     assert one.equals(two)
     table = [(tmp_path / name / "table.json").read_text() for name in ("run", "unbroken")]
@@ -303,6 +306,7 @@ def test_a_run_with_timed_grounding_resumes_where_it_was(tmp_path: Path) -> None
             assert (step, name) in numbers, name
         assert 0 <= numbers[step, "lost_time/low_s"] <= numbers[step, "lost_time/best_s"]
         assert numbers[step, "lost_time/best_s"] <= numbers[step, "lost_time/high_s"] <= 3
+        assert ((step, "lost_time/matched_s/signal_0") in numbers) == match
     assert numbers[1, "gate/alpha"] == np.inf
     assert numbers[2, "gate/alpha"] == pytest.approx(numbers[1, "gate/mean_u"])
 

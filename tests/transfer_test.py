@@ -15,6 +15,7 @@ import torch
 import ugat_marl.transfer as transfer_module
 from ugat_marl.__main__ import main
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
+from ugat_marl.grounding.delays import TimedConfig
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.random_delays import RandomDelays
 from ugat_marl.learners.dqn_config import DQNConfig
@@ -190,7 +191,11 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
         ({"random_delay_s": 0}, "random_delay_s = 0: must be at least 1"),
         ({"real": "none", "real_log": Path("x"), "oracle": True}, "oracle needs a real domain"),
         ({"real": "none", "real_log": Path("x"), "fine_tuned": True}, "needs a real domain"),
-        ({"real_log": Path("x"), "fine_tuned": True}, "which a real_log does not allow"),
+        ({"real_log": Path("x"), "fine_tuned": True}, "a real_log does not allow it"),
+        (
+            {"real_log": Path("x"), "ugat": UgatConfig("timed", timed=TimedConfig(match=True))},
+            "timed match acts in the real domain",
+        ),
         ({"real": "sim"}, '"same-world"'),
         ({"real": "sim", "placebo": "noise"}, "is the simulation itself"),
         ({"real": "sim", "placebo": "same-world", "oracle": True}, "oracle needs a real domain"),

@@ -30,6 +30,8 @@ def test_an_executor_plays_the_same(most_delay_s: int) -> None:
             one, other = (world.collect(policy, iteration, 7) for world in (here, there))
             assert one is not None and other is not None
             assert one.frame.equals(other.frame)
+        logs = zip(*(world.under_delays(policy, 0, 7) for world in (here, there)), strict=True)
+        assert [one.frame.equals(other.frame) for one, other in logs] == [True] * (most_delay_s + 1)
     here.close()
     there.close()
 

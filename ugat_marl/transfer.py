@@ -163,8 +163,9 @@ class TransferConfig:
         for name in ("fine_tuned", "oracle"):
             if getattr(self, name) and len(self.domains) < 2:
                 raise OptionError(f"{name} needs a real domain to train in, not {self.real!r}")
-        if self.fine_tuned and self.real_log is not None:
-            raise OptionError("fine_tuned acts in the real domain, which a real_log does not allow")
+        for name, acts in (("fine_tuned", self.fine_tuned), ("timed match", self.ugat.matches)):
+            if acts and self.real_log is not None:
+                raise OptionError(f"{name} acts in the real domain; a real_log does not allow it")
 
     @property
     def env_options(self) -> dict[str, Any]:
@@ -380,14 +381,13 @@ def _other_env(
 def _identity(
     config: TransferConfig, scenario: Scenario, env: TrafficEnv, controls: Sequence[Control]
 ) -> dict[str, Any]:
-    settings = {**asdict(config), "dqn": config.dqn.identity}
+    settings = {**asdict(config), "dqn": config.dqn.identity, "ugat": config.ugat.identity}
     for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", "device", "corrected", *ADDED):
         settings.pop(other)
     if config.placebo == "none":  # runs from before there were any can be resumed
         settings.pop("placebo")
     if config.learner == DQN_NAME:  # the same
-        settings.pop("learner")
-        settings.pop("learner_settings")
+        del settings["learner"], settings["learner_settings"]
     log = config.real_log  # the same if its content is, wherever it lies
     settings["real_log"] = hashlib.sha256(log.read_bytes()).hexdigest() if log else None
     hashes = {"sim": env.scenario.hash}

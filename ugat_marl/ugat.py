@@ -9,11 +9,13 @@ from __future__ import annotations
 import concurrent.futures
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ugat_marl.devices import device_of
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -24,6 +26,7 @@ from ugat_marl.grounding.fitting import fit
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig, GateReport
 from ugat_marl.grounding.inverse import InverseConfig
+from ugat_marl.grounding.matching import matching_delays, mean_rewards
 from ugat_marl.grounding.timed import TimedTransform
 from ugat_marl.grounding.timed_fitting import fit_timed
 from ugat_marl.grounding.timed_report import TimedReport
@@ -34,7 +37,7 @@ from ugat_marl.policy import AnyParallelEnv, Learner, Policy
 from ugat_marl.seeding import derive_seed
 from ugat_marl.training import Run
 from ugat_marl.transitions import AgentLayout, TransitionLog
-from ugat_marl.worlds import World
+from ugat_marl.worlds import SimulatedWorld, World
 
 CHUNK = 10
 """Episodes of plain training between two checkpoints."""
@@ -89,6 +92,19 @@ class UgatConfig:
     def most_delay_s(self) -> int:
         """Longest of the random delays in the roll-outs for D_sim; 0 for none."""
         return self.timed.most_s if self.grounding == "timed" else 0
+
+    @property
+    def matches(self) -> bool:
+        """Whether the simulation is asked under which delays it pays what the street pays."""
+        return self.grounding == "timed" and self.timed.match
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The settings by which runs are told apart; later ones only if they are used."""
+        settings = asdict(self)
+        if not self.timed.match:  # runs from before it could can be resumed
+            settings["timed"].pop("match")
+        return settings
 
     def transform(
         self,
@@ -157,7 +173,7 @@ Probe = Callable[[Policy], Mapping[str, float]]
 def train_ugat(
     state: State,
     env: AnyParallelEnv,
-    sim: World,
+    sim: SimulatedWorld,
     real: World,
     config: UgatConfig,
     seed: int,
@@ -188,7 +204,8 @@ def train_ugat(
         i = state.iteration
         policy = state.learner.policy()
         _collect(state, sim, real, policy, i, seed, run)
-        report = _fit(state, config, derive_seed(seed, "fit", i), run, i, place)
+        matched = _match(state, sim, policy, i, seed, run) if config.matches else None
+        report = _fit(state, config, derive_seed(seed, "fit", i), run, i, place, matched)
         if config.least_accuracy is not None:
             state.transform.gate.trust(report.trusted(config.least_accuracy))
         state.transform.gate.begin(report.expected_u)
@@ -258,6 +275,18 @@ def _collect(
             advance()
 
 
+def _match(
+    state: State, sim: SimulatedWorld, policy: Policy, iteration: int, seed: int, run: Run
+) -> NDArray[np.float64]:
+    """The delays, ``(agents,)``, with which `sim` pays the policy what the street just paid it."""
+    agents = state.transform.stack.agents
+    with run.reporter.task(f"roll-outs under delays, round {iteration + 1}", 1) as advance:
+        logs = sim.under_delays(policy, iteration, seed)
+        advance()
+    street, *simulated = [mean_rewards(log, agents) for log in (state.real[-1], *logs)]
+    return matching_delays(street, np.array(simulated))
+
+
 def _fit(
     state: State,
     config: UgatConfig,
@@ -265,6 +294,7 @@ def _fit(
     run: Run,
     iteration: int,
     device: torch.device,
+    matched: NDArray[np.float64] | None,
 ) -> FitReport | TimedReport:
     transform = state.transform
     real, simulated = (TransitionLog.concatenate(logs) for logs in (state.real, state.simulated))
@@ -275,7 +305,8 @@ def _fit(
             go(note=f"{model} {loss:.2g}")
 
         if isinstance(transform, TimedTransform):
-            report = fit_timed(transform, real, simulated, config.fit, seed, on_epoch, device)
+            how = config.fit, seed, on_epoch, device, matched
+            report = fit_timed(transform, real, simulated, *how)
         else:
             assert isinstance(transform, GroundedActionTransform)
             models = transform.forward, transform.inverse

@@ -77,22 +77,35 @@ class SimulatedWorld:
             derive_seed(seed, "roll-out", self._name, iteration, episode)
             for episode in range(self._episodes)
         ]
+        return TransitionLog.concatenate(self._play(policy, [(s, None) for s in seeds]))
+
+    def under_delays(self, policy: Policy, iteration: int, seed: int) -> list[TransitionLog]:
+        """One roll-out for each delay of 0, 1, ... s up to the longest, which every green has.
+
+        Each has traffic of its own: a busy hour would make all delays look short.
+        """
+        lates = range(self._most_delay_s + 1)
+        seeds = [derive_seed(seed, "matching", self._name, iteration, late) for late in lates]
+        return self._play(policy, list(zip(seeds, lates, strict=True)))
+
+    def _play(self, policy: Policy, parts: Sequence[tuple[int, int | None]]) -> list[TransitionLog]:
+        """Roll-outs by their seeds and constant delays, in that order."""
         if isinstance(self._workers, Executor):
-            return TransitionLog.concatenate(self._played_by(self._workers, policy, seeds))
+            return self._played_by(self._workers, policy, parts)
         if self._env is None:
             self._env = _delayed(self._make_env, self._most_delay_s)
         env, exploring = self._env, Exploring(policy, self._epsilon)
-        return TransitionLog.concatenate([_recorded(env, exploring, s, self._stop) for s in seeds])
+        return [_recorded(env, exploring, *part, self._stop) for part in parts]
 
     def _played_by(
-        self, workers: Executor, policy: Policy, seeds: Sequence[int]
+        self, workers: Executor, policy: Policy, parts: Sequence[tuple[int, int | None]]
     ) -> list[TransitionLog]:
-        """The roll-outs in the order of their seeds."""
         stop, made = self._stop, (self._make_env, self._most_delay_s, policy, self._epsilon)
-        parts = [(*made, seed, stop) for seed in seeds]
-        found = dict(as_done(workers, _roll_out_alone, parts, stop))
+        found = dict(
+            as_done(workers, _roll_out_alone, [(*made, *part, stop) for part in parts], stop)
+        )
         self._stop = Stop()  # the other is set now, since nobody waits any more
-        return [found[number] for number in range(len(seeds))]
+        return [found[number] for number in range(len(parts))]
 
     def stop(self) -> None:
         """Ends the roll-out that is under way."""
@@ -110,8 +123,12 @@ def _delayed(make_env: Callable[[], TrafficEnv], most_delay_s: int) -> AnyParall
     return RandomDelays(env, most_delay_s) if most_delay_s else env
 
 
-def _recorded(env: AnyParallelEnv, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
+def _recorded(
+    env: AnyParallelEnv, policy: Policy, seed: int, always_s: int | None, stop: Stop
+) -> TransitionLog:
     observer = observer_of(env)
+    if isinstance(env, RandomDelays):
+        env.always_s = always_s
     played = persistently(lambda: roll_out(env, policy, seed, record=observer, on_step=until(stop)))
     assert played.log is not None
     return played.log
@@ -123,12 +140,13 @@ def _roll_out_alone(
     policy: Policy,
     epsilon: float,
     seed: int,
+    always_s: int | None,
     stop: Stop,
 ) -> TransitionLog:
     """One roll-out in an environment of its own, wherever that is."""
     env = _delayed(make_env, most_delay_s)
     try:
-        return _recorded(env, Exploring(policy, epsilon), seed, stop)
+        return _recorded(env, Exploring(policy, epsilon), seed, always_s, stop)
     finally:
         env.close()
 

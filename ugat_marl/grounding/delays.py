@@ -31,12 +31,16 @@ class TimedConfig:
             of their intersection and phase. What the data say little about stays close.
         target_noise: Noise on the changes that h learns to read, in units of what the simulation
             leaves unpredicted: f, too, is fitted to finitely many transitions.
+        match: Whether the delays of an intersection are raised or lowered together until the
+            simulation pays the policy in training what the street pays it (`matching`); needs
+            roll-outs of that policy in both.
     """
 
     most_s: int = 5
     answer: Literal["state", "constant"] = "state"
     spread_s: float = 1.0
     target_noise: float = 0.2
+    match: bool = False
 
     def __post_init__(self) -> None:
         if self.most_s < 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.policy import AnyParallelEnv, Begun, Stepped
@@ -21,7 +22,12 @@ class RandomDelays(BaseParallelWrapper[str, Any, Any]):
     Args:
         env: An environment of the suite.
         most_s: Longest delay.
+
+    Attributes:
+        always_s: In place of random delays, the same for every green; None for random ones.
     """
+
+    always_s: int | None = None
 
     def __init__(self, env: AnyParallelEnv, most_s: int) -> None:
         super().__init__(env)
@@ -40,8 +46,11 @@ class RandomDelays(BaseParallelWrapper[str, Any, Any]):
         agents = list(self.env.agents)
         if not agents:  # after the last step; the environment itself says so
             return self.env.step(actions)
-        drawn = self._generator.integers(self._most_s + 1, size=len(agents))
-        drawn = drawn * (self._generator.random(len(agents)) < self._chance)
+        if self.always_s is None:
+            drawn = self._generator.integers(self._most_s + 1, size=len(agents))
+            drawn = drawn * (self._generator.random(len(agents)) < self._chance)
+        else:
+            drawn = np.full(len(agents), self.always_s)
         delays = dict(zip(agents, drawn.astype(float).tolist(), strict=True))
         env: Any = self.env
         env.delay_greens(delays)

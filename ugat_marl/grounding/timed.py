@@ -30,13 +30,21 @@ from ugat_marl.transitions import AgentLayout
 
 
 class _Constants(nn.Module):
-    """The delay in s that is expected of every intersection and phase."""
+    """The delay in s that is expected of every intersection and phase.
+
+    Attributes:
+        delay_s: What greens lose when they begin, ``(agents, phases)``.
+        beyond_s: What all of an intersection are later by, to match rewards, ``(agents, 1)``.
+    """
 
     delay_s: Tensor
+    beyond_s: Tensor
 
-    def __init__(self, stack: Stack) -> None:
+    def __init__(self, stack: Stack, match: bool) -> None:
         super().__init__()
         self.register_buffer("delay_s", torch.zeros(len(stack.agents), stack.actions))
+        # Checkpoints of those that match nothing do without.
+        self.register_buffer("beyond_s", torch.zeros(len(stack.agents), 1), persistent=match)
 
 
 class TimedTransform(Transform):
@@ -82,7 +90,7 @@ class TimedTransform(Transform):
         self.inverse = DelayModel(
             self.stack, inverse, most_s, torch_generator(seed, "inverse"), view=self.local
         )
-        self.constants = _Constants(self.stack)
+        self.constants = _Constants(self.stack, self.timed.match)
 
     @property
     def models(self) -> dict[str, nn.Module]:
@@ -113,7 +121,7 @@ class TimedTransform(Transform):
         than the one taken without h.
         """
         asked = torch.from_numpy(actions)[:, None]
-        usual = self.constants.delay_s.gather(1, asked)
+        usual = self._later(self.constants.delay_s.gather(1, asked))
         switched = (self.stack.current_phase(observations) != asked)[:, 0].numpy()
         if self.timed.answer == "constant":
             delay = np.where(switched, usual[:, 0].numpy(), 0.0).astype(np.float32)
@@ -146,4 +154,10 @@ class TimedTransform(Transform):
         change = self.forward(seen, actions) * self.forward.scale
         answer = self.inverse.predict(local, actions, change)
         usual = self.constants.delay_s.gather(1, actions)
-        return likely_delay(answer.probability, usual, self.timed.spread_s), answer.u
+        # h says what a green loses when it begins, in some states more and in others less.
+        found = likely_delay(answer.probability, usual, self.timed.spread_s)
+        return self._later(found), answer.u
+
+    def _later(self, delay_s: Tensor) -> Tensor:
+        """Delays ``(agents, batch)`` after all of an intersection have been moved."""
+        return (delay_s + self.constants.beyond_s).clamp(0.0, float(self.timed.most_s))

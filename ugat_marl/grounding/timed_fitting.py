@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ugat_marl.batched import one_thread
@@ -37,6 +39,7 @@ def fit_timed(
     seed: int,
     on_epoch: EpochCallback | None = None,
     device: torch.device = CPU,
+    matched_s: NDArray[np.float64] | None = None,
 ) -> TimedReport:
     """Fits all models of a timed grounding, and measures them.
 
@@ -48,6 +51,8 @@ def fit_timed(
         seed: Decides fresh weights, the order of batches, and what is drawn.
         on_epoch: Called after every epoch.
         device: Where the models are trained; they come from the CPU and end there.
+        matched_s: ``(agents,)``, the delays to which those of an intersection are moved together,
+            where rewards were matched.
 
     Raises:
         LogError: As `fitting.fit`.
@@ -69,6 +74,9 @@ def fit_timed(
     # Models that know nothing of a street or of the simulation know of no lost time either.
     learnt = torch.from_numpy(f.learnt & g.learnt)
     transform.constants.delay_s.copy_(lost.phase_s * learnt[:, None])
+    if matched_s is not None:
+        beyond = torch.from_numpy(matched_s - lost.best_s) * learnt
+        transform.constants.beyond_s.copy_(beyond[:, None])
     data = replace(data, weight=data.weight * begins)
     h = _fit_delays(
         transform,
@@ -80,7 +88,7 @@ def fit_timed(
         on_epoch,
         device,
     )
-    return TimedReport(stack.agents, f, g, lost, h, transform.timed.most_s)
+    return TimedReport(stack.agents, f, g, lost, h, transform.timed.most_s, matched_s)
 
 
 def _alike(

@@ -56,6 +56,7 @@ class TimedReport:
         lost: The delays that fit the street best.
         inverse: h.
         most_s: Longest delay tried.
+        matched_s: The delays with which rewards are those of the street, if they were matched.
     """
 
     agents: tuple[str, ...]
@@ -64,6 +65,7 @@ class TimedReport:
     lost: LostTime
     inverse: DelayReport
     most_s: int
+    matched_s: Floats | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -117,6 +119,8 @@ class TimedReport:
             numbers[f"inverse/{name}"] = getattr(self.inverse, name)
         for name in ("best_s", "low_s", "high_s"):
             numbers |= entries(f"lost_time/{name}", getattr(self.lost, name), self.agents)
+        if self.matched_s is not None:
+            numbers |= entries("lost_time/matched_s", self.matched_s, self.agents)
         return numbers
 
 

@@ -90,6 +90,7 @@ class Job:
     def identity(self) -> dict[str, Any]:
         """What decides the policy: a job with the same is the same job."""
         settings = {**asdict(self), "dqn": self.dqn.identity}
+        settings["ugat"] = None if self.ugat is None else self.ugat.identity
         for other in ("domains", "evaluation_seeds", "scenario", "device"):
             settings.pop(other)
         worlds = sorted({world for world in (self.sim, self.target, self.world) if world})

@@ -129,6 +129,7 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
     fitted = replace(base, gate=replace(base.gate, start="fitted"))
     plain = replace(ungated, fit=replace(base.fit, uncertainty="none"))
     proven = replace(base, least_accuracy=0.0)
+    matching = replace(base, timed=replace(base.timed, match=True))
     return [
         Setting(full, "grounded", ugat=base),
         Setting(f"{full}: α = 0.5", "grounded", ugat=static),
@@ -139,6 +140,7 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
             [Setting(f"{full}: where f and h are proven", "grounded", ugat=proven)]
             * (base != proven)
         ),
+        *([Setting(f"{full}: rewards matched", "grounded", ugat=matching)] * matching.matches),
     ]
 
 

@@ -1,0 +1,115 @@
+"""Delays with which a simulation pays what a street pays: by hand, and planted in SUMO."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ugat_marl.controllers import controller_for
+from ugat_marl.errors import CheckpointError
+from ugat_marl.grounding.delays import TimedConfig
+from ugat_marl.grounding.matching import falling, matching_delays, mean_rewards
+from ugat_marl.grounding.timed import TimedTransform
+from ugat_marl.traffic_env import parallel_env
+from ugat_marl.transitions import AgentLayout, Provenance, TransitionRecorder
+from ugat_marl.ugat import UgatConfig
+from ugat_marl.worlds import SimulatedWorld
+
+LAYOUTS = {"b_0": AgentLayout(2, 2), "a_0": AgentLayout(2, 2)}
+SIGHT: dict[str, Any] = {"duration_s": 3600, "observation": "movements"}
+
+
+def test_a_curve_that_rises_by_chance_is_averaged_there() -> None:
+    assert falling(np.array([3.0, 1.0, 2.0, 0.0])).tolist() == [3.0, 1.5, 1.5, 0.0]
+    assert falling(np.array([1.0, 2.0, 3.0])).tolist() == [2.0, 2.0, 2.0]
+    assert falling(np.array([2.0, 3.0, 1.0, 2.0, 3.0])).tolist() == [2.5, 2.5, 2.0, 2.0, 2.0]
+
+
+@given(st.lists(st.integers(-50, 50), min_size=1, max_size=8), st.data())
+def test_no_other_falling_curve_is_closer(values: list[int], data: st.DataObject) -> None:
+    own = np.array(values, dtype=np.float64)
+    found = falling(own)
+    drawn = data.draw(st.lists(st.integers(-50, 50), min_size=len(own), max_size=len(own)))
+    other = np.array(sorted(drawn, reverse=True), dtype=np.float64)
+    assert (np.diff(found) <= 1e-9).all() and found.sum() == pytest.approx(own.sum())
+    assert ((found - own) ** 2).sum() <= ((other - own) ** 2).sum() + 1e-9
+
+
+def test_delays_lie_where_the_rewards_are_the_same() -> None:
+    one = np.array([-10.0, -12.0, -20.0, -30.0])
+    level = np.array([-10.0, -10.0, -20.0, -20.0])  # of delays that pay the same the shortest
+    streets = [-9.0, -10.0, -11.0, -16.0, -30.0, -99.0]
+    expected = [0.0, 0.0, 0.5, 1.5, 3.0, 3.0]
+    curves = np.repeat(one[:, None], len(streets), axis=1)
+    assert matching_delays(np.array(streets), curves) == pytest.approx(expected)
+    curves = np.repeat(level[:, None], 3, axis=1)
+    assert matching_delays(np.array([-10.0, -20.0, -25.0]), curves).tolist() == [0.0, 2.0, 2.0]
+
+
+def test_rewards_are_means_over_all_decisions_in_the_order_that_is_asked_for() -> None:
+    recorder = TransitionRecorder(Provenance("street", "", "sim", (), 10.0, "count", LAYOUTS))
+    seen = {agent: np.zeros(4) for agent in LAYOUTS}
+    did, late = dict.fromkeys(LAYOUTS, 0), dict.fromkeys(LAYOUTS, 0.0)
+    for place, rewards in (((0, 0), (1.0, 5.0)), ((0, 1), (2.0, 5.0)), ((1, 0), (6.0, 8.0))):
+        paid = dict(zip(LAYOUTS, rewards, strict=True))
+        recorder.record(*place, seen, did, did, paid, seen, late)
+    log = recorder.log()
+    assert mean_rewards(log, ["a_0", "b_0"]).tolist() == [6.0, 3.0]
+    assert mean_rewards(log, ["b_0", "a_0"]).tolist() == [3.0, 6.0]
+
+
+def test_a_planted_delay_is_found() -> None:
+    make = partial(parallel_env, "single-v1", **SIGHT)
+    env = make()
+    policy, agents = controller_for("largest-queue:20", env), env.possible_agents
+    env.close()
+    sim = SimulatedWorld(make, "sim", 1, 0.3, 5)
+    logs = sim.under_delays(policy, 0, 3)
+    sim.close()
+    for late, log in enumerate(logs):
+        assert set(log.frame["delay_s"].to_list()) == {0.0, float(late)}
+    simulated = np.array([mean_rewards(log, agents) for log in logs])
+    for planted_s in (0, 3):
+        street = partial(parallel_env, "single-v1", f"late_green=*,{planted_s}", **SIGHT)
+        real = SimulatedWorld(street, "real", 2, 0.3)
+        log = real.collect(policy, 0, 3)
+        real.close()
+        assert log is not None
+        found = matching_delays(mean_rewards(log, agents), simulated)
+        assert found == pytest.approx([planted_s], abs=1.2)  # an hour is one sample
+
+
+def test_all_delays_of_an_intersection_move_together(tmp_path: Path) -> None:
+    plain = TimedTransform(LAYOUTS, 1)
+    moved = TimedTransform(LAYOUTS, 1, timed=TimedConfig(match=True))
+    for transform in (plain, moved):
+        for model in (transform.forward, transform.simulated, transform.inverse):
+            model.fitted.fill_(True)
+        transform.constants.delay_s.copy_(torch.tensor([[1.0, 2.0], [4.0, 0.5]]))
+    moved.constants.beyond_s.copy_(torch.tensor([[1.5], [3.0]]))
+    observations = torch.zeros(2, 1, 4)
+    observations[:, 0, 2] = 1.0  # the first phase is shown, the second asked for
+    asked, two = np.array([1, 1]), np.ones((2, 2), dtype=np.bool_)
+    with torch.no_grad():
+        usual, later = (t.ground(observations, asked, two, ()).delay_s for t in (plain, moved))
+    assert usual is not None and later is not None
+    assert later == pytest.approx(np.clip(usual + np.array([1.5, 3.0]), 0.0, 5.0), abs=1e-6)
+    moved.save(tmp_path / "moved.pt")
+    again = TimedTransform(LAYOUTS, 2, timed=TimedConfig(match=True))
+    again.load(tmp_path / "moved.pt")
+    assert again.constants.beyond_s.equal(moved.constants.beyond_s)
+    with pytest.raises(CheckpointError):
+        TimedTransform(LAYOUTS, 2).load(tmp_path / "moved.pt")
+
+
+def test_runs_that_match_nothing_are_known_by_what_they_were_known_by() -> None:
+    plain, matching = (UgatConfig("timed", timed=TimedConfig(match=on)) for on in (False, True))
+    assert "match" not in plain.identity["timed"] and matching.identity["timed"]["match"]
+    assert not UgatConfig("phase", timed=TimedConfig(match=True)).matches
