@@ -191,7 +191,7 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
         ({"random_delay_s": 0}, "random_delay_s = 0: must be at least 1"),
         ({"real": "none", "real_log": Path("x"), "oracle": True}, "oracle needs a real domain"),
         ({"real": "none", "real_log": Path("x"), "fine_tuned": True}, "needs a real domain"),
-        ({"real_log": Path("x"), "fine_tuned": True}, "a real_log does not allow it"),
+        ({"real_log": Path("x"), "fine_tuned": True}, "which a real_log does not allow"),
         (
             {"real_log": Path("x"), "ugat": UgatConfig("timed", timed=TimedConfig(match=True))},
             "timed match acts in the real domain",

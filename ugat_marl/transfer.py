@@ -163,9 +163,9 @@ class TransferConfig:
         for name in ("fine_tuned", "oracle"):
             if getattr(self, name) and len(self.domains) < 2:
                 raise OptionError(f"{name} needs a real domain to train in, not {self.real!r}")
-        for name, acts in (("fine_tuned", self.fine_tuned), ("timed match", self.ugat.matches)):
+        for who, acts in (("fine_tuned", self.fine_tuned), ("timed match", self.ugat.matches)):
             if acts and self.real_log is not None:
-                raise OptionError(f"{name} acts in the real domain; a real_log does not allow it")
+                raise OptionError(f"{who} acts in the real domain, which a real_log does not allow")
 
     @property
     def env_options(self) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ugat_marl.devices import device_of
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -26,7 +25,7 @@ from ugat_marl.grounding.fitting import fit
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig, GateReport
 from ugat_marl.grounding.inverse import InverseConfig
-from ugat_marl.grounding.matching import matching_delays, mean_rewards
+from ugat_marl.grounding.matching import Floats, matching_delays, mean_rewards
 from ugat_marl.grounding.timed import TimedTransform
 from ugat_marl.grounding.timed_fitting import fit_timed
 from ugat_marl.grounding.timed_report import TimedReport
@@ -277,7 +276,7 @@ def _collect(
 
 def _match(
     state: State, sim: SimulatedWorld, policy: Policy, iteration: int, seed: int, run: Run
-) -> NDArray[np.float64]:
+) -> Floats:
     """The delays, ``(agents,)``, with which `sim` pays the policy what the street just paid it."""
     agents = state.transform.stack.agents
     with run.reporter.task(f"roll-outs under delays, round {iteration + 1}", 1) as advance:
@@ -294,7 +293,7 @@ def _fit(
     run: Run,
     iteration: int,
     device: torch.device,
-    matched: NDArray[np.float64] | None,
+    matched: Floats | None,
 ) -> FitReport | TimedReport:
     transform = state.transform
     real, simulated = (TransitionLog.concatenate(logs) for logs in (state.real, state.simulated))

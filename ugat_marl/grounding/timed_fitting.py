@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ugat_marl.batched import one_thread
@@ -22,6 +20,7 @@ from ugat_marl.grounding.fitting import (
     refuse_mismatch,
 )
 from ugat_marl.grounding.lost_time import Means, lost_time
+from ugat_marl.grounding.matching import Floats
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import Stack, StackedTransitions, stack_log
 from ugat_marl.grounding.timed import TimedTransform
@@ -39,7 +38,7 @@ def fit_timed(
     seed: int,
     on_epoch: EpochCallback | None = None,
     device: torch.device = CPU,
-    matched_s: NDArray[np.float64] | None = None,
+    matched_s: Floats | None = None,
 ) -> TimedReport:
     """Fits all models of a timed grounding, and measures them.
 
