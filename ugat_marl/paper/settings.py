@@ -106,7 +106,15 @@ def constant_name(seconds: int) -> str:
 
 
 def _grounded(bases: dict[str, UgatConfig]) -> list[Setting]:
-    return [Setting(GROUNDED_NAME[name], "grounded", ugat=base) for name, base in bases.items()]
+    rows = [Setting(GROUNDED_NAME[name], "grounded", ugat=base) for name, base in bases.items()]
+    return rows + [row for name, base in bases.items() for row in _matching(name, base)]
+
+
+def _matching(name: str, base: UgatConfig) -> list[Setting]:
+    """Timed grounding that matches rewards; nothing for the phase's, which cannot."""
+    ugat = replace(base, timed=replace(base.timed, match=True))
+    row = Setting(f"{GROUNDED_NAME[name]}: rewards matched", "grounded", ugat=ugat)
+    return [row] * (ugat.matches and ugat != base)
 
 
 def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Setting]:
@@ -129,7 +137,6 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
     fitted = replace(base, gate=replace(base.gate, start="fitted"))
     plain = replace(ungated, fit=replace(base.fit, uncertainty="none"))
     proven = replace(base, least_accuracy=0.0)
-    matching = replace(base, timed=replace(base.timed, match=True))
     return [
         Setting(full, "grounded", ugat=base),
         Setting(f"{full}: α = 0.5", "grounded", ugat=static),
@@ -140,7 +147,7 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
             [Setting(f"{full}: where f and h are proven", "grounded", ugat=proven)]
             * (base != proven)
         ),
-        *([Setting(f"{full}: rewards matched", "grounded", ugat=matching)] * matching.matches),
+        *_matching(name, base),
     ]
 
 
