@@ -36,13 +36,19 @@ Act = Callable[[Any, Any], dict[str, int]]
 
 
 def policy_of(
-    shared: bool, hidden: tuple[int, ...] = (16, 16), agents: AgentSet = AGENTS
+    shared: bool,
+    hidden: tuple[int, ...] = (16, 16),
+    agents: AgentSet = AGENTS,
+    ceiling: float | None = None,
 ) -> DQNPolicy:
     """A policy of random weights, drawn wider than a learner begins with."""
     learner = DQN(agents, DQNConfig(hidden=hidden, shared=shared), seed=4)
     size = learner.policy().parameters.size
     weights = np.random.default_rng(7).normal(size=size).astype(np.float32)
-    return DQNPolicy(agents, hidden, weights, {"observation": "queue"}, shared)
+    held = None
+    if ceiling is not None:
+        held = np.full((len(agents), agents.widest_observation), ceiling, np.float32)
+    return DQNPolicy(agents, hidden, weights, {"observation": "queue"}, shared, None, held)
 
 
 def page_loader(suffix: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Act:
@@ -86,11 +92,17 @@ def inputs(rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("ceiling", [None, 0.3])
 @KINDS
 def test_random_inputs_give_the_same_actions(
-    suffix: str, shared: bool, hidden: tuple[int, ...], tmp_path: Path, monkeypatch: Any
+    suffix: str,
+    shared: bool,
+    hidden: tuple[int, ...],
+    ceiling: float | None,
+    tmp_path: Path,
+    monkeypatch: Any,
 ) -> None:
-    policy = policy_of(shared, hidden)
+    policy = policy_of(shared, hidden, ceiling=ceiling)
     exported(policy, suffix, tmp_path)
     act = page_loader(suffix, tmp_path, monkeypatch)
     rng, masked = np.random.default_rng(0), 0

@@ -81,6 +81,8 @@ def export_policy(policy: DQNPolicy, path: Path, env: AnyParallelEnv | None = No
 def layers_of(policy: DQNPolicy) -> list[Layer]:
     """The policy's network as affine maps with ReLU between them; of one kind, shared or not.
 
+    A ceiling c is a layer more: min(x, c) is c - ReLU(c - x).
+
     Raises:
         OptionError: It is a network with structure, which is more than that.
     """
@@ -93,7 +95,12 @@ def layers_of(policy: DQNPolicy) -> list[Layer]:
     parameters = [p.numpy().copy() for p in policy._network.parameters()]
     for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
         found.append((weight if weight.ndim == 3 else weight[None], bias))
-    return found
+    if policy.ceiling is None:
+        return found
+    ceiling = policy.ceiling[:, None, :]
+    (weight, bias), *later = found
+    mirror = -np.eye(weight.shape[1], dtype=np.float32)[None]
+    return [(mirror, ceiling), (-weight, bias + ceiling @ weight), *later]
 
 
 class NumpyPolicy:
@@ -226,8 +233,11 @@ def _torchscript(policy: DQNPolicy) -> bytes:
         def __init__(self) -> None:
             super().__init__()
             self.network = policy._network
+            self.ceiling = policy._ceiling
 
         def forward(self, observations: Tensor, allowed: Tensor) -> Tensor:
+            if self.ceiling is not None:
+                observations = torch.minimum(observations, self.ceiling)
             values = self.network(observations.unsqueeze(1)).squeeze(1)
             return values.masked_fill(~allowed, -torch.inf).argmax(dim=1)
 

@@ -22,7 +22,7 @@ from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.devices import CPU
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
-from ugat_marl.learners.dqn_config import DQNConfig
+from ugat_marl.learners.dqn_config import CEILING_DECISIONS, DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy, header, parse_header
 from ugat_marl.learners.exploration import StickyExploration
 from ugat_marl.learners.q_network import (
@@ -33,7 +33,7 @@ from ugat_marl.learners.q_network import (
     reading_unscaled,
 )
 from ugat_marl.learners.replay import Replay
-from ugat_marl.learners.scaling import input_factors
+from ugat_marl.learners.scaling import ceilings, input_factors
 from ugat_marl.learners.structure import Structure, structure_in
 from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
@@ -184,7 +184,10 @@ class DQN:
         if self.config.network in _SCALED:
             factors = self._inputs[0, 0] if self._is_one_network else self._inputs[:, 0]
             weights = reading_unscaled(self._target, factors.to(self.device))
-        return DQNPolicy(self.agents, hidden, weights, options, shared, self.structure)
+        ceiling = None
+        if self.config.ceiling is not None and self._replay.added:
+            ceiling = ceilings(self._replay.recent(CEILING_DECISIONS), self.config.ceiling)
+        return DQNPolicy(self.agents, hidden, weights, options, shared, self.structure, ceiling)
 
     def _episode(self, env: AnyParallelEnv, seed: int) -> dict[str, float]:
         number = self.episodes

@@ -9,6 +9,9 @@ from ugat_marl.errors import OptionError
 
 NetworkName = Literal["mlp", "frap", "colight"]
 
+CEILING_DECISIONS = 1_000
+"""How far back a ceiling looks: long enough for a quantile, too short for early exploration."""
+
 
 @dataclass(frozen=True)
 class DQNConfig:
@@ -53,6 +56,10 @@ class DQNConfig:
             intersections; `hidden` is the size of a demand and that of a pair of phases. "colight":
             attention to the neighbours (Wei et al. 2019), one network for all intersections;
             `hidden` is the size of an embedding and that of the layer after the attention.
+        ceiling: Quantile of each number of an observation, over the last `CEILING_DECISIONS`
+            decisions in training, below which policies hold it: they act in a fuller street than
+            they know as in the fullest they know, and not by what a network makes of numbers it
+            has never had. None gives policies observations as they are.
     """
 
     hidden: tuple[int, ...] = (48, 48)
@@ -72,6 +79,7 @@ class DQNConfig:
     scale_inputs: bool = True
     shared: bool = False
     network: NetworkName = "mlp"
+    ceiling: float | None = None
 
     def __post_init__(self) -> None:
         # a list, as JSON has it, would differ from the tuple of a checkpoint
@@ -94,6 +102,8 @@ class DQNConfig:
         self._require("huber_delta", 0 < self.huber_delta < float("inf"), "above 0")
         scale = self.reward_scale
         self._require("reward_scale", scale is None or 0 < scale < float("inf"), "above 0, or None")
+        ceiling = self.ceiling
+        self._require("ceiling", ceiling is None or 0 < ceiling <= 1, "above 0, at most 1, or None")
         self._require_network()
         self._require(
             "warmup_decisions",
@@ -107,6 +117,8 @@ class DQNConfig:
         settings = asdict(self)
         if self.network == "mlp":  # runs from before there were others can be resumed
             settings.pop("network")
+        if self.ceiling is None:
+            settings.pop("ceiling")
         return settings
 
     def _require_network(self) -> None:

@@ -34,9 +34,11 @@ class DQNPolicy:
         env_options: Options of the environment the policy relies on.
         shared: Whether all agents share one network.
         structure: What a network other than "mlp" knows of the intersections.
+        ceiling: What the numbers of an observation are held below, ``(agents,
+            widest_observation)``; None takes them as they are. See `DQNConfig.ceiling`.
 
     Raises:
-        ValueError: `parameters` are those of other networks.
+        ValueError: `parameters` or `ceiling` are those of other networks.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class DQNPolicy:
         env_options: Mapping[str, Any],
         shared: bool = False,
         structure: Structure | None = None,
+        ceiling: Tensor | NDArray[np.float32] | None = None,
     ) -> None:
         self.agents = agents
         self.hidden = hidden
@@ -60,18 +63,29 @@ class DQNPolicy:
             raise ValueError(f"parameters of shape {tuple(vector.shape)}, needed: ({needed},)")
         nn.utils.vector_to_parameters(vector, self._network.parameters())
         self._network.requires_grad_(False)
+        self._ceiling = None
+        if ceiling is not None:
+            self._ceiling = torch.as_tensor(ceiling, dtype=torch.float32).to(CPU, copy=True)
+            wanted = (len(agents), agents.widest_observation)
+            if self._ceiling.shape != wanted:
+                raise ValueError(f"a ceiling of shape {tuple(self._ceiling.shape)}, not {wanted}")
 
     @property
     def parameters(self) -> NDArray[np.float32]:
         """All parameters as one vector (a copy)."""
         return nn.utils.parameters_to_vector(self._network.parameters()).numpy().copy()
 
+    @property
+    def ceiling(self) -> NDArray[np.float32] | None:
+        """What observations are held below, ``(agents, widest_observation)`` (a copy)."""
+        return None if self._ceiling is None else self._ceiling.numpy().copy()
+
     def reset(self, seed: int) -> None:
         """Nothing to forget: the policy is deterministic and has no memory."""
 
     def q_values(self, observations: Observations) -> dict[str, NDArray[np.float32]]:
         """Every agent's Q of every one of its actions, ``(actions,)`` (in scaled reward)."""
-        values = self._network(torch.from_numpy(self.agents.stack(observations)).unsqueeze(1))
+        values = self._network(self._seen(observations).unsqueeze(1))
         rows = zip(self.agents.names, self.agents.action_counts, values.squeeze(1), strict=True)
         return {name: row[:count].numpy() for name, count, row in rows}
 
@@ -82,15 +96,21 @@ class DQNPolicy:
             OptionError: The observations are not of the agents this policy was trained for, or not
                 finite.
         """
-        stacked = torch.from_numpy(self.agents.stack(observations))
+        stacked = self._seen(observations)
         allowed = torch.from_numpy(self.agents.masks(infos))
         return self.agents.actions(greedy_actions(self._network, stacked, allowed))
+
+    def _seen(self, observations: Observations) -> Tensor:
+        stacked = torch.from_numpy(self.agents.stack(observations))
+        return stacked if self._ceiling is None else torch.minimum(stacked, self._ceiling)
 
     def save(self, path: Path) -> None:
         """Writes the policy to one file; `load` reads it."""
         content = header(self.agents, self.hidden, self.env_options, self.shared, self.structure)
-        parameters = torch.from_numpy(self.parameters)
-        write_checkpoint(path, _KIND, {**content, "parameters": parameters})
+        content["parameters"] = torch.from_numpy(self.parameters)
+        if self._ceiling is not None:
+            content["ceiling"] = self._ceiling
+        write_checkpoint(path, _KIND, content)
 
     @classmethod
     def load(cls, path: Path) -> DQNPolicy:
@@ -103,14 +123,15 @@ class DQNPolicy:
         try:
             agents, hidden, env_options, shared = parse_header(content)
             structure = structure_in(content, agents)
-            return cls(agents, hidden, content["parameters"], env_options, shared, structure)
+            own = (agents, hidden, content["parameters"], env_options, shared, structure)
+            return cls(*own, content.get("ceiling"))
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{path}: not a whole policy ({error}); save it again") from None
 
     def __reduce__(self) -> tuple[type[DQNPolicy], tuple[Any, ...]]:
         # numpy, since torch would send tensors between processes through shared memory
         own = (self.agents, self.hidden, self.parameters, self.env_options, self.shared)
-        return DQNPolicy, (*own, self.structure)
+        return DQNPolicy, (*own, self.structure, self.ceiling)
 
 
 def header(

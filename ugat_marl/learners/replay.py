@@ -99,6 +99,12 @@ class Replay:
         """All stored observations, ``(agents, len(self), widest_observation)``."""
         return self._columns.observation[:, : len(self)]
 
+    def recent(self, decisions: int) -> Tensor:
+        """Observations of the last so many decisions, ``(agents, decisions, ...)``, or of all."""
+        first = max(0, self.added - min(decisions, self.capacity))
+        at = torch.arange(first, self.added) % self.capacity
+        return self._columns.observation.index_select(1, at)
+
     def rows(self, added: int) -> dict[str, Tensor]:
         """Views of the rows that are in use once `added` decisions were added."""
         used = min(added, self.capacity)

@@ -91,3 +91,21 @@ def input_factors(observations: Tensor, agents: AgentSet, pooled: bool) -> Tenso
 def places(agents: AgentSet) -> NDArray[np.bool_]:
     """Where padded observations ``(agents, widest_observation)`` hold an agent's own numbers."""
     return np.arange(agents.widest_observation) < np.array(agents.observation_sizes)[:, None]
+
+
+def ceilings(seen: Tensor, quantile: float) -> Tensor:
+    """What each number of an observation was below in a share of the time.
+
+    A number that is so rarely more than its least (a phase hardly ever chosen) is held by its
+    greatest instead, since held by the quantile it would say nothing any more.
+
+    Args:
+        seen: Observations ``(agents, time, widest_observation)``.
+        quantile: The share.
+
+    Returns:
+        ``(agents, widest_observation)``.
+    """
+    # not torch's: it refuses more than 16 million numbers
+    level = torch.from_numpy(np.quantile(seen.numpy(), quantile, axis=1).astype(np.float32))
+    return torch.where(level > seen.amin(dim=1), level, seen.amax(dim=1))
