@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from tests.dqn_test import QUICK
 from ugat_marl.errors import CheckpointError, OptionError
@@ -33,8 +34,8 @@ def policy_of(
     return DQNPolicy(AGENTS, hidden, weights, {}, shared, None, ceiling)
 
 
-def seen(wide: list[float], narrow: list[float]) -> dict[str, np.ndarray]:
-    return {"wide": np.float32(wide), "narrow": np.float32(narrow)}
+def seen(wide: list[float], narrow: list[float]) -> dict[str, NDArray[np.float32]]:
+    return {"wide": np.array(wide, np.float32), "narrow": np.array(narrow, np.float32)}
 
 
 def test_beyond_the_ceiling_everything_looks_the_same() -> None:

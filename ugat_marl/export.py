@@ -99,8 +99,9 @@ def layers_of(policy: DQNPolicy) -> list[Layer]:
         return found
     ceiling = policy.ceiling[:, None, :]
     (weight, bias), *later = found
-    mirror = -np.eye(weight.shape[1], dtype=np.float32)[None]
-    return [(mirror, ceiling), (-weight, bias + ceiling @ weight), *later]
+    mirror = np.negative(np.eye(weight.shape[1], dtype=np.float32))[None]
+    moved = np.add(bias, np.matmul(ceiling, weight), dtype=np.float32)
+    return [(mirror, ceiling), (np.negative(weight), moved), *later]
 
 
 class NumpyPolicy:
