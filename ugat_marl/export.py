@@ -234,11 +234,8 @@ def _torchscript(policy: DQNPolicy) -> bytes:
         def __init__(self) -> None:
             super().__init__()
             self.network = policy._network
-            self.ceiling = policy._ceiling
 
         def forward(self, observations: Tensor, allowed: Tensor) -> Tensor:
-            if self.ceiling is not None:
-                observations = torch.minimum(observations, self.ceiling)
             values = self.network(observations.unsqueeze(1)).squeeze(1)
             return values.masked_fill(~allowed, -torch.inf).argmax(dim=1)
 

@@ -16,7 +16,7 @@ from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
 from ugat_marl.devices import CPU
 from ugat_marl.errors import CheckpointError
 from ugat_marl.learners.agents import AgentSet
-from ugat_marl.learners.q_network import greedy_actions, q_network
+from ugat_marl.learners.q_network import Held, greedy_actions, q_network
 from ugat_marl.learners.structure import Structure, structure_in
 from ugat_marl.policy import Actions, Infos, Observations
 
@@ -69,6 +69,7 @@ class DQNPolicy:
             wanted = (len(agents), agents.widest_observation)
             if self._ceiling.shape != wanted:
                 raise ValueError(f"a ceiling of shape {tuple(self._ceiling.shape)}, not {wanted}")
+            self._network = Held(self._network, self._ceiling)
 
     @property
     def parameters(self) -> NDArray[np.float32]:
@@ -85,7 +86,7 @@ class DQNPolicy:
 
     def q_values(self, observations: Observations) -> dict[str, NDArray[np.float32]]:
         """Every agent's Q of every one of its actions, ``(actions,)`` (in scaled reward)."""
-        values = self._network(self._seen(observations).unsqueeze(1))
+        values = self._network(torch.from_numpy(self.agents.stack(observations)).unsqueeze(1))
         rows = zip(self.agents.names, self.agents.action_counts, values.squeeze(1), strict=True)
         return {name: row[:count].numpy() for name, count, row in rows}
 
@@ -96,13 +97,9 @@ class DQNPolicy:
             OptionError: The observations are not of the agents this policy was trained for, or not
                 finite.
         """
-        stacked = self._seen(observations)
+        stacked = torch.from_numpy(self.agents.stack(observations))
         allowed = torch.from_numpy(self.agents.masks(infos))
         return self.agents.actions(greedy_actions(self._network, stacked, allowed))
-
-    def _seen(self, observations: Observations) -> Tensor:
-        stacked = torch.from_numpy(self.agents.stack(observations))
-        return stacked if self._ceiling is None else torch.minimum(stacked, self._ceiling)
 
     def save(self, path: Path) -> None:
         """Writes the policy to one file; `load` reads it."""

@@ -37,6 +37,21 @@ def q_network(
     return BatchedMLP(agents.observation_sizes, hidden, agents.most_actions, generator)
 
 
+class Held(nn.Module):
+    """Networks that are told of no number more than its ceiling, ``(agents, width)``."""
+
+    ceiling: Tensor
+
+    def __init__(self, network: nn.Module, ceiling: Tensor) -> None:
+        super().__init__()
+        self.network = network
+        self.register_buffer("ceiling", ceiling.unsqueeze(1))
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Values of observations ``(agents, batch, width)``, as of the networks themselves."""
+        return self.network(torch.minimum(observations, self.ceiling))
+
+
 def greedy_actions(network: nn.Module, stacked: Tensor, allowed: Tensor) -> NDArray[np.int64]:
     """Allowed action of highest value for one observation of every agent, ``(agents,)``."""
     with torch.no_grad():
