@@ -306,7 +306,8 @@ def test_a_run_with_timed_grounding_resumes_where_it_was(match: bool, tmp_path: 
             assert (step, name) in numbers, name
         assert 0 <= numbers[step, "lost_time/low_s"] <= numbers[step, "lost_time/best_s"]
         assert numbers[step, "lost_time/best_s"] <= numbers[step, "lost_time/high_s"] <= 3
-        assert ((step, "lost_time/matched_s/signal_0") in numbers) == match
+        for name in ("matched_s/signal_0", "beyond_s/signal_0", "chance"):
+            assert ((step, f"lost_time/{name}") in numbers) == match
     assert numbers[1, "gate/alpha"] == np.inf
     assert numbers[2, "gate/alpha"] == pytest.approx(numbers[1, "gate/mean_u"])
 

@@ -25,7 +25,7 @@ from ugat_marl.grounding.fitting import fit
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig, GateReport
 from ugat_marl.grounding.inverse import InverseConfig
-from ugat_marl.grounding.matching import Floats, matching_delays, mean_rewards
+from ugat_marl.grounding.matching import Paid, episode_rewards
 from ugat_marl.grounding.timed import TimedTransform
 from ugat_marl.grounding.timed_fitting import fit_timed
 from ugat_marl.grounding.timed_report import TimedReport
@@ -203,8 +203,8 @@ def train_ugat(
         i = state.iteration
         policy = state.learner.policy()
         _collect(state, sim, real, policy, i, seed, run)
-        matched = _match(state, sim, policy, i, seed, run) if config.matches else None
-        report = _fit(state, config, derive_seed(seed, "fit", i), run, i, place, matched)
+        paid = _pay(state, sim, policy, i, seed, run) if config.matches else None
+        report = _fit(state, config, derive_seed(seed, "fit", i), run, i, place, paid)
         if config.least_accuracy is not None:
             state.transform.gate.trust(report.trusted(config.least_accuracy))
         state.transform.gate.begin(report.expected_u)
@@ -274,16 +274,16 @@ def _collect(
             advance()
 
 
-def _match(
+def _pay(
     state: State, sim: SimulatedWorld, policy: Policy, iteration: int, seed: int, run: Run
-) -> Floats:
-    """The delays, ``(agents,)``, with which `sim` pays the policy what the street just paid it."""
+) -> Paid:
+    """What the policy gets in `sim` under each delay, beside what it just got in both worlds."""
     agents = state.transform.stack.agents
     with run.reporter.task(f"roll-outs under delays, round {iteration + 1}", 1) as advance:
         logs = sim.under_delays(policy, iteration, seed)
         advance()
-    street, *simulated = [mean_rewards(log, agents) for log in (state.real[-1], *logs)]
-    return matching_delays(street, np.array(simulated))
+    *before, street = [episode_rewards(log, agents) for log in state.real]
+    return Paid(street, np.array([episode_rewards(log, agents) for log in logs]), before)
 
 
 def _fit(
@@ -293,7 +293,7 @@ def _fit(
     run: Run,
     iteration: int,
     device: torch.device,
-    matched: Floats | None,
+    paid: Paid | None,
 ) -> FitReport | TimedReport:
     transform = state.transform
     real, simulated = (TransitionLog.concatenate(logs) for logs in (state.real, state.simulated))
@@ -304,7 +304,7 @@ def _fit(
             go(note=f"{model} {loss:.2g}")
 
         if isinstance(transform, TimedTransform):
-            how = config.fit, seed, on_epoch, device, matched
+            how = config.fit, seed, on_epoch, device, paid
             report = fit_timed(transform, real, simulated, *how)
         else:
             assert isinstance(transform, GroundedActionTransform)

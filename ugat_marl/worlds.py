@@ -23,6 +23,8 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.transitions import TransitionLog
 
+EPISODES_PER_DELAY = 2
+
 
 class World(Protocol):
     """Where transitions come from."""
@@ -80,13 +82,20 @@ class SimulatedWorld:
         return TransitionLog.concatenate(self._play(policy, [(s, None) for s in seeds]))
 
     def under_delays(self, policy: Policy, iteration: int, seed: int) -> list[TransitionLog]:
-        """One roll-out for each delay of 0, 1, ... s up to the longest, which every green has.
+        """Roll-outs for each delay of 0, 1, ... s up to the longest, which every green has.
 
-        Each has traffic of its own: a busy hour would make all delays look short.
+        Each has traffic of its own: a busy hour would make all delays look short. There are two of
+        each, so that they tell how much chance there is in one.
         """
         lates = range(self._most_delay_s + 1)
-        seeds = [derive_seed(seed, "matching", self._name, iteration, late) for late in lates]
-        return self._play(policy, list(zip(seeds, lates, strict=True)))
+        parts = [
+            (derive_seed(seed, "matching", self._name, iteration, late, episode), late)
+            for late in lates
+            for episode in range(EPISODES_PER_DELAY)
+        ]
+        logs = self._play(policy, parts)
+        size = EPISODES_PER_DELAY
+        return [TransitionLog.concatenate(logs[late * size : late * size + size]) for late in lates]
 
     def _play(self, policy: Policy, parts: Sequence[tuple[int, int | None]]) -> list[TransitionLog]:
         """Roll-outs by their seeds and constant delays, in that order."""

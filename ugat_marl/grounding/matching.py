@@ -5,25 +5,121 @@ vehicles lose more while the green lasts, and no delay of a beginning is that; b
 for it: with the delay found here the same policy has, over whole episodes, the same reward in both
 worlds. That is blunt where it comes to why: whatever else the worlds differ in is charged to the
 delay, too. And it has to be the same policy, so that logs of another one do not do.
+
+An hour of traffic is one sample, and some delay fits best even where no green is late. So the
+delays found here are taken only where chance does not explain why what the greens lose when they
+begin is not enough.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.comparison import student_p
 from ugat_marl.transitions import TransitionLog
 
 Floats = NDArray[np.float64]
 
+CHANCE = 0.05
+"""What is likelier than this under the lost time alone does not speak against it."""
 
-def mean_rewards(log: TransitionLog, agents: Sequence[str]) -> Floats:
-    """Mean reward of each of these agents over all its decisions, ``(agents,)``."""
-    found = dict(log.frame.group_by("agent").agg(pl.col("reward").mean()).iter_rows())
-    return np.array([found[agent] for agent in agents], dtype=np.float64)
+
+@dataclass(frozen=True)
+class Paid:
+    """Mean rewards per decision that one policy got in single episodes.
+
+    Attributes:
+        street: ``(episodes, agents)``.
+        simulated: In the simulation with all greens late by 0, 1, 2, ... s,
+            ``(delays, episodes, agents)``.
+        before: What earlier policies got on the street, each ``(episodes, agents)``: they, too,
+            tell how much the rewards of an episode vary.
+    """
+
+    street: Floats
+    simulated: Floats
+    before: Sequence[Floats] = ()
+
+
+@dataclass(frozen=True)
+class Matched:
+    """What rewards say of the delays of greens.
+
+    Attributes:
+        delay_s: ``(agents,)``, with which the simulation pays what the street pays, in s.
+        chance: How likely the street's rewards are under the lost time alone (`chance_of`).
+        beyond_s: ``(agents,)``, what greens are to be later by than the lost time; 0 where chance
+            explains the rewards.
+    """
+
+    delay_s: Floats
+    chance: float
+    beyond_s: Floats
+
+
+def match(paid: Paid, lost_s: Floats) -> Matched:
+    """Asks rewards whether greens have to be later than what they lose when they begin.
+
+    Args:
+        paid: Rewards in both worlds.
+        lost_s: ``(agents,)``, what greens lose when they begin, in s.
+    """
+    delay_s, chance = (
+        matching_delays(paid.street.mean(0), paid.simulated.mean(1)),
+        chance_of(paid, lost_s),
+    )
+    return Matched(delay_s, chance, (delay_s - lost_s) * (chance < CHANCE))
+
+
+def episode_rewards(log: TransitionLog, agents: Sequence[str]) -> Floats:
+    """Mean reward of each of these agents in each episode of a log, ``(episodes, agents)``."""
+    means = log.frame.group_by("episode", "agent").agg(pl.col("reward").mean())
+    table = means.pivot("agent", index="episode", values="reward").sort("episode")
+    return table.select(agents).to_numpy().astype(np.float64)
+
+
+def chance_of(paid: Paid, delay_s: Floats) -> float:
+    """How likely the street's rewards are, if its greens are late by these delays and no more.
+
+    Two-sided, by Student's t, of the sum over the network: what an hour's traffic does to rewards
+    it does to all intersections. Episodes are taken to vary in proportion to their mean.
+
+    Args:
+        paid: Rewards in both worlds.
+        delay_s: ``(agents,)``, delays in s.
+
+    Returns:
+        A p-value; 1 where no two episodes tell how much rewards vary.
+    """
+    delays, episodes, _ = paid.simulated.shape
+    late = np.arange(delays, dtype=np.float64)
+    curves = zip(delay_s, paid.simulated.mean(1).T, strict=True)
+    expected = sum(float(np.interp(seconds, late, falling(curve))) for seconds, curve in curves)
+    street = paid.street.sum(1)
+    alike = [street, *paid.simulated.sum(2), *(group.sum(1) for group in paid.before)]
+    degrees = sum(len(group) - 1 for group in alike)
+    if degrees < 1:
+        return 1.0
+    varies = math.sqrt(sum(_relative_squares(group) for group in alike) / degrees)
+    error = varies * math.hypot(
+        float(street.mean()) / math.sqrt(len(street)), expected / math.sqrt(episodes)
+    )
+    beyond = float(street.mean()) - expected
+    if beyond == 0.0 or error == 0.0:
+        return 1.0 if beyond == 0.0 else 0.0
+    return student_p(beyond / error, degrees)
+
+
+def _relative_squares(group: Floats) -> float:
+    """Sum of squared distances from the mean, as shares of it; 0 around a mean of 0."""
+    mean = float(group.mean())
+    return float((((group - mean) / mean) ** 2).sum()) if mean else 0.0
 
 
 def matching_delays(street: Floats, simulated: Floats) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +21,7 @@ from ugat_marl.grounding.fitting import (
     refuse_mismatch,
 )
 from ugat_marl.grounding.lost_time import Means, lost_time
-from ugat_marl.grounding.matching import Floats
+from ugat_marl.grounding.matching import Paid, match
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import Stack, StackedTransitions, stack_log
 from ugat_marl.grounding.timed import TimedTransform
@@ -38,7 +39,7 @@ def fit_timed(
     seed: int,
     on_epoch: EpochCallback | None = None,
     device: torch.device = CPU,
-    matched_s: Floats | None = None,
+    paid: Paid | None = None,
 ) -> TimedReport:
     """Fits all models of a timed grounding, and measures them.
 
@@ -50,8 +51,8 @@ def fit_timed(
         seed: Decides fresh weights, the order of batches, and what is drawn.
         on_epoch: Called after every epoch.
         device: Where the models are trained; they come from the CPU and end there.
-        matched_s: ``(agents,)``, the delays to which those of an intersection are moved together,
-            where rewards were matched.
+        paid: What the policy in training got in both worlds; with it all delays of an intersection
+            are moved together until it gets the same, where the lost time does not explain it.
 
     Raises:
         LogError: As `fitting.fit`.
@@ -71,11 +72,13 @@ def fit_timed(
     street = replace(street, weight=street.weight * _begins(street, stack))
     lost = lost_time(model, street, known, transform.timed.spread_s)
     # Models that know nothing of a street or of the simulation know of no lost time either.
-    learnt = torch.from_numpy(f.learnt & g.learnt)
-    transform.constants.delay_s.copy_(lost.phase_s * learnt[:, None])
-    if matched_s is not None:
-        beyond = torch.from_numpy(matched_s - lost.best_s) * learnt
-        transform.constants.beyond_s.copy_(beyond[:, None])
+    learnt = f.learnt & g.learnt
+    transform.constants.delay_s.copy_(lost.phase_s * torch.from_numpy(learnt)[:, None])
+    matched = None
+    if paid is not None:
+        matched = match(paid, np.where(learnt, lost.best_s, 0.0))
+        matched = replace(matched, beyond_s=matched.beyond_s * learnt)
+        transform.constants.beyond_s.copy_(torch.from_numpy(matched.beyond_s)[:, None])
     data = replace(data, weight=data.weight * begins)
     h = _fit_delays(
         transform,
@@ -87,7 +90,7 @@ def fit_timed(
         on_epoch,
         device,
     )
-    return TimedReport(stack.agents, f, g, lost, h, transform.timed.most_s, matched_s)
+    return TimedReport(stack.agents, f, g, lost, h, transform.timed.most_s, matched)
 
 
 def _alike(

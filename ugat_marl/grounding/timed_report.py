@@ -12,9 +12,9 @@ from torch import Tensor
 from ugat_marl.grounding.calibration import auroc
 from ugat_marl.grounding.fit_report import ForwardReport, TrainingRecord, entries, said_of
 from ugat_marl.grounding.lost_time import LostTime
+from ugat_marl.grounding.matching import Floats, Matched
 from ugat_marl.grounding.uncertainty import MethodName
 
-Floats = NDArray[np.float64]
 END_S = 0.5
 """A best delay so close to the longest one tried may well be longer."""
 
@@ -56,7 +56,7 @@ class TimedReport:
         lost: The delays that fit the street best.
         inverse: h.
         most_s: Longest delay tried.
-        matched_s: The delays with which rewards are those of the street, if they were matched.
+        matched: What rewards say of the delays, if they were asked.
     """
 
     agents: tuple[str, ...]
@@ -65,7 +65,7 @@ class TimedReport:
     lost: LostTime
     inverse: DelayReport
     most_s: int
-    matched_s: Floats | None = None
+    matched: Matched | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -81,7 +81,7 @@ class TimedReport:
             ),
             said_of(
                 f"the best delay is the longest tried ({self.most_s} s; raise timed most_s)",
-                self.lost.best_s > self.most_s - END_S,
+                self._delay_s > self.most_s - END_S,
                 self.agents,
             ),
         ]
@@ -90,6 +90,11 @@ class TimedReport:
         elif self.inverse.auroc_off_data <= 0.5:
             found.append(f"u does not rise off the data (AUROC {self.inverse.auroc_off_data:.2f})")
         return tuple(sentence for sentence in found if sentence)
+
+    @property
+    def _delay_s(self) -> Floats:
+        """What greens are late by in the mean, per agent."""
+        return self.lost.best_s + (0.0 if self.matched is None else self.matched.beyond_s)
 
     @property
     def expected_u(self) -> Floats:
@@ -119,8 +124,10 @@ class TimedReport:
             numbers[f"inverse/{name}"] = getattr(self.inverse, name)
         for name in ("best_s", "low_s", "high_s"):
             numbers |= entries(f"lost_time/{name}", getattr(self.lost, name), self.agents)
-        if self.matched_s is not None:
-            numbers |= entries("lost_time/matched_s", self.matched_s, self.agents)
+        if self.matched is not None:
+            numbers |= entries("lost_time/matched_s", self.matched.delay_s, self.agents)
+            numbers |= entries("lost_time/beyond_s", self.matched.beyond_s, self.agents)
+            numbers["lost_time/chance"] = self.matched.chance
         return numbers
 
 
