@@ -68,6 +68,8 @@ def test_an_interval_by_hand() -> None:
     half = 4.3027 / math.sqrt(3)  # the standard deviation is 1
     assert (found.mean, found.low, found.high) == pytest.approx((2.0, 2 - half, 2 + half), abs=1e-3)
     assert math.isnan(Interval.of(np.array([5.0])).low)
+    level = Interval.of(np.full(5, 107.71235))  # whose mean, summed up, is beside it
+    assert level.low == level.mean == level.high
 
 
 def test_a_paired_test_sees_what_an_unpaired_one_would_not() -> None:

@@ -56,7 +56,9 @@ class Interval:
         mean, count = float(values.mean()), values.size
         if count < 2:
             return cls(mean, math.nan, math.nan)
-        half = student_quantile(0.975, count - 1) * float(values.std(ddof=1)) / math.sqrt(count)
+        # Equal values have a mean beside them by rounding, and a spread of nearly 0.
+        spread = float(values.std(ddof=1)) if values.min() < values.max() else 0.0
+        half = student_quantile(0.975, count - 1) * spread / math.sqrt(count)
         return cls(mean, mean - half, mean + half)
 
 
