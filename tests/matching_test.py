@@ -136,7 +136,7 @@ def test_a_planted_delay_is_found() -> None:
     policy, agents = controller_for("largest-queue:20", env), env.possible_agents
     env.close()
     sim = SimulatedWorld(make, "sim", 1, 0.3, 4)
-    logs = sim.under_delays(policy, 0, 3)
+    logs = sim.under_delays(policy, 0, 3, list)
     sim.close()
     for late, log in enumerate(logs):
         assert set(log.frame["delay_s"].to_list()) == {0.0, float(late)} and log.episodes == 2

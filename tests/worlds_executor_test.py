@@ -17,12 +17,15 @@ from ugat_marl.traffic_env import parallel_env
 from ugat_marl.transfer import TransferConfig, transfer
 from ugat_marl.worlds import SimulatedWorld
 
-MAKE = partial(parallel_env, "single-v1", "V4", duration_s=120)
+MAKE = partial(parallel_env, "single-v1", "V4", duration_s=120, observation="movements")
 
 
 @pytest.mark.parametrize("most_delay_s", [0, 3])
-def test_an_executor_plays_the_same(most_delay_s: int) -> None:
-    policy = DQN.of(MAKE(), DQNConfig(), 3).policy()
+@pytest.mark.parametrize("rule", [None, "largest-queue:20"])  # which remembers its episode
+def test_an_executor_plays_the_same(most_delay_s: int, rule: str | None) -> None:
+    env = MAKE()
+    policy = DQN.of(env, DQNConfig(), 3).policy() if rule is None else controller_for(rule, env)
+    env.close()
     here = SimulatedWorld(MAKE, "real", 3, 0.3, most_delay_s)
     with ThreadPoolExecutor(2) as pool:
         there = SimulatedWorld(MAKE, "real", 3, 0.3, most_delay_s, pool)
@@ -30,7 +33,10 @@ def test_an_executor_plays_the_same(most_delay_s: int) -> None:
             one, other = (world.collect(policy, iteration, 7) for world in (here, there))
             assert one is not None and other is not None
             assert one.frame.equals(other.frame)
-        logs = zip(*(world.under_delays(policy, 0, 7) for world in (here, there)), strict=True)
+        done: list[None] = []
+        found = [w.under_delays(policy, 0, 7, lambda: done.append(None)) for w in (here, there)]
+        assert len(done) == 2 * here.roll_outs_under_delays == 4 * (most_delay_s + 1)
+        logs = list(zip(*found, strict=True))
         assert [one.frame.equals(other.frame) for one, other in logs] == [True] * (most_delay_s + 1)
     here.close()
     there.close()

@@ -279,9 +279,9 @@ def _pay(
 ) -> Paid:
     """What the policy gets in `sim` under each delay, beside what it just got in both worlds."""
     agents = state.transform.stack.agents
-    with run.reporter.task(f"roll-outs under delays, round {iteration + 1}", 1) as advance:
-        logs = sim.under_delays(policy, iteration, seed)
-        advance()
+    title = f"under delays, round {iteration + 1}"
+    with run.reporter.task(title, sim.roll_outs_under_delays) as advance:
+        logs = sim.under_delays(policy, iteration, seed, advance)
     *before, street = [episode_rewards(log, agents) for log in state.real]
     return Paid(street, np.array([episode_rewards(log, agents) for log in logs]), before)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -81,11 +82,19 @@ class SimulatedWorld:
         ]
         return TransitionLog.concatenate(self._play(policy, [(s, None) for s in seeds]))
 
-    def under_delays(self, policy: Policy, iteration: int, seed: int) -> list[TransitionLog]:
+    def under_delays(
+        self, policy: Policy, iteration: int, seed: int, on_done: Callable[[], object]
+    ) -> list[TransitionLog]:
         """Roll-outs for each delay of 0, 1, ... s up to the longest, which every green has.
 
-        Each has traffic of its own: a busy hour would make all delays look short. There are two of
-        each, so that they tell how much chance there is in one.
+        Each has traffic of its own: a busy hour would make all delays look short. There are
+        `EPISODES_PER_DELAY` of each, which tell how much chance there is in one.
+
+        Args:
+            policy: Who acts.
+            iteration: Decides the seeds, with `seed`.
+            seed: As for `collect`.
+            on_done: Called after each of `roll_outs_under_delays`.
         """
         lates = range(self._most_delay_s + 1)
         parts = [
@@ -93,9 +102,14 @@ class SimulatedWorld:
             for late in lates
             for episode in range(EPISODES_PER_DELAY)
         ]
-        logs = self._play(policy, parts)
+        logs = self._played_by(self._workers, policy, parts, on_done)
         size = EPISODES_PER_DELAY
         return [TransitionLog.concatenate(logs[late * size : late * size + size]) for late in lates]
+
+    @property
+    def roll_outs_under_delays(self) -> int:
+        """How many `under_delays` plays."""
+        return EPISODES_PER_DELAY * (self._most_delay_s + 1)
 
     def _play(self, policy: Policy, parts: Sequence[tuple[int, int | None]]) -> list[TransitionLog]:
         """Roll-outs by their seeds and constant delays, in that order."""
@@ -107,12 +121,18 @@ class SimulatedWorld:
         return [_recorded(env, exploring, *part, self._stop) for part in parts]
 
     def _played_by(
-        self, workers: Executor, policy: Policy, parts: Sequence[tuple[int, int | None]]
+        self,
+        workers: Workers,
+        policy: Policy,
+        parts: Sequence[tuple[int, int | None]],
+        on_done: Callable[[], object] = lambda: None,
     ) -> list[TransitionLog]:
         stop, made = self._stop, (self._make_env, self._most_delay_s, policy, self._epsilon)
-        found = dict(
-            as_done(workers, _roll_out_alone, [(*made, *part, stop) for part in parts], stop)
-        )
+        found: dict[int, TransitionLog] = {}
+        given = [(*made, *part, stop) for part in parts]
+        for number, log in as_done(workers, _roll_out_alone, given, stop):
+            found[number] = log
+            on_done()
         self._stop = Stop()  # the other is set now, since nobody waits any more
         return [found[number] for number in range(len(parts))]
 
@@ -154,8 +174,9 @@ def _roll_out_alone(
 ) -> TransitionLog:
     """One roll-out in an environment of its own, wherever that is."""
     env = _delayed(make_env, most_delay_s)
+    own = copy.deepcopy(policy)  # some remember their episode, and others play beside this one
     try:
-        return _recorded(env, Exploring(policy, epsilon), seed, always_s, stop)
+        return _recorded(env, Exploring(own, epsilon), seed, always_s, stop)
     finally:
         env.close()
 
