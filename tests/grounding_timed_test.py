@@ -149,9 +149,21 @@ def test_only_rows_in_which_a_green_begins_count(planted) -> None:
 
 
 def test_a_street_like_the_simulation_loses_nothing() -> None:
-    _, report = fitted(street({"a_0": 0.0, "b_0": 0.0}, seed=3))
+    transform, report = fitted(street({"a_0": 0.0, "b_0": 0.0}, seed=3))
     assert (report.lost.best_s <= 0.3).all()
     assert (report.lost.low_s == 0.0).all()
+    assert not report.lost.shown.any() and not report.trusted().any()
+    assert not transform.constants.delay_s.any()  # nor what single phases have by chance
+
+
+@pytest.mark.parametrize(
+    ("low_s", "best_s", "shown"),
+    [(0.0, 0.0, False), (0.0, 0.4, False), (0.0, 0.5, True), (0.1, 0.3, True), (0.0, 2.0, True)],
+)
+def test_what_chance_explains_is_no_lost_time(planted, low_s, best_s, shown) -> None:
+    known = planted[1].lost
+    lost = dataclasses.replace(known, low_s=np.full(2, low_s), best_s=np.full(2, best_s))
+    assert lost.shown.tolist() == [shown, shown]
 
 
 def test_a_delay_between_whole_seconds_is_found() -> None:
@@ -200,7 +212,7 @@ def test_h_reads_the_delay_off_the_changes(planted) -> None:
     assert (h.error_on_transitions_s >= h.error_s - 0.05).all()
     assert np.isfinite(h.error_on_transitions_s).all()
     assert h.mean_u_off_data > h.mean_u + 0.2 and h.auroc_off_data > 0.7
-    assert planted[1].trusted().tolist() == [True, True]
+    assert planted[1].trusted().tolist() == [True, False]  # the second has nothing to refine
     assert planted[1].trusted(least_accuracy=0.99).tolist() == [False, False]
 
 

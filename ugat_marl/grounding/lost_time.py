@@ -24,6 +24,8 @@ STEP_S = 0.1
 """Resolution of the estimates."""
 LEAST_ROWS = 5
 """Fewer transitions have no mean to speak of."""
+LEAST_S = 0.5
+"""What is less is 0 in whole seconds."""
 LEVEL = 3.84
 """95 % quantile of chi-squared with one degree of freedom."""
 
@@ -44,6 +46,15 @@ class LostTime:
     low_s: NDArray[np.float64]
     high_s: NDArray[np.float64]
     switches: NDArray[np.int64]
+
+    @property
+    def shown(self) -> NDArray[np.bool_]:
+        """Whether there is any, ``(agents,)``.
+
+        There is none where 0 s would do as well and the best delay is 0 in whole seconds: what is
+        left is chance, and it would be made up for in every green of training.
+        """
+        return (self.low_s > 0.0) | (self.best_s >= LEAST_S)
 
 
 @dataclass(frozen=True)

@@ -73,10 +73,11 @@ def fit_timed(
     lost = lost_time(model, street, known, transform.timed.spread_s)
     # Models that know nothing of a street or of the simulation know of no lost time either.
     learnt = f.learnt & g.learnt
-    transform.constants.delay_s.copy_(lost.phase_s * torch.from_numpy(learnt)[:, None])
+    found = learnt & lost.shown
+    transform.constants.delay_s.copy_(lost.phase_s * torch.from_numpy(found)[:, None])
     matched = None
     if paid is not None:
-        matched = match(paid, np.where(learnt, lost.best_s, 0.0))
+        matched = match(paid, np.where(found, lost.best_s, 0.0))
         matched = replace(matched, beyond_s=matched.beyond_s * learnt)
         transform.constants.beyond_s.copy_(torch.from_numpy(matched.beyond_s)[:, None])
     data = replace(data, weight=data.weight * begins)

@@ -104,10 +104,10 @@ class TimedReport:
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
         """Agents whose h may be obeyed, for `Gate.trust`; the others take the best constant.
 
-        f and the model of the simulation have learnt something, and h, on its own task, beats a
-        guess by the share `least_accuracy`.
+        f and the model of the simulation have learnt something, there is a lost time for h to
+        refine, and h, on its own task, beats a guess by the share `least_accuracy`.
         """
-        better = self.forward.learnt & self.simulated.learnt
+        better = self.forward.learnt & self.simulated.learnt & self.lost.shown
         return better & (self.inverse.error_s < (1.0 - least_accuracy) * self.inverse.guess_s)
 
     def as_dict(self) -> dict[str, float]:
