@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ugat_marl.comparison import Floats
 from ugat_marl.grounding.calibration import (
     auroc,
     expected_calibration_error,
@@ -26,8 +27,6 @@ from ugat_marl.grounding.uncertainty import MethodName
 QUANTILES = 5
 DISCRIMINATES = 0.55
 """AUROC below which u is called uninformative in the warnings."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

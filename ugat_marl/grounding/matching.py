@@ -19,12 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
-from ugat_marl.comparison import student_p
+from ugat_marl.comparison import Floats, student_p
 from ugat_marl.transitions import TransitionLog
-
-Floats = NDArray[np.float64]
 
 CHANCE = 0.05
 """What is likelier than this under the lost time alone does not speak against it."""

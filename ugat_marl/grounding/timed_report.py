@@ -9,10 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ugat_marl.comparison import Floats
 from ugat_marl.grounding.calibration import auroc
 from ugat_marl.grounding.fit_report import ForwardReport, TrainingRecord, entries, said_of
 from ugat_marl.grounding.lost_time import LostTime
-from ugat_marl.grounding.matching import Floats, Matched
+from ugat_marl.grounding.matching import Matched
 from ugat_marl.grounding.uncertainty import MethodName
 
 END_S = 0.5
