@@ -45,6 +45,16 @@ def test_main_has_the_controls_an_honest_table_needs() -> None:
     ]  # fmt: skip
 
 
+def test_rewards_are_matched_in_the_row_that_says_so_alone() -> None:
+    matching = {
+        setting.name
+        for table in TABLES
+        for setting in SHORT.settings(table)
+        if setting.kind == "grounded" and setting.ugat.matches
+    }
+    assert matching == {"UGAT, timed: rewards matched"}
+
+
 @pytest.mark.parametrize("table", TABLES)
 def test_rows_of_a_table_have_names_of_their_own_and_begin_with_direct_transfer(table: str) -> None:
     names = [setting.name for setting in SHORT.settings(table)]

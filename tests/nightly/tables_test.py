@@ -49,6 +49,7 @@ def test_main(runs: Path) -> None:
     assert att(found, TIMED) < att(found, CONTROL)
     assert att(found, RULE) < att(found, DIRECT)
     assert found.test(TIMED, DIRECT, DOMAIN).better == CONFIG.seeds
+    assert found.won_back(f"{TIMED}: rewards matched", DOMAIN, DIRECT) >= 0.7
 
 
 def test_ablation(runs: Path) -> None:

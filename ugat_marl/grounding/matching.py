@@ -6,9 +6,9 @@ for it: with the delay found here the same policy has, over whole episodes, the 
 worlds. That is blunt where it comes to why: whatever else the worlds differ in is charged to the
 delay, too. And it has to be the same policy, so that logs of another one do not do.
 
-An hour of traffic is one sample, and some delay fits best even where no green is late. So the
-delays found here are taken only where chance does not explain why what the greens lose when they
-begin is not enough.
+An hour of traffic is one sample, and some delay fits best even where no green is late. So greens
+are moved only where chance does not explain what lies between the street's rewards and those of the
+simulation with the lost time alone.
 """
 
 from __future__ import annotations
@@ -67,10 +67,8 @@ def match(paid: Paid, lost_s: Floats) -> Matched:
         paid: Rewards in both worlds.
         lost_s: ``(agents,)``, what greens lose when they begin, in s.
     """
-    delay_s, chance = (
-        matching_delays(paid.street.mean(0), paid.simulated.mean(1)),
-        chance_of(paid, lost_s),
-    )
+    delay_s = matching_delays(paid.street.mean(0), paid.simulated.mean(1))
+    chance = chance_of(paid, lost_s)
     return Matched(delay_s, chance, (delay_s - lost_s) * (chance < CHANCE))
 
 

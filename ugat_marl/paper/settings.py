@@ -84,7 +84,8 @@ def settings_of(
         raise OptionError(f"constants holds {wrong[0]}: delays are whole seconds, at least 1")
     # The paper's grounding obeys its models from the start.
     least = {"phase": None, "timed": ugat.least_accuracy}
-    bases = {g: replace(ugat, grounding=g, least_accuracy=least[g]) for g in groundings}
+    alone = replace(ugat, timed=replace(ugat.timed, match=False))  # matching is a row of its own
+    bases = {g: replace(alone, grounding=g, least_accuracy=least[g]) for g in groundings}
     direct, rule = Setting(DIRECT, "direct"), Setting(RULE, "rule")
     if table == "main":
         return [direct, *_grounded(bases), *_controls(ugat, sim, constants), rule]
@@ -114,7 +115,7 @@ def _matching(name: str, base: UgatConfig) -> list[Setting]:
     """Timed grounding that matches rewards; nothing for the phase's, which cannot."""
     ugat = replace(base, timed=replace(base.timed, match=True))
     row = Setting(f"{GROUNDED_NAME[name]}: rewards matched", "grounded", ugat=ugat)
-    return [row] * (ugat.matches and ugat != base)
+    return [row] * ugat.matches
 
 
 def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Setting]:
