@@ -53,7 +53,7 @@ class SimulatedWorld:
         epsilon: Chance of a random phase.
         most_delay_s: Longest of the random delays of greens; 0 for none.
         workers: An executor that plays each roll-out in an environment of its own; anything else:
-            one after the other here, in one environment.
+            those of `collect` one after the other here, in one environment.
     """
 
     def __init__(
@@ -80,7 +80,15 @@ class SimulatedWorld:
             derive_seed(seed, "roll-out", self._name, iteration, episode)
             for episode in range(self._episodes)
         ]
-        return TransitionLog.concatenate(self._play(policy, [(s, None) for s in seeds]))
+        if isinstance(self._workers, Executor):
+            logs = self._played_by(self._workers, policy, [(s, None) for s in seeds])
+            return TransitionLog.concatenate(logs)
+        if self._env is None:
+            self._env = _delayed(self._make_env, self._most_delay_s)
+        env, exploring = self._env, Exploring(policy, self._epsilon)
+        return TransitionLog.concatenate(
+            [_recorded(env, exploring, s, None, self._stop) for s in seeds]
+        )
 
     def under_delays(
         self, policy: Policy, iteration: int, seed: int, on_done: Callable[[], object]
@@ -111,15 +119,6 @@ class SimulatedWorld:
         """How many `under_delays` plays."""
         return EPISODES_PER_DELAY * (self._most_delay_s + 1)
 
-    def _play(self, policy: Policy, parts: Sequence[tuple[int, int | None]]) -> list[TransitionLog]:
-        """Roll-outs by their seeds and constant delays, in that order."""
-        if isinstance(self._workers, Executor):
-            return self._played_by(self._workers, policy, parts)
-        if self._env is None:
-            self._env = _delayed(self._make_env, self._most_delay_s)
-        env, exploring = self._env, Exploring(policy, self._epsilon)
-        return [_recorded(env, exploring, *part, self._stop) for part in parts]
-
     def _played_by(
         self,
         workers: Workers,
@@ -127,6 +126,7 @@ class SimulatedWorld:
         parts: Sequence[tuple[int, int | None]],
         on_done: Callable[[], object] = lambda: None,
     ) -> list[TransitionLog]:
+        """Roll-outs by their seeds and constant delays, in that order."""
         stop, made = self._stop, (self._make_env, self._most_delay_s, policy, self._epsilon)
         found: dict[int, TransitionLog] = {}
         given = [(*made, *part, stop) for part in parts]
