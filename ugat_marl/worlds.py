@@ -25,6 +25,7 @@ from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.transitions import TransitionLog
 
 EPISODES_PER_DELAY = 2
+"""The fewest that tell how much chance there is in one."""
 
 
 class World(Protocol):
@@ -96,7 +97,7 @@ class SimulatedWorld:
         """Roll-outs for each delay of 0, 1, ... s up to the longest, which every green has.
 
         Each has traffic of its own: a busy hour would make all delays look short. There are
-        `EPISODES_PER_DELAY` of each, which tell how much chance there is in one.
+        `EPISODES_PER_DELAY` of each.
 
         Args:
             policy: Who acts.

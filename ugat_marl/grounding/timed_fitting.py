@@ -58,15 +58,16 @@ def fit_timed(
         LogError: As `fitting.fit`.
     """
     refuse_mismatch(real, simulated)
+    how = config, seed, on_epoch, device
     stack, model = transform.stack, transform.simulated
     street, data = _alike(stack_log(real, stack), stack_log(simulated, stack))
     parts = split(street, config.held_out_every, stack)
     lesson = Changes("forward", transform.forward.view.of(street), street.outcome, street.asked)
-    f = fit_changes(transform.forward, lesson, parts, config, seed, on_epoch, device)
+    f = fit_changes(transform.forward, lesson, parts, *how)
     parts = split(data, config.held_out_every, stack)
     extra = model.extra(data.delay_s)
     lesson = Changes("simulated", model.view.of(data), data.outcome, data.executed, extra)
-    g = fit_changes(model, lesson, parts, config, seed, on_epoch, device)
+    g = fit_changes(model, lesson, parts, *how)
     begins = _begins(data, stack)
     known = Means.of(model, replace(data, weight=parts.train * begins))
     street = replace(street, weight=street.weight * _begins(street, stack))
@@ -81,16 +82,8 @@ def fit_timed(
         matched = replace(matched, beyond_s=matched.beyond_s * learnt)
         transform.constants.beyond_s.copy_(torch.from_numpy(matched.beyond_s)[:, None])
     data = replace(data, weight=data.weight * begins)
-    h = _fit_delays(
-        transform,
-        data,
-        _where(begins, parts),
-        known.spread[:, None],
-        config,
-        seed,
-        on_epoch,
-        device,
-    )
+    spread = known.spread[:, None]
+    h = _fit_delays(transform, data, _where(begins, parts), spread, *how)
     return TimedReport(stack.agents, f, g, lost, h, transform.timed.most_s, matched)
 
 
