@@ -1,0 +1,126 @@
+"""Puts the overview in results/README.md together again, from the tables beside it.
+
+python results/overview.py
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+from ugat_marl.files import write_whole
+from ugat_marl.report.comparison_tables import number, percent
+from ugat_marl.transfer import CONTROL, DIRECT, ORACLE, TIMED
+
+FOLDER = Path(__file__).parent
+BEGIN, END = "<!-- overview -->\n", "<!-- end of overview -->\n"
+MATCHED = f"{TIMED}: rewards matched"
+GROUNDED = (TIMED, MATCHED)
+CONSTANT, RULE = "constant delay", "best rule"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a way to come to a policy has in one domain.
+
+    Attributes:
+        att_s: Travel time there in s, mean over training seeds.
+        gap_s: That minus the travel time in the simulation.
+    """
+
+    att_s: float
+    gap_s: float
+
+
+Column = Mapping[str, Outcome]
+"""The outcomes in one domain, by setting."""
+
+
+def columns(table: Path) -> dict[str, Column]:
+    """The domains of a `table.csv`."""
+    found: dict[str, dict[str, Outcome]] = defaultdict(dict)
+    with table.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            own = Outcome(float(row["att_s"]), float(row["att_s_gap"]))
+            found[row["domain"]][row["setting"]] = own
+    return dict(found)
+
+
+def won_back(setting: str, column: Column) -> float:
+    """Share of direct transfer's regret that is gone."""
+    start, best = column[DIRECT].att_s, min(own.att_s for own in column.values())
+    return (start - column[setting].att_s) / (start - best)
+
+
+def reduction(setting: str, column: Column) -> float:
+    """Change of direct transfer's gap, as a share."""
+    return column[setting].gap_s / column[DIRECT].gap_s - 1.0
+
+
+def overview(folder: Path = FOLDER) -> str:
+    """The overview as Markdown: every domain of every table of transfer, and their means."""
+    lines = [
+        "| table | | direct transfer | UGAT, timed | timed, rewards matched | more plain `sim` "
+        "| constant delay | trained in real | best rule there |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for table in sorted(folder.glob("*/main*/table.csv")):
+        found = columns(table)
+        place = table.parent.relative_to(folder)
+        name = f"[{place.parts[0]}{place.name.removeprefix('main').replace('-', ', ')}]"
+        first = f"{name}({place}/table.md)"
+        for domain, column in found.items():
+            lines.append(_line(first, domain, column))
+            first = ""
+        if len(found) > 1:
+            lines.append(_mean(list(found.values())))
+    return "\n".join(lines) + "\n"
+
+
+def _line(name: str, domain: str, column: Column) -> str:
+    others = [
+        _att(column, [own for own in column if own.startswith(start)])
+        for start in (CONTROL, CONSTANT, ORACLE, RULE)
+    ]
+    cells = [name, domain, _att(column, [DIRECT]), *(_grounded(g, column) for g in GROUNDED)]
+    return f"| {' | '.join(cells + others)} |"
+
+
+def _att(column: Column, settings: Sequence[str]) -> str:
+    return number(min(column[own].att_s for own in settings)) if settings else ""
+
+
+def _grounded(setting: str, column: Column) -> str:
+    if setting not in column:
+        return ""
+    gap, share = percent(reduction(setting, column)), won_back(setting, column)
+    return f"**{number(column[setting].att_s)}** {gap}, {share:.2f}"
+
+
+def _mean(found: Sequence[Column]) -> str:
+    cells = ["", "*mean*", ""]
+    for setting in GROUNDED:
+        having = [column for column in found if setting in column]
+        if len(having) < len(found):
+            cells.append("")
+            continue
+        gap = percent(fmean(reduction(setting, column) for column in having))
+        cells.append(f"*{gap}, {fmean(won_back(setting, column) for column in having):.2f}*")
+    return f"| {' | '.join(cells)} | | | | |"
+
+
+def with_overview(page: str, folder: Path = FOLDER) -> str:
+    """The page with the overview of today between its marks."""
+    if BEGIN not in page or END not in page:
+        raise ValueError(f"the overview belongs between {BEGIN.strip()} and {END.strip()}")
+    before, _, rest = page.partition(BEGIN)
+    return f"{before}{BEGIN}\n{overview(folder)}\n{END}{rest.partition(END)[2]}"
+
+
+if __name__ == "__main__":
+    page = FOLDER / "README.md"
+    write_whole(page, with_overview(page.read_text(encoding="utf-8")))
