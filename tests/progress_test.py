@@ -8,6 +8,7 @@ import re
 import pytest
 from rich.console import Console
 
+from ugat_marl import progress
 from ugat_marl.progress import Bars
 
 
@@ -26,3 +27,15 @@ def test_a_long_note_does_not_squeeze_the_bar(width: int) -> None:
     assert "left" in last
     assert max(map(len, lines)) <= width
     assert ("startup_delay" in last) == (width == 160), "shortened where there is no room"
+
+
+def test_a_log_shows_once_a_minute_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    written = io.StringIO()
+    with Bars(Console(file=written, width=80)).task("paper main", 8) as advance:
+        for _ in range(6):
+            now[0] += 25.0
+            advance(note="V1")
+    done = re.findall(r"^paper main +━+╸? +(\d)/8 .* V1$", written.getvalue(), flags=re.MULTILINE)
+    assert done == ["3", "6", "8"], "after 75 s, after 150 s, and at the end"

@@ -1,4 +1,4 @@
-"""What long work says while it runs: progress bars in a terminal, nothing elsewhere."""
+"""What long work says while it runs: bars in a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ from rich.table import Column
 
 Advance = Callable[..., None]
 """Called as ``advance()`` or ``advance(note="...")`` when a unit of work is done."""
+
+_QUIET_S = 60.0
+"""Least seconds from one line of a task to the next where there is no terminal."""
 
 _PATIENCE_S = 1.0
 """Seconds after which reading a file is worth a bar."""
@@ -53,7 +56,10 @@ class Silent:
 
 
 class Bars:
-    """Progress bars with the time left; where there is no terminal, one line per task at its end.
+    """Progress bars with the time left.
+
+    Where there is no terminal, as in a log, a bar is printed when its task ends, and before that
+    at most once a minute.
 
     Args:
         console: Where to write.
@@ -76,10 +82,15 @@ class Bars:
         )
         with Progress(*columns, console=self._console) as progress:
             bar = progress.add_task(name, total=total, note="")
+            printed = time.monotonic()
 
             def advance(note: str = "") -> None:
+                nonlocal printed
                 fields: dict[str, Any] = {"note": note} if note else {}
                 progress.update(bar, advance=1, **fields)
+                if not self._console.is_terminal and time.monotonic() - printed >= _QUIET_S:
+                    printed = time.monotonic()
+                    self._console.print(progress.make_tasks_table(progress.tasks))
 
             yield advance
             progress.update(bar, completed=total)  # the work may have ended early, by its own rule
