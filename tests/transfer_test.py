@@ -104,6 +104,12 @@ CONTROLS: dict[str, Any] = {
 }
 
 
+def test_without_iterations_there_is_no_ugat_to_judge(tmp_path: Path) -> None:
+    plain = replace(SMALL, ugat=replace(SMALL.ugat, iterations=0))
+    assert transfer(plain, tmp_path / "run").policies == ["direct transfer"]
+    assert [path.name for path in (tmp_path / "run/policies").iterdir()] == ["direct-transfer.pt"]
+
+
 def test_every_control_is_trained_as_long_as_it_says_where_it_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

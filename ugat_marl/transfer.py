@@ -227,10 +227,10 @@ def transfer(
         state = State(learner, transform)
         restore(state, run, DQNPolicy.load)
         policy = _train(config, scenario, env, recorded, state, run, workers)
-        policies: dict[str, Policy] = {}
-        if state.direct is not None:
-            policies[DIRECT] = state.direct
-        policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
+        assert state.direct is not None  # plain training comes first
+        policies: dict[str, Policy] = {DIRECT: state.direct}
+        if config.ugat.iterations:
+            policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
         direct = directory / DIRECT_LEARNER
         for control in controls:
             policies[control.name] = train_control(control, make, config.seed, run, direct)
