@@ -22,6 +22,7 @@ from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.learners.dqn_policy import DQNPolicy
 from ugat_marl.progress import Silent
 from ugat_marl.randomised import RandomisedEnv
+from ugat_marl.recipes import file_names
 from ugat_marl.training import Metrics
 from ugat_marl.transfer import TransferConfig, transfer
 from ugat_marl.transitions import TransitionLog
@@ -147,7 +148,7 @@ def test_every_control_is_trained_as_long_as_it_says_where_it_says(
             "acceleration", "deceleration", "emergency_deceleration", "startup_delay",
         }  # fmt: skip
     assert set(late) == {5} and len(late) == 6 * 10  # six episodes of ten decisions
-    policies = [weights(tmp_path, transfer_module.file_name(name)) for name in names]
+    policies = [weights(tmp_path, file) for file in file_names(names)]
     for i, one in enumerate(policies):
         assert not any(np.array_equal(one, other) for other in policies[:i])
 
@@ -164,6 +165,15 @@ def test_controls_are_the_trainings_that_go_by_other_names(tmp_path: Path) -> No
         ("fine-tuned-on-the-same-data", "further-in-v4"),
     ):
         assert np.array_equal(weights(tmp_path, one), weights(tmp_path, other))
+
+
+def test_domains_whose_names_differ_by_a_sign_are_trained_in_one_by_one(tmp_path: Path) -> None:
+    domains = ("acceleration=0.5+demand_timing=*,-60", "acceleration=0.5+demand_timing=*,60")
+    transfer(replace(SMALL, further=domains), tmp_path)
+    assert len(list(tmp_path.glob("further-in-*-learner.pt"))) == 2
+    first = "further-in-acceleration-0.5-demand-timing-60"
+    one, two = (weights(tmp_path, name) for name in (first, f"{first}-2"))
+    assert not np.array_equal(one, two)
 
 
 def test_controls_can_be_added_to_a_run_and_change_nothing_else(tmp_path: Path) -> None:
@@ -281,3 +291,9 @@ def test_timed_grounding_learns_from_a_log_of_fixed_time(crossings: bool, tmp_pa
     assert not (tmp_path / "run" / "checkpoint" / "real-001.parquet").exists()
     found = numbers(tmp_path / "run")
     assert 0 <= found[1, "lost_time/low_s"] <= found[1, "lost_time/best_s"] <= 5
+
+
+def test_names_of_policies_are_names_of_files_of_their_own() -> None:
+    names = ["direct transfer", "further in a=-1", "further in a=1", "further in a-1"]
+    expected = ["direct-transfer", "further-in-a-1", "further-in-a-1-2", "further-in-a-1-3"]
+    assert file_names(names) == expected

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from ugat_marl.learners.registry import LearnerFactory
 from ugat_marl.policy import AnyParallelEnv, Learner, Policy
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Scenario
-from ugat_marl.traffic_env import parallel_env
+from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
 from ugat_marl.ugat import CHUNK, UgatConfig
 from ugat_marl.worlds import SimulatedWorld
@@ -128,6 +128,28 @@ def train_control(
     return learner.policy()
 
 
+def further(domain: str, env: TrafficEnv, episodes: int) -> Control:
+    """Direct transfer trained on in another domain, kept by the name and the content of it.
+
+    Args:
+        domain: How it is spelled.
+        env: The domain.
+        episodes: As for `Control`.
+    """
+    name = f"further in {domain}"
+    own = f"{file_name(name)}-{env.scenario.hash[:8]}-learner.pt"
+    return Control(name, env, episodes, file=own)
+
+
 def file_name(name: str) -> str:
     """The name of a policy as the name of a file."""
     return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
+
+
+def file_names(names: Iterable[str]) -> list[str]:
+    """The names of policies as names of files, all different: a second one of a kind ends in -2."""
+    found: list[str] = []
+    for name in names:
+        own = [file_name(name), *(f"{file_name(name)}-{k}" for k in range(2, len(found) + 2))]
+        found.append(next(file for file in own if file not in found))
+    return found

@@ -36,7 +36,7 @@ from ugat_marl.policy import Policy
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.queues import QUEUES, QueueRecord
 from ugat_marl.randomised import randomised_env
-from ugat_marl.recipes import Control, file_name, simulated_worlds, train_control
+from ugat_marl.recipes import Control, file_names, further, simulated_worlds, train_control
 from ugat_marl.scenario import Scenario
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run, write_settings
@@ -238,9 +238,9 @@ def transfer(
         for made in (env, *(control.env for control in controls)):
             made.close()
         run.close()
-    for name, trained in policies.items():
+    for file, trained in zip(file_names(policies), policies.values(), strict=True):
         if isinstance(trained, DQNPolicy):
-            trained.save(directory / "policies" / f"{file_name(name)}.pt")
+            trained.save(directory / "policies" / f"{file}.pt")
     queues = QueueRecord()
     table = judge(config, scenario, policies, reporter, queues.watch, workers)
     queues.write(directory / QUEUES)
@@ -344,7 +344,7 @@ def _controls(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> li
         title = "control: more plain sim"
         found.append(Control(CONTROL, env, whole, file="control-learner.pt", title=title))
     for domain in config.further:
-        found += [Control(f"further in {describe(domain)}", world("further", domain), whole)]
+        found.append(further(describe(domain), world("further", domain), whole))
     if config.random_delay_s is not None:
         late = RandomDelays(world("sim", config.sim), config.random_delay_s)
         found.append(Control(f"{RANDOM_DELAY} 0-{config.random_delay_s} s", late, whole))
