@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -365,6 +366,59 @@ def test_damaged_and_foreign_checkpoints_are_refused_and_change_nothing(tmp_path
     with pytest.raises(CheckpointError, match="expected"):
         DQNPolicy.load(path)
     assert np.array_equal(target.policy().parameters, untouched)
+
+
+def _replace(*path: str, by: Any) -> Callable[[dict[str, Any]], None]:
+    def change(content: dict[str, Any]) -> None:
+        for key in path[:-1]:
+            content = content[key]
+        content[path[-1]] = by
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _replace("adam", "exp_avg", by=torch.zeros(3)),
+        _replace("adam", "exp_avg_sq", by=torch.zeros(1)),
+        _replace("adam", "step", by=torch.zeros(2)),
+        _replace("adam", by={"step": torch.zeros(())}),
+        _replace("tensors", "centre", by=[0.0]),
+        _replace("counters", "decisions", by=-5),
+        _replace("counters", "added", by=-1),
+        _replace("replay", "action", by=torch.full((3, 40), 7)),
+        _replace("replay", "action", by=torch.full((3, 40), -1)),
+        _replace("action_counts", by=[2]),
+        _replace("hidden", by=[0]),
+        _replace("hidden", by=[]),
+    ],
+    ids=lambda change: str(change.__closure__[1].cell_contents),
+)
+def test_a_crafted_checkpoint_is_refused_before_anything_reads_it(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None]
+):
+    learner = DQN.of(CueEnv(), QUICK)
+    learner.learn(CueEnv(), 2, seed=0)
+    learner.save(tmp_path / "dqn.pt")
+    content = torch.load(tmp_path / "dqn.pt", weights_only=True)
+    assert content["adam"] and tuple(content["replay"]["action"].shape) == (3, 40)
+    DQN.of(CueEnv(), QUICK).load(tmp_path / "dqn.pt")
+    change(content)
+    torch.save(content, tmp_path / "dqn.pt")
+    with pytest.raises(CheckpointError, match=r"dqn\.pt"):
+        DQN.of(CueEnv(), QUICK, seed=3).load(tmp_path / "dqn.pt")
+
+
+@pytest.mark.parametrize(
+    "change", [("agents", ["a"]), ("observation_sizes", [0, 3]), ("hidden", [0])]
+)
+def test_a_crafted_policy_is_refused(tmp_path: Path, change: tuple[str, list[Any]]):
+    DQN.of(CueEnv(), QUICK).policy().save(tmp_path / "policy.pt")
+    content = torch.load(tmp_path / "policy.pt", weights_only=True)
+    torch.save(content | dict([change]), tmp_path / "policy.pt")
+    with pytest.raises(CheckpointError, match="no network's"):
+        DQNPolicy.load(tmp_path / "policy.pt")
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])

@@ -74,6 +74,30 @@ def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> N
             raise CheckpointError(f"{name}: {key} holds NaN or infinity; the file {consequence}")
 
 
+def tensors_like(
+    path: Path, found: Mapping[str, torch.Tensor], own: Mapping[str, torch.Tensor]
+) -> dict[str, torch.Tensor]:
+    """Tensors of a checkpoint with the names, shapes and types of one's own.
+
+    Args:
+        path: The checkpoint, for messages.
+        found: What it holds; what is not among one's own is left out.
+        own: What is needed.
+
+    Raises:
+        CheckpointError: One is of another shape or type.
+        KeyError: One is missing.
+    """
+    for name, tensor in own.items():
+        given = found[name]
+        if given.shape != tensor.shape or given.dtype != tensor.dtype:
+            raise CheckpointError(
+                f"{path}: {name} has shape {tuple(given.shape)}, this learner needs "
+                f"{tuple(tensor.shape)}; use the settings it was saved with"
+            )
+    return {name: found[name] for name in own}
+
+
 def _tensors(prefix: str, content: Mapping[str, Any]) -> Iterator[tuple[str, torch.Tensor]]:
     for key, value in content.items():
         if isinstance(value, Mapping):

@@ -343,8 +343,7 @@ def _controls(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> li
     if config.control:
         title = "control: more plain sim"
         found.append(Control(CONTROL, env, whole, file="control-learner.pt", title=title))
-    for domain in config.further:
-        found.append(further(describe(domain), world("further", domain), whole))
+    found += [further(describe(d), world("further", d), whole) for d in config.further]
     if config.random_delay_s is not None:
         late = RandomDelays(world("sim", config.sim), config.random_delay_s)
         found.append(Control(f"{RANDOM_DELAY} 0-{config.random_delay_s} s", late, whole))

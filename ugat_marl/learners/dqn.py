@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.batched import one_thread
-from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
+from ugat_marl.checkpoints import read_checkpoint, tensors_like, write_checkpoint
 from ugat_marl.devices import CPU
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.learners.agents import AgentSet
@@ -340,11 +340,14 @@ class DQN:
                     "this learner's; give the checkpoint of this scenario, or train a new one"
                 )
             counters = {name: int(content["counters"][name]) for name in (*_COUNTERS, "added")}
-            tensors = _like(path, content["tensors"], self._tensors())
-            stored = _like(path, content["replay"], self._replay.rows(counters["added"]))
-            adam = content["adam"]
-            moments = {name: adam[name].to(self.device) for name in _MOMENTS if adam}
-        except (KeyError, TypeError, ValueError) as error:
+            tensors = tensors_like(path, content["tensors"], self._tensors())
+            stored = tensors_like(path, content["replay"], self._replay.rows(counters["added"]))
+            moments = tensors_like(
+                path, content["adam"], self._moments() if content["adam"] else {}
+            )
+            if min(counters.values()) < 0 or not self._chosen(stored["action"]):
+                raise ValueError("counters below 0, or actions that no agent has")
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a whole checkpoint ({error!r})") from None
         self.env_options = env_options
         for name in _COUNTERS:
@@ -353,9 +356,18 @@ class DQN:
             tensor.copy_(tensors[name])
         self._replay.restore(stored, counters["added"])
         self._adam.state.clear()
-        if moments:
-            self._adam.state[self._weights] = moments
+        if moments:  # Adam reads them where the weights lie, side by side
+            placed = {name: moments[name].contiguous().to(self.device) for name in _MOMENTS}
+            self._adam.state[self._weights] = placed
         self._acting.forget()
+
+    def _moments(self) -> dict[str, Tensor]:
+        weights = self._weights.data
+        return dict(zip(_MOMENTS, (weights.new_zeros(()), weights, weights), strict=True))
+
+    def _chosen(self, actions: Tensor) -> bool:
+        counts = torch.tensor(self.agents.action_counts).unsqueeze(1)
+        return bool(((actions >= 0) & (actions < counts)).all())
 
     def _tensors(self) -> dict[str, Tensor]:
         return {
@@ -377,15 +389,3 @@ def _require_same(path: Path, what: str, found: object, own: object) -> None:
             f"{path}: its {what} are {found}, this learner's {own}; give the checkpoint of this "
             "scenario and these settings, or train a new one"
         )
-
-
-def _like(path: Path, found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of `found`, checked against names, shapes and types of `own`."""
-    for name, tensor in own.items():
-        given = found[name]
-        if given.shape != tensor.shape or given.dtype != tensor.dtype:
-            raise CheckpointError(
-                f"{path}: {name} has shape {tuple(given.shape)}, this learner needs "
-                f"{tuple(tensor.shape)}; use the settings it was saved with"
-            )
-    return dict(found)

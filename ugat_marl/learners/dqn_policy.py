@@ -169,8 +169,12 @@ def parse_header(
         tuple(content["observation_sizes"]),
         tuple(content["action_counts"]),
     )
+    sizes = agents.observation_sizes, agents.action_counts
+    hidden = tuple(int(width) for width in content["hidden"])
+    if {len(agents)} != {len(each) for each in sizes} or min(*sizes[0], *sizes[1], *hidden) < 1:
+        raise ValueError("its agents or the sizes of its layers are no network's")
     options = cast(dict[str, Any], json.loads(content["env_options"]))
     shared = content.get("shared", False)  # older files do not have it
     if not isinstance(shared, bool):
         raise TypeError(f"shared = {shared!r} is not a bool")
-    return agents, tuple(content["hidden"]), options, shared
+    return agents, hidden, options, shared
