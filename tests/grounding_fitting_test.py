@@ -276,6 +276,15 @@ def test_each_agent_keeps_its_own_best_weights() -> None:
         assert report.error[0] == pytest.approx(together.error[i], rel=1e-3)
 
 
+def test_a_fit_does_not_end_before_the_loss_is_that_of_training() -> None:
+    log = planted(0.3, episodes=4, steps=90)
+    f, h = models()
+    config = FitConfig(epochs=60, patience=3, kl_epochs=40, off_data_weight=1.0, learning_rate=3e-3)
+    report = fit(f, h, log, log, config, seed=0)
+    assert report.inverse.training.epochs > 40
+    assert (report.inverse.accuracy > 0.95).all()  # 0.52 where patience ends it in epoch 5
+
+
 def test_f_learns_what_was_asked_and_h_what_was_served() -> None:
     log = planted(0.3, episodes=3, steps=120, swap=1)
     f, h = models()

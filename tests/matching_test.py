@@ -60,8 +60,20 @@ def test_delays_lie_where_the_rewards_are_the_same() -> None:
     expected = [0.0, 0.0, 0.5, 1.5, 3.0, 3.0]
     curves = np.repeat(one[:, None], len(streets), axis=1)
     assert matching_delays(np.array(streets), curves) == pytest.approx(expected)
-    curves = np.repeat(level[:, None], 3, axis=1)
-    assert matching_delays(np.array([-10.0, -20.0, -25.0]), curves).tolist() == [0.0, 2.0, 2.0]
+    curves = np.repeat(level[:, None], 4, axis=1)
+    paid = np.array([-10.0, -15.0, -20.0, -25.0])
+    assert matching_delays(paid, curves).tolist() == [0.0, 1.5, 2.0, 2.0]
+
+
+@given(st.lists(st.integers(-50, 50), min_size=1, max_size=8), st.integers(-60, 60))
+def test_the_curve_pays_at_the_delay_what_the_street_pays(values: list[int], paid: int) -> None:
+    own = np.array(values, dtype=np.float64)
+    (delay,) = matching_delays(np.array([float(paid)]), own[:, None])
+    curve = falling(own)
+    pays = np.interp(delay, np.arange(len(own)), curve)
+    assert pays == pytest.approx(min(max(paid, curve[-1]), curve[0]), abs=1e-9)
+    earlier = np.linspace(0.0, delay, 50)[:-1]
+    assert (np.interp(earlier, np.arange(len(own)), curve) >= pays - 1e-9).all()
 
 
 def test_rewards_are_means_of_episodes_in_the_order_that_is_asked_for() -> None:

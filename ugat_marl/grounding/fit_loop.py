@@ -98,10 +98,13 @@ def train_model(
     config: FitConfig,
     generator: torch.Generator,
     on_epoch: EpochCallback | None,
+    annealed: int = 0,
 ) -> TrainingRecord:
     """Trains until the held-out loss has stopped falling; the model keeps its best weights.
 
-    Model, columns of the data and `parts` are on one device; `generator` is on the CPU.
+    Model, columns of the data and `parts` are on one device; `generator` is on the CPU. The
+    held-out loss has all its terms from the start: that it does not fall in the `annealed` epochs,
+    in which they come into training one by one, says nothing.
     """
     # Agents of f and members of h share no weight, so each may keep its own best.
     h = model if isinstance(model, AnswerModel) else None
@@ -125,7 +128,7 @@ def train_model(
             held_out_loss = held_out()
         improved = best.offer(held_out_loss)
         epoch += 1
-        waited = 0 if improved else waited + 1
+        waited = 0 if improved or epoch <= annealed else waited + 1
         if on_epoch is not None:
             on_epoch(name, epoch, float(held_out_loss.mean()))
     best.restore()

@@ -276,4 +276,5 @@ def fit_answers(
         return model.net.loss(taken(standardised, columns), taken(answers, columns), lesson)
 
     with placed(device, model):
-        return train_model("inverse", model, loss, parts, config, generator, on_epoch)
+        annealed = config.kl_epochs if fresh and config.uncertainty != "none" else 0
+        return train_model("inverse", model, loss, parts, config, generator, on_epoch, annealed)

@@ -128,8 +128,8 @@ def matching_delays(street: Floats, simulated: Floats) -> Floats:
         simulated: The same with greens late by 0, 1, 2, ... s, ``(delays, agents)``.
 
     Returns:
-        Delays in s, ``(agents,)``; 0 where the street pays more than the simulation at its best,
-        the longest where it pays less than at its worst.
+        Delays in s, ``(agents,)``, of several that pay the same the shortest; 0 where the street
+        pays more than the simulation at its best, that of its worst where it pays less.
     """
     pairs = zip(street, simulated.T, strict=True)
     return np.array([_matching(paid, falling(curve)) for paid, curve in pairs], dtype=np.float64)
@@ -147,5 +147,7 @@ def falling(values: Floats) -> Floats:
 
 
 def _matching(paid: float, curve: Floats) -> float:
-    (shortest,) = np.nonzero(np.diff(curve, prepend=np.inf) < 0)  # of those that pay the same
-    return float(np.interp(-paid, -curve[shortest], shortest.astype(np.float64)))
+    after = int(np.argmax(curve <= max(paid, curve[-1])))  # the shortest of those that pay the same
+    if after == 0 or curve[after] > paid:
+        return float(after)
+    return after - (paid - curve[after]) / (curve[after - 1] - curve[after])
