@@ -135,6 +135,25 @@ def test_impossible_rows_are_refused() -> None:
         settings_of("main", UgatConfig(), "sim", groundings=("fase",))
 
 
+def test_greens_are_late_in_the_simulation_that_is_trained_in(tmp_path: Path) -> None:
+    def worlds(sim: str) -> list[str | None]:
+        rows = settings_of("main", UgatConfig(), sim, constants=(3,))
+        return [row.world for row in rows if row.name == "constant delay 3 s"]
+
+    assert worlds("sim") == ["late_green=*,3"]
+    assert worlds("meso") == ["queue_model=500+late_green=*,3"]
+    (tmp_path / "scenario.toml").touch()
+    with pytest.raises(OptionError, match="--constants"):
+        worlds(str(tmp_path))
+    assert settings_of("main", UgatConfig(), str(tmp_path), constants=())
+
+
+def test_the_simulation_is_no_real_domain_of_its_own_table() -> None:
+    assert PaperConfig(sim="V1").targets("main") == ["V2", "V3", "V4"]
+    with pytest.raises(OptionError, match="name domains"):
+        PaperConfig(sim="light-loads").targets("alpha")
+
+
 def test_a_failed_job_says_why_and_the_next_call_starts_it_again(tmp_path: Path) -> None:
     broken = replace(planner().bases[0].job, options={"observation": "conut"})
     planned = Planned(broken, "broken")

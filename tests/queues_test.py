@@ -75,14 +75,16 @@ def test_an_evaluation_fills_it(tmp_path: Path) -> None:
             assert own["queue"].mean() == pytest.approx(mean)
 
 
-def test_another_evaluation_replaces_its_own_part(tmp_path: Path) -> None:
+def test_another_evaluation_adds_its_episodes(tmp_path: Path) -> None:
     path = tmp_path / "queues.parquet"
 
-    def write(domain: str, halting: float, *, keep: bool = True) -> None:
+    def write(domain: str, *episodes: float, keep: bool = True) -> None:
         env = stub(decisions=2, interval_s=60.0)
         look = (record := QueueRecord()).watch("policy", domain, env)
-        env.snapshot = SimpleNamespace(halting=np.full(len(env.network.lane_table().ids), halting))
-        look(1)
+        for halting in episodes:
+            lanes = len(env.network.lane_table().ids)
+            env.snapshot = SimpleNamespace(halting=np.full(lanes, halting))
+            look(1)
         record.write(path, keep=keep)
 
     path.write_bytes(b"broken")
@@ -90,7 +92,7 @@ def test_another_evaluation_replaces_its_own_part(tmp_path: Path) -> None:
     write("V4", 2.0)
     first = read_queues(path)
     assert set(first["domain"]) == {"sim", "V4"}
-    write("V4", 4.0)
+    write("V4", 4.0, 6.0)
     again = read_queues(path)
     assert len(again) == len(first)
     assert again.filter(domain="sim").equals(first.filter(domain="sim"))

@@ -92,13 +92,13 @@ def metrics(iterations: int = 2, episodes: int = 24, shift: float = 0.0) -> Metr
 
 def queues() -> pl.DataFrame:
     rows = [
-        (policy, domain, minute, tls, float(k + (minute if tls == "B2" else 0)) * factor)
+        (policy, domain, minute, tls, float(k + (minute if tls == "B2" else 0)) * factor, 6)
         for policy, factor in (("direct transfer", 2.0), ("UGAT", 1.0))
         for domain in ("sim", "V4")
         for minute in range(10)
         for k, tls in enumerate(LIGHTS)
     ]
-    names = ["policy", "domain", "minute", "intersection", "queue"]
+    names = ["policy", "domain", "minute", "intersection", "queue", "looks"]
     return pl.DataFrame(rows, schema=names, orient="row")
 
 
@@ -430,8 +430,8 @@ def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
 
 def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
     make_job(tmp_path, "direct-0", ("sim", "V4"), seed=0)
-    rows = [("policy", d, m, "A1", 3.0 + m) for d in ("sim", "V4") for m in range(5)]
-    schema = ["policy", "domain", "minute", "intersection", "queue"]
+    rows = [("policy", d, m, "A1", 3.0 + m, 6) for d in ("sim", "V4") for m in range(5)]
+    schema = ["policy", "domain", "minute", "intersection", "queue", "looks"]
     pl.DataFrame(rows, schema=schema, orient="row").write_parquet(
         tmp_path / "direct-0" / "queues.parquet"
     )
@@ -440,10 +440,11 @@ def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
     assert "direct transfer in V4" in page.text
 
 
+@pytest.mark.parametrize("sim", ["sim", "meso"])
 @pytest.mark.parametrize("table", TABLES)
-def test_jobs_are_called_as_in_the_tables_of_the_paper(table: str) -> None:
-    for row in settings_of(table, UgatConfig(), "sim"):
-        job = {"kind": row.kind, "world": row.world, "sim": "sim",
+def test_jobs_are_called_as_in_the_tables_of_the_paper(table: str, sim: str) -> None:
+    for row in settings_of(table, UgatConfig(), sim):
+        job = {"kind": row.kind, "world": row.world, "sim": sim,
                "ugat": asdict(row.ugat) if row.kind == "grounded" else None}  # fmt: skip
         assert row.name.split(":")[0] == job_name(job)
 

@@ -305,6 +305,14 @@ def test_a_log_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         config = TransferConfig("single-v1", real="none", real_log=log, duration_s=200)
         with pytest.raises(LogError, match=name):
             transfer(config, tmp_path / f"run-{name}")
+    short = recorded(tmp_path / "short.parquet")
+    whole = TransitionLog.read(short)
+    for name, rows in (("no row", 0), ("to hold out", 1)):
+        TransitionLog(whole.provenance, whole.frame.head(rows)).write(short)
+        config = TransferConfig("single-v1", real="none", real_log=short, duration_s=200)
+        with pytest.raises(LogError, match=name):
+            transfer(config, tmp_path / f"run-{name}")
+        assert not (tmp_path / f"run-{name}").exists(), "before anything is trained"
     cut_in_half(tmp_path / "queue.parquet")
     config = TransferConfig("single-v1", real="none", real_log=tmp_path / "queue.parquet")
     with pytest.raises(LogError, match=r"queue\.parquet"):

@@ -25,7 +25,9 @@ _SCHEMA = {
     "minute": pl.Int64,
     "intersection": pl.String,
     "queue": pl.Float64,
+    "looks": pl.Int64,
 }
+_PLACE = ["policy", "domain", "minute", "intersection"]
 
 
 @dataclass
@@ -78,14 +80,14 @@ class QueueRecord:
         return look
 
     def frame(self) -> pl.DataFrame:
-        """Columns policy, domain, minute (from 0), intersection, queue (mean, vehicles)."""
-        rows: list[tuple[str, str, int, str, float]] = []
+        """Columns policy, domain, minute (from 0), intersection, queue (mean, vehicles), looks."""
+        rows: list[tuple[str, str, int, str, float, int]] = []
         with self._lock:
             for (policy, domain), sums in self._sums.items():
                 for minute in np.flatnonzero(sums.looks).tolist():
-                    means = sums.queues[minute] / sums.looks[minute]
-                    named = zip(sums.intersections, means.tolist(), strict=True)
-                    rows += [(policy, domain, minute, tls, mean) for tls, mean in named]
+                    looks = int(sums.looks[minute])
+                    named = zip(sums.intersections, sums.queues[minute].tolist(), strict=True)
+                    rows += [(policy, domain, minute, t, q / looks, looks) for t, q in named]
         return pl.DataFrame(rows, schema=_SCHEMA, orient="row")
 
     def write(self, path: Path, *, keep: bool = False) -> None:
@@ -93,14 +95,14 @@ class QueueRecord:
 
         Args:
             path: The file.
-            keep: Whether what is there of other policies and domains stays; a file that cannot be
-                read does not.
+            keep: Whether what is there already counts as well; a file that cannot be read does not.
         """
         frame = self.frame()
         if keep and path.exists():
             with contextlib.suppress(CheckpointError):
-                before = read_queues(path).join(frame, on=["policy", "domain"], how="anti")
-                frame = pl.concat([before, frame])
+                both = pl.concat([read_queues(path), frame]).group_by(_PLACE, maintain_order=True)
+                mean = (pl.col("queue") * pl.col("looks")).sum() / pl.col("looks").sum()
+                frame = both.agg(mean, pl.col("looks").sum())
         with replacing(path) as temporary:
             frame.write_parquet(temporary)
 

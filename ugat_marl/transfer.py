@@ -214,7 +214,8 @@ def transfer(
     recorded: RecordedWorld | None = None
     if config.real_log is not None:
         log = TransitionLog.read(config.real_log)
-        recorded = RecordedWorld(log, env)  # refuses a misfit before anything is written
+        every = config.ugat.fit.held_out_every
+        recorded = RecordedWorld(log, env, every)  # refuses a misfit before anything is written
         _say_if_from_elsewhere(log, config, reporter)
     controls = _controls(config, scenario, env)
     learner = make(env, config.seed)

@@ -14,7 +14,10 @@ from ugat_marl.effects import Domain
 from ugat_marl.errors import LogError
 from ugat_marl.evaluation import PolicyFactory
 from ugat_marl.executors import Stop, Workers, as_done, persistently
+from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.fit_loop import split
 from ugat_marl.grounding.random_delays import RandomDelays
+from ugat_marl.grounding.stacked import Stack, stack_log
 from ugat_marl.metrics import Scores
 from ugat_marl.policy import AnyParallelEnv, Policy
 from ugat_marl.progress import Reporter, Silent
@@ -259,12 +262,16 @@ class RecordedWorld:
     Args:
         log: The transitions.
         env: The simulation they are to be compared with.
+        held_out_every: As for `FitConfig`.
 
     Raises:
-        LogError: The log's agents, observation or decision interval are not those of `env`.
+        LogError: The log's agents, observation or decision interval are not those of `env`, or
+            there are too few rows to fit anything to.
     """
 
-    def __init__(self, log: TransitionLog, env: TrafficEnv) -> None:
+    def __init__(
+        self, log: TransitionLog, env: TrafficEnv, held_out_every: int = FitConfig.held_out_every
+    ) -> None:
         own = log.provenance
         for what, found, wanted in (
             ("agents", list(own.layouts), list(env.layouts)),
@@ -280,6 +287,8 @@ class RecordedWorld:
                     f"the real log's {what} are {found}, the simulation's {wanted}; record it on "
                     f"{env.scenario.id!r} with the same options"
                 )
+        stack = Stack(env.layouts)
+        split(stack_log(log, stack), held_out_every, stack)  # now rather than after hours
         self._log = log
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:

@@ -137,10 +137,10 @@ def perform(job: Job, folder: Path, reporter: Reporter) -> None:
     else:
         factory = fixed_policy(_policy(job, folder, reporter))
     scenario = load(job.scenario)
-    queues = QueueRecord()
     for domain, seeds in missing.items():
         if not seeds:
             continue
+        queues = QueueRecord()
         found = evaluate(
             scenario,
             {"policy": factory},
@@ -154,8 +154,8 @@ def perform(job: Job, folder: Path, reporter: Reporter) -> None:
         )
         known |= {(domain, result.seed): result.scores for result in found.results}
         rows = [{"domain": d, "seed": s, **asdict(scores)} for (d, s), scores in known.items()]
+        queues.write(folder / QUEUES, keep=True)  # before what says that these were played
         write_whole(folder / SCORES, json.dumps(rows, indent=1) + "\n")
-        queues.write(folder / QUEUES, keep=True)
 
 
 def _rule(job: Job, folder: Path) -> str:

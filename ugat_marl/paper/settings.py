@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from ugat_marl.effects import describe, scenario_of
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.gate import GateConfig
@@ -106,6 +107,21 @@ def constant_name(seconds: int) -> str:
     return f"constant delay {seconds} s"
 
 
+def late_in(sim: str, seconds: int) -> str:
+    """The simulation with every green late by so many seconds.
+
+    Raises:
+        OptionError: It is a scenario of its own, to which no effect can be added by name.
+    """
+    if scenario_of(sim) is not None:
+        raise OptionError(
+            f"sim = {sim!r} is a scenario of its own, in which no greens can be delayed: give "
+            "--constants without any number"
+        )
+    late = f"late_green=*,{seconds}"
+    return late if describe(sim) == "sim" else f"{describe(sim)}+{late}"
+
+
 def _grounded(bases: dict[str, UgatConfig]) -> list[Setting]:
     rows = [Setting(GROUNDED_NAME[name], "grounded", ugat=base) for name, base in bases.items()]
     return rows + [row for name, base in bases.items() for row in _matching(name, base)]
@@ -124,7 +140,7 @@ def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Sett
         Setting(CONTROL, "further", sim),
         Setting(RANDOMISED, "randomised"),
         Setting(RANDOM_DELAY, "delays", sim),
-        *(Setting(constant_name(s), "further", f"late_green=*,{s}") for s in constants),
+        *(Setting(constant_name(s), "further", late_in(sim, s)) for s in constants),
         Setting(FINE_TUNED, "further", episodes=seen),
         Setting(ORACLE, "scratch"),
     ]

@@ -107,7 +107,12 @@ class PaperConfig:
     def targets(self, table: str) -> list[str]:
         """The real domains of a table."""
         default = ("V1",) if table in ("ablation", "alpha") else ("V1", "V2", "V3", "V4")
-        return [describe(domain) for domain in self.domains or default]
+        found = [describe(domain) for domain in self.domains or default]
+        if left := [domain for domain in found if domain != describe(self.sim)]:
+            return left
+        raise OptionError(
+            f"table {table!r} has {self.sim} alone, to which sim is set; name domains"
+        )
 
     def settings(self, table: str) -> list[Setting]:
         """The rows of a table.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,7 +13,7 @@ _PLAIN = {
     "rule": "best rule, tuned there",
 }
 _GROUNDED = {"phase": "UGAT", "timed": "UGAT, timed"}
-_LATE = "late_green=*,"
+_LATE = re.compile(r"(?:.*\+)?late_green=\*,(\d+)")
 
 
 def job_name(job: Mapping[str, Any]) -> str:
@@ -31,8 +32,8 @@ def job_name(job: Mapping[str, Any]) -> str:
             return "fine-tuned on the same data"
         if world == job.get("sim"):
             return "more plain sim"
-        late = str(world).removeprefix(_LATE)
-        return f"constant delay {late} s" if str(world).startswith(_LATE) else f"further in {world}"
+        late = _LATE.fullmatch(str(world))
+        return f"constant delay {late[1]} s" if late else f"further in {world}"
     if kind == "scratch":
         return "trained in real" if world is None else f"trained in {world}"
     return kind or "unknown"

@@ -334,7 +334,7 @@ def _worst(page: RunPage, record: RunRecord, places: Places | None) -> str:
     policies = [*policies, *(p for p in record.evaluation.policies[:1] if p not in policies)]
     queues: dict[str, dict[str, list[float]]] = {}
     rows = record.queues.sort("minute").rows()
-    for policy, where, _, tls, queue in rows:
+    for policy, where, _, tls, queue, _ in rows:
         if where == domain and policy in policies:
             queues.setdefault(policy, {}).setdefault(tls, []).append(queue)
     queues = {policy: queues[policy] for policy in policies if policy in queues}
