@@ -109,6 +109,21 @@ def test_nothing_to_win_has_no_share() -> None:
     assert math.isnan(found.won_back("UGAT", "V4", "direct transfer"))
 
 
+def test_episodes_that_broke_down_are_counted_one_by_one() -> None:
+    def episode(target: str, training: int | None, att_s: float, arrived: float) -> Trial:
+        scores = replace(BLANK, att_s=att_s, throughput=arrived, due=200.0)
+        return Trial("direct transfer", "V4", target, training, 1, scores)
+
+    rows = [
+        episode("V4", 0, 100.0, 190.0), episode("V4", 0, 120.0, 180.0),
+        episode("V4", 1, 700.0, 179.0), episode("sim", 1, 60.0, 0.0),
+    ]  # fmt: skip
+    found = Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
+    assert found.median_s("direct transfer", "V4") == 120.0
+    assert found.unserved("direct transfer", "V4") == pytest.approx(1 / 3)
+    assert "| direct transfer | 120, 33 % |" in markdown(found, "direct transfer", FACTS)
+
+
 def test_pages_hold_the_numbers(found: Comparison) -> None:
     page = markdown(found, "direct transfer", FACTS)
     assert "# toy: main" in page

@@ -16,6 +16,7 @@ from gymnasium.spaces import Box
 import ugat_marl
 from ugat_marl.__main__ import main
 from ugat_marl.effects import (
+    BlockerPatience,
     Incident,
     QueueModel,
     effect_from,
@@ -130,7 +131,7 @@ def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
 def test_every_effect_on_controllers_is_documented_with_its_fields_and_ranges() -> None:
     page = (Path(__file__).parent.parent / "docs" / "gaps.md").read_text()
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
-    others = {kind.name: kind for kind in (Incident, QueueModel)}
+    others = {kind.name: kind for kind in (Incident, QueueModel, BlockerPatience)}
     for name, kind in {**effects_on_controllers(), **others}.items():
         cell = rows[name]
         assert re.findall(r"`(\w+)`", cell) == [item.name for item in fields(kind)], name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import os
 import subprocess
 import xml.etree.ElementTree as ET
@@ -32,6 +33,7 @@ from ugat_marl.effects import (
     parse_domain,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
+from ugat_marl.evaluation import evaluate, rule_factory
 from ugat_marl.scenario import Scenario, shipped_scenarios
 from ugat_marl.simulator import LibsumoSimulator, launch_of
 
@@ -418,3 +420,32 @@ def test_a_shipped_scenario_in_v4_runs_in_plain_sumo(name: str, tmp_path: Path) 
             for key in ("accel", "decel", "emergencyDecel", "startupDelay")
         ]
         assert tuple(values) == PAPER["V4"], kind
+
+
+# --- junctions
+
+
+def test_the_option_for_blocked_junctions_reaches_sumo_and_no_diagnosis_looks_for_it(
+    tmp_path: Path,
+) -> None:
+    assert "blocker_patience" not in known_effects()
+    scenario = in_domain(load("single-v1"), "blocker_patience=45")
+    assert scenario.hash != load("single-v1").hash
+    arguments = launch_of(scenario, 1, tmp_path, ()).arguments
+    assert arguments[arguments.index("--ignore-junction-blocker") + 1] == "45"
+    with pytest.raises(OptionError, match="blocker_patience"):
+        in_domain(load("single-v1"), "blocker_patience=0")
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("sumo_rl") is None, reason="the RESCO networks come with sumo-rl"
+)
+def test_vehicles_that_hold_each_other_on_a_junction_let_go() -> None:
+    """Slow vehicles of cologne3 meet on its largest junction after four minutes (actuated)."""
+    arrived: dict[str, float] = {}
+    for domain in ("V1", "V1+blocker_patience=60"):
+        rule = {"rule": rule_factory("actuated:60:3")}
+        found = evaluate(load("resco:cologne3"), rule, [domain], [1002], duration_s=1200, workers=1)
+        arrived[domain] = found.results[0].scores.throughput / found.results[0].scores.due
+    assert arrived["V1"] < 0.6
+    assert arrived["V1+blocker_patience=60"] > 0.8

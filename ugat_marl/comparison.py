@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from ugat_marl.metrics import MEASURES, Scores
 
 Floats = NDArray[np.float64]
+SERVED = 0.9
+"""Share of the vehicles due that arrive in an episode that did not break down."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,20 @@ class Comparison:
             return np.full(max(len(self.training_seeds), 1), float(np.mean(found[None])))
         means = [float(np.mean(found[seed])) for seed in sorted(found, key=lambda s: s or 0)]
         return np.array(means)
+
+    def episodes(self, setting: str, target: str) -> list[Scores]:
+        """Every episode in the target, of all training seeds."""
+        wanted = setting, target, target
+        return [t.scores for t in self.trials if (t.setting, t.target, t.domain) == wanted]
+
+    def median_s(self, setting: str, target: str) -> float:
+        """The ATT that half of the episodes in the target stay below."""
+        return float(np.median([own.att_s for own in self.episodes(setting, target)]))
+
+    def unserved(self, setting: str, target: str) -> float:
+        """Share of the episodes in the target in which less than `SERVED` of those due arrived."""
+        found = self.episodes(setting, target)
+        return sum(own.throughput < SERVED * own.due for own in found) / len(found)
 
     def estimate(
         self, setting: str, target: str, measure: str, domain: str | None = None

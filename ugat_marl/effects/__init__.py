@@ -25,7 +25,7 @@ from ugat_marl.effects.detectors import (
     owners,
 )
 from ugat_marl.effects.domains import GAPS, NAMED, NamedDomain, spelled_out
-from ugat_marl.effects.engine import QueueModel
+from ugat_marl.effects.engine import BlockerPatience, QueueModel
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
 from ugat_marl.effects.judging import Objective
 from ugat_marl.effects.observing import (
@@ -87,6 +87,7 @@ __all__ = [
     "SETTINGS",
     "Acceleration",
     "AllRedTime",
+    "BlockerPatience",
     "ClockDrift",
     "ControllerEffect",
     "CountingError",

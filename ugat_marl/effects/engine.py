@@ -1,4 +1,4 @@
-"""Another engine for the same network and demand: SUMO's queue model in place of car following."""
+"""How SUMO goes about it: in queues in place of car following, and with blocked junctions."""
 
 from __future__ import annotations
 
@@ -54,6 +54,31 @@ class QueueModel(Effect):
         control = settings["control"]
         clearance_s = control["yellow_s"] + control["all_red_s"]
         settings["control"] = {**control, "yellow_s": 0.0, "all_red_s": clearance_s}
+        return replace(
+            scenario,
+            settings=validated(settings, f"scenario {scenario.id!r}"),
+            applied=(*scenario.applied, str(self)),
+        )
+
+
+@dataclass(frozen=True)
+class BlockerPatience(Effect):
+    """Who has stood on a junction for so many seconds is no obstacle to others any more.
+
+    Vehicles that meet in the middle of a junction, slow ones that started late above all, can hold
+    each other up for ever: SUMO solves that by teleporting alone, which the suite switches off, and
+    whatever signals show, the network fills up to the end of the episode. On a street somebody
+    gives way (SUMO: ``--ignore-junction-blocker``). A diagnosis does not look for it.
+    """
+
+    name: ClassVar[str] = "blocker_patience"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 1.0, 3600.0)}
+    seconds: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Sets the option of SUMO."""
+        settings = scenario.settings.model_dump()
+        settings["sumo"] = {**settings["sumo"], "ignore-junction-blocker": f"{self.seconds:g}"}
         return replace(
             scenario,
             settings=validated(settings, f"scenario {scenario.id!r}"),

@@ -21,7 +21,7 @@ from ugat_marl.effects.detectors import (
     Undercount,
 )
 from ugat_marl.effects.domains import NAMED
-from ugat_marl.effects.engine import QueueModel
+from ugat_marl.effects.engine import BlockerPatience, QueueModel
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
 from ugat_marl.effects.judging import JUDGING
 from ugat_marl.effects.observing import OBSERVING
@@ -95,7 +95,9 @@ _EFFECTS: dict[str, type[Effect]] = {
 _ON_CONTROLLERS: dict[str, type[Effect]] = {
     kind.name: kind for kind in (*OBSERVING, *ACTING, *JUDGING)
 }
-_OTHERS: dict[str, type[Effect]] = {kind.name: kind for kind in (Incident, QueueModel)}
+_OTHERS: dict[str, type[Effect]] = {
+    kind.name: kind for kind in (Incident, QueueModel, BlockerPatience)
+}
 
 _ALL: dict[str, type[Effect]] = {**_EFFECTS, **_ON_CONTROLLERS, **_OTHERS}
 

@@ -13,7 +13,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from ugat_marl.comparison import Comparison, Interval, PairedTest
+from ugat_marl.comparison import SERVED, Comparison, Interval, PairedTest
 from ugat_marl.metrics import MEASURES
 from ugat_marl.report.tables import number
 
@@ -61,6 +61,16 @@ def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
         "of the training seeds it is lower.",
         "",
         *_grid(found, lambda s, t: _tested(found.test(s, direct, t)), leave_out=direct),
+        "",
+    ]
+    lines += [
+        "## Single episodes",
+        "",
+        "Median of the ATT in s over all of them in the real domain, and the share of those in "
+        f"which fewer than {SERVED:.0%} of the vehicles due arrived: where two outcomes are "
+        "possible, means and intervals say little.".replace("%", " %"),
+        "",
+        *_grid(found, _episodes(found)),
         "",
     ]
     if others := constants(found):
@@ -123,6 +133,10 @@ def _headlines(found: Comparison, direct: str) -> list[tuple[str, Cell]]:
 
 def _estimated(found: Comparison, domain: str | None) -> Cell:
     return lambda s, t: with_interval(found.estimate(s, t, "att_s", domain))
+
+
+def _episodes(found: Comparison) -> Cell:
+    return lambda s, t: f"{number(found.median_s(s, t))}, {100 * found.unserved(s, t):.0f} %"
 
 
 def _with_gap(found: Comparison, measure: str) -> Cell:
