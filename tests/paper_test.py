@@ -141,7 +141,7 @@ def test_greens_are_late_in_the_simulation_that_is_trained_in(tmp_path: Path) ->
         return [row.world for row in rows if row.name == "constant delay 3 s"]
 
     assert worlds("sim") == ["late_green=*,3"]
-    assert worlds("meso") == ["queue_model=500+late_green=*,3"]
+    assert worlds("meso") == ["meso+late_green=*,3"]
     (tmp_path / "scenario.toml").touch()
     with pytest.raises(OptionError, match="--constants"):
         worlds(str(tmp_path))
