@@ -109,6 +109,10 @@ def test_nothing_to_win_has_no_share() -> None:
     assert math.isnan(found.won_back("UGAT", "V4", "direct transfer"))
 
 
+def test_a_value_that_is_missing_is_no_certainty() -> None:
+    assert math.isnan(PairedTest.of(np.array([1.0, math.nan]), np.array([0.0, 0.0])).p)
+
+
 def test_episodes_that_broke_down_are_counted_one_by_one() -> None:
     def episode(target: str, training: int | None, att_s: float, arrived: float) -> Trial:
         scores = replace(BLANK, att_s=att_s, throughput=arrived, due=200.0)

@@ -182,6 +182,19 @@ def test_a_job_ends_with_whoever_started_it(tmp_path: Path) -> None:
     assert process.wait(60) == 1
 
 
+def test_what_a_killed_job_was_writing_is_cleared(tmp_path: Path) -> None:
+    planned = planner(replace(SHORT, evaluation_seeds=1)).bases[0]
+    scores = asdict(Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1))
+    rows = [{"domain": domain, "seed": 1000, **scores} for domain in planned.job.domains]
+    (tmp_path / SCORES).write_text(json.dumps(rows))  # nothing is left to do
+    (tmp_path / JOB).write_text(json.dumps(asdict(planned.job)))
+    (tmp_path / ".learner.pt.x1y2z3.tmp").write_bytes(b"half")
+    command = [sys.executable, "-m", "ugat_marl.paper.job", str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        assert process.wait(60) == 0  # its input stays open: it would end with whoever started it
+    assert {path.name for path in tmp_path.iterdir()} == {SCORES, JOB}
+
+
 @pytest.mark.parametrize("content", ["", "[{}]", '[{"domain": "sim"}]', '{"a": 1}', "[1]"])
 def test_broken_scores_are_no_scores(tmp_path: Path, content: str) -> None:
     (tmp_path / SCORES).write_text(content)

@@ -70,7 +70,7 @@ class PairedTest:
 
     Attributes:
         difference: One minus the other.
-        p: Two-sided, of Student's paired test; nan for a single seed.
+        p: Two-sided, of Student's paired test; nan for a single seed, or where a value is nan.
         better: Number of seeds in which the difference is below zero.
         count: Number of seeds.
     """
@@ -86,7 +86,7 @@ class PairedTest:
         differences = one - other
         count, better = differences.size, int((differences < 0).sum())
         p = math.nan
-        if count > 1:
+        if count > 1 and np.isfinite(differences).all():
             spread = float(differences.std(ddof=1))
             t = abs(float(differences.mean())) * math.sqrt(count)
             # Equal differences leave no doubt, or none to settle.

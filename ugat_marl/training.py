@@ -237,3 +237,13 @@ def _remove_remains(directory: Path) -> None:
         old.rename(current)
     for remains in (old, fresh):
         shutil.rmtree(remains, ignore_errors=True)
+    remove_temporaries(directory)
+
+
+def remove_temporaries(directory: Path) -> None:
+    """Clears files that were being written (`files.replacing`) when their process was killed.
+
+    For whoever has locked the folder: nobody else may be writing there.
+    """
+    for remains in directory.glob(".*.tmp"):
+        remains.unlink(missing_ok=True)

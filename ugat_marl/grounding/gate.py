@@ -35,7 +35,8 @@ class GateConfig:
             "dynamic" with the mean of the u logged before the last update.
         static_alpha: Threshold in (0, 1], for mode "static".
         scope: One alpha per intersection, or one pooled over all.
-        window_epochs: E, the number of epochs whose u enter the mean.
+        window_epochs: The number of epochs (episodes of grounded training) whose u enter the mean,
+            the last ones, those of earlier iterations and of their h included.
         start: Alpha of "dynamic" before any u is logged: "open" is infinite, as in the paper;
             "fitted" is the mean u of the first fit, of h's answers to what f predicts.
     """

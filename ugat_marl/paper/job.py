@@ -36,7 +36,7 @@ from ugat_marl.queues import QUEUES, QueueRecord
 from ugat_marl.randomised import randomised_env
 from ugat_marl.recipes import simulated_worlds, train_until
 from ugat_marl.traffic_env import parallel_env
-from ugat_marl.training import Run
+from ugat_marl.training import Run, remove_temporaries
 from ugat_marl.tuning import tuned_rules
 from ugat_marl.ugat import State, UgatConfig, restore, train_ugat
 from ugat_marl.versions import versions_of
@@ -245,6 +245,7 @@ def _world(job: Job) -> AnyParallelEnv:
 def main(folder: Path) -> int:
     """Performs the job in a folder; returns the exit code."""
     end_with_input()
+    remove_temporaries(folder)
     try:
         job = TypeAdapter(Job).validate_json((folder / JOB).read_bytes())
         perform(job, folder, Bars(Console(width=100)))
