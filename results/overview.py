@@ -6,6 +6,7 @@ python results/overview.py
 from __future__ import annotations
 
 import csv
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -51,9 +52,9 @@ def columns(table: Path) -> dict[str, Column]:
 
 
 def won_back(setting: str, column: Column) -> float:
-    """Share of direct transfer's regret that is gone."""
+    """Share of direct transfer's regret that is gone; nan where it is the best of all."""
     start, best = column[DIRECT].att_s, min(own.att_s for own in column.values())
-    return (start - column[setting].att_s) / (start - best)
+    return (start - column[setting].att_s) / (start - best) if start > best else math.nan
 
 
 def reduction(setting: str, column: Column) -> float:
@@ -97,8 +98,12 @@ def _att(column: Column, settings: Sequence[str]) -> str:
 def _grounded(setting: str, column: Column) -> str:
     if setting not in column:
         return ""
-    gap, share = percent(reduction(setting, column)), won_back(setting, column)
-    return f"**{number(column[setting].att_s)}** {gap}, {share:.2f}"
+    gap, share = percent(reduction(setting, column)), _share(won_back(setting, column))
+    return f"**{number(column[setting].att_s)}** {gap}, {share}"
+
+
+def _share(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
 
 
 def _mean(found: Sequence[Column]) -> str:
@@ -109,7 +114,8 @@ def _mean(found: Sequence[Column]) -> str:
             cells.append("")
             continue
         gap = percent(fmean(reduction(setting, column) for column in having))
-        cells.append(f"*{gap}, {fmean(won_back(setting, column) for column in having):.2f}*")
+        share = _share(fmean(won_back(setting, column) for column in having))
+        cells.append(f"*{gap}, {share}*")
     return f"| {' | '.join(cells)} | | | | |"
 
 

@@ -58,6 +58,14 @@ def test_by_hand(folder: Path) -> None:
     assert mean == ["", "*mean*", "", "*−65 %, 0.85*", "", "", "", "", ""]
 
 
+def test_where_direct_transfer_is_best_there_is_nothing_to_win_back(folder: Path) -> None:
+    (folder / "grid2x2-v1" / "main-short" / "table.csv").write_text(
+        TABLE.replace("direct transfer,V1,100", "direct transfer,V1,70")
+    )
+    first, second, mean = script.overview(folder).splitlines()[2:]
+    assert "**80.0** −50 %, – |" in first and "0.90" in second and "*−65 %, –*" in mean
+
+
 def test_what_stands_around_it_stays(folder: Path) -> None:
     page = f"# Results\n\n{script.BEGIN}old\n{script.END}\nWords.\n"
     found = script.with_overview(page, folder)
