@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -74,3 +75,9 @@ def test_what_stands_around_it_stays(folder: Path) -> None:
     assert script.with_overview(found, folder) == found
     with pytest.raises(ValueError, match="overview"):
         script.with_overview("# Results\n", folder)
+
+
+def test_every_table_is_named_on_the_page() -> None:
+    page = (FILE.parent / "README.md").read_text(encoding="utf-8").partition("## All tables")[2]
+    made = {str(path.relative_to(FILE.parent)) for path in FILE.parent.glob("*/*/table.md")}
+    assert made == set(re.findall(r"^\| .*?\]\(([\w/.-]+table\.md)\) \|", page, flags=re.MULTILINE))
