@@ -74,8 +74,10 @@ def overview(folder: Path = FOLDER) -> str:
         place = table.parent.relative_to(folder)
         name = f"[{place.parts[0]}{place.name.removeprefix('main').replace('-', ', ')}]"
         first = f"{name}({place}/table.md)"
+        shared = {domain.partition("+")[2] for domain in found}  # in sim as well: the table's own
         for domain, column in found.items():
-            lines.append(_line(first, domain, column))
+            short = domain.partition("+")[0] if len(shared) == 1 else domain
+            lines.append(_line(first, short, column))
             first = ""
         if len(found) > 1:
             lines.append(_mean(list(found.values())))

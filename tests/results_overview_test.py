@@ -67,6 +67,15 @@ def test_where_direct_transfer_is_best_there_is_nothing_to_win_back(folder: Path
     assert "**80.0** −50 %, – |" in first and "0.90" in second and "*−65 %, –*" in mean
 
 
+def test_what_all_domains_of_a_table_share_is_left_out(folder: Path) -> None:
+    table = folder / "grid2x2-v1" / "main-short" / "table.csv"
+    plain = script.overview(folder)
+    table.write_text(TABLE.replace(",V1,", ",V1+headway=2,").replace(",V4,", ",V4+headway=2,"))
+    assert script.overview(folder) == plain
+    table.write_text(TABLE.replace(",V4,", ",V4+headway=2,"))
+    assert "| V4+headway=2 |" in script.overview(folder)
+
+
 def test_what_stands_around_it_stays(folder: Path) -> None:
     page = f"# Results\n\n{script.BEGIN}old\n{script.END}\nWords.\n"
     found = script.with_overview(page, folder)
