@@ -65,13 +65,14 @@ def gap_picture(found: Comparison, path: Path) -> None:
         path: Where to write.
     """
     with mpl.rc_context(_STYLE):
-        height = 1.6 + 0.32 * len(found.settings) * max(1.0, 0.45 * len(found.targets))
+        height = 1.9 + 0.32 * len(found.settings) * max(1.0, 0.45 * len(found.targets))
         figure = Figure(figsize=(10, height), dpi=120, layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
         left.invert_yaxis()
         _gaps(left, found, "att_s", "Δ of ATT [s]; shorter is better")
         _gaps(right, found, "throughput", "Δ of throughput [veh]")
-        right.legend(frameon=False, title="domain", loc="best")
+        names = right.get_legend_handles_labels()  # outside: no corner is free of bars for certain
+        figure.legend(*names, loc="outside lower center", ncols=4, frameon=False)
         figure.suptitle(
             f"{found.scenario}: real domain minus simulation", fontsize=11, x=0.01, ha="left"
         )
