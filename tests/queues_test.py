@@ -41,12 +41,13 @@ def test_queues_are_means_by_minute_and_intersection() -> None:
         halting[lanes.indices(second.incoming_lanes[:1])] = 2.0
         env.snapshot = SimpleNamespace(halting=halting)
         look(step)
-    rows = {(m, tls): queue for _, _, m, tls, queue in record.frame().rows()}
+    rows = {(m, tls): queue for _, _, m, tls, queue, _ in record.frame().rows()}
     # 6 decisions in the first minute, 3 in the second
     assert rows[0, first.id] == np.mean([1, 2, 3, 4, 5, 6]) + 1
     assert rows[1, first.id] == np.mean([7, 8, 9]) + 1
     assert rows[0, second.id] == rows[1, second.id] == 2.0
     assert {m for m, _ in rows} == {0, 1} and len(rows) == 8
+    assert {(row[2], row[5]) for row in record.frame().rows()} == {(0, 6), (1, 3)}
 
 
 def test_long_intervals_leave_minutes_out() -> None:

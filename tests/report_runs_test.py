@@ -343,8 +343,8 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
     results = tuple(replace(r, policy=f"{NASTY}{r.policy}", domain=f"{NASTY}{r.domain}")
                     for r in found.results)  # fmt: skip
     replace(found, results=results).write(run / "table.json")
-    names = [(f"{NASTY}{p}", f"{NASTY}{d}", m, f"{NASTY}\x1b{t}", q)
-             for p, d, m, t, q in queues().rows()]  # fmt: skip
+    names = [(f"{NASTY}{p}", f"{NASTY}{d}", m, f"{NASTY}\x1b{t}", *means)
+             for p, d, m, t, *means in queues().rows()]  # fmt: skip
     pl.DataFrame(names, schema=queues().schema, orient="row").write_parquet(run / "queues.parquet")
     numbers = Metrics([(s, n, f"{k}{NASTY}\x07", v) for s, n, k, v in metrics().rows])
     Metrics([*metrics().rows, *numbers.rows]).write(run / "metrics.parquet")
