@@ -14,14 +14,14 @@ from pathlib import Path
 from statistics import fmean
 
 from ugat_marl.files import write_whole
+from ugat_marl.paper.settings import RULE, matched_name
 from ugat_marl.report.comparison_tables import number, percent
 from ugat_marl.transfer import CONTROL, DIRECT, ORACLE, TIMED
 
 FOLDER = Path(__file__).parent
 BEGIN, END = "<!-- overview -->\n", "<!-- end of overview -->\n"
-MATCHED = f"{TIMED}: rewards matched"
-GROUNDED = (TIMED, MATCHED)
-CONSTANT, RULE = "constant delay", "best rule"
+GROUNDED = (TIMED, matched_name("timed"))
+CONSTANT = "constant delay"
 
 
 @dataclass(frozen=True)

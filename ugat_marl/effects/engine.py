@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -49,16 +50,8 @@ class QueueModel(Effect):
             "meso-jam-threshold": "1",
             "meso-tauff": f"{HEADWAY_S:g}",
         }
-        settings = scenario.settings.model_dump()
-        settings["sumo"] = {**settings["sumo"], **options}
-        control = settings["control"]
-        clearance_s = control["yellow_s"] + control["all_red_s"]
-        settings["control"] = {**control, "yellow_s": 0.0, "all_red_s": clearance_s}
-        return replace(
-            scenario,
-            settings=validated(settings, f"scenario {scenario.id!r}"),
-            applied=(*scenario.applied, str(self)),
-        )
+        clearance_s = scenario.control.yellow_s + scenario.control.all_red_s
+        return _changed(scenario, self, options, yellow_s=0.0, all_red_s=clearance_s)
 
 
 @dataclass(frozen=True)
@@ -77,10 +70,18 @@ class BlockerPatience(Effect):
 
     def apply(self, scenario: Scenario) -> Scenario:
         """Sets the option of SUMO."""
-        settings = scenario.settings.model_dump()
-        settings["sumo"] = {**settings["sumo"], "ignore-junction-blocker": f"{self.seconds:g}"}
-        return replace(
-            scenario,
-            settings=validated(settings, f"scenario {scenario.id!r}"),
-            applied=(*scenario.applied, str(self)),
-        )
+        return _changed(scenario, self, {"ignore-junction-blocker": f"{self.seconds:g}"})
+
+
+def _changed(
+    scenario: Scenario, effect: Effect, options: Mapping[str, str], **control: float
+) -> Scenario:
+    """The scenario with further options of SUMO, and other times in its control."""
+    settings = scenario.settings.model_dump()
+    settings["sumo"] = {**settings["sumo"], **options}
+    settings["control"] = {**settings["control"], **control}
+    return replace(
+        scenario,
+        settings=validated(settings, f"scenario {scenario.id!r}"),
+        applied=(*scenario.applied, str(effect)),
+    )

@@ -107,6 +107,11 @@ def constant_name(seconds: int) -> str:
     return f"constant delay {seconds} s"
 
 
+def matched_name(grounding: str) -> str:
+    """The row of a grounding that matches rewards."""
+    return f"{GROUNDED_NAME[grounding]}: rewards matched"
+
+
 def late_in(sim: str, seconds: int) -> str:
     """The simulation with every green late by so many seconds.
 
@@ -130,7 +135,7 @@ def _grounded(bases: dict[str, UgatConfig]) -> list[Setting]:
 def _matching(name: str, base: UgatConfig) -> list[Setting]:
     """Timed grounding that matches rewards; nothing for the phase's, which cannot."""
     ugat = replace(base, timed=replace(base.timed, match=True))
-    row = Setting(f"{GROUNDED_NAME[name]}: rewards matched", "grounded", ugat=ugat)
+    row = Setting(matched_name(name), "grounded", ugat=ugat)
     return [row] * ugat.matches
 
 

@@ -67,8 +67,8 @@ def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
         "## Single episodes",
         "",
         "Median of the ATT in s over all of them in the real domain, and the share of those in "
-        f"which fewer than {SERVED:.0%} of the vehicles due arrived: where two outcomes are "
-        "possible, means and intervals say little.".replace("%", " %"),
+        f"which fewer than {100 * SERVED:.0f} % of the vehicles due arrived: where two outcomes "
+        "are possible, means and intervals say little.",
         "",
         *_grid(found, _episodes(found)),
         "",
