@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import subprocess
 import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ugat_marl
+from ugat_marl.__main__ import main
 from ugat_marl.controllers import controller_for
-from ugat_marl.effects import load
-from ugat_marl.junctions import behind_of
+from ugat_marl.effects import in_domain, load
+from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.field.site import Site
+from ugat_marl.files import Document
+from ugat_marl.junctions import Upstream, behind_of
+from ugat_marl.measurements import NOBODY
 from ugat_marl.network import Network
 from ugat_marl.networks.survey import survey
 from ugat_marl.redraw import sumo_program
@@ -24,11 +31,15 @@ ROADS = ("Ww", "wM", "ME", "NM", "MS", "SM", "MN")
 @pytest.fixture(scope="module")
 def split(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
     """A crossroads whose western road has a node of the map 11 m before the middle."""
-    folder = tmp_path_factory.mktemp("split")
+    return crossroads(tmp_path_factory.mktemp("split"), 11)
+
+
+def crossroads(folder: Path, before_m: int) -> Scenario:
+    places = {**NODES, "w": (-before_m, 0)}
     nodes = "".join(
         f'<node id="{name}" x="{x}" y="{y}" type="{"traffic_light" if name == "M" else "priority"}"'
         "/>"
-        for name, (x, y) in NODES.items()
+        for name, (x, y) in places.items()
     )
     edges = "".join(f'<edge id="{r}" from="{r[0]}" to="{r[1]}" speed="13"/>' for r in ROADS)
     (folder / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
@@ -52,11 +63,11 @@ def test_a_short_lane_has_the_lane_behind(split: Scenario) -> None:
     network = Network.read(split)
     short = network.lanes["wM_0"]
     assert short.length_m < 7.5
-    assert [name for name, _ in short.behind][-1] == "Ww_0"
-    assert all(share == 1.0 for _, share in short.behind)
+    assert list(short.behind.lanes)[-1] == "Ww_0"
+    assert set(short.behind.lanes.values()) == {1.0}
     assert short.room_m == pytest.approx(short.length_m + network.lanes["Ww_0"].length_m)
     assert short.capacity == pytest.approx(short.room_m / 7.5)
-    assert network.lanes["NM_0"].behind == ()
+    assert network.lanes["NM_0"].behind == Upstream()
     (item,) = survey(split).intersections
     assert item.lanes_behind == ("wM_0",)
 
@@ -109,34 +120,138 @@ def net(*links: str) -> ET.Element:
 LENGTHS_M = {"a_0": 3.0, "a_1": 3.0, "b_0": 50.0, "c_0": 2.0, "d_0": 50.0}
 
 
+def lanes_behind(*links: str, reach_m: float = 7.5) -> dict[str, dict[str, float]]:
+    return {name: own.lanes for name, own in behind_of(net(*links), LENGTHS_M, reach_m).items()}
+
+
 def test_a_lane_that_leads_to_two_is_shared() -> None:
-    found = behind_of(net("b0>a0", "b0>a1", "a0>z0*", "a1>z1*"), LENGTHS_M, 7.5)
-    assert found == {
+    assert lanes_behind("b0>a0", "b0>a1", "a0>z0*", "a1>z1*") == {
         "a_0": {":b0a0": 1.0, "b_0": 0.5},
         "a_1": {":b0a1": 1.0, "b_0": 0.5},
     }
 
 
-def test_one_looks_back_until_there_is_room() -> None:
-    found = behind_of(net("b0>c0", "c0>a0", "a0>z0*"), LENGTHS_M, 7.5)
-    assert list(found["a_0"]) == [":c0a0", "c_0", ":b0c0", "b_0"]
-    assert list(behind_of(net("b0>c0", "c0>a0", "a0>z0*"), LENGTHS_M, 5.0)["a_0"])[-1] == "c_0"
+def test_one_looks_back_until_the_reach() -> None:
+    links = ("b0>c0", "c0>a0", "a0>z0*")
+    assert list(lanes_behind(*links)["a_0"]) == [":c0a0", "c_0", ":b0c0", "b_0"]
+    assert list(lanes_behind(*links, reach_m=5.0)["a_0"]) == [":c0a0", "c_0"]
+    assert lanes_behind("d0>b0", "b0>z0*", reach_m=50.0) == {}
+    assert lanes_behind("d0>b0", "b0>z0*", reach_m=50.5) == {"b_0": {":d0b0": 1.0, "d_0": 1.0}}
+
+
+def test_some_of_those_who_may_go_elsewhere_are_counted() -> None:
+    """Half of the vehicles on b go to d; c leads to b in two ways of three."""
+    links = ("b0>a0", "b0>d0", "c0>b0", "c0>b1", "c0>d0", "a0>z0*")
+    found = lanes_behind(*links, reach_m=60.0)["a_0"]
+    assert found["b_0"] == 0.5
+    assert found["c_0"] == pytest.approx(0.5 / 3)
+
+
+def test_two_ways_to_the_same_lane_add_up() -> None:
+    """From b by d and by c, and straight to the lane at the light: all of b's ways lead there."""
+    links = ("c0>a0", "d0>a0", "b0>c0", "b0>d0", "a0>z0*")
+    found = lanes_behind(*links, reach_m=55.0)["a_0"]
+    assert found["b_0"] == 1.0
 
 
 @pytest.mark.parametrize(
     "links",
     [
         ("b0>a0*", "a0>z0*"),  # who stands there waits for the other light
-        ("b0>a0", "b0>d0", "a0>z0*"),  # who stands there may go elsewhere
+        ("b0>a0", "b0>d0*", "a0>z0*"),  # who stands there may wait for the other light
         ("b0>d0", "d0>z0*"),  # there is room
         ("a0>a0", "a0>z0*"),  # a circle
     ],
 )
 def test_what_is_not_behind(links: tuple[str, ...]) -> None:
-    assert behind_of(net(*links), LENGTHS_M, 7.5) == {}
+    assert not any(lanes_behind(*links).values())
+
+
+def test_turning_around_is_no_way() -> None:
+    root = net("b0>a0", "a0>z0*")
+    extra = ET.fromstring('<connection from="b" fromLane="0" to="y" toLane="0" via=":u" dir="t"/>')
+    root.append(extra)
+    assert behind_of(root, LENGTHS_M, 7.5)["a_0"].lanes["b_0"] == 1.0
+
+
+def test_whose_waiting_vehicles_are_counted() -> None:
+    """Roads that begin nearer than the reach, each lane with its part of those who wait there."""
+    links = ("b0>a0", "b0>a1", "a0>z0*", "a1>z1*")
+    assert behind_of(net(*links), LENGTHS_M, 7.5)["a_0"].roads == {"a": 0.5}
+    assert behind_of(net(*links), LENGTHS_M, 100.0)["a_0"].roads == {"a": 0.5, "b": 0.5}
 
 
 def test_other_networks_are_measured_as_before() -> None:
     table = Network.read(load("single-v1")).lane_table()
-    assert table.behind == ()
+    assert table.behind == NOBODY
     assert np.all(table.capacity > 1)
+
+
+# --- a reach that is asked for
+
+
+def test_who_waits_to_enter_is_counted_within_the_reach(split: Scenario) -> None:
+    """Sixty cars for 200 m of road, in front of a red light: thirty of them find no room."""
+    cars = "".join(
+        f'<vehicle id="{i}" depart="{i}"><route edges="Ww wM ME"/></vehicle>' for i in range(60)
+    )
+    full = replace(
+        split, routes=(Document("r.rou.xml", content=f"<routes>{cars}</routes>".encode()),)
+    )
+    counted: dict[float, tuple[float, float, float, float]] = {}
+    for reach_m in (100.0, 300.0):
+        world = in_domain(full, f"reach={reach_m:g}")
+        env = ugat_marl.parallel_env(world, reward="waiting", observation="waiting")
+        (item,) = env.network.intersections
+        letter = next(link.index for link in item.links if link.from_lane == "wM_0")
+        red = next(i for i, state in enumerate(item.phases) if state[letter] == "r")
+        env.reset(seed=1)
+        (agent,) = env.agents
+        rewards = [env.step({agent: red})[1][agent] for _ in range(10)]
+        lane = env.network.lane_table().ids.index("wM_0")
+        seen = env.snapshot
+        counted[reach_m] = (
+            seen.vehicles[lane], seen.halting[lane], seen.waiting_s[lane], float(seen.backlog)
+        )  # fmt: skip
+        assert rewards[-1] < 0
+        env.close()
+    (near, near_halting, near_s, backlog), (far, far_halting, far_s, _) = counted.values()
+    assert backlog > 25
+    assert near == near_halting == 60 - backlog
+    assert far == far_halting == 60
+    # the last ones have been due for about 40 s, those before them for longer
+    assert 40 * backlog < far_s - near_s < 100 * backlog
+
+
+def test_the_queue_model_knows_no_reach(split: Scenario) -> None:
+    for domain in ("queue_model=500+reach=100", "reach=100+queue_model=500"):
+        with pytest.raises(ScenarioError, match="upstream of a lane"):
+            in_domain(split, domain)
+
+
+def test_the_field_loop_knows_no_reach(split: Scenario) -> None:
+    with pytest.raises(OptionError, match="100 m upstream"):
+        Site.of(in_domain(split, "reach=100"), {})
+
+
+def test_a_scenario_may_say_how_far(split: Scenario, tmp_path: Path) -> None:
+    folder = split.with_control(reach_m=50.0).write(tmp_path / "far")
+    assert "reach_m = 50" in (folder / "scenario.toml").read_text()
+    assert load(folder).control.reach_m == 50.0
+    assert "reach_m" not in (split.write(tmp_path / "near") / "scenario.toml").read_text()
+    (item,) = survey(load(folder)).intersections
+    assert item.lanes_behind == ("wM_0",)
+
+
+def test_short_lanes_are_told(
+    split: Scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (item,) = survey(split).intersections
+    assert item.short_lanes == ()  # the one short lane is counted with those behind
+    folder = tmp_path / "far"
+    folder.mkdir()
+    crossroads(folder, 40)
+    for domain, told in (("sim", True), ("reach=100", False)):
+        main(["scenario", "check", str(folder), "--no-simulate", "--domain", domain])
+        said = capsys.readouterr().out
+        assert ("shorter than 50 m: 1." in said) == told

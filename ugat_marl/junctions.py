@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 CROSSING = "c"
 """Direction of a link for people on foot."""
@@ -37,12 +37,12 @@ class Link:
     @property
     def from_edge(self) -> str:
         """Edge of the incoming lane."""
-        return self.from_lane.rsplit("_", 1)[0]
+        return _road(self.from_lane)
 
     @property
     def to_edge(self) -> str:
         """Edge of the outgoing lane."""
-        return self.to_lane.rsplit("_", 1)[0]
+        return _road(self.to_lane)
 
 
 def links_of(root: ET.Element) -> dict[str, list[Link]]:
@@ -116,7 +116,7 @@ def neighbours_of(
             following[item.get("from", "")].add(item.get("to", ""))
     adjacent: dict[str, set[str]] = {tls: set() for tls in links}
     for tls, own in links.items():
-        edges = {link.to_lane.rsplit("_", 1)[0] for link in own}
+        edges = {link.to_edge for link in own}
         seen: set[str] = set()
         while edges:
             edge = edges.pop()
@@ -165,54 +165,79 @@ def _request_of(via: str) -> tuple[str, int]:
     return junction, int(first) + int(lane)
 
 
-def behind_of(
-    root: ET.Element, lengths_m: Mapping[str, float], room_m: float
-) -> dict[str, dict[str, float]]:
-    """Lanes where those wait who have no room on the lane at the light.
+@dataclass(frozen=True)
+class Upstream:
+    """What lies upstream of a lane at a light.
 
-    Networks made of maps have lanes at lights that are shorter than a vehicle, with a node of the
-    map before them. Who waits there stands on the lane behind, of which nothing would be seen.
+    Attributes:
+        lanes: Lanes inside junctions and outside to the share of their vehicles that is counted.
+        roads: Roads to the share of the vehicles waiting to enter the network there.
+    """
+
+    lanes: dict[str, float] = field(default_factory=dict[str, float])
+    roads: dict[str, float] = field(default_factory=dict[str, float])
+
+
+def behind_of(
+    root: ET.Element, lengths_m: Mapping[str, float], reach_m: float
+) -> dict[str, Upstream]:
+    """Lanes where those stand who are on their way to a light, but not on the lane at it.
+
+    Networks made of maps have lanes at lights that are cut off by a node of the map, some shorter
+    than a vehicle. Who waits farther back stands on the lanes behind, of which nothing would be
+    seen.
 
     Args:
         root: The ``<net>``.
         lengths_m: Length of every lane outside of junctions, m.
-        room_m: Lanes shorter than this are too short; lanes behind are added until they have it.
+        reach_m: How far upstream one looks: lanes behind are added until they begin so far from the
+            light or farther, each as a whole.
 
     Returns:
-        For each lane at a light that is too short, the lanes, inside junctions and outside, from
-        which one can only get to it, with the share of each that is its own: one over the lanes a
-        lane leads to. Roads that end at a light of their own are not behind another one.
+        For each lane at a light that is shorter, what is counted with it. The share of a lane
+        is one over the ways it leads on, along all of the way to the light; turning around
+        is none. Lanes at a light of their own are not behind another one. Where a lane begins
+        nearer than `reach_m`, vehicles that wait to enter on its road, each on any of its lanes,
+        are behind it.
     """
     feeds: dict[str, list[tuple[str, str]]] = defaultdict(list)
-    roads: dict[str, set[str]] = defaultdict(set)
     ways: dict[str, int] = defaultdict(int)
     at_lights: dict[str, None] = {}
     for item in root.iter("connection"):
         start, end = item.get("from", ":"), item.get("to", ":")
-        if start.startswith(":") or end.startswith(":"):
+        if start.startswith(":") or end.startswith(":") or item.get("dir") == "t":
             continue
         lane = f"{start}_{item.get('fromLane')}"
-        roads[start].add(end)
         ways[lane] += 1
         if item.get("tl") is None:
             feeds[f"{end}_{item.get('toLane')}"].append((lane, item.get("via", "")))
         else:
             at_lights[lane] = None
-    found: dict[str, dict[str, float]] = {}
+    widths = Counter(map(_road, lengths_m))
+    found: dict[str, Upstream] = {}
     for lane in at_lights:
-        reach, room, shares = {lane: 1.0}, lengths_m.get(lane, room_m), dict[str, float]()
-        while reach and room < room_m:
+        begins_m = {lane: lengths_m.get(lane, reach_m)}
+        own, roads = Upstream(), defaultdict[str, float](float)
+        here = {lane: 1.0} if begins_m[lane] < reach_m else {}
+        while here:
             before: dict[str, float] = defaultdict(float)
-            for here, share in reach.items():
-                for feeder, via in feeds[here]:
-                    road = feeder.rsplit("_", 1)[0]
-                    if roads[road] == {here.rsplit("_", 1)[0]} and feeder not in shares:
-                        before[feeder] += share / ways[feeder]
-                        if via:
-                            shares[via] = share
-            shares |= before
-            room += sum(lengths_m.get(name, 0.0) * share for name, share in before.items())
-            reach = before
-        if shares:
-            found[lane] = shares
+            for name, share in here.items():
+                roads[_road(name)] += share / widths[_road(name)]
+                for feeder, via in feeds[name]:
+                    if feeder in at_lights or (feeder in begins_m and feeder not in before):
+                        continue
+                    before[feeder] += share / ways[feeder]
+                    at_m = begins_m[name] + lengths_m.get(feeder, 0.0)
+                    begins_m[feeder] = min(begins_m.get(feeder, at_m), at_m)
+                    if via:
+                        own.lanes[via] = share
+            own.lanes.update(before)
+            here = {name: share for name, share in before.items() if begins_m[name] < reach_m}
+        if roads:
+            own.roads.update(roads)
+            found[lane] = own
     return found
+
+
+def _road(lane: str) -> str:
+    return lane.rsplit("_", 1)[0]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import OptionError
-from ugat_marl.measurements import HALTING_MPS
+from ugat_marl.measurements import HALTING_MPS, Behind
 
 
 @dataclass(slots=True)
@@ -218,12 +218,14 @@ def refuse_in_queues(scenario: str, **asked: bool) -> None:
 
 def add_those_behind(
     api: Any,
-    behind: Sequence[Sequence[tuple[str, float]]],
+    behind: Behind,
     measured: tuple[
         NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
     ],
 ) -> None:
-    """Counts vehicles that wait behind a lane that is too short for them as if they were on it.
+    """Counts vehicles behind a lane that is too short for them as if they were on it.
+
+    Those that wait to enter the network halt; their waiting time is that since they were due.
 
     Args:
         api: The module `libsumo`, with a simulation under way.
@@ -232,7 +234,8 @@ def add_those_behind(
             empty) per lane, each ``(lanes,)``; changed in place.
     """
     vehicles, halting, speed_mps, waiting_s = measured
-    for index, shares in enumerate(behind):
+    lanes, roads = behind
+    for index, shares in enumerate(lanes):
         for lane, share in shares:
             count = share * api.lane.getLastStepVehicleNumber(lane)
             if not count:
@@ -244,3 +247,14 @@ def add_those_behind(
             halting[index] += share * api.lane.getLastStepHaltingNumber(lane)
             if waiting_s.size:
                 waiting_s[index] += share * api.lane.getWaitingTime(lane)
+    for index, shares in enumerate(roads):
+        for road, share in shares:
+            outside = api.edge.getPendingVehicles(road)
+            if not outside:
+                continue
+            count = share * len(outside)
+            speed_mps[index] *= vehicles[index] / (vehicles[index] + count)
+            vehicles[index] += count
+            halting[index] += count
+            if waiting_s.size:
+                waiting_s[index] += share * sum(map(api.vehicle.getDepartDelay, outside))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,25 @@ HALTING_MPS = 0.1
 """A vehicle slower than this stands in a queue (SUMO's definition of halting, m/s)."""
 
 
-Behind = tuple[tuple[tuple[str, float], ...], ...]
-"""For each lane the lanes that are counted with it, with the share of each."""
+Shares = tuple[tuple[tuple[str, float], ...], ...]
+"""For each measured lane names of others, each with a share in (0, 1]."""
+
+
+class Behind(NamedTuple):
+    """Who is counted with lanes that end before an agent's sight does (`junctions.behind_of`).
+
+    Attributes:
+        lanes: For each measured lane the lanes upstream of it, inside junctions and outside.
+        roads: For each the roads on which it or those begin: vehicles due there that find no room
+            to enter the network stand behind them.
+    """
+
+    lanes: Shares = ()
+    roads: Shares = ()
+
+
+NOBODY = Behind()
+"""Nobody is counted with any lane."""
 
 
 @dataclass(frozen=True)
@@ -24,14 +42,13 @@ class LaneTable:
         ids: Lane ids of SUMO, ``(lanes,)``.
         capacity: Vehicles that fit on the lane, ``(lanes,)``, float64.
         speed_mps: Speed limit, ``(lanes,)``, float64.
-        behind: Lanes that are counted with a lane on which no vehicle has room; empty if there is
-            no such lane.
+        behind: Who is counted with lanes that are too short.
     """
 
     ids: tuple[str, ...]
     capacity: NDArray[np.float64]
     speed_mps: NDArray[np.float64]
-    behind: Behind = ()
+    behind: Behind = NOBODY
 
     def indices(self, lanes: Sequence[str]) -> NDArray[np.int64]:
         """Positions of `lanes` in the arrays, int64."""

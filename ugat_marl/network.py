@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
@@ -13,6 +13,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml
 from ugat_marl.junctions import (
     Link,
+    Upstream,
     behind_of,
     crossings_of,
     foes_of,
@@ -21,7 +22,7 @@ from ugat_marl.junctions import (
     right_on_red_of,
     yields_of,
 )
-from ugat_marl.measurements import LaneTable
+from ugat_marl.measurements import NOBODY, Behind, LaneTable
 from ugat_marl.phases import (
     RightOfWay,
     conflict_free_phases,
@@ -45,8 +46,8 @@ class Lane:
         length_m: Length.
         speed_mps: Speed limit.
         shape: Centre line, ``((x, y), ...)`` in m.
-        behind: Lanes that are measured along with it, since no vehicle has room on it, and shares.
-        room_m: Length on which vehicles are measured, those lanes included.
+        behind: What is counted with it, since it ends before an agent's sight does.
+        room_m: Length on which vehicles are measured, lanes behind included.
     """
 
     id: str
@@ -54,7 +55,7 @@ class Lane:
     length_m: float
     speed_mps: float
     shape: tuple[tuple[float, float], ...]
-    behind: tuple[tuple[str, float], ...] = ()
+    behind: Upstream = field(default_factory=Upstream)
     room_m: float = 0.0
 
     @property
@@ -129,7 +130,7 @@ class Network:
     @classmethod
     def _of(cls, root: ET.Element, scenario: Scenario) -> Network:
         document = scenario.network
-        lanes = _with_room(_lanes(root), root)
+        lanes = _with_room(_lanes(root), root, scenario.control.reach_m)
         links = links_of(root)
         programmes = _programmes(root, scenario)
         if unknown := sorted(set(scenario.settings.intersections) - set(links)):
@@ -190,12 +191,17 @@ class Network:
             for item in self.intersections
             for lane in (*item.incoming_lanes, *item.outgoing_lanes)
         )
-        behind = tuple(self.lanes[name].behind for name in names)
+        behind = [self.lanes[name].behind for name in names]
         return LaneTable(
             names,
             np.array([self.lanes[name].capacity for name in names]),
             np.array([self.lanes[name].speed_mps for name in names]),
-            behind if any(behind) else (),
+            Behind(
+                tuple(tuple(item.lanes.items()) for item in behind),
+                tuple(tuple(item.roads.items()) for item in behind),
+            )
+            if any(item.roads for item in behind)
+            else NOBODY,
         )
 
 
@@ -338,13 +344,12 @@ def _lanes(root: ET.Element) -> dict[str, Lane]:
     return lanes
 
 
-def _with_room(lanes: dict[str, Lane], root: ET.Element) -> dict[str, Lane]:
-    """The lanes, those too short for a vehicle with the lanes behind them."""
+def _with_room(lanes: dict[str, Lane], root: ET.Element, reach_m: float) -> dict[str, Lane]:
+    """The lanes, those at lights that are too short with what is counted with them."""
     lengths_m = {name: lane.length_m for name, lane in lanes.items()}
-    for name, shares in behind_of(root, lengths_m, VEHICLE_SPACE_M).items():
-        room_m = sum(lengths_m.get(other, 0.0) * share for other, share in shares.items())
-        short = lanes[name]
-        lanes[name] = replace(short, behind=tuple(shares.items()), room_m=short.length_m + room_m)
+    for name, found in behind_of(root, lengths_m, max(reach_m, VEHICLE_SPACE_M)).items():
+        room_m = sum(lengths_m.get(other, 0.0) * share for other, share in found.lanes.items())
+        lanes[name] = replace(lanes[name], behind=found, room_m=lengths_m[name] + room_m)
     return lanes
 
 

@@ -39,6 +39,8 @@ class ControlSettings(pydantic.BaseModel):
     phases: PhaseSource = "programme"
     late_green_s: Annotated[float, Field(ge=0, le=60, exclude_if=lambda value: value == 0)] = 0.0
     """Traffic on every link starts so much later than its green, to which the agent is blind."""
+    reach_m: Annotated[float, Field(ge=0, le=2000, exclude_if=lambda value: value == 0)] = 0.0
+    """How far upstream of a stop line vehicles are counted where the lane at it is shorter."""
 
 
 class IntersectionSettings(pydantic.BaseModel):
@@ -105,6 +107,11 @@ def validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
                 f"{source}: {key} = {value:g} is not a multiple of step_length_s = {step:g}; "
                 "SUMO would cut it short"
             )
+    if control.reach_m and "mesosim" in settings.sumo:
+        raise ScenarioError(
+            f"{source}: control.reach_m = {control.reach_m:g}, but in SUMO's mesoscopic model "
+            "(queue_model) it is not counted who is upstream of a lane; leave out one of the two"
+        )
     if settings.duration_s < control.decision_interval_s:
         raise ScenarioError(
             f"{source}: duration_s = {settings.duration_s:g} is shorter than one decision interval "

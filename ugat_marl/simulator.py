@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.files import write_whole
 from ugat_marl.looks import QueueLook, add_those_behind, near_the_end, refuse_in_queues
-from ugat_marl.measurements import Behind, Snapshot, Trips
+from ugat_marl.measurements import NOBODY, Behind, Snapshot, Trips
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.signals import Segment
 from ugat_marl.trips import measuring_options, read_trips
@@ -60,7 +60,7 @@ class Launch:
     files: tuple[tuple[str, bytes], ...] = ()
     zone_m: float = 0.0
     persons: tuple[tuple[str, float], ...] = ()
-    behind: Behind = ()
+    behind: Behind = NOBODY
 
     @property
     def segment_m(self) -> float:
@@ -136,7 +136,7 @@ def launch_of(
     gui: bool = False,
     zone_m: float = 0.0,
     persons: Mapping[str, float] | None = None,
-    behind: Behind = (),
+    behind: Behind = NOBODY,
 ) -> Launch:
     """Lists SUMO's options, and the files that have to be written for it; writes nothing.
 

@@ -16,7 +16,7 @@ from ugat_marl.commands.arguments import LengthS, Workers
 from ugat_marl.effects import in_domain, load
 from ugat_marl.errors import OptionError
 from ugat_marl.headroom import HOLDS_S, Row
-from ugat_marl.networks.survey import IntersectionFacts, Survey, survey
+from ugat_marl.networks.survey import SHORT_M, IntersectionFacts, Survey, survey
 from ugat_marl.networks.trial import (
     Run,
     as_json,
@@ -156,6 +156,11 @@ def show(
         say(f"no agents (fewer than two green phases): {', '.join(facts.uncontrolled)}")
     console.print(_intersections(agents))
     console.print(_approaches(agents))
+    if short := sum(len(item.short_lanes) for item in agents):
+        say(
+            f"lanes at lights that are shorter than {SHORT_M:g} m: {short}. Agents see nobody "
+            "upstream of them; reach_m = 100 under [control], or the effect reach=100, counts those"
+        )
     if runs:
         console.print(_runs(runs))
     if rows is None:
@@ -204,7 +209,7 @@ def _row(item: IntersectionFacts) -> tuple[str, ...]:
         "links without a light": item.uncontrolled,
         "links never green": len(item.unserved_links),
         "lanes served in part": len(item.partly_served),
-        "lanes shorter than a vehicle": len(item.lanes_behind),
+        "lanes counted with those behind": len(item.lanes_behind),
     }
     counts = (item.lanes, item.links, item.movements, item.conflicts, len(item.phases))
     return (*map(str, counts), "; ".join(f"{n} {what}" for what, n in remarks.items() if n))

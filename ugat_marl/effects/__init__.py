@@ -25,7 +25,7 @@ from ugat_marl.effects.detectors import (
     owners,
 )
 from ugat_marl.effects.domains import GAPS, NAMED, NamedDomain, spelled_out
-from ugat_marl.effects.engine import BlockerPatience, QueueModel
+from ugat_marl.effects.engine import BlockerPatience, QueueModel, Reach
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
 from ugat_marl.effects.judging import Objective
 from ugat_marl.effects.observing import (
@@ -128,6 +128,7 @@ __all__ = [
     "PhaseOrder",
     "QuantisedCounts",
     "QueueModel",
+    "Reach",
     "ReactionStep",
     "RedRunning",
     "SignalClock",

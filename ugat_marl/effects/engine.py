@@ -1,4 +1,4 @@
-"""How SUMO goes about it: in queues in place of car following, and with blocked junctions."""
+"""How a simulation goes about it: in queues, with blocked junctions, and how far it counts."""
 
 from __future__ import annotations
 
@@ -71,6 +71,25 @@ class BlockerPatience(Effect):
     def apply(self, scenario: Scenario) -> Scenario:
         """Sets the option of SUMO."""
         return _changed(scenario, self, {"ignore-junction-blocker": f"{self.seconds:g}"})
+
+
+@dataclass(frozen=True)
+class Reach(Effect):
+    """Vehicles are counted so far upstream of stop lines, where lanes at lights are shorter.
+
+    Networks made of maps are cut into short roads, and whoever stands on the road before the last
+    is seen by nobody; a policy learns that vehicles there cost nothing. With it observations and
+    rewards, and the measured queue, hold those on the lanes upstream, too, and those that wait
+    to enter the network there. A diagnosis does not look for it.
+    """
+
+    name: ClassVar[str] = "reach"
+    ranges: ClassVar[dict[str, Parameter]] = {"metres": Parameter("m", 1.0, 2000.0)}
+    metres: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Sets `control.reach_m`."""
+        return _changed(scenario, self, {}, reach_m=self.metres)
 
 
 def _changed(

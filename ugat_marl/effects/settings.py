@@ -21,7 +21,7 @@ from ugat_marl.effects.detectors import (
     Undercount,
 )
 from ugat_marl.effects.domains import NAMED
-from ugat_marl.effects.engine import BlockerPatience, QueueModel
+from ugat_marl.effects.engine import BlockerPatience, QueueModel, Reach
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
 from ugat_marl.effects.judging import JUDGING
 from ugat_marl.effects.observing import OBSERVING
@@ -96,7 +96,7 @@ _ON_CONTROLLERS: dict[str, type[Effect]] = {
     kind.name: kind for kind in (*OBSERVING, *ACTING, *JUDGING)
 }
 _OTHERS: dict[str, type[Effect]] = {
-    kind.name: kind for kind in (Incident, QueueModel, BlockerPatience)
+    kind.name: kind for kind in (Incident, QueueModel, BlockerPatience, Reach)
 }
 
 _ALL: dict[str, type[Effect]] = {**_EFFECTS, **_ON_CONTROLLERS, **_OTHERS}

@@ -61,8 +61,14 @@ class Site:
                 "the policy leaves the signals to the network's own programme; there is nothing "
                 "to decide, so take another one"
             )
-        network = Network.read(scenario)
         control = scenario.control
+        if control.reach_m:
+            raise OptionError(
+                f"scenario {scenario.id!r} counts vehicles {control.reach_m:g} m upstream of stop "
+                "lines (reach), the field loop on the lanes at the lights alone; leave it out, and "
+                "take a policy that was trained without it"
+            )
+        network = Network.read(scenario)
         items = network.intersections
         own = {
             item.id: item.incoming_lanes

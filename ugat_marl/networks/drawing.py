@@ -212,7 +212,7 @@ def _roads(axes: Any, place: _Place) -> None:
     axes.axis("off")
     names = {*item.incoming_lanes, *item.outgoing_lanes}
     before = (network.lanes[lane].behind for lane in item.incoming_lanes)
-    names |= {name for lanes in before for name, _ in lanes if name in network.lanes}
+    names |= {name for found in before for name in found.lanes if name in network.lanes}
     shapes = [np.array(network.lanes[name].shape) for name in sorted(names)]
     axes.add_collection(
         LineCollection(shapes, colors=_ROAD, linewidths=_points(2.9, frame), capstyle="butt")

@@ -18,6 +18,9 @@ from ugat_marl.scenario import Scenario
 from ugat_marl.scenario_settings import seconds_of
 from ugat_marl.signals import GREEN
 
+SHORT_M = 50.0
+"""Lanes at lights that are shorter show little of a queue."""
+
 SATURATION_VPH = 1800.0
 """Vehicles an hour that a lane discharges in green: a headway of 2 s."""
 FILLINGS = 3.0
@@ -77,8 +80,9 @@ class IntersectionFacts:
         unserved_links: Links that are green in no phase, as ``lane -> lane``.
         partly_served: Lanes that some phase serves in one direction only: who waits for the other
             blocks them.
-        lanes_behind: Lanes on which no vehicle has room, so that those are counted with them who
-            wait on the lanes behind.
+        lanes_behind: Lanes that are too short, so that those are counted with them who are on the
+            lanes behind.
+        short_lanes: Lanes shorter than `SHORT_M`, beyond which nobody is counted.
         always_green: Links that are green in every phase: the signal never stops them.
         right_on_red: Links that may go on red after a stop.
         u_turns: Links that turn around.
@@ -103,6 +107,7 @@ class IntersectionFacts:
     unserved_links: tuple[str, ...]
     partly_served: tuple[str, ...]
     lanes_behind: tuple[str, ...]
+    short_lanes: tuple[str, ...]
     always_green: int
     right_on_red: int
     u_turns: int
@@ -206,7 +211,14 @@ def _facts(
             f"{link.from_lane} -> {link.to_lane}" for link in item.links if link.index not in may_go
         ),
         partly_served=tuple(lane for lane in item.incoming_lanes if _in_part(lane, item)),
-        lanes_behind=tuple(lane for lane in item.incoming_lanes if network.lanes[lane].behind),
+        lanes_behind=tuple(
+            lane for lane in item.incoming_lanes if network.lanes[lane].behind.lanes
+        ),
+        short_lanes=tuple(
+            lane
+            for lane in item.incoming_lanes
+            if network.lanes[lane].length_m < SHORT_M and not network.lanes[lane].behind.roads
+        ),
         always_green=sum(all(link.index in green for green in served) for link in item.links),
         right_on_red=sum(link.index in stop_and_go for link in item.links),
         u_turns=sum(link.direction in "tT" for link in item.links),
