@@ -22,6 +22,8 @@ FOLDER = Path(__file__).parent
 BEGIN, END = "<!-- overview -->\n", "<!-- end of overview -->\n"
 GROUNDED = (TIMED, matched_name("timed"))
 CONSTANT = "constant delay"
+THERE = "there"
+"""Folder of a table of what else is known in the domains, with the same direct transfer."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,18 @@ def columns(table: Path) -> dict[str, Column]:
     return dict(found)
 
 
+def known(table: Path) -> dict[str, Column]:
+    """The domains of a `table.csv`, with the rows of the table `THERE`.
+
+    They belong together where direct transfer, which both have, is the same to the digit.
+    """
+    found, other = columns(table), table.parent.parent / THERE / table.name
+    for domain, column in columns(other).items() if other.exists() else ():
+        if domain in found and found[domain][DIRECT] == column[DIRECT]:
+            found[domain] = {**column, **found[domain]}
+    return found
+
+
 def won_back(setting: str, column: Column) -> float:
     """Share of direct transfer's regret that is gone; nan where it is the best of all."""
     start, best = column[DIRECT].att_s, min(own.att_s for own in column.values())
@@ -70,7 +84,7 @@ def overview(folder: Path = FOLDER) -> str:
         "|---|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for table in sorted(folder.glob("*/main*/table.csv")):
-        found = columns(table)
+        found = known(table)
         place = table.parent.relative_to(folder)
         name = f"[{place.parts[0]}{place.name.removeprefix('main').replace('-', ', ')}]"
         first = f"{name}({place}/table.md)"

@@ -76,6 +76,18 @@ def test_what_all_domains_of_a_table_share_is_left_out(folder: Path) -> None:
     assert "| V4+headway=2 |" in script.overview(folder)
 
 
+def test_what_else_is_known_there_counts_as_well(folder: Path) -> None:
+    there = folder / "grid2x2-v1" / "there"
+    there.mkdir()
+    (there / "table.csv").write_text(
+        "setting,domain,att_s,att_s_gap\ndirect transfer,V1,100,40\ntrained in real,V1,60,1\n"
+        "direct transfer,V4,201,140\ntrained in real,V4,90,1\n"
+    )
+    first, second, _ = script.overview(folder).splitlines()[2:]
+    assert "**80.0** −50 %, 0.50 |" in first and "| 60.0 | 90.0 |" in first
+    assert "0.90 |" in second and "|  | 100 |" in second  # another direct transfer: another table
+
+
 def test_what_stands_around_it_stays(folder: Path) -> None:
     page = f"# Results\n\n{script.BEGIN}old\n{script.END}\nWords.\n"
     found = script.with_overview(page, folder)
