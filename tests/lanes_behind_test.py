@@ -21,8 +21,10 @@ from ugat_marl.junctions import Upstream, behind_of
 from ugat_marl.measurements import NOBODY
 from ugat_marl.network import Network
 from ugat_marl.networks.survey import survey
+from ugat_marl.recipes import simulated_worlds
 from ugat_marl.redraw import sumo_program
 from ugat_marl.scenario import Scenario
+from ugat_marl.ugat import UgatConfig
 
 NODES = {"M": (0, 0), "N": (0, 200), "S": (0, -200), "W": (-200, 0), "w": (-11, 0), "E": (200, 0)}
 ROADS = ("Ww", "wM", "ME", "NM", "MS", "SM", "MN")
@@ -121,7 +123,9 @@ LENGTHS_M = {"a_0": 3.0, "a_1": 3.0, "b_0": 50.0, "c_0": 2.0, "d_0": 50.0}
 
 
 def lanes_behind(*links: str, reach_m: float = 7.5) -> dict[str, dict[str, float]]:
-    return {name: own.lanes for name, own in behind_of(net(*links), LENGTHS_M, reach_m).items()}
+    return {
+        name: own.lanes for name, own in behind_of(net(*links), LENGTHS_M, reach_m, {"T"}).items()
+    }
 
 
 def test_a_lane_that_leads_to_two_is_shared() -> None:
@@ -167,18 +171,51 @@ def test_what_is_not_behind(links: tuple[str, ...]) -> None:
     assert not any(lanes_behind(*links).values())
 
 
+def test_a_lane_near_the_light_by_two_ways() -> None:
+    """Straight to the lane at the light, and by c: both of b's ways lead there."""
+    links = ("b0>a0", "b0>c0", "c0>a0", "a0>z0*")
+    assert lanes_behind(*links)["a_0"]["b_0"] == 1.0
+
+
+def test_in_a_roundabout_shares_are_those_of_all_rounds() -> None:
+    """Of c half go to the light, half round by d and back: all come there in the end."""
+    links = ("c0>a0", "c0>d0", "d0>c0", "a0>z0*")
+    found = lanes_behind(*links, reach_m=200.0)["a_0"]
+    assert found["c_0"] == pytest.approx(1.0)
+    assert found["d_0"] == pytest.approx(1.0)
+
+
+def test_both_parts_of_a_way_inside_a_junction() -> None:
+    root = net("b0>a0", "a0>z0*")
+    root.append(
+        ET.fromstring('<connection from=":b0a" fromLane="0" to="a" toLane="0" via=":x_0"/>')
+    )
+    next(item for item in root if item.get("from") == "b").set("via", ":b0a_0")
+    found = behind_of(root, LENGTHS_M, 7.5, {"T"})["a_0"].lanes
+    assert found == {":b0a_0": 1.0, ":x_0": 1.0, "b_0": 1.0}
+
+
+def test_a_light_without_an_agent_is_a_plain_node() -> None:
+    root = net("b0>a0*", "a0>z0*")
+    next(item for item in root if item.get("from") == "b").set("tl", "U")
+    assert behind_of(root, LENGTHS_M, 7.5, {"T", "U"})["a_0"].lanes == {}
+    assert behind_of(root, LENGTHS_M, 7.5, {"T"})["a_0"].lanes == {":b0a0": 1.0, "b_0": 1.0}
+
+
 def test_turning_around_is_no_way() -> None:
     root = net("b0>a0", "a0>z0*")
     extra = ET.fromstring('<connection from="b" fromLane="0" to="y" toLane="0" via=":u" dir="t"/>')
     root.append(extra)
-    assert behind_of(root, LENGTHS_M, 7.5)["a_0"].lanes["b_0"] == 1.0
+    assert behind_of(root, LENGTHS_M, 7.5, {"T"})["a_0"].lanes["b_0"] == 1.0
 
 
 def test_whose_waiting_vehicles_are_counted() -> None:
     """Roads that begin nearer than the reach, each lane with its part of those who wait there."""
     links = ("b0>a0", "b0>a1", "a0>z0*", "a1>z1*")
-    assert behind_of(net(*links), LENGTHS_M, 7.5)["a_0"].roads == {"a": 0.5}
-    assert behind_of(net(*links), LENGTHS_M, 100.0)["a_0"].roads == {"a": 0.5, "b": 0.5}
+    assert behind_of(net(*links), LENGTHS_M, 7.5, {"T"})["a_0"].roads == {"a": 0.5}
+    with_pavement = {**LENGTHS_M, "a_2": 3.0}
+    assert behind_of(net(*links), with_pavement, 7.5, {"T"})["a_0"].roads == {"a": 0.5}
+    assert behind_of(net(*links), LENGTHS_M, 100.0, {"T"})["a_0"].roads == {"a": 0.5, "b": 0.5}
 
 
 def test_other_networks_are_measured_as_before() -> None:
@@ -203,6 +240,7 @@ def test_who_waits_to_enter_is_counted_within_the_reach(split: Scenario) -> None
         world = in_domain(full, f"reach={reach_m:g}")
         env = ugat_marl.parallel_env(world, reward="waiting", observation="waiting")
         (item,) = env.network.intersections
+        assert env.network.lanes["wM_0"].capacity >= reach_m / 7.5
         letter = next(link.index for link in item.links if link.from_lane == "wM_0")
         red = next(i for i, state in enumerate(item.phases) if state[letter] == "r")
         env.reset(seed=1)
@@ -227,6 +265,20 @@ def test_the_queue_model_knows_no_reach(split: Scenario) -> None:
     for domain in ("queue_model=500+reach=100", "reach=100+queue_model=500"):
         with pytest.raises(ScenarioError, match="upstream of a lane"):
             in_domain(split, domain)
+
+
+def test_a_detection_zone_and_a_reach_exclude_each_other(split: Scenario) -> None:
+    for domain in ("reach=100+detection_zone=50", "detection_zone=50+reach=100"):
+        with pytest.raises(OptionError, match="upstream"):
+            in_domain(split, domain)
+
+
+def test_both_worlds_have_the_same_reach(split: Scenario) -> None:
+    for world in ("V1", "V1+reach=50"):
+        with pytest.raises(OptionError, match="give both the same"):
+            simulated_worlds(split, "reach=100", world, UgatConfig(), {})
+    for made in simulated_worlds(split, "reach=100", "V1+reach=100", UgatConfig(), {}):
+        made.close()
 
 
 def test_the_field_loop_knows_no_reach(split: Scenario) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import heapq
 import xml.etree.ElementTree as ET
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 CROSSING = "c"
 """Direction of a link for people on foot."""
+
+_ROUNDS = 50
 
 Matrix = Mapping[str, Sequence[int]]
 """Per junction, a bit mask of other rows for each row of its right-of-way matrix."""
@@ -179,7 +182,7 @@ class Upstream:
 
 
 def behind_of(
-    root: ET.Element, lengths_m: Mapping[str, float], reach_m: float
+    root: ET.Element, lengths_m: Mapping[str, float], reach_m: float, lights: Container[str]
 ) -> dict[str, Upstream]:
     """Lanes where those stand who are on their way to a light, but not on the lane at it.
 
@@ -192,51 +195,112 @@ def behind_of(
         lengths_m: Length of every lane outside of junctions, m.
         reach_m: How far upstream one looks: lanes behind are added until they begin so far from the
             light or farther, each as a whole.
+        lights: The traffic lights that matter; others are taken for plain nodes.
 
     Returns:
         For each lane at a light that is shorter, what is counted with it. The share of a lane
-        is one over the ways it leads on, along all of the way to the light; turning around
-        is none. Lanes at a light of their own are not behind another one. Where a lane begins
-        nearer than `reach_m`, vehicles that wait to enter on its road, each on any of its lanes,
-        are behind it.
+        is that of its ways that lead to the lane at the light, one over their number at every
+        node; turning around is no way. Lanes at a light of their own are not behind another one.
+        Where a lane begins nearer than `reach_m`, vehicles that wait to enter on its road, each on
+        any of its lanes, are behind it.
     """
-    feeds: dict[str, list[tuple[str, str]]] = defaultdict(list)
-    ways: dict[str, int] = defaultdict(int)
-    at_lights: dict[str, None] = {}
-    for item in root.iter("connection"):
-        start, end = item.get("from", ":"), item.get("to", ":")
-        if start.startswith(":") or end.startswith(":") or item.get("dir") == "t":
-            continue
-        lane = f"{start}_{item.get('fromLane')}"
-        ways[lane] += 1
-        if item.get("tl") is None:
-            feeds[f"{end}_{item.get('toLane')}"].append((lane, item.get("via", "")))
-        else:
-            at_lights[lane] = None
-    widths = Counter(map(_road, lengths_m))
+    ways = _ways(root, lights)
+    widths = Counter(map(_road, ways.number))
     found: dict[str, Upstream] = {}
-    for lane in at_lights:
-        begins_m = {lane: lengths_m.get(lane, reach_m)}
-        own, roads = Upstream(), defaultdict[str, float](float)
-        here = {lane: 1.0} if begins_m[lane] < reach_m else {}
-        while here:
-            before: dict[str, float] = defaultdict(float)
-            for name, share in here.items():
-                roads[_road(name)] += share / widths[_road(name)]
-                for feeder, via in feeds[name]:
-                    if feeder in at_lights or (feeder in begins_m and feeder not in before):
-                        continue
-                    before[feeder] += share / ways[feeder]
-                    at_m = begins_m[name] + lengths_m.get(feeder, 0.0)
-                    begins_m[feeder] = min(begins_m.get(feeder, at_m), at_m)
-                    if via:
-                        own.lanes[via] = share
-            own.lanes.update(before)
-            here = {name: share for name, share in before.items() if begins_m[name] < reach_m}
-        if roads:
-            own.roads.update(roads)
-            found[lane] = own
+    for lane in ways.at_lights:
+        begins_m = _begins(lane, ways, lengths_m, reach_m)
+        near = [name for name, at_m in begins_m.items() if at_m < reach_m]
+        if not near:
+            continue
+        shares = _shares(lane, near, ways)
+        own = found[lane] = Upstream()
+        for name in near:
+            road = _road(name)
+            own.roads[road] = own.roads.get(road, 0.0) + shares[name] / widths[road]
+            for feeder, inside in ways.feeds.get(name, ()):
+                if feeder in begins_m and feeder not in ways.at_lights:
+                    own.lanes.update(dict.fromkeys(inside, shares[name]))
+                    own.lanes[feeder] = shares[feeder]
     return found
+
+
+@dataclass(frozen=True)
+class _Ways:
+    """How lanes outside of junctions lead to each other.
+
+    Attributes:
+        feeds: For each lane those that lead to it without a light, with the lanes inside the
+            junction in between.
+        number: In how many ways each lane leads on.
+        at_lights: Lanes that end at a light.
+    """
+
+    feeds: Mapping[str, Sequence[tuple[str, Sequence[str]]]]
+    number: Mapping[str, int]
+    at_lights: Mapping[str, None]
+
+
+def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
+    feeds: dict[str, list[tuple[str, list[str]]]] = defaultdict(list)
+    number: dict[str, int] = defaultdict(int)
+    at_lights: dict[str, None] = {}
+    onward: dict[str, str] = {}
+    for item in root.iter("connection"):
+        start, end, via = item.get("from", ":"), item.get("to", ":"), item.get("via", "")
+        lane = f"{start}_{item.get('fromLane')}"
+        if start.startswith(":"):
+            onward[lane] = via
+            continue
+        if end.startswith(":"):
+            continue
+        if item.get("tl") in lights:
+            at_lights[lane] = None
+        if item.get("dir") != "t":
+            number[lane] += 1
+            if item.get("tl") not in lights:
+                feeds[f"{end}_{item.get('toLane')}"].append((lane, [via] if via else []))
+    for own in feeds.values():
+        for _, inside in own:
+            while inside and (following := onward.get(inside[-1])) and following not in inside:
+                inside.append(following)
+    return _Ways(feeds, number, at_lights)
+
+
+def _begins(
+    lane: str, ways: _Ways, lengths_m: Mapping[str, float], reach_m: float
+) -> dict[str, float]:
+    """How far from the light lanes begin, up to those that begin beyond the reach, by distance."""
+    found: dict[str, float] = {}
+    waiting = [(lengths_m.get(lane, reach_m), lane)]
+    while waiting:
+        at_m, name = heapq.heappop(waiting)
+        if name in found:
+            continue
+        found[name] = at_m
+        if at_m < reach_m:
+            for feeder, _ in ways.feeds.get(name, ()):
+                if feeder not in ways.at_lights:
+                    heapq.heappush(waiting, (at_m + lengths_m.get(feeder, 0.0), feeder))
+    return found
+
+
+def _shares(lane: str, near: Sequence[str], ways: _Ways) -> dict[str, float]:
+    """Share of the vehicles on each lane that come to `lane`, by all ways through `near`.
+
+    The shares are the solution of one equation per lane, reached by repeating it: roundabouts
+    need more than one round, and what goes round once more is a fraction each time.
+    """
+    shares = {lane: 1.0}
+    for _ in range(_ROUNDS):
+        after: dict[str, float] = defaultdict(float, {lane: 1.0})
+        for name in near:
+            for feeder, _inside in ways.feeds.get(name, ()):
+                if feeder not in ways.at_lights:
+                    after[feeder] += shares.get(name, 0.0) / ways.number[feeder]
+        if after == shares:
+            break
+        shares = dict(after)
+    return shares
 
 
 def _road(lane: str) -> str:

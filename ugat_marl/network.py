@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 
@@ -47,7 +47,7 @@ class Lane:
         speed_mps: Speed limit.
         shape: Centre line, ``((x, y), ...)`` in m.
         behind: What is counted with it, since it ends before an agent's sight does.
-        room_m: Length on which vehicles are measured, lanes behind included.
+        room_m: Length on which vehicles are measured: lanes behind included, and the reach.
     """
 
     id: str
@@ -130,7 +130,7 @@ class Network:
     @classmethod
     def _of(cls, root: ET.Element, scenario: Scenario) -> Network:
         document = scenario.network
-        lanes = _with_room(_lanes(root), root, scenario.control.reach_m)
+        lanes = _lanes(root)
         links = links_of(root)
         programmes = _programmes(root, scenario)
         if unknown := sorted(set(scenario.settings.intersections) - set(links)):
@@ -178,7 +178,8 @@ class Network:
             )
         agents = {intersection.id for intersection in found}
         pruned = tuple(_with_neighbours(item, agents) for item in found)
-        return cls(lanes, pruned, tuple(uncontrolled))
+        reach_m = scenario.control.reach_m
+        return cls(_with_room(lanes, root, agents, reach_m), pruned, tuple(uncontrolled))
 
     def intersection(self, tls: str) -> Intersection:
         """The intersection with this SUMO id."""
@@ -200,7 +201,7 @@ class Network:
                 tuple(tuple(item.lanes.items()) for item in behind),
                 tuple(tuple(item.roads.items()) for item in behind),
             )
-            if any(item.roads for item in behind)
+            if any(item.lanes or item.roads for item in behind)
             else NOBODY,
         )
 
@@ -344,12 +345,16 @@ def _lanes(root: ET.Element) -> dict[str, Lane]:
     return lanes
 
 
-def _with_room(lanes: dict[str, Lane], root: ET.Element, reach_m: float) -> dict[str, Lane]:
+def _with_room(
+    lanes: dict[str, Lane], root: ET.Element, agents: Container[str], reach_m: float
+) -> dict[str, Lane]:
     """The lanes, those at lights that are too short with what is counted with them."""
     lengths_m = {name: lane.length_m for name, lane in lanes.items()}
-    for name, found in behind_of(root, lengths_m, max(reach_m, VEHICLE_SPACE_M)).items():
-        room_m = sum(lengths_m.get(other, 0.0) * share for other, share in found.lanes.items())
-        lanes[name] = replace(lanes[name], behind=found, room_m=lengths_m[name] + room_m)
+    for name, own in behind_of(root, lengths_m, max(reach_m, VEHICLE_SPACE_M), agents).items():
+        behind = own if reach_m else Upstream(own.lanes)
+        room_m = sum(lengths_m.get(other, 0.0) * share for other, share in own.lanes.items())
+        room_m = max(lengths_m[name] + room_m, reach_m)
+        lanes[name] = replace(lanes[name], behind=behind, room_m=room_m)
     return lanes
 
 

@@ -9,7 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.effects import Domain
+from ugat_marl.effects import Domain, describe, in_domain
+from ugat_marl.errors import OptionError
 from ugat_marl.executors import Workers
 from ugat_marl.learners.registry import LearnerFactory
 from ugat_marl.policy import AnyParallelEnv, Learner, Policy
@@ -67,7 +68,17 @@ def simulated_worlds(
         ugat: How often is rolled out, and whether greens are delayed by chance.
         options: Of both environments.
         workers: As for `SimulatedWorld`.
+
+    Raises:
+        OptionError: Agents look farther in one of them, so that rewards are not the same.
     """
+    here_m, there_m = (in_domain(scenario, world).control.reach_m for world in (sim, real))
+    if here_m != there_m:
+        raise OptionError(
+            f"agents look {here_m:g} m upstream in {describe(sim)!r} and {there_m:g} m in "
+            f"{describe(real)!r}, so that counts and rewards are not the same; give both the same "
+            f"reach, such as {describe(sim)}+reach=100 and {describe(real)}+reach=100"
+        )
 
     def world(domain: Domain, name: str, episodes: int, most_delay_s: int = 0) -> SimulatedWorld:
         crossings = ugat.most_delay_s > 0  # they tell best when a green began

@@ -24,7 +24,7 @@ from ugat_marl.effects.domains import NAMED
 from ugat_marl.effects.engine import BlockerPatience, QueueModel, Reach
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
 from ugat_marl.effects.judging import JUDGING
-from ugat_marl.effects.observing import OBSERVING
+from ugat_marl.effects.observing import OBSERVING, DetectionZone
 from ugat_marl.effects.roads import Incident, LaneClosure, LocalSpeed, Parking
 from ugat_marl.effects.signals import AllRedTime, LateGreen, YellowTime
 from ugat_marl.effects.turning import Turning
@@ -278,7 +278,7 @@ def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
 
     Raises:
         UnknownNameError: No such setting or effect.
-        OptionError: An effect has an impossible value.
+        OptionError: An effect has an impossible value, or two of them exclude each other.
         ScenarioError: A scenario named as a domain cannot be read or has other roads.
     """
     if (path := scenario_of(domain)) is not None:
@@ -288,8 +288,19 @@ def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
                 f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "
                 "a domain must be on the same network, or a policy means nothing in it"
             )
-        return other
-    return apply_effects(scenario, parse_domain(domain))
+        return _checked(other)
+    return _checked(apply_effects(scenario, parse_domain(domain)))
+
+
+def _checked(scenario: Scenario) -> Scenario:
+    """The scenario, unless agents are to look farther than whole lanes and not as far."""
+    zones = (item for item in scenario.settings.effects if item.get("name") == DetectionZone.name)
+    if scenario.control.reach_m and any(zones):
+        raise OptionError(
+            f"scenario {scenario.id!r}: a detection_zone shows vehicles on the lane at the light "
+            "alone, a reach (control.reach_m) those upstream of it, too; leave out one of the two"
+        )
+    return scenario
 
 
 def scenario_of(domain: Domain) -> Path | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -82,7 +82,8 @@ class IntersectionFacts:
             blocks them.
         lanes_behind: Lanes that are too short, so that those are counted with them who are on the
             lanes behind.
-        short_lanes: Lanes shorter than `SHORT_M`, beyond which nobody is counted.
+        short_lanes: Lanes shorter than `SHORT_M` of a road that goes on upstream, or on which
+            vehicles wait to enter, without that anybody there is counted.
         always_green: Links that are green in every phase: the signal never stops them.
         right_on_red: Links that may go on red after a stop.
         u_turns: Links that turn around.
@@ -164,6 +165,7 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
     root = scenario.network.parse()
     traffic = _Traffic.of(scenario, network, demand, reporter)
     free = _free_links(root)
+    short = _short(scenario, network)
     rules = RightOfWay(foes_of(root), yields_of(root))
     interval = scenario.control.decision_interval_s
     shortest = traffic.first_s + FILLINGS * traffic.fill_s
@@ -177,9 +179,21 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
         round(traffic.first_s, 2),
         round(traffic.fill_s, 1),
         shortest,
-        tuple(_facts(item, network, rules, free, traffic) for item in network.intersections),
+        tuple(_facts(item, network, rules, free, traffic, short) for item in network.intersections),
         network.uncontrolled,
     )
+
+
+def _short(scenario: Scenario, network: Network) -> set[str]:
+    """Lanes with which more would be counted, did agents look as far as `SHORT_M`."""
+    if scenario.control.reach_m >= SHORT_M or "mesosim" in scenario.settings.sumo:
+        return set()
+    farther = Network.read(scenario.with_control(reach_m=SHORT_M))
+    return {
+        name
+        for name, lane in farther.lanes.items()
+        if lane.behind.lanes.keys() - network.lanes[name].behind.lanes.keys()
+    }
 
 
 def _facts(
@@ -188,6 +202,7 @@ def _facts(
     rules: RightOfWay,
     free: Mapping[str, int],
     traffic: _Traffic,
+    short: Container[str],
 ) -> IntersectionFacts:
     served = [{i for i, letter in enumerate(phase) if letter in GREEN} for phase in item.phases]
     ever = set[int]().union(*served)
@@ -214,11 +229,7 @@ def _facts(
         lanes_behind=tuple(
             lane for lane in item.incoming_lanes if network.lanes[lane].behind.lanes
         ),
-        short_lanes=tuple(
-            lane
-            for lane in item.incoming_lanes
-            if network.lanes[lane].length_m < SHORT_M and not network.lanes[lane].behind.roads
-        ),
+        short_lanes=tuple(lane for lane in item.incoming_lanes if lane in short),
         always_green=sum(all(link.index in green for green in served) for link in item.links),
         right_on_red=sum(link.index in stop_and_go for link in item.links),
         u_turns=sum(link.direction in "tT" for link in item.links),
