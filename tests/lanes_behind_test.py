@@ -281,6 +281,19 @@ def test_both_worlds_have_the_same_reach(split: Scenario) -> None:
         made.close()
 
 
+def test_a_table_and_a_training_say_so_before_they_begin(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = tmp_path / "runs"
+    for command in (
+        ["paper", "gap", "--scenario", "single-v1", "--runs", str(runs), "--out", str(tmp_path)],
+        ["train", "single-v1", "--real", "V1", "--out", str(runs)],
+    ):
+        assert main([*command, "--sim", "reach=400"]) == 2
+        assert "give both the same reach" in capsys.readouterr().err
+    assert not list(runs.rglob("*.pt"))
+
+
 def test_the_field_loop_knows_no_reach(split: Scenario) -> None:
     with pytest.raises(OptionError, match="100 m upstream"):
         Site.of(in_domain(split, "reach=100"), {})

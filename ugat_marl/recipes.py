@@ -51,6 +51,22 @@ def train_until(
             left -= chunk
 
 
+def check_worlds(scenario: Scenario, sim: Domain, real: Domain) -> None:
+    """Checks that what is seen and rewarded is the same in two worlds.
+
+    Raises:
+        UnknownNameError: No such domain.
+        OptionError: Agents look farther in one of them.
+    """
+    here_m, there_m = (in_domain(scenario, world).control.reach_m for world in (sim, real))
+    if here_m != there_m:
+        raise OptionError(
+            f"agents look {here_m:g} m upstream in {describe(sim)!r} and {there_m:g} m in "
+            f"{describe(real)!r}, so that counts and rewards are not the same; give both the same "
+            "reach, such as +reach=100"
+        )
+
+
 def simulated_worlds(
     scenario: Scenario,
     sim: Domain,
@@ -70,15 +86,9 @@ def simulated_worlds(
         workers: As for `SimulatedWorld`.
 
     Raises:
-        OptionError: Agents look farther in one of them, so that rewards are not the same.
+        OptionError: As `check_worlds`.
     """
-    here_m, there_m = (in_domain(scenario, world).control.reach_m for world in (sim, real))
-    if here_m != there_m:
-        raise OptionError(
-            f"agents look {here_m:g} m upstream in {describe(sim)!r} and {there_m:g} m in "
-            f"{describe(real)!r}, so that counts and rewards are not the same; give both the same "
-            f"reach, such as {describe(sim)}+reach=100 and {describe(real)}+reach=100"
-        )
+    check_worlds(scenario, sim, real)
 
     def world(domain: Domain, name: str, episodes: int, most_delay_s: int = 0) -> SimulatedWorld:
         crossings = ugat.most_delay_s > 0  # they tell best when a green began

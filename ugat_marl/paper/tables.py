@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ugat_marl.comparison import Comparison, Trial
 from ugat_marl.devices import require_device_name
-from ugat_marl.effects import describe, in_domain, load
+from ugat_marl.effects import describe, load
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.executors import Workers
 from ugat_marl.learners.dqn_config import DQNConfig
@@ -16,6 +16,7 @@ from ugat_marl.paper.job import Job
 from ugat_marl.paper.runner import Planned, done, perform_all
 from ugat_marl.paper.settings import Kind, Setting, settings_of
 from ugat_marl.progress import Reporter
+from ugat_marl.recipes import check_worlds
 from ugat_marl.transfer import DIRECT, EVALUATION_SEED
 from ugat_marl.tuning import BUDGET, LEAST_BUDGET
 from ugat_marl.ugat import UgatConfig
@@ -148,7 +149,7 @@ def compare(
     """
     loaded = load(scenario)
     for target in config.targets(table):
-        in_domain(loaded, target)  # a wrong name is an error now, not in an hour
+        check_worlds(loaded, config.sim, target)  # an error now, not in an hour
     planner = Planner(table, scenario, config)
     plan = [job for row in config.settings(table) for job in planner.jobs(row)]
     perform_all(planner.bases + plan, folder, workers, reporter, f"paper {table}")
