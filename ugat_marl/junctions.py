@@ -247,17 +247,18 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
     onward: dict[str, str] = {}
     for item in root.iter("connection"):
         start, end, via = item.get("from", ":"), item.get("to", ":"), item.get("via", "")
+        ends_at_light = item.get("tl", "") in lights
         lane = f"{start}_{item.get('fromLane')}"
         if start.startswith(":"):
             onward[lane] = via
             continue
         if end.startswith(":"):
             continue
-        if item.get("tl") in lights:
+        if ends_at_light:
             at_lights[lane] = None
         if item.get("dir") != "t":
             number[lane] += 1
-            if item.get("tl") not in lights:
+            if not ends_at_light:
                 feeds[f"{end}_{item.get('toLane')}"].append((lane, [via] if via else []))
     for own in feeds.values():
         for _, inside in own:
