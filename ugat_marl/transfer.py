@@ -318,7 +318,7 @@ def _train(
         )
         return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
 
-    street = config.sim if config.placebo == "same-world" else config.real
+    street = config.sim if recorded or config.placebo == "same-world" else config.real
     sim, street_world = simulated_worlds(
         scenario, config.sim, street, config.ugat, config.env_options, workers
     )
