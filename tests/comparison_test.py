@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
+import matplotlib.image
 import numpy as np
 import pytest
 
@@ -17,6 +19,7 @@ from ugat_marl.comparison import (
     student_quantile,
 )
 from ugat_marl.metrics import Scores
+from ugat_marl.report.comparison_pictures import gap_picture
 from ugat_marl.report.comparison_tables import as_csv, markdown, seeds_csv
 
 BLANK = Scores(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
@@ -126,6 +129,21 @@ def test_episodes_that_broke_down_are_counted_one_by_one() -> None:
     assert found.median_s("direct transfer", "V4") == 120.0
     assert found.unserved("direct transfer", "V4") == pytest.approx(1 / 3)
     assert "| direct transfer | 120, 33 % |" in markdown(found, "direct transfer", FACTS)
+
+
+@pytest.mark.parametrize("shared", ["", "+blocker_patience=60+reach=100", "+reach=100" * 6])
+def test_bars_are_told_apart_within_the_picture(shared: str, tmp_path: Path) -> None:
+    rows = [
+        Trial("direct transfer", domain, domain, 0, 1, replace(BLANK, att_s=100.0))
+        for domain in (f"V{number}{shared}" for number in (1, 2, 3, 4))
+    ]
+    rows += [replace(row, domain="sim") for row in rows]
+    found = Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
+    path = tmp_path / "gaps.png"
+    gap_picture(found, path)
+    pixels = matplotlib.image.imread(path)[-130:, :, :3]
+    edges = np.concatenate((pixels[:, :3], pixels[:, -3:]), axis=1)
+    assert pixels.min() < 0.5 and edges.min() == 1.0  # a legend, and none of it cut off
 
 
 def test_pages_hold_the_numbers(found: Comparison) -> None:

@@ -72,7 +72,9 @@ def gap_picture(found: Comparison, path: Path) -> None:
         _gaps(left, found, "att_s", "Δ of ATT [s]; shorter is better")
         _gaps(right, found, "throughput", "Δ of throughput [veh]")
         names = right.get_legend_handles_labels()  # outside: no corner is free of bars for certain
-        figure.legend(*names, loc="outside lower center", ncols=4, frameon=False)
+        longest_in = 0.55 + 0.085 * max(map(len, found.targets))  # with its coloured box
+        columns = max(1, min(4, int(9.6 / longest_in)))
+        figure.legend(*names, loc="outside lower center", ncols=columns, frameon=False)
         figure.suptitle(
             f"{found.scenario}: real domain minus simulation", fontsize=11, x=0.01, ha="left"
         )
