@@ -185,6 +185,19 @@ def test_in_a_roundabout_shares_are_those_of_all_rounds() -> None:
     assert found["d_0"] == pytest.approx(1.0)
 
 
+def test_a_chain_of_many_short_lanes() -> None:
+    """A road cut at every other metre: more pieces than a roundabout has rounds."""
+    pieces = [f"e{number}" for number in range(200)]
+    root = ET.Element("net")
+    for start, end in zip(pieces, [*pieces[1:], "z"], strict=True):
+        ways = {"from": start, "fromLane": "0", "to": end, "toLane": "0"}
+        light = {"tl": "T"} if end == "z" else {}
+        ET.SubElement(root, "connection", {**ways, **light})
+    lengths_m = {f"{piece}_0": 2.0 for piece in pieces}
+    found = behind_of(root, lengths_m, 400.0, {"T"})["e199_0"].lanes
+    assert len(found) == 199 and set(found.values()) == {1.0}
+
+
 def test_both_parts_of_a_way_inside_a_junction() -> None:
     root = net("b0>a0", "a0>z0*")
     root.append(

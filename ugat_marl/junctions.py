@@ -12,6 +12,7 @@ CROSSING = "c"
 """Direction of a link for people on foot."""
 
 _ROUNDS = 50
+"""How often shares go round a roundabout; with each round what is missing is a fraction."""
 
 Matrix = Mapping[str, Sequence[int]]
 """Per junction, a bit mask of other rows for each row of its right-of-way matrix."""
@@ -292,7 +293,7 @@ def _shares(lane: str, near: Sequence[str], ways: _Ways) -> dict[str, float]:
     need more than one round, and what goes round once more is a fraction each time.
     """
     shares = {lane: 1.0}
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS + len(near)):  # a chain of n lanes takes n rounds
         after: dict[str, float] = defaultdict(float, {lane: 1.0})
         for name in near:
             for feeder, _inside in ways.feeds.get(name, ()):

@@ -95,7 +95,7 @@ class Reach(Effect):
 def _changed(
     scenario: Scenario, effect: Effect, options: Mapping[str, str], **control: float
 ) -> Scenario:
-    """The scenario with further options of SUMO, and other times in its control."""
+    """The scenario with further options of SUMO, and other values in its control."""
     settings = scenario.settings.model_dump()
     settings["sumo"] = {**settings["sumo"], **options}
     settings["control"] = {**settings["control"], **control}

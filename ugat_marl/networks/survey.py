@@ -82,8 +82,8 @@ class IntersectionFacts:
             blocks them.
         lanes_behind: Lanes that are too short, so that those are counted with them who are on the
             lanes behind.
-        short_lanes: Lanes shorter than `SHORT_M` of a road that goes on upstream, or on which
-            vehicles wait to enter, without that anybody there is counted.
+        short_lanes: Lanes shorter than `SHORT_M` of a road that goes on upstream, where nobody is
+            counted.
         always_green: Links that are green in every phase: the signal never stops them.
         right_on_red: Links that may go on red after a stop.
         u_turns: Links that turn around.
