@@ -65,22 +65,28 @@ def known(table: Path) -> dict[str, Column]:
     return found
 
 
+def regret_s(setting: str, column: Column) -> float:
+    """Travel time above that of the best of all, in s."""
+    return column[setting].att_s - min(own.att_s for own in column.values())
+
+
 def won_back(setting: str, column: Column) -> float:
     """Share of direct transfer's regret that is gone; nan where it is the best of all."""
-    start, best = column[DIRECT].att_s, min(own.att_s for own in column.values())
-    return (start - column[setting].att_s) / (start - best) if start > best else math.nan
+    start = regret_s(DIRECT, column)
+    return 1.0 - regret_s(setting, column) / start if start > 0 else math.nan
 
 
 def reduction(setting: str, column: Column) -> float:
-    """Change of direct transfer's gap, as a share."""
-    return column[setting].gap_s / column[DIRECT].gap_s - 1.0
+    """Change of direct transfer's gap, as a share; nan where it has none to make smaller."""
+    start = column[DIRECT].gap_s
+    return column[setting].gap_s / start - 1.0 if start > 0 else math.nan
 
 
 def overview(folder: Path = FOLDER) -> str:
     """The overview as Markdown: every domain of every table of transfer, and their means."""
     lines = [
-        "| table | | direct transfer | UGAT, timed | timed, rewards matched | more plain `sim` "
-        "| constant delay | trained in real | best rule there |",
+        "| table | | direct transfer (regret) | UGAT, timed | timed, rewards matched "
+        "| more plain `sim` | constant delay | trained in real | best rule there |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for table in sorted(folder.glob("*/main*/table.csv")):
@@ -103,7 +109,8 @@ def _line(name: str, domain: str, column: Column) -> str:
         _att(column, [own for own in column if own.startswith(start)])
         for start in (CONTROL, CONSTANT, ORACLE, RULE)
     ]
-    cells = [name, domain, _att(column, [DIRECT]), *(_grounded(g, column) for g in GROUNDED)]
+    direct = f"{_att(column, [DIRECT])} ({number(regret_s(DIRECT, column))})"
+    cells = [name, domain, direct, *(_grounded(g, column) for g in GROUNDED)]
     return f"| {' | '.join(cells + others)} |"
 
 

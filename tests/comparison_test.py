@@ -102,6 +102,7 @@ def test_regret_won_back_by_hand(found: Comparison) -> None:
     assert found.won_back("UGAT", "V4", "direct transfer") == pytest.approx((220 - 140) / 100)
     assert found.won_back("direct transfer", "V4", "direct transfer") == 0.0
     assert found.won_back("best rule, tuned there", "V4", "direct transfer") == 1.0
+    assert found.regret_s("UGAT", "V4").tolist() == [10.0, 30.0]
     # the gap: 149 s before, (130 - 71 + 150 - 71) / 2 = 69 after
     assert found.reduction("UGAT", "V4", "direct transfer") == pytest.approx(1 - 69 / 149)
 
@@ -110,6 +111,18 @@ def test_nothing_to_win_has_no_share() -> None:
     rows = trials("direct transfer", {0: (70.0, 80.0)}) + trials("UGAT", {0: (70.0, 90.0)})
     found = Comparison("toy", "0", "sim", tuple(rows), {"table": "main"})
     assert math.isnan(found.won_back("UGAT", "V4", "direct transfer"))
+
+
+def test_what_loses_nothing_on_the_way_has_no_gap_to_make_smaller() -> None:
+    rows = trials("direct transfer", {0: (90.0, 80.0)}) + trials("UGAT", {0: (70.0, 290.0)})
+    found = Comparison("toy", "0", "sim", tuple(rows), {"table": "main"})
+    assert math.isnan(found.reduction("UGAT", "V4", "direct transfer"))
+    served = [
+        replace(row, scores=replace(row.scores, throughput=30.0 if row.domain == "V4" else 50.0))
+        for row in rows
+    ]
+    found = Comparison("toy", "0", "sim", tuple(served), {"table": "main"})
+    assert found.reduction("UGAT", "V4", "direct transfer", "throughput") == 0.0  # fewer: a gap
 
 
 def test_a_value_that_is_missing_is_no_certainty() -> None:
@@ -151,6 +164,7 @@ def test_pages_hold_the_numbers(found: Comparison) -> None:
     assert "# toy: main" in page
     assert "| UGAT | −54 % |" in page
     assert "| UGAT | 0.80 |" in page
+    assert "| direct transfer | 100 (-154 to 354) |" in page  # t = 12.71, 20 s apart from the mean
     assert "| best constant | 2 s |" in page
     assert "| UGAT | -80.0 (" in page
     table = as_csv(found).splitlines()

@@ -211,7 +211,10 @@ def test_h_reads_the_delay_off_the_changes(planted) -> None:
     # Of single transitions it reads as much as chance leaves in them.
     assert (h.error_on_transitions_s >= h.error_s - 0.05).all()
     assert np.isfinite(h.error_on_transitions_s).all()
-    assert h.mean_u_off_data > h.mean_u + 0.2 and h.auroc_off_data > 0.7
+    u = h.calibration
+    assert u.mean_u_off_data > u.mean_u + 0.2 and u.auroc_off_data > 0.7
+    assert u.auroc > 0.6 and u.risk_by_coverage[0] < u.risk_by_coverage[-1]  # it tells errors
+    assert 0.0 <= u.ece < 0.35
     assert planted[1].trusted().tolist() == [True, False]  # the second has nothing to refine
     assert planted[1].trusted(least_accuracy=0.99).tolist() == [False, False]
 
@@ -239,8 +242,11 @@ def test_the_report_is_flat_numbers(planted) -> None:
         "inverse/error_s",
         "inverse/error_on_transitions_s/a_0",
         "inverse/guess_s",
-        "inverse/mean_u_off_data",
-        "inverse/auroc_off_data",
+        "calibration/auroc",
+        "calibration/ece",
+        "calibration/error_by_quantile/0",
+        "calibration/mean_u_off_data",
+        "calibration/auroc_off_data",
         "lost_time/best_s",
         "lost_time/best_s/a_0",
         "lost_time/low_s/a_0",
@@ -252,11 +258,12 @@ def test_the_report_is_flat_numbers(planted) -> None:
 
 def test_a_report_says_what_is_doubtful(planted) -> None:
     report = planted[1]
+    useless = dataclasses.replace(report.inverse.calibration, auroc_off_data=0.5)
     poor = dataclasses.replace(
         report,
         forward=dataclasses.replace(report.forward, error=np.array([9.0, 0.0])),
         simulated=dataclasses.replace(report.simulated, error=np.array([0.0, 9.0])),
-        inverse=dataclasses.replace(report.inverse, auroc_off_data=0.5),
+        inverse=dataclasses.replace(report.inverse, calibration=useless),
     )
     assert poor.warnings == (
         "f is no better than predicting no change at 1 of 2 (a_0)",
@@ -271,7 +278,7 @@ def test_a_report_says_what_is_doubtful(planted) -> None:
 def test_without_uncertainty_the_report_says_that_all_is_taken() -> None:
     config = dataclasses.replace(BRIEF, uncertainty="none")
     made, report = fitted(street(PLANTED, seed=9), config=config)
-    assert made.inverse.method.name == "none" and report.inverse.mean_u == 0.0
+    assert made.inverse.method.name == "none" and report.inverse.calibration.mean_u == 0.0
     assert "without uncertainty u is 0, and the gate takes every answer of h" in report.warnings
 
 
@@ -321,6 +328,15 @@ def test_an_intersection_that_never_changes_its_phase_harms_no_other(planted) ->
     assert (report.lost.low_s[1], report.lost.high_s[1]) == (0.0, MOST_S)
     assert math.isnan(report.inverse.error_s[1])
     assert report.trusted().tolist() == [True, False]
+
+
+def test_where_no_green_ever_begins_nothing_is_said_of_u() -> None:
+    logs = (frozen(frozen(street(PLANTED, seed=2), "a_0"), "b_0"),
+            frozen(frozen(SIMULATED, "a_0"), "b_0"))  # fmt: skip
+    _, report = fitted(*logs, config=BRIEF)
+    assert math.isnan(report.inverse.calibration.mean_u)
+    assert math.isnan(report.inverse.calibration.ece)
+    assert report.trusted().tolist() == [False, False]
 
 
 def test_a_phase_seldom_served_on_the_street_takes_its_intersections_delay() -> None:

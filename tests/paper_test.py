@@ -13,6 +13,10 @@ import pytest
 
 from ugat_marl.__main__ import main
 from ugat_marl.errors import MeasurementError, OptionError, UnknownNameError
+from ugat_marl.grounding.delays import TimedConfig
+from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.gate import GateConfig
+from ugat_marl.grounding.view import InputsConfig
 from ugat_marl.metrics import Scores
 from ugat_marl.paper.job import JOB, SCORES, read_scores
 from ugat_marl.paper.runner import LOG, Planned, done, perform_all
@@ -53,6 +57,24 @@ def test_rewards_are_matched_in_the_row_that_says_so_alone() -> None:
         if setting.kind == "grounded" and setting.ugat.matches
     }
     assert matching == {"UGAT, timed: rewards matched"}
+
+
+def test_rows_share_what_is_given_and_keep_what_they_are_named_for() -> None:
+    config = replace(
+        SHORT, inputs=InputsConfig(hops=1), gate=GateConfig(window_epochs=3),
+        fit=FitConfig(uncertainty="dropout"),
+    )  # fmt: skip
+    rows = {setting.name: setting.ugat for setting in config.settings("ablation")}
+    grounded = {name: own for name, own in rows.items() if name.startswith("UGAT")}
+    assert all(own.inputs.hops == 1 for own in grounded.values())
+    assert all(own.gate.window_epochs == 3 for own in grounded.values())
+    named = {name: own.fit.uncertainty for name, own in grounded.items()}
+    assert {named.pop(f"{name}: no uncertainty (GAT)") for name in ("UGAT", TIMED)} == {"none"}
+    assert set(named.values()) == {"dropout"}
+    pairs = {name for name, own in grounded.items() if own.fit.pairs == "smoothed"}
+    assert pairs == {"UGAT: h on smoothed pairs"}
+    without = {name for name, own in grounded.items() if own.timed.answer == "constant"}
+    assert without == {f"{TIMED}: lost times without h"}
 
 
 @pytest.mark.parametrize("table", TABLES)
@@ -121,6 +143,7 @@ def test_what_decides_a_policy_decides_its_folder() -> None:
         ({"domains": ("V3", "rain")}, "listed twice"),
         ({"domains": ("sim",)}, "the simulation itself"),
         ({"grounded_episodes": 0}, "grounded_episodes = 0"),
+        ({"timed": TimedConfig(match=True)}, "a row of its own"),
     ],
 )
 def test_impossible_tables_are_refused(wrong: dict[str, Any], says: str) -> None:

@@ -54,8 +54,8 @@ def test_by_hand(folder: Path) -> None:
     ]
     link = "[grid2x2-v1, short](grid2x2-v1/main-short/table.md)"
     # Of 25 s to the best constant timed grounding has 20; in V4 90 of 100 s to the rule.
-    assert first == [link, "V1", "100", "**80.0** −50 %, 0.80", "", "", "75.0", "", "90.0"]
-    assert second == ["", "V4", "200", "**110** −80 %, 0.90", "", "", "115", "", "100"]
+    assert first == [link, "V1", "100 (25.0)", "**80.0** −50 %, 0.80", "", "", "75.0", "", "90.0"]
+    assert second == ["", "V4", "200 (100)", "**110** −80 %, 0.90", "", "", "115", "", "100"]
     assert mean == ["", "*mean*", "", "*−65 %, 0.85*", "", "", "", "", ""]
 
 
@@ -65,6 +65,13 @@ def test_where_direct_transfer_is_best_there_is_nothing_to_win_back(folder: Path
     )
     first, second, mean = script.overview(folder).splitlines()[2:]
     assert "**80.0** −50 %, – |" in first and "0.90" in second and "*−65 %, –*" in mean
+
+
+def test_a_gap_that_is_none_cannot_become_smaller(folder: Path) -> None:
+    table = folder / "grid2x2-v1" / "main-short" / "table.csv"
+    table.write_text(TABLE.replace("direct transfer,V1,100,40", "direct transfer,V1,100,-8"))
+    first, _, mean = script.overview(folder).splitlines()[2:]
+    assert "**80.0** –, 0.80" in first and "*–, 0.85*" in mean
 
 
 def test_what_all_domains_of_a_table_share_is_left_out(folder: Path) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.metrics import MEASURES, Scores
+from ugat_marl.metrics import MEASURES, MORE_IS_BETTER, Scores
 
 Floats = NDArray[np.float64]
 SERVED = 0.9
@@ -186,27 +186,32 @@ class Comparison:
         names = [name for name in among or self.settings if self.has(name, target)]
         return min(names, key=lambda name: float(self.values(name, target, "att_s").mean()))
 
+    def regret_s(self, setting: str, target: str) -> Floats:
+        """ATT above that of the best setting in the domain, in s, one per training seed."""
+        best = self.values(self.best(target), target, "att_s")
+        return self.values(setting, target, "att_s") - best
+
     def won_back(self, setting: str, target: str, direct: str) -> float:
         """Share of the regret of `direct` that is gone: 1 is as good as the best setting there.
 
         A ratio of means over training seeds; nan where direct transfer leaves nothing to win.
         """
-        best = float(self.values(self.best(target), target, "att_s").mean())
-        start = float(self.values(direct, target, "att_s").mean())
-        mine = float(self.values(setting, target, "att_s").mean())
-        return (start - mine) / (start - best) if start > best else math.nan
+        start = float(self.regret_s(direct, target).mean())
+        mine = float(self.regret_s(setting, target).mean())
+        return 1.0 - mine / start if start > 0 else math.nan
 
     def reduction(self, setting: str, target: str, direct: str, measure: str = "att_s") -> float:
         """By how much smaller the gap is than that of `direct`, as a share (paper, Table 2).
 
-        nan where direct transfer has no gap.
+        nan where direct transfer loses nothing on the way: there is no gap to make smaller.
         """
-        start = float(self.gaps(direct, target, measure).mean())
-        mine = float(self.gaps(setting, target, measure).mean())
-        return 1.0 - mine / start if start else math.nan
+        sign = -1.0 if measure in MORE_IS_BETTER else 1.0
+        start = sign * float(self.gaps(direct, target, measure).mean())
+        mine = sign * float(self.gaps(setting, target, measure).mean())
+        return 1.0 - mine / start if start > 0 else math.nan
 
     def rows(self) -> list[dict[str, Any]]:
-        """One flat row per setting and target: means, intervals and gaps of all measures."""
+        """One flat row per setting and target: means and gaps of all measures, and regret."""
         found: list[dict[str, Any]] = []
         for setting in self.settings:
             for target in self.targets:
@@ -230,6 +235,12 @@ class Comparison:
                             f"{name}_low": interval.low,
                             f"{name}_high": interval.high,
                         }
+                regret = Interval.of(self.regret_s(setting, target))
+                row |= {
+                    "regret_s": regret.mean,
+                    "regret_s_low": regret.low,
+                    "regret_s_high": regret.high,
+                }
                 found.append(row)
         return found
 

@@ -53,6 +53,8 @@ MEASURES: dict[str, str] = {
     "delay_s": "delay [s]",
 }
 """The five measures of the paper and delay in seconds, with their headings."""
+MORE_IS_BETTER = ("throughput", "reward")
+"""Those of which more is better."""
 
 
 def relative_slowness(

@@ -16,7 +16,7 @@ from ugat_marl.comparison import Comparison
 from ugat_marl.devices import device_of
 from ugat_marl.errors import OptionError
 from ugat_marl.files import require_writable, write_whole
-from ugat_marl.paper.settings import GROUNDED_NAME
+from ugat_marl.paper.settings import GROUNDED_NAME, matched_name
 from ugat_marl.paper.tables import PaperConfig, compare
 from ugat_marl.progress import Bars
 from ugat_marl.report.comparison_pictures import gap_picture, radar_picture
@@ -137,6 +137,7 @@ def _write(found: Comparison, folder: Path) -> None:
     write_whole(folder / "table.md", markdown(found, DIRECT, machine_facts()) + "\n")
     write_whole(folder / "table.csv", as_csv(found))
     write_whole(folder / "seeds.csv", seeds_csv(found))
-    drawn = [DIRECT, *(name for name in GROUNDED_NAME.values() if name in found.settings)]
+    grounded = [*GROUNDED_NAME.values(), matched_name("timed")]
+    drawn = [DIRECT, *(name for name in grounded if name in found.settings)]
     radar_picture(found, drawn, folder / "radar.png")
     gap_picture(found, folder / "gaps.png")

@@ -16,7 +16,9 @@ def ranks(values: Numbers) -> NDArray[np.float64]:
 
 
 def spearman(one: Numbers, other: Numbers) -> float:
-    """Rank correlation of two samples; NaN if one of them is constant."""
+    """Rank correlation of two samples; NaN if one of them is constant, or empty."""
+    if not len(one):
+        return float("nan")
     a, b = ranks(one), ranks(other)
     a, b = a - a.mean(), b - b.mean()
     norm = float(np.sqrt((a**2).sum() * (b**2).sum()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
@@ -22,7 +23,7 @@ from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.inverse import InverseModel
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import StackedTransitions
-from ugat_marl.grounding.uncertainty import MethodName
+from ugat_marl.grounding.uncertainty import InversePrediction, MethodName
 
 QUANTILES = 5
 DISCRIMINATES = 0.55
@@ -132,6 +133,38 @@ class Calibration:
     mean_u: float
     mean_u_off_data: float
     auroc_off_data: float
+
+    @classmethod
+    def of(
+        cls, answer: InversePrediction, wrong: Tensor, held_out: Tensor, off: InversePrediction
+    ) -> Calibration:
+        """Of answers, of which some are wrong, on held-out rows (bool), and off the data."""
+        on_u, on_wrong = answer.u[held_out].numpy(), wrong[held_out].numpy()
+        off_u = off.u.flatten().numpy()
+        both = np.concatenate([on_u, off_u])
+        likeliest = answer.probability.amax(-1)[held_out].numpy()
+        return cls(
+            spearman=spearman(on_u, on_wrong),
+            auroc=auroc(on_u, on_wrong),
+            error_by_quantile=rate_by_quantile(on_u, on_wrong, QUANTILES),
+            risk_by_coverage=risk_by_coverage(on_u, on_wrong, QUANTILES),
+            ece=expected_calibration_error(likeliest, ~on_wrong),
+            mean_u=float(on_u.mean()) if len(on_u) else math.nan,
+            mean_u_off_data=float(off_u.mean()),
+            auroc_off_data=auroc(both, np.arange(len(both)) >= len(on_u)),
+        )
+
+    def as_dict(self) -> dict[str, float]:
+        """Flat numbers, one entry per fifth."""
+        numbers: dict[str, float] = {}
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if isinstance(value, tuple):
+                for i, rate in enumerate(value):
+                    numbers[f"calibration/{entry.name}/{i}"] = rate
+            else:
+                numbers[f"calibration/{entry.name}"] = value
+        return numbers
 
 
 @dataclass(frozen=True)
@@ -243,15 +276,7 @@ class FitReport:
             "accuracy_on_means",
         ):
             numbers |= entries(name, getattr(self, name), self.agents)
-        calibration = self.inverse.calibration
-        for entry in fields(calibration):
-            value = getattr(calibration, entry.name)
-            if isinstance(value, tuple):
-                for i, rate in enumerate(value):
-                    numbers[f"calibration/{entry.name}/{i}"] = rate
-            else:
-                numbers[f"calibration/{entry.name}"] = value
-        return numbers
+        return numbers | self.inverse.calibration.as_dict()
 
 
 @torch.no_grad()
@@ -289,30 +314,16 @@ def inverse_report(
     """Accuracy of h and calibration of its u on the held-out rows."""
     inputs = model.inputs(model.view.of(data), data.next_observation)
     answer = model.answer(inputs)
-    kept = held_out.bool().numpy()
-    wrong = (answer.action != data.executed).numpy()
-    u = answer.u.numpy()
+    missed = answer.action != data.executed
+    kept, wrong, u = held_out.bool().numpy(), missed.numpy(), answer.u.numpy()
     drawn = OffData.around(inputs, train, model.view).draw(
         int(held_out.sum(1).max()), generator, state_share=1.0
     )
-    off = model.answer(drawn).u.flatten().numpy()
     counts = torch.zeros(train.shape[0], model.stack.actions)
     counts.scatter_add_(1, data.executed, train)
     usual = counts.argmax(1)[:, None]
     majority = ((data.executed == usual) * held_out).sum(1) / held_out.sum(1)
     rows = range(len(kept))
-    on_u, on_wrong = u[kept], wrong[kept]
-    both = np.concatenate([on_u, off])
-    calibration = Calibration(
-        spearman=spearman(on_u, on_wrong),
-        auroc=auroc(on_u, on_wrong),
-        error_by_quantile=rate_by_quantile(on_u, on_wrong, QUANTILES),
-        risk_by_coverage=risk_by_coverage(on_u, on_wrong, QUANTILES),
-        ece=expected_calibration_error(answer.probability.amax(-1).numpy()[kept], ~on_wrong),
-        mean_u=float(on_u.mean()),
-        mean_u_off_data=float(off.mean()),
-        auroc_off_data=auroc(both, np.arange(len(both)) >= len(on_u)),
-    )
     return InverseReport(
         training=training,
         accuracy=np.array([1.0 - wrong[i][kept[i]].mean() for i in rows]),
@@ -320,7 +331,7 @@ def inverse_report(
         majority=majority.double().numpy(),
         mean_u=np.array([u[i][kept[i]].mean() for i in rows], float),
         auroc=np.array([auroc(u[i][kept[i]], wrong[i][kept[i]]) for i in rows]),
-        calibration=calibration,
+        calibration=Calibration.of(answer, missed, held_out.bool(), model.answer(drawn)),
         uncertainty=model.method.name,
     )
 

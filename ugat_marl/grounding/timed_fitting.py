@@ -12,7 +12,7 @@ from ugat_marl.batched import one_thread
 from ugat_marl.devices import CPU
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.fit_loop import EpochCallback, Split, split
-from ugat_marl.grounding.fit_report import TrainingRecord
+from ugat_marl.grounding.fit_report import Calibration, TrainingRecord
 from ugat_marl.grounding.fitting import (
     Changes,
     Questions,
@@ -25,7 +25,7 @@ from ugat_marl.grounding.matching import Paid, match
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import Stack, StackedTransitions, stack_log
 from ugat_marl.grounding.timed import TimedTransform
-from ugat_marl.grounding.timed_report import DelayReport, TimedReport, mean_error, off_data_auroc
+from ugat_marl.grounding.timed_report import DelayReport, TimedReport, mean_error
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import TransitionLog
 
@@ -163,7 +163,7 @@ def _report(
     single = model.predict(model.view.of(data), data.executed, happened)
     held = parts.held_out * data.weight  # nothing is known of an agent that had to take all rows
     drawn = asked.off_data.draw(int(held.sum(1).max().clamp(min=1)), generator, state_share=1.0)
-    on, off = answer.u[held.bool()], model.answer(drawn).u.flatten()
+    missed = answer.action != asked.answers
     return DelayReport(
         training=record,
         error_s=mean_error((answer.probability * seconds).sum(-1), asked.answers.float(), held),
@@ -171,8 +171,6 @@ def _report(
             (single.probability * seconds).sum(-1), data.delay_s, held
         ),
         guess_s=float((seconds - seconds.mean()).abs().mean()),
-        mean_u=float(on.mean()),
-        mean_u_off_data=float(off.mean()),
-        auroc_off_data=off_data_auroc(on, off),
+        calibration=Calibration.of(answer, missed, held.bool(), model.answer(drawn)),
         uncertainty=model.method.name,
     )

@@ -5,13 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ugat_marl.comparison import Floats
-from ugat_marl.grounding.calibration import auroc
-from ugat_marl.grounding.fit_report import ForwardReport, TrainingRecord, entries, said_of
+from ugat_marl.grounding.fit_report import (
+    Calibration,
+    ForwardReport,
+    TrainingRecord,
+    entries,
+    said_of,
+)
 from ugat_marl.grounding.lost_time import LostTime
 from ugat_marl.grounding.matching import Matched
 from ugat_marl.grounding.uncertainty import MethodName
@@ -30,9 +34,7 @@ class DelayReport:
         error_on_transitions_s: The same on single transitions as they happened, whose noise no
             answer can see through.
         guess_s: Mean absolute error of always answering the middle of the range.
-        mean_u: Mean uncertainty on held-out states.
-        mean_u_off_data: Mean u on inputs drawn around, not from, the data.
-        auroc_off_data: Probability that u is higher off the data than on it.
+        calibration: u against naming another second, and off the data.
         uncertainty: Where u came from.
     """
 
@@ -40,9 +42,7 @@ class DelayReport:
     error_s: Floats
     error_on_transitions_s: Floats
     guess_s: float
-    mean_u: float
-    mean_u_off_data: float
-    auroc_off_data: float
+    calibration: Calibration
     uncertainty: MethodName
 
 
@@ -88,8 +88,8 @@ class TimedReport:
         ]
         if self.inverse.uncertainty == "none":
             found.append("without uncertainty u is 0, and the gate takes every answer of h")
-        elif self.inverse.auroc_off_data <= 0.5:
-            found.append(f"u does not rise off the data (AUROC {self.inverse.auroc_off_data:.2f})")
+        elif (off := self.inverse.calibration.auroc_off_data) <= 0.5:
+            found.append(f"u does not rise off the data (AUROC {off:.2f})")
         return tuple(sentence for sentence in found if sentence)
 
     @property
@@ -100,7 +100,7 @@ class TimedReport:
     @property
     def expected_u(self) -> Floats:
         """Mean u to expect at the gate, per agent: that of h on its held-out states."""
-        return np.full(len(self.agents), self.inverse.mean_u)
+        return np.full(len(self.agents), self.inverse.calibration.mean_u)
 
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
         """Agents whose h may be obeyed, for `Gate.trust`; the others take the best constant.
@@ -121,24 +121,17 @@ class TimedReport:
         numbers |= self.inverse.training.as_dict("inverse")
         for name in ("error_s", "error_on_transitions_s"):
             numbers |= entries(f"inverse/{name}", getattr(self.inverse, name), self.agents)
-        for name in ("guess_s", "mean_u", "mean_u_off_data", "auroc_off_data"):
-            numbers[f"inverse/{name}"] = getattr(self.inverse, name)
+        numbers["inverse/guess_s"] = self.inverse.guess_s
         for name in ("best_s", "low_s", "high_s"):
             numbers |= entries(f"lost_time/{name}", getattr(self.lost, name), self.agents)
         if self.matched is not None:
             numbers |= entries("lost_time/matched_s", self.matched.delay_s, self.agents)
             numbers |= entries("lost_time/beyond_s", self.matched.beyond_s, self.agents)
             numbers["lost_time/chance"] = self.matched.chance
-        return numbers
+        return numbers | self.inverse.calibration.as_dict()
 
 
 def mean_error(found_s: Tensor, true_s: Tensor, weight: Tensor) -> Floats:
     """Mean absolute error per agent, ``(agents,)``; NaN without rows."""
     total = ((found_s - true_s).abs() * weight).sum(1).double()
     return (total / weight.sum(1).double()).numpy()
-
-
-def off_data_auroc(on: Tensor, off: Tensor) -> float:
-    """Probability that u is higher off the data than on it."""
-    both = torch.cat([on, off]).numpy()
-    return auroc(both, np.arange(len(both)) >= len(on))

@@ -152,7 +152,7 @@ def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Sett
 
 
 def _ablated(name: str, base: UgatConfig) -> list[Setting]:
-    """Table 3 of the paper: static threshold, no uncertainty; the gate alone, too."""
+    """Table 3 of the paper: static threshold, no uncertainty; and every other part alone."""
     full = GROUNDED_NAME[name]
     static = replace(base, gate=replace(base.gate, mode="static", static_alpha=0.5))
     ungated = replace(base, gate=replace(base.gate, mode="infinite"))
@@ -169,8 +169,19 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
             [Setting(f"{full}: where f and h are proven", "grounded", ugat=proven)]
             * (base != proven)
         ),
+        *_other_answers(name, base),
         *_matching(name, base),
     ]
+
+
+def _other_answers(name: str, base: UgatConfig) -> list[Setting]:
+    """Another h: of the phase's one that is trained on means, of the timed one none at all."""
+    full = GROUNDED_NAME[name]
+    if name == "phase":
+        smoothed = replace(base, fit=replace(base.fit, pairs="smoothed"))
+        return [Setting(f"{full}: h on smoothed pairs", "grounded", ugat=smoothed)]
+    constants = replace(base, timed=replace(base.timed, answer="constant"))
+    return [Setting(f"{full}: lost times without h", "grounded", ugat=constants)]
 
 
 def _alphas(name: str, base: UgatConfig) -> list[Setting]:

@@ -11,6 +11,10 @@ from ugat_marl.devices import require_device_name
 from ugat_marl.effects import describe, load
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.executors import Workers
+from ugat_marl.grounding.delays import TimedConfig
+from ugat_marl.grounding.fit_config import FitConfig
+from ugat_marl.grounding.gate import GateConfig
+from ugat_marl.grounding.view import InputsConfig
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.paper.job import Job
 from ugat_marl.paper.runner import Planned, done, perform_all
@@ -49,6 +53,10 @@ class PaperConfig:
         duration_s: Length of an episode in s; default: the scenario's own.
         device: Where updates and fits are computed: cpu, cuda, or cuda:N; all trainings share it.
         dqn: Settings of the learner.
+        inputs: What f and h see beside the intersection's own state and action.
+        fit: How f and h are fitted, but for what a row says itself.
+        gate: How alpha is found, but for what a row says itself.
+        timed: How greens are delayed, but for what a row says itself.
     """
 
     scenario: tuple[str, ...] = ("single-v1",)
@@ -72,6 +80,10 @@ class PaperConfig:
     duration_s: float | None = None
     device: str = "cpu"
     dqn: DQNConfig = field(default_factory=DQNConfig)
+    inputs: InputsConfig = field(default_factory=InputsConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    gate: GateConfig = field(default_factory=GateConfig)
+    timed: TimedConfig = field(default_factory=TimedConfig)
 
     def __post_init__(self) -> None:
         for name in ("seeds", "evaluation_seeds", "episodes"):
@@ -87,6 +99,8 @@ class PaperConfig:
             raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
         if describe(self.sim) in names:
             raise OptionError(f"domain {self.sim!r} is the simulation itself; name real ones")
+        if self.timed.match:
+            raise OptionError("rewards are matched in a row of its own; leave timed.match out")
         _ = self.ugat  # refuses what is impossible
 
     @property
@@ -98,6 +112,10 @@ class PaperConfig:
             grounded_episodes=self.grounded_episodes,
             sim_rollouts=self.sim_rollouts,
             real_rollouts=self.real_rollouts,
+            inputs=self.inputs,
+            fit=self.fit,
+            gate=self.gate,
+            timed=self.timed,
         )
 
     @property

@@ -22,7 +22,7 @@ Cell = Callable[[str, str], str]
 
 
 def terminal_tables(found: Comparison, direct: str) -> RenderableType:
-    """ATT, change of the gap and share of the regret won back, in 80 columns."""
+    """ATT, change of the gap, regret and its share that is won back, in 80 columns."""
     blocks: list[RenderableType] = []
     for title, cell in _headlines(found, direct):
         table = Table(
@@ -58,7 +58,8 @@ def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
     lines += ["## Against direct transfer, seed by seed", ""]
     lines += [
         "Difference of ATT in s (95 % interval), two-sided p of the paired t-test, and in how many "
-        "of the training seeds it is lower.",
+        "of the training seeds it is lower. All are judged on the same episodes, which intervals "
+        "and tests take as given, and so is a rule, which has no training seed.",
         "",
         *_grid(found, lambda s, t: _tested(found.test(s, direct, t)), leave_out=direct),
         "",
@@ -123,6 +124,10 @@ def _headlines(found: Comparison, direct: str) -> list[tuple[str, Cell]]:
         (
             "change of the gap Δ against direct transfer",
             lambda s, t: percent(-found.reduction(s, t, direct)),
+        ),
+        (
+            "transfer regret, s above the best in the table",
+            lambda s, t: with_interval(Interval.of(found.regret_s(s, t))),
         ),
         (
             "share of the regret won back (1: the best in the table)",
@@ -197,11 +202,12 @@ def with_interval(interval: Interval) -> str:
     """A mean with its interval, if it has one."""
     if math.isnan(interval.low) or interval.low == interval.high:
         return number(interval.mean)
-    return f"{number(interval.mean)} ({number(interval.low)}–{number(interval.high)})"
+    to = " to " if interval.low < 0 else "–"
+    return f"{number(interval.mean)} ({number(interval.low)}{to}{number(interval.high)})"
 
 
 def _share(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.2f}"
+    return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
 
 
 def percent(share: float) -> str:
