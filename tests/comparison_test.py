@@ -10,14 +10,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from ugat_marl.comparison import (
-    Comparison,
-    Interval,
-    PairedTest,
-    Trial,
-    student_p,
-    student_quantile,
-)
+from ugat_marl.comparison import Comparison, Trial
 from ugat_marl.metrics import Scores
 from ugat_marl.report.comparison_pictures import gap_picture
 from ugat_marl.report.comparison_tables import as_csv, markdown, seeds_csv
@@ -48,46 +41,6 @@ def found() -> Comparison:
         *trials("best rule, tuned there", {None: (80.0, 120.0)}),
     ]
     return Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
-
-
-@pytest.mark.parametrize(
-    ("degrees", "quantile"),
-    [(1, 12.706), (2, 4.303), (3, 3.182), (4, 2.776), (5, 2.571), (9, 2.262), (30, 2.042)],
-)
-def test_quantiles_are_those_of_the_printed_tables(degrees: int, quantile: float) -> None:
-    assert student_quantile(0.975, degrees) == pytest.approx(quantile, abs=5e-4)
-    assert student_p(quantile, degrees) == pytest.approx(0.05, abs=1e-4)
-
-
-def test_p_values_are_symmetric_and_bounded() -> None:
-    assert student_p(0.0, 4) == 1.0
-    assert student_p(-2.0, 4) == student_p(2.0, 4)
-    assert 0.0 <= student_p(1e9, 4) < 1e-9
-    assert student_p(1.0, 1) == pytest.approx(0.5)  # Cauchy: P(|t| > 1) = 1/2
-
-
-def test_an_interval_by_hand() -> None:
-    found = Interval.of(np.array([1.0, 2.0, 3.0]))
-    half = 4.3027 / math.sqrt(3)  # the standard deviation is 1
-    assert (found.mean, found.low, found.high) == pytest.approx((2.0, 2 - half, 2 + half), abs=1e-3)
-    assert math.isnan(Interval.of(np.array([5.0])).low)
-    level = Interval.of(np.full(5, 107.71235))  # whose mean, summed up, is beside it
-    assert level.low == level.mean == level.high
-
-
-def test_a_paired_test_sees_what_an_unpaired_one_would_not() -> None:
-    one, other = np.array([10.0, 50.0, 90.0]), np.array([11.0, 52.0, 91.0])
-    test = PairedTest.of(one, other)
-    assert test.difference.mean == pytest.approx(-4 / 3)
-    # t = (4/3) / (0.57735 / sqrt 3) = 4; with two degrees of freedom p = 1 - 4 / sqrt(2 + 16)
-    assert test.p == pytest.approx(1 - 4 / math.sqrt(18))
-    assert (test.better, test.count) == (3, 3)
-
-
-def test_equal_differences() -> None:
-    same = np.array([3.0, 4.0])
-    assert PairedTest.of(same, same).p == 1.0
-    assert PairedTest.of(same - 1, same).p == 0.0
 
 
 def test_values_are_in_the_order_of_the_training_seeds(found: Comparison) -> None:
@@ -123,10 +76,6 @@ def test_what_loses_nothing_on_the_way_has_no_gap_to_make_smaller() -> None:
     ]
     found = Comparison("toy", "0", "sim", tuple(served), {"table": "main"})
     assert found.reduction("UGAT", "V4", "direct transfer", "throughput") == 0.0  # fewer: a gap
-
-
-def test_a_value_that_is_missing_is_no_certainty() -> None:
-    assert math.isnan(PairedTest.of(np.array([1.0, math.nan]), np.array([0.0, 0.0])).p)
 
 
 def test_episodes_that_broke_down_are_counted_one_by_one() -> None:

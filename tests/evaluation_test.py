@@ -54,7 +54,8 @@ def test_gap_is_paired_by_seed_and_regret_is_against_the_best_there(found: Evalu
     assert found.estimate("slow", "V4", "att_s").median == 160.0
     assert found.regret("fast", "V4").mean == 0.0
     gap = found.gap("slow", "V4", "att_s")  # the two differences are 50 and 60
-    assert (gap.low, gap.high) == (50.0, 60.0)
+    half = 12.7062 * 5  # t of one degree of freedom, and the error of the mean
+    assert (gap.low, gap.high) == pytest.approx((55 - half, 55 + half), abs=1e-3)
 
 
 def test_a_single_seed_has_no_interval(found: Evaluation) -> None:

@@ -13,7 +13,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ugat_marl.comparison import student_p
 from ugat_marl.controllers import controller_for
 from ugat_marl.errors import CheckpointError
 from ugat_marl.grounding.delays import TimedConfig
@@ -28,6 +27,7 @@ from ugat_marl.grounding.matching import (
     matching_delays,
 )
 from ugat_marl.grounding.timed import TimedTransform
+from ugat_marl.intervals import student_p
 from ugat_marl.traffic_env import parallel_env
 from ugat_marl.transitions import AgentLayout, Provenance, TransitionRecorder
 from ugat_marl.ugat import UgatConfig

@@ -20,7 +20,6 @@ from ugat_marl.metrics import (
     MEASURES,
     EpisodeRecorder,
     Scores,
-    bootstrap_interval,
     relative_slowness,
 )
 
@@ -196,26 +195,3 @@ def test_every_measure_is_a_score() -> None:
     names = set(Scores.__dataclass_fields__)
     assert set(MEASURES) <= names
     assert HALTING_MPS == 0.1
-
-
-def test_bootstrap_interval_covers_the_mean_as_often_as_it_says() -> None:
-    generator = np.random.default_rng(5)
-    hits = 0
-    for _ in range(300):
-        low, high = bootstrap_interval(generator.normal(3, 1, 30), generator, resamples=300)
-        assert low < high
-        hits += low <= 3 <= high
-    assert 0.88 < hits / 300 < 0.98
-
-
-def test_bootstrap_interval_of_equal_values_is_a_point_and_of_one_value_unknown() -> None:
-    generator = np.random.default_rng(0)
-    assert bootstrap_interval(np.full(5, 2.0), generator) == (2.0, 2.0)
-    assert all(map(math.isnan, bootstrap_interval(np.array([2.0]), generator)))
-    assert all(map(math.isnan, bootstrap_interval(np.array([]), generator)))
-
-
-def test_bootstrap_interval_repeats_with_its_generator() -> None:
-    values = np.arange(8.0)
-    first = bootstrap_interval(values, np.random.default_rng(3))
-    assert first == bootstrap_interval(values, np.random.default_rng(3))

@@ -24,7 +24,7 @@ RULE = {"fixed-time:30": rule_factory("fixed-time:30")}
 LENGTH_S = 400.0
 
 
-def gap_of(corrected: Any, real: str = "V4", seeds: tuple[int, ...] = (1, 2)) -> dict[str, Any]:
+def gap_of(corrected: Any, real: str = "V4", seeds: tuple[int, ...] = (1, 2, 3)) -> dict[str, Any]:
     found = policy_gap(SCENARIO, corrected, real, RULE, seeds, duration_s=LENGTH_S)
     return found["fixed-time:30"]
 
@@ -93,7 +93,7 @@ def test_the_command_writes_the_gap_and_keeps_the_rest(
     monkeypatch.setenv("COLUMNS", "80")
     folder = diagnosed(tmp_path / "headway=1.4")
     call = ["policy-gap", "single-v1", str(folder), "--real", "V4", "--policies", "fixed-time:30"]
-    call += ["largest-queue:20", "--seeds", "2", "--duration-s", "400"]
+    call += ["largest-queue:20", "--seeds", "3", "--duration-s", "400"]
     before = json.loads((folder / "diagnosis.json").read_text())
     assert main(call) == 0
     written = (folder / "diagnosis.json").read_text()

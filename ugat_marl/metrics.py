@@ -20,7 +20,8 @@ class Scores:
             arrival or the end of the episode.
         att_finished_s: The same over the vehicles that arrived.
         throughput: Vehicles that arrived.
-        reward: Mean over decisions and agents of the reward the environment gave.
+        reward: Mean over decisions and agents of the reward the environment gave; evaluations are
+            paid by queues, whatever a policy was trained for.
         queue: Mean over decisions and intersections of the halting vehicles on incoming lanes.
         delay: Mean over decisions and incoming lanes of 1 - v / v_max (unitless; 0 for an empty
             lane), as in the tables of the UGAT paper.
@@ -114,14 +115,3 @@ class EpisodeRecorder:
 
 def _mean(values: NDArray[np.float64]) -> float:
     return float(values.mean()) if values.size else float("nan")
-
-
-def bootstrap_interval(
-    values: NDArray[np.float64], generator: np.random.Generator, resamples: int = 2000
-) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean of ``(n,)`` values; nan for fewer than two."""
-    if values.size < 2:
-        return float("nan"), float("nan")
-    draws = generator.integers(0, values.size, size=(resamples, values.size))
-    low, high = np.quantile(values[draws].mean(axis=1), [0.025, 0.975])
-    return float(low), float(high)

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import CheckpointError
 from ugat_marl.files import write_whole
-from ugat_marl.metrics import MEASURES, Scores, bootstrap_interval
-from ugat_marl.seeding import numpy_generator
+from ugat_marl.intervals import Interval
+from ugat_marl.metrics import MEASURES, Scores
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean over seeds with a 95 % bootstrap interval (nan for a single seed), and the median."""
+    """Mean over seeds with Student's 95 % interval (nan for a single seed), and the median."""
 
     mean: float
     low: float
@@ -53,8 +53,8 @@ class Estimate:
     @classmethod
     def of(cls, values: NDArray[np.float64]) -> Estimate:
         """The estimate from one value per seed."""
-        low, high = bootstrap_interval(values, numpy_generator(0, "bootstrap"))
-        return cls(float(values.mean()), low, high, float(np.median(values)))
+        found = Interval.of(values)
+        return cls(found.mean, found.low, found.high, float(np.median(values)))
 
 
 @dataclass(frozen=True)

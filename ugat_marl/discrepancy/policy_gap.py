@@ -54,7 +54,7 @@ def policy_gap(
         workers: Simulations at a time, or who plays them (`executors`).
 
     Returns:
-        For each policy ``sim``, ``corrected`` and ``real``: ATT in s as mean with a 95 % bootstrap
+        For each policy ``sim``, ``corrected`` and ``real``: ATT in s as mean with Student's 95 %
         interval ``low``, ``high`` (None for one seed); ``before`` and ``after``: |ATT(real) -
         ATT(sim)| and |ATT(real) - ATT(corrected)| of the means, s; ``shrink``: 1 - after / before,
         None where no gap is to be seen before (the interval of ATT(real) - ATT(sim), paired by

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ugat_marl.comparison import Floats
 from ugat_marl.grounding.calibration import (
     auroc,
     expected_calibration_error,
@@ -24,6 +23,7 @@ from ugat_marl.grounding.inverse import InverseModel
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import StackedTransitions
 from ugat_marl.grounding.uncertainty import InversePrediction, MethodName
+from ugat_marl.intervals import Floats
 
 QUANTILES = 5
 DISCRIMINATES = 0.55

@@ -20,9 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from ugat_marl.comparison import Floats, student_p
+from ugat_marl.intervals import Floats, student_p
 from ugat_marl.transitions import TransitionLog
 
+MATCHED_REWARD = "queue"
+"""The reward that can be matched: it falls with every delay, and an episode's mean is one of many
+moments. Differences of waiting times add up to what is left at the end."""
 CHANCE = 0.05
 """What is likelier than this under the lost time alone does not speak against it."""
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.comparison import Interval
+from ugat_marl.intervals import Interval
 from ugat_marl.learning_curves.training import DOMAIN, Curve, Training
 from ugat_marl.report.comparison_tables import with_interval
 from ugat_marl.report.tables import number

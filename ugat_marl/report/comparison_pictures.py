@@ -12,8 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ugat_marl.comparison import Comparison, Interval
+from ugat_marl.comparison import Comparison
 from ugat_marl.files import replacing
+from ugat_marl.intervals import Interval
 from ugat_marl.report.pictures import COLOURS
 
 _AXES = {

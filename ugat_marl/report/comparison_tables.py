@@ -13,7 +13,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from ugat_marl.comparison import SERVED, Comparison, Interval, PairedTest
+from ugat_marl.comparison import SERVED, Comparison
+from ugat_marl.intervals import Interval, PairedTest
 from ugat_marl.metrics import MEASURES
 from ugat_marl.report.tables import number
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ugat_marl.comparison import Interval
+from ugat_marl.intervals import Interval
 from ugat_marl.report.comparison_pictures import goodness
 from ugat_marl.report.drawing import Drawing, Point, shortened
 from ugat_marl.report.job_names import grounding_of

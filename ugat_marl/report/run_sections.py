@@ -87,9 +87,9 @@ def overview(records: Sequence[RunRecord]) -> str:
     )  # fmt: skip
     numbers = headings[6:]
     legend = (
-        '<p class="soft">Average travel times over all vehicles due, with 95 % bootstrap intervals '
-        "over the episodes; direct transfer and the rule in the real domain. Accepted: share of "
-        "decisions in which the grounded action was taken, last iteration.</p>"
+        '<p class="soft">Average travel times over all vehicles due, with 95 % intervals '
+        "(Student's) over the episodes; direct transfer and the rule in the real domain. Accepted: "
+        "share of decisions in which the grounded action was taken, last iteration.</p>"
     )
     return f"{legend}{grid(headings, rows, numbers)}"
 
@@ -167,7 +167,7 @@ def scores_table(found: Evaluation) -> str:
     seeds = len({result.seed for result in found.results})
     legend = (
         '<p class="soft">Average travel time over all vehicles due, mean of '
-        f"{seeds} episodes (95 % bootstrap interval over them). Δ: minus {escape(first)}. Regret: "
+        f"{seeds} episodes (Student's 95 % interval over them). Δ: minus {escape(first)}. Regret: "
         "above the best of these policies in that domain.</p>"
     )
     return f"{legend}{grid(headings, rows, headings[1:])}{_measures(found)}"
@@ -188,7 +188,7 @@ def _measures(found: Evaluation) -> str:
         for policy in found.policies
         for domain in found.domains
     ]
-    legend = '<p class="soft">±: half of the 95 % bootstrap interval over the episodes.</p>'
+    legend = '<p class="soft">±: half of the 95 % interval over the episodes.</p>'
     return folded("All measures", legend + grid(headings, rows, headings[2:]))
 
 
