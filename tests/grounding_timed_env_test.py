@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import ugat_marl.transfer as transfer_module
+from ugat_marl.effects import load
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.grounding.delays import TimedConfig
 from ugat_marl.grounding.fit_config import FitConfig
@@ -25,6 +26,7 @@ from ugat_marl.grounding.wrapper import GroundedEnv
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.policy import AnyParallelEnv
 from ugat_marl.progress import Silent
+from ugat_marl.recipes import simulated_worlds
 from ugat_marl.rollout import observer_of, roll_out
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Metrics
@@ -127,6 +129,38 @@ def test_traffic_is_delayed_in_some_episodes_more_often_than_in_others(env: Traf
         delayed.reset(seed=seed)
         chances.append(delayed._chance)
     assert len(set(chances)) == 4 and all(0.5 <= chance <= 1.0 for chance in chances)
+
+
+TIMED = UgatConfig("timed")
+
+
+@pytest.mark.parametrize(
+    ("control", "real"),
+    [
+        ({"decision_interval_s": 5.0}, "V4"),
+        ({"min_green_s": 8.0}, "V4"),
+        ({"all_red_s": 7.0, "min_green_s": 0.0}, "V4"),
+        ({}, "V4+min_green=15"),
+    ],
+)
+def test_greens_that_begin_later_than_asked_are_not_delayed(
+    control: dict[str, float], real: str
+) -> None:
+    """A delay would be told of one decision and executed in another, or not at all."""
+    scenario = load("grid2x2-v1").with_control(**control)
+    with pytest.raises(OptionError, match="in the decision that asks for it"):
+        simulated_worlds(scenario, "sim", real, TIMED, {})
+    for world in simulated_worlds(scenario, "sim", real, UgatConfig("phase"), {}):
+        world.close()
+
+
+@pytest.mark.parametrize("reward", ["waiting", "pressure"])
+def test_rewards_that_say_nothing_of_a_delay_are_not_matched(reward: str) -> None:
+    matching = UgatConfig("timed", timed=TimedConfig(match=True))
+    with pytest.raises(OptionError, match=f"not '{reward}'"):
+        simulated_worlds(load("grid2x2-v1"), "sim", "V4", matching, {"reward": reward})
+    for world in simulated_worlds(load("grid2x2-v1"), "sim", "V4", TIMED, {"reward": reward}):
+        world.close()
 
 
 @pytest.mark.parametrize("most_s", [0, MOST_S])

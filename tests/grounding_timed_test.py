@@ -231,6 +231,17 @@ def test_h_answers_with_the_delay_of_the_street(planted) -> None:
     assert ((u > 0) & (u <= 1)).all()
 
 
+def test_the_u_to_expect_is_that_of_what_f_predicts_where_greens_begin(planted) -> None:
+    made, report = planted
+    data = stack_log(street(PLANTED, seed=2), made.stack)
+    switched = made.stack.current_phase(data.observation) != data.executed
+    with torch.no_grad():
+        _, u = made.delays(data.observation, data.observation, data.executed)
+    mean = [float(u[i][switched[i]].mean()) for i in range(2)]
+    assert report.expected_u == pytest.approx(mean, abs=0.02)
+    assert mean[0] != pytest.approx(mean[1], abs=0.01)  # each has its own
+
+
 def test_the_report_is_flat_numbers(planted) -> None:
     numbers = planted[1].as_dict()
     assert all(isinstance(value, float) for value in numbers.values())

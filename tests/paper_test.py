@@ -77,6 +77,11 @@ def test_rows_share_what_is_given_and_keep_what_they_are_named_for() -> None:
     assert without == {f"{TIMED}: lost times without h"}
 
 
+def test_rewards_that_cannot_be_matched_have_no_such_row() -> None:
+    names = [setting.name for setting in replace(SHORT, reward="pressure").settings("main")]
+    assert "UGAT, timed" in names and "UGAT, timed: rewards matched" not in names
+
+
 @pytest.mark.parametrize("table", TABLES)
 def test_rows_of_a_table_have_names_of_their_own_and_begin_with_direct_transfer(table: str) -> None:
     names = [setting.name for setting in SHORT.settings(table)]

@@ -20,6 +20,7 @@ from ugat_marl.signals import (
     SignalState,
     SignalTiming,
     advance,
+    begins_when_asked,
     check_phases,
     delayed_log,
     free_to_change,
@@ -190,6 +191,18 @@ def test_a_clearance_shows_nothing_green_that_one_phase_forbids(origin: str, tar
 
 TIMING = SignalTiming(yellow_s=3, all_red_s=2, min_green_s=5)
 PHASES = ("GGrr", "rrGG", "GrrG")
+
+
+@given(timings, halves.filter(bool))
+def test_whether_every_green_begins_when_it_is_asked_for(
+    timing: SignalTiming, interval_s: float
+) -> None:
+    """Two phases in turn, decision by decision: a light that falls behind does so soon."""
+    state, in_time = initial_state(timing), True
+    for decision in range(1, 60):
+        state, _ = advance(PHASES, state, decision % 2, interval_s, timing)
+        in_time = in_time and (state.phase, state.clearing) == (decision % 2, False)
+    assert in_time == begins_when_asked(timing, interval_s)
 
 
 def test_a_change_by_hand() -> None:

@@ -12,10 +12,12 @@ from typing import Any
 from ugat_marl.effects import Domain, describe, in_domain
 from ugat_marl.errors import OptionError
 from ugat_marl.executors import Workers
+from ugat_marl.grounding.matching import MATCHED_REWARD
 from ugat_marl.learners.registry import LearnerFactory
 from ugat_marl.policy import AnyParallelEnv, Learner, Policy
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Scenario
+from ugat_marl.signals import SignalTiming, begins_when_asked
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
 from ugat_marl.ugat import CHUNK, UgatConfig
@@ -51,14 +53,32 @@ def train_until(
             left -= chunk
 
 
-def check_worlds(scenario: Scenario, sim: Domain, real: Domain) -> None:
+def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = False) -> None:
     """Checks that what is seen and rewarded is the same in two worlds.
+
+    Args:
+        scenario: The network and its traffic.
+        sim: The simulation.
+        real: The real domain.
+        timed: Whether greens are to be delayed: one that begins a decision later than it was asked
+            for has no delay that could be told, or executed.
 
     Raises:
         UnknownNameError: No such domain.
-        OptionError: Agents look farther in one of them.
+        OptionError: Agents look farther in one of them, or greens begin too late to be delayed.
     """
-    here_m, there_m = (in_domain(scenario, world).control.reach_m for world in (sim, real))
+    here, there = (in_domain(scenario, world).control for world in (sim, real))
+    for control in (here, there) if timed else ():
+        timing = SignalTiming(control.yellow_s, control.all_red_s, control.min_green_s)
+        if not begins_when_asked(timing, control.decision_interval_s):
+            raise OptionError(
+                "timed grounding delays a green in the decision that asks for it, and here some "
+                f"begin later: decision_interval_s = {control.decision_interval_s:g} must be "
+                f"longer than yellow_s + all_red_s = {timing.clearance_s:g} by min_green_s = "
+                f"{timing.min_green_s:g} or more; change them in scenario.toml, or use the "
+                "grounding phase"
+            )
+    here_m, there_m = here.reach_m, there.reach_m
     if here_m != there_m:
         raise OptionError(
             f"agents look {here_m:g} m upstream in {describe(sim)!r} and {there_m:g} m in "
@@ -86,9 +106,15 @@ def simulated_worlds(
         workers: As for `SimulatedWorld`.
 
     Raises:
-        OptionError: As `check_worlds`.
+        OptionError: As `check_worlds`, or rewards that cannot be matched.
     """
-    check_worlds(scenario, sim, real)
+    check_worlds(scenario, sim, real, ugat.grounding == "timed")
+    reward = options.get("reward", MATCHED_REWARD)
+    if ugat.matches and reward != MATCHED_REWARD:
+        raise OptionError(
+            f"timed match compares mean rewards of the kind {MATCHED_REWARD!r}, not {reward!r}; "
+            "leave one of the two options out"
+        )
 
     def world(domain: Domain, name: str, episodes: int, most_delay_s: int = 0) -> SimulatedWorld:
         crossings = ugat.most_delay_s > 0  # they tell best when a green began

@@ -81,6 +81,16 @@ def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) ->
     return wait < within_s - _INSTANT_S
 
 
+def begins_when_asked(timing: SignalTiming, interval_s: float) -> bool:
+    """Whether every green begins within the decision that asks for it.
+
+    It does if clearance leaves some of an interval, and the minimum green lasts no longer than
+    that: then a light may always change at once, and has done so when the next decision is due.
+    """
+    left_s = interval_s - timing.clearance_s
+    return left_s > _INSTANT_S and timing.min_green_s <= left_s + _INSTANT_S
+
+
 def advance(
     phases: Sequence[str],
     state: SignalState,

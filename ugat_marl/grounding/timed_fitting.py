@@ -26,6 +26,7 @@ from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import Stack, StackedTransitions, stack_log
 from ugat_marl.grounding.timed import TimedTransform
 from ugat_marl.grounding.timed_report import DelayReport, TimedReport, mean_error
+from ugat_marl.intervals import Floats
 from ugat_marl.seeding import torch_generator
 from ugat_marl.transitions import TransitionLog
 
@@ -84,7 +85,18 @@ def fit_timed(
     data = replace(data, weight=data.weight * begins)
     spread = known.spread[:, None]
     h = _fit_delays(transform, data, _where(begins, parts), spread, *how)
-    return TimedReport(stack.agents, f, g, lost, h, transform.timed.most_s, matched)
+    most_s, u = transform.timed.most_s, _expected_u(transform, street)
+    return TimedReport(stack.agents, f, g, lost, h, most_s, u, matched)
+
+
+@torch.no_grad()
+def _expected_u(transform: TimedTransform, street: StackedTransitions) -> Floats:
+    """Mean u of h's answers to what f predicts, per agent, by the weights of the rows."""
+    seen, local = transform.forward.view.of(street), transform.local.of(street)
+    u = transform.delays(seen, local, street.executed)[1]
+    mean = ((u * street.weight).sum(1) / street.weight.sum(1)).double().numpy()
+    everywhere = np.nanmean(mean) if np.isfinite(mean).any() else 1.0
+    return np.where(np.isnan(mean), everywhere, mean)
 
 
 def _alike(

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ugat_marl.comparison import Floats
 from ugat_marl.grounding.fit_report import (
     Calibration,
     ForwardReport,
@@ -19,6 +18,7 @@ from ugat_marl.grounding.fit_report import (
 from ugat_marl.grounding.lost_time import LostTime
 from ugat_marl.grounding.matching import Matched
 from ugat_marl.grounding.uncertainty import MethodName
+from ugat_marl.intervals import Floats
 
 END_S = 0.5
 """A best delay so close to the longest one tried may well be longer."""
@@ -57,6 +57,8 @@ class TimedReport:
         lost: The delays that fit the street best.
         inverse: h.
         most_s: Longest delay tried.
+        expected_u: Mean u to expect at the gate, per agent: of h's answers to what f predicts where
+            greens begin on the street; of all agents where one has none.
         matched: What rewards say of the delays, if they were asked.
     """
 
@@ -66,6 +68,7 @@ class TimedReport:
     lost: LostTime
     inverse: DelayReport
     most_s: int
+    expected_u: Floats
     matched: Matched | None = None
 
     @property
@@ -95,12 +98,8 @@ class TimedReport:
     @property
     def _delay_s(self) -> Floats:
         """What greens are late by in the mean, per agent."""
-        return self.lost.best_s + (0.0 if self.matched is None else self.matched.beyond_s)
-
-    @property
-    def expected_u(self) -> Floats:
-        """Mean u to expect at the gate, per agent: that of h on its held-out states."""
-        return np.full(len(self.agents), self.inverse.calibration.mean_u)
+        found = np.where(self.forward.learnt & self.simulated.learnt & self.lost.shown, 1.0, 0.0)
+        return found * self.lost.best_s + (0.0 if self.matched is None else self.matched.beyond_s)
 
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
         """Agents whose h may be obeyed, for `Gate.trust`; the others take the best constant.

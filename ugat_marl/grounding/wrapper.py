@@ -24,7 +24,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
     its own action beside them. What was done instead is in the infos of `reset` and `step`:
 
     - ``grounded_action``: int, the inverse model's answer; -1 at reset.
-    - ``uncertainty``: float, its u in (0, 1]; 1.0 at reset.
+    - ``uncertainty``: float, its u in [0, 1]; 1.0 at reset.
     - ``accepted``: int, 1 if the grounded action was executed.
     - ``delay_s``: float, for how long the agent's greens were held back; 0.0 at reset.
 

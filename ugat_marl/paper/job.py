@@ -212,7 +212,7 @@ def _grounded(job: Job, folder: Path, reporter: Reporter) -> DQN:
     options: dict[str, Any] = dict(job.options)
     env = parallel_env(scenario, job.sim, **options)
     run = Run(folder, job.identity, resume=True, reporter=reporter)
-    sim, real = simulated_worlds(scenario, job.sim, job.target, job.ugat, options)
+    sim, real = simulated_worlds(scenario, job.sim, job.target, job.ugat, options, workers=1)
     try:
         learner = DQN.of(env, job.dqn, job.seed, device=device_of(job.device))
         before = _start(job, folder)

@@ -14,6 +14,7 @@ from ugat_marl.executors import Workers
 from ugat_marl.grounding.delays import TimedConfig
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.gate import GateConfig
+from ugat_marl.grounding.matching import MATCHED_REWARD
 from ugat_marl.grounding.view import InputsConfig
 from ugat_marl.learners.dqn_config import DQNConfig
 from ugat_marl.paper.job import Job
@@ -134,12 +135,14 @@ class PaperConfig:
         )
 
     def settings(self, table: str) -> list[Setting]:
-        """The rows of a table.
+        """The rows of a table; without those that match rewards which cannot be matched.
 
         Raises:
             UnknownNameError: The table has no row of that name.
         """
         found = settings_of(table, self.ugat, self.sim, self.groundings, self.constants)
+        if self.reward != MATCHED_REWARD:
+            found = [setting for setting in found if not setting.ugat.matches]
         names = [setting.name for setting in found]
         for row in self.rows:
             if row not in names:
@@ -166,12 +169,14 @@ def compare(
         reporter: Shows progress.
     """
     loaded = load(scenario)
+    rows = config.settings(table)
+    timed = any(row.kind == "grounded" and row.ugat.grounding == "timed" for row in rows)
     for target in config.targets(table):
-        check_worlds(loaded, config.sim, target)  # an error now, not in an hour
+        check_worlds(loaded, config.sim, target, timed)  # an error now, not in an hour
     planner = Planner(table, scenario, config)
-    plan = [job for row in config.settings(table) for job in planner.jobs(row)]
+    plan = [job for row in rows for job in planner.jobs(row)]
     perform_all(planner.bases + plan, folder, workers, reporter, f"paper {table}")
-    trials = [trial for row in config.settings(table) for trial in planner.trials(row, folder)]
+    trials = [trial for row in rows for trial in planner.trials(row, folder)]
     return Comparison(loaded.id, loaded.hash, describe(config.sim), tuple(trials), {"table": table})
 
 
