@@ -70,7 +70,7 @@ def _risks(axes: Any, found: dict[int, dict[str, float]]) -> None:
         axes.axhline(risks[-1], color=COLOURS[number], ls="--", lw=1)
     axes.set_xlabel("share of answers taken, lowest u first")
     axes.set_ylabel("wrong among them")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.08 * axes.dataLim.ymax or 1)
     axes.set_title("held-out errors of h; dashed: a u that says nothing", fontsize=9)
     axes.legend(frameon=False)
 
@@ -82,9 +82,10 @@ def _levels(axes: Any, found: dict[int, dict[str, float]]) -> None:
     ):
         axes.plot(steps, [found[s][name] for s in steps], "o-", color=COLOURS[number], label=label)
     axes.set_xlabel("iteration")
+    axes.set_xlim(steps[0] - 0.5, steps[-1] + 0.5)  # one alone has no width of its own
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylabel("mean u")
-    axes.set_ylim(0, 1)
+    axes.set_ylim(0, 1.03)
     axes.set_title("does u rise where the simulation never was?", fontsize=9)
     axes.legend(frameon=False)
 
