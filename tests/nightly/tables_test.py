@@ -7,13 +7,15 @@ folder that is kept between runs of this file in one session.
 from __future__ import annotations
 
 from pathlib import Path
+from statistics import fmean
 
 import pytest
 
 from ugat_marl.comparison import Comparison
 from ugat_marl.paper.settings import RULE, constant_name
-from ugat_marl.paper.tables import PaperConfig, compare
+from ugat_marl.paper.tables import PaperConfig, Planner, compare
 from ugat_marl.progress import Silent
+from ugat_marl.training import METRICS, Metrics
 from ugat_marl.transfer import CONTROL, DIRECT, ORACLE, TIMED, UGAT
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
@@ -38,6 +40,19 @@ def att(found: Comparison, setting: str, domain: str | None = None) -> float:
     return found.estimate(setting, DOMAIN, "att_s", domain).mean
 
 
+def accepted(table_name: str, setting: str, runs: Path) -> float:
+    """Share of the grounded actions that the gate let pass, over seeds and rounds."""
+    (row,) = [own for own in CONFIG.settings(table_name) if own.name == setting]
+    values = [
+        value
+        for planned in Planner(table_name, "single-v1", CONFIG).jobs(row)
+        for _, _, name, value in Metrics.read(runs / planned.name / METRICS).rows
+        if name == "gate/acceptance"
+    ]
+    assert len(values) == CONFIG.seeds * CONFIG.iterations
+    return fmean(values)
+
+
 def test_main(runs: Path) -> None:
     found = table("main", runs)
     assert att(found, DIRECT) > 1.3 * att(found, DIRECT, "sim")  # there is a gap
@@ -54,7 +69,7 @@ def test_main(runs: Path) -> None:
 
 def test_ablation(runs: Path) -> None:
     found = table("ablation", runs)
-    for part in ("α = 0.5", "no gate", "no uncertainty (GAT)"):
+    for part in ("α = 0.5", "no gate", "no uncertainty (GAT)", "lost times without h"):
         # a rejection falls back to the best constant: every variant wins most of it back
         assert found.reduction(f"{TIMED}: {part}", DOMAIN, DIRECT) > 0.3
     # phase grounding that obeys h from the start is no better than timed grounding
@@ -63,8 +78,9 @@ def test_ablation(runs: Path) -> None:
 
 def test_alpha(runs: Path) -> None:
     found = table("alpha", runs)
-    low, high = (att(found, f"{UGAT}: α = {alpha}") for alpha in (0.2, 0.8))
-    assert low != high  # the threshold reaches the training
+    for grounding in (UGAT, TIMED):  # the higher the threshold, the more passes
+        shares = [accepted("alpha", f"{grounding}: α = {a}", runs) for a in (0.2, 0.5, 0.8)]
+        assert shares[0] <= shares[1] <= shares[2] and shares[0] < shares[2], shares
     assert found.reduction(f"{TIMED}: α = 0.2", DOMAIN, DIRECT) > 0.3
 
 
