@@ -194,7 +194,7 @@ def _provenance(found: Comparison, facts: Mapping[str, Any]) -> list[str]:
         f"    {facts['command']}",
         "",
         f"Training seeds {seeds}; intervals are 95 %, Student's, over them. {facts['cpu']}, "
-        f"{facts['cores']} cores, Python {facts['python']}, {versions}, {facts['date'][:10]}.",
+        f"{facts['cores']} core{'s' * (facts['cores'] != 1)}, Python {facts['python']}, {versions}, {facts['date'][:10]}.",
         *(["", ". ".join(notes) + "."] if notes else []),
     ]
 
