@@ -189,12 +189,13 @@ def _against_constants(found: Comparison, others: list[str]) -> list[str]:
 def _provenance(found: Comparison, facts: Mapping[str, Any]) -> list[str]:
     versions = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
     seeds = ", ".join(map(str, found.training_seeds))
+    cores = "1 core" if facts["cores"] == 1 else f"{facts['cores']} cores"
     notes = [f"{key}: {value}" for key, value in found.notes.items() if key != "table"]
     return [
         f"    {facts['command']}",
         "",
         f"Training seeds {seeds}; intervals are 95 %, Student's, over them. {facts['cpu']}, "
-        f"{facts['cores']} core{'s' * (facts['cores'] != 1)}, Python {facts['python']}, {versions}, {facts['date'][:10]}.",
+        f"{cores}, Python {facts['python']}, {versions}, {facts['date'][:10]}.",
         *(["", ". ".join(notes) + "."] if notes else []),
     ]
 
