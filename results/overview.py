@@ -15,7 +15,7 @@ from statistics import fmean
 
 from ugat_marl.files import write_whole
 from ugat_marl.paper.settings import RULE, matched_name
-from ugat_marl.report.comparison_tables import number, percent
+from ugat_marl.report.comparison_tables import number, percent, share
 from ugat_marl.transfer import CONTROL, DIRECT, ORACLE, TIMED
 
 FOLDER = Path(__file__).parent
@@ -121,12 +121,8 @@ def _att(column: Column, settings: Sequence[str]) -> str:
 def _grounded(setting: str, column: Column) -> str:
     if setting not in column:
         return ""
-    gap, share = percent(reduction(setting, column)), _share(won_back(setting, column))
-    return f"**{number(column[setting].att_s)}** {gap}, {share}"
-
-
-def _share(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
+    gap, back = percent(reduction(setting, column)), share(won_back(setting, column))
+    return f"**{number(column[setting].att_s)}** {gap}, {back}"
 
 
 def _mean(found: Sequence[Column]) -> str:
@@ -137,8 +133,8 @@ def _mean(found: Sequence[Column]) -> str:
             cells.append("")
             continue
         gap = percent(fmean(reduction(setting, column) for column in having))
-        share = _share(fmean(won_back(setting, column) for column in having))
-        cells.append(f"*{gap}, {share}*")
+        back = share(fmean(won_back(setting, column) for column in having))
+        cells.append(f"*{gap}, {back}*")
     return f"| {' | '.join(cells)} | | | | |"
 
 

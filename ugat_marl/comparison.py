@@ -7,6 +7,7 @@ initial weights, the same episodes of plain training and the same traffic in the
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -78,7 +79,16 @@ class Comparison:
 
     def has(self, setting: str, target: str) -> bool:
         """Whether there are trials of the setting for that domain."""
-        return any(t.setting == setting and t.target == target for t in self.trials)
+        return any(played[:2] == (setting, target) for played in self._scores)
+
+    @functools.cached_property
+    def _scores(self) -> Mapping[tuple[str, str, str], Mapping[int | None, Sequence[Scores]]]:
+        """The episodes by setting, target and domain, and then by training seed."""
+        found: dict[tuple[str, str, str], dict[int | None, list[Scores]]] = {}
+        for t in self.trials:
+            seeds = found.setdefault((t.setting, t.target, t.domain), {})
+            seeds.setdefault(t.training_seed, []).append(t.scores)
+        return found
 
     def values(self, setting: str, target: str, measure: str, domain: str | None = None) -> Floats:
         """Means over the episodes, one per training seed, ``(n,)``.
@@ -91,15 +101,13 @@ class Comparison:
             measure: A field of `Scores`.
             domain: Where it was played; default: the target.
         """
-        domain = target if domain is None else domain
-        found: dict[int | None, list[float]] = {}
-        for t in self.trials:
-            if (t.setting, t.target, t.domain) == (setting, target, domain):
-                found.setdefault(t.training_seed, []).append(getattr(t.scores, measure))
-        if None in found:
-            return np.full(max(len(self.training_seeds), 1), float(np.mean(found[None])))
-        means = [float(np.mean(found[seed])) for seed in sorted(found, key=lambda s: s or 0)]
-        return np.array(means)
+        played = self._scores.get((setting, target, target if domain is None else domain), {})
+        means = {
+            seed: float(np.mean([getattr(own, measure) for own in played[seed]])) for seed in played
+        }
+        if None in means:
+            return np.full(max(len(self.training_seeds), 1), means[None])
+        return np.array([means[seed] for seed in sorted(means, key=lambda s: s or 0)])
 
     def episodes(self, setting: str, target: str) -> list[Scores]:
         """Every episode in the target, of all training seeds."""
@@ -172,23 +180,18 @@ class Comparison:
                     "domain": target,
                     "training_seeds": self.values(setting, target, "att_s").size,
                 }
+                columns: dict[str, Floats] = {}
                 for measure in MEASURES:
-                    for name, values in (
-                        (measure, self.values(setting, target, measure)),
-                        (f"{measure}_sim", self.values(setting, target, measure, self.sim)),
-                        (f"{measure}_gap", self.gaps(setting, target, measure)),
-                    ):
-                        interval = Interval.of(values)
-                        row |= {
-                            name: interval.mean,
-                            f"{name}_low": interval.low,
-                            f"{name}_high": interval.high,
-                        }
-                regret = Interval.of(self.regret_s(setting, target))
-                row |= {
-                    "regret_s": regret.mean,
-                    "regret_s_low": regret.low,
-                    "regret_s_high": regret.high,
-                }
+                    columns[measure] = self.values(setting, target, measure)
+                    columns[f"{measure}_sim"] = self.values(setting, target, measure, self.sim)
+                    columns[f"{measure}_gap"] = self.gaps(setting, target, measure)
+                columns["regret_s"] = self.regret_s(setting, target)
+                for name, values in columns.items():
+                    interval = Interval.of(values)
+                    row |= {
+                        name: interval.mean,
+                        f"{name}_low": interval.low,
+                        f"{name}_high": interval.high,
+                    }
                 found.append(row)
         return found

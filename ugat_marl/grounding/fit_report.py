@@ -246,8 +246,7 @@ class FitReport:
     @property
     def expected_u(self) -> Floats:
         """Mean u to expect at the gate, per agent; of all agents where one has no held-out rows."""
-        known = self.mean_u_on_predictions
-        return np.where(np.isnan(known), np.nanmean(known), known)
+        return with_the_others(self.mean_u_on_predictions)
 
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
         """Agents whose models may be obeyed, for `Gate.trust`; ``(agents,)``.
@@ -277,6 +276,12 @@ class FitReport:
         ):
             numbers |= entries(name, getattr(self, name), self.agents)
         return numbers | self.inverse.calibration.as_dict()
+
+
+def with_the_others(u: Floats) -> Floats:
+    """Mean u per agent; NaN replaced by the mean of the other agents, of all by 1, the most."""
+    known = u[~np.isnan(u)]
+    return np.where(np.isnan(u), known.mean() if known.size else 1.0, u)
 
 
 @torch.no_grad()

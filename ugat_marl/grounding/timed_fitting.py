@@ -12,7 +12,7 @@ from ugat_marl.batched import one_thread
 from ugat_marl.devices import CPU
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.fit_loop import EpochCallback, Split, split
-from ugat_marl.grounding.fit_report import Calibration, TrainingRecord
+from ugat_marl.grounding.fit_report import Calibration, TrainingRecord, with_the_others
 from ugat_marl.grounding.fitting import (
     Changes,
     Questions,
@@ -94,9 +94,8 @@ def _expected_u(transform: TimedTransform, street: StackedTransitions) -> Floats
     """Mean u of h's answers to what f predicts, per agent, by the weights of the rows."""
     seen, local = transform.forward.view.of(street), transform.local.of(street)
     u = transform.delays(seen, local, street.executed)[1]
-    mean = ((u * street.weight).sum(1) / street.weight.sum(1)).double().numpy()
-    everywhere = np.nanmean(mean) if np.isfinite(mean).any() else 1.0
-    return np.where(np.isnan(mean), everywhere, mean)
+    mean = (u * street.weight).sum(1) / street.weight.sum(1)
+    return with_the_others(mean.double().numpy())
 
 
 def _alike(

@@ -98,8 +98,13 @@ class TimedReport:
     @property
     def _delay_s(self) -> Floats:
         """What greens are late by in the mean, per agent."""
-        found = np.where(self.forward.learnt & self.simulated.learnt & self.lost.shown, 1.0, 0.0)
-        return found * self.lost.best_s + (0.0 if self.matched is None else self.matched.beyond_s)
+        beyond_s = 0.0 if self.matched is None else self.matched.beyond_s
+        return self.lost.best_s * self._found + beyond_s
+
+    @property
+    def _found(self) -> NDArray[np.bool_]:
+        """Where there is a lost time, by models that have learnt something."""
+        return self.forward.learnt & self.simulated.learnt & self.lost.shown
 
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
         """Agents whose h may be obeyed, for `Gate.trust`; the others take the best constant.
@@ -107,8 +112,7 @@ class TimedReport:
         f and the model of the simulation have learnt something, there is a lost time for h to
         refine, and h, on its own task, beats a guess by the share `least_accuracy`.
         """
-        better = self.forward.learnt & self.simulated.learnt & self.lost.shown
-        return better & (self.inverse.error_s < (1.0 - least_accuracy) * self.inverse.guess_s)
+        return self._found & (self.inverse.error_s < (1.0 - least_accuracy) * self.inverse.guess_s)
 
     def as_dict(self) -> dict[str, float]:
         """Flat numbers; arrays as their mean over agents and as one entry per agent."""

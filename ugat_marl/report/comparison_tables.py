@@ -132,7 +132,7 @@ def _headlines(found: Comparison, direct: str) -> list[tuple[str, Cell]]:
         ),
         (
             "share of the regret won back (1: the best in the table)",
-            lambda s, t: _share(found.won_back(s, t, direct)),
+            lambda s, t: share(found.won_back(s, t, direct)),
         ),
     ]
 
@@ -208,13 +208,14 @@ def with_interval(interval: Interval) -> str:
     return f"{number(interval.mean)} ({number(interval.low)}{to}{number(interval.high)})"
 
 
-def _share(value: float) -> str:
+def share(value: float) -> str:
+    """A share of the regret; a dash where there is none."""
     return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
 
 
-def percent(share: float) -> str:
+def percent(value: float) -> str:
     """A signed share in per cent."""
-    return "–" if math.isnan(share) else f"{'−' if share < 0 else '+'}{abs(100 * share):.0f} %"
+    return "–" if math.isnan(value) else f"{'−' if value < 0 else '+'}{abs(100 * value):.0f} %"
 
 
 def _tested(test: PairedTest) -> str:
