@@ -17,7 +17,7 @@ from ugat_marl.learners.registry import LearnerFactory
 from ugat_marl.policy import AnyParallelEnv, Learner, Policy
 from ugat_marl.progress import Reporter
 from ugat_marl.scenario import Scenario
-from ugat_marl.signals import SignalTiming, begins_when_asked
+from ugat_marl.signals import begins_when_asked
 from ugat_marl.traffic_env import TrafficEnv, parallel_env
 from ugat_marl.training import Run
 from ugat_marl.ugat import CHUNK, UgatConfig
@@ -67,18 +67,18 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
         UnknownNameError: No such domain.
         OptionError: Agents look farther in one of them, or greens begin too late to be delayed.
     """
-    here, there = (in_domain(scenario, world).control for world in (sim, real))
-    for control in (here, there) if timed else ():
-        timing = SignalTiming(control.yellow_s, control.all_red_s, control.min_green_s)
-        if not begins_when_asked(timing, control.decision_interval_s):
+    here, there = (in_domain(scenario, world) for world in (sim, real))
+    for world in (here, there) if timed else ():
+        timing, interval_s = world.timing, world.control.decision_interval_s
+        if not begins_when_asked(timing, interval_s):
             raise OptionError(
                 "timed grounding delays a green in the decision that asks for it, and here some "
-                f"begin later: decision_interval_s = {control.decision_interval_s:g} must be "
+                f"begin later: decision_interval_s = {interval_s:g} must be "
                 f"longer than yellow_s + all_red_s = {timing.clearance_s:g} by min_green_s = "
                 f"{timing.min_green_s:g} or more; change them in scenario.toml, or use the "
                 "grounding phase"
             )
-    here_m, there_m = here.reach_m, there.reach_m
+    here_m, there_m = here.control.reach_m, there.control.reach_m
     if here_m != there_m:
         raise OptionError(
             f"agents look {here_m:g} m upstream in {describe(sim)!r} and {there_m:g} m in "

@@ -42,12 +42,9 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """Mean over seeds with Student's 95 % interval (nan for a single seed), and the median."""
+class Estimate(Interval):
+    """A mean over seeds with its interval, and the median."""
 
-    mean: float
-    low: float
-    high: float
     median: float
 
     @classmethod

@@ -27,6 +27,7 @@ from ugat_marl.scenario_settings import (
     seconds_of,
     validated,
 )
+from ugat_marl.signals import SignalTiming
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,12 @@ class Scenario:
     def control(self) -> ControlSettings:
         """Signal timing."""
         return self.settings.control
+
+    @property
+    def timing(self) -> SignalTiming:
+        """Clearance and minimum green of every intersection."""
+        control = self.control
+        return SignalTiming(control.yellow_s, control.all_red_s, control.min_green_s)
 
     @property
     def decisions(self) -> int:

@@ -76,11 +76,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.render_mode = options.render_mode
         self.network = Network.read(self.scenario)
         self.demand = check_demand(self.scenario, self.network, whole=False)
-        control = self.scenario.control
-        self.decision_interval_s = control.decision_interval_s
-        self._timing = signals.SignalTiming(
-            control.yellow_s, control.all_red_s, control.min_green_s
-        )
+        self.decision_interval_s = self.scenario.control.decision_interval_s
+        self._timing = self.scenario.timing
         self._lanes = self.network.lane_table()
         self._observer = Observer(self.network, options.observation, options.neighbours)
         self._rewarder = Rewarder(self.network, options.reward)

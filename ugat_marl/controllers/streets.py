@@ -46,13 +46,12 @@ class Streets:
         base: Any = env.unwrapped
         network: Network = base.network
         tls_of: Mapping[str, str] = base.intersection_of
-        control = base.scenario.control
         return cls(
             {agent: network.intersection(tls_of[agent]) for agent in base.possible_agents},
             {name: lane.capacity for name, lane in network.lanes.items()},
             {name: lane.length_m / lane.speed_mps for name, lane in network.lanes.items()},
             base.decision_interval_s,
-            control.yellow_s + control.all_red_s,
+            base.scenario.timing.clearance_s,
         )
 
     @cached_property

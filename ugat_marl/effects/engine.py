@@ -50,7 +50,7 @@ class QueueModel(Effect):
             "meso-jam-threshold": "1",
             "meso-tauff": f"{HEADWAY_S:g}",
         }
-        clearance_s = scenario.control.yellow_s + scenario.control.all_red_s
+        clearance_s = scenario.timing.clearance_s
         return _changed(scenario, self, options, yellow_s=0.0, all_red_s=clearance_s)
 
 

@@ -80,7 +80,7 @@ class Site:
         return cls(
             network,
             Observer(network, name, hops),
-            SignalTiming(control.yellow_s, control.all_red_s, control.min_green_s),
+            scenario.timing,
             control.decision_interval_s,
             {
                 light: tuple(
