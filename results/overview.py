@@ -22,8 +22,8 @@ FOLDER = Path(__file__).parent
 BEGIN, END = "<!-- overview -->\n", "<!-- end of overview -->\n"
 GROUNDED = (TIMED, matched_name("timed"))
 CONSTANT = "constant delay"
-THERE = "there"
-"""Folder of a table of what else is known in the domains, with the same direct transfer."""
+BESIDE = ("there", "*matched*")
+"""Folders of tables of what else is known in the domains, beside the same direct transfer."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,15 @@ def columns(table: Path) -> dict[str, Column]:
 
 
 def known(table: Path) -> dict[str, Column]:
-    """The domains of a `table.csv`, with the rows of the table `THERE`.
+    """The domains of a `table.csv`, with the rows of the tables `BESIDE` it.
 
-    They belong together where direct transfer, which both have, is the same to the digit.
+    They belong together where direct transfer, which all have, is the same to the digit.
     """
-    found, other = columns(table), table.parent.parent / THERE / table.name
-    for domain, column in columns(other).items() if other.exists() else ():
-        if domain in found and found[domain][DIRECT] == column[DIRECT]:
-            found[domain] = {**column, **found[domain]}
+    found, scenario = columns(table), table.parent.parent
+    for other in (path for name in BESIDE for path in sorted(scenario.glob(f"{name}/table.csv"))):
+        for domain, column in columns(other).items():
+            if domain in found and found[domain][DIRECT] == column[DIRECT]:
+                found[domain] = {**column, **found[domain]}
     return found
 
 

@@ -83,8 +83,9 @@ def test_what_all_domains_of_a_table_share_is_left_out(folder: Path) -> None:
     assert "| V4+headway=2 |" in script.overview(folder)
 
 
-def test_what_else_is_known_there_counts_as_well(folder: Path) -> None:
-    there = folder / "grid2x2-v1" / "there"
+@pytest.mark.parametrize("name", ["there", "matched"])
+def test_what_else_is_known_there_counts_as_well(folder: Path, name: str) -> None:
+    there = folder / "grid2x2-v1" / name
     there.mkdir()
     (there / "table.csv").write_text(
         "setting,domain,att_s,att_s_gap\ndirect transfer,V1,100,40\ntrained in real,V1,60,1\n"
