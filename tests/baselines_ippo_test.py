@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,6 +19,7 @@ from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.transform import GroundedActionTransform
 from ugat_marl.grounding.wrapper import GroundedEnv
 from ugat_marl.learners import DQNPolicy
+from ugat_marl.learners.registry import load_baseline
 from ugat_marl.policy import Learner, Policy
 from ugat_marl.testing import ToyTraffic, check_policy, failures
 from ugat_marl.wrappers import agent_indicator, pad
@@ -30,17 +29,7 @@ if not FILE.is_file():
     pytest.skip("baselines/ is part of a checkout only", allow_module_level=True)
 
 
-def load_file() -> Any:
-    """The baseline as a module; it is not part of the wheel."""
-    spec = importlib.util.spec_from_file_location("baselines_ippo", FILE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-ippo = load_file()
+ippo: Any = load_baseline("ippo")
 IPPO, Config = ippo.IPPO, ippo.IPPOConfig
 QUICK: dict[str, Any] = {
     "hidden": (32, 32),
