@@ -8,6 +8,8 @@ from collections import Counter, defaultdict
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from ugat_marl.naming import edge_of
+
 CROSSING = "c"
 """Direction of a link for people on foot."""
 
@@ -41,12 +43,12 @@ class Link:
     @property
     def from_edge(self) -> str:
         """Edge of the incoming lane."""
-        return _road(self.from_lane)
+        return edge_of(self.from_lane)
 
     @property
     def to_edge(self) -> str:
         """Edge of the outgoing lane."""
-        return _road(self.to_lane)
+        return edge_of(self.to_lane)
 
 
 def links_of(root: ET.Element) -> dict[str, list[Link]]:
@@ -206,7 +208,7 @@ def behind_of(
         any of its lanes, are behind it.
     """
     ways = _ways(root, lights)
-    widths = Counter(map(_road, ways.number))
+    widths = Counter(map(edge_of, ways.number))
     found: dict[str, Upstream] = {}
     for lane in ways.at_lights:
         begins_m = _begins(lane, ways, lengths_m, reach_m)
@@ -216,7 +218,7 @@ def behind_of(
         shares = _shares(lane, near, ways)
         own = found[lane] = Upstream()
         for name in near:
-            road = _road(name)
+            road = edge_of(name)
             own.roads[road] = own.roads.get(road, 0.0) + shares[name] / widths[road]
             for feeder, inside in ways.feeds.get(name, ()):
                 if feeder in begins_m and feeder not in ways.at_lights:
@@ -303,7 +305,3 @@ def _shares(lane: str, near: Sequence[str], ways: _Ways) -> dict[str, float]:
             break
         shares = dict(after)
     return shares
-
-
-def _road(lane: str) -> str:
-    return lane.rsplit("_", 1)[0]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import OptionError
 from ugat_marl.measurements import HALTING_MPS, Behind
+from ugat_marl.naming import edge_of
 
 
 @dataclass(slots=True)
@@ -86,11 +87,11 @@ class QueueLook:
         self._index = [int(lane.rpartition("_")[2]) for lane in lanes]
         self._roads: dict[str, _Road] = {}
         for place, lane in enumerate(lanes):
-            edge, length = lane.rpartition("_")[0], api.lane.getLength(lane)
+            edge, length = edge_of(lane), api.lane.getLength(lane)
             segments = max(1, math.floor(length / segment_m + 0.5))
             road = self._roads.setdefault(edge, _Road(edge, [], defaultdict(list), 0.0, 0.0, {}))
             road.lanes.append(place)
-            for following in {link[0].rpartition("_")[0] for link in api.lane.getLinks(lane)}:
+            for following in {edge_of(link[0]) for link in api.lane.getLinks(lane)}:
                 road.towards[following].append(place)
             road.segment_s = length / segments / api.lane.getMaxSpeed(lane)
             road.last_m = length * (1 - 1.5 / segments)

@@ -1,4 +1,4 @@
-"""Names of agents: the same prefix means the same kind."""
+"""Names of agents, whose prefix says of what kind they are, and of SUMO's lanes."""
 
 from __future__ import annotations
 
@@ -39,3 +39,8 @@ def letters(number: int) -> str:
         number, digit = divmod(number - 1, 26)
         text = chr(ord("a") + digit) + text
     return text
+
+
+def edge_of(lane: str) -> str:
+    """The edge of a lane, by SUMO's naming; empty if it is not a lane's name."""
+    return lane.rpartition("_")[0]

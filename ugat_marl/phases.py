@@ -49,7 +49,7 @@ def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple
         for b in green[position + 1 :]:
             if (
                 a.from_edge != b.from_edge
-                and a.to_lane.rsplit("_", 1)[0] != b.to_lane.rsplit("_", 1)[0]
+                and a.to_edge != b.to_edge
                 and "s" in (a.direction, b.direction)
                 and are_foes(a, b, foes)
             ):

@@ -21,6 +21,7 @@ from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.files import write_whole
 from ugat_marl.looks import QueueLook, add_those_behind, near_the_end, refuse_in_queues
 from ugat_marl.measurements import NOBODY, Behind, Snapshot, Trips
+from ugat_marl.naming import edge_of
 from ugat_marl.scenario import Document, Scenario
 from ugat_marl.signals import Segment
 from ugat_marl.trips import measuring_options, read_trips
@@ -332,9 +333,8 @@ class LibsumoSimulator:
         assert self._launch is not None
         now: dict[str, tuple[int, str]] = {}
         for index, lane in enumerate(self._launch.lanes):
-            road = lane.rpartition("_")[0]
-            for name in libsumo.lane.getLastStepVehicleIDs(lane):
-                now[name] = index, road
+            place = index, edge_of(lane)
+            now.update(dict.fromkeys(libsumo.lane.getLastStepVehicleIDs(lane), place))
         before, self._on = self._on, now
         for name, (index, road) in before.items():
             if now.get(name, (0, ""))[1] != road:

@@ -16,6 +16,7 @@ from ugat_marl.discrepancy.signal_timing import IN_THE_LOG
 from ugat_marl.effects import SETTINGS, Effect, effect_from, known_effects
 from ugat_marl.effects.base import EVERYWHERE
 from ugat_marl.errors import UnknownNameError
+from ugat_marl.naming import edge_of
 from ugat_marl.scenario import Scenario
 
 GROUPS: Mapping[str, float] = {
@@ -236,7 +237,7 @@ def _outside(
         return Drawn("outside", member, strength, (Driveway(edge, 0.1 * scale),))
     if member == "double_parking":
         parked = hidden_effect("parking", strength, scenario, busy, generator)
-        edge = "" if parked is None else str(parked.record()["lane"]).rpartition("_")[0]
+        edge = "" if parked is None else edge_of(str(parked.record()["lane"]))
         ways = [turn for turn in busy.turns if turn[0] == edge]
         if parked is None or not ways:
             return None

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ugat_marl.controllers.streets import Streets, green_indices, mask_of
+from ugat_marl.naming import edge_of
 from ugat_marl.network import Intersection
 from ugat_marl.phases import Link
 from ugat_marl.policy import Actions, Infos, Observations
@@ -54,13 +55,13 @@ def _roads_from(agent: str, free: Mapping[str, Intersection], streets: Streets) 
         while True:
             straight = _straight(free[agents[-1]], edges[-1])
             lanes += len({link.from_lane for link in straight})
-            ahead = [link.to_lane for link in straight if edge_of(link.to_lane) in entered]
-            following = entered[edge_of(ahead[0])] if ahead else agents[-1]
+            ahead = [link for link in straight if link.to_edge in entered]
+            following = entered[ahead[0].to_edge] if ahead else agents[-1]
             if following in agents:
                 break
             agents.append(following)
-            edges.append(edge_of(ahead[0]))
-            arrival_s.append(arrival_s[-1] + streets.free_flow_s[ahead[0]])
+            edges.append(ahead[0].to_edge)
+            arrival_s.append(arrival_s[-1] + streets.free_flow_s[ahead[0].to_lane])
         yield Road(tuple(agents), tuple(edges), tuple(arrival_s), lanes)
 
 
@@ -126,11 +127,6 @@ class GreenWave:
             turns = [along] * (length - other * len(others))
             self._turns[agent] = turns + [phase for phase in others for _ in range(other)]
             self._offsets[agent] = round(arrival_s / streets.decision_interval_s)
-
-
-def edge_of(lane: str) -> str:
-    """The edge of a lane, by SUMO's naming."""
-    return lane.rsplit("_", 1)[0]
 
 
 def _straight(item: Intersection, edge: str) -> list[Link]:

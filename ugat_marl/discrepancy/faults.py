@@ -12,6 +12,7 @@ from ugat_marl.discrepancy.hypotheses import Hypothesis
 from ugat_marl.discrepancy.site import Site
 from ugat_marl.discrepancy.statistics import Distance, Reference
 from ugat_marl.measured.data import Passages, Period
+from ugat_marl.naming import edge_of
 
 _SILENT = 15.0
 """Vehicles that must be missing before silence is a fault."""
@@ -122,7 +123,7 @@ def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None
     found = [known[str(name)] for name in short if name in known]
     for one in found:
         for other in found:
-            lane, edge = lanes.get(one.lane), other.lane.rsplit("_", 1)[0]
+            lane, edge = lanes.get(one.lane), edge_of(other.lane)
             if lane is None:
                 continue
             if other.kind == "exit":

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.measured.data import Detector, Finding, Measured
+from ugat_marl.naming import edge_of
 from ugat_marl.redraw import ways
 from ugat_marl.scenario import Scenario
 
@@ -25,7 +26,7 @@ def unreached(
     Raises:
         MeasuredDataError: No route leads over any of the measured edges.
     """
-    edges = {item.id: item.lane.rpartition("_")[0] for item in detectors}
+    edges = {item.id: edge_of(item.lane) for item in detectors}
     counted: dict[str, int] = {}
     for period in measured.periods:
         for name, passages in period.passages.items():

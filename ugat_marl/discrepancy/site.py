@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.measured.data import Detector, DetectorKind, Period, SignalLog, letter
+from ugat_marl.naming import edge_of
 from ugat_marl.network import Intersection, Network
 from ugat_marl.signals import GREEN, YELLOW
 
@@ -122,7 +123,7 @@ class Site:
     def places(self) -> tuple[tuple[int, str, str], ...]:
         """Index of the traffic light, edge and lane of every place: incoming lanes, then exits."""
         incoming = [(lane.intersection, lane.edge, lane.id) for lane in self.lanes]
-        outgoing = [(owner, name.rsplit("_", 1)[0], name) for owner, name, _ in self.exits]
+        outgoing = [(owner, edge_of(name), name) for owner, name, _ in self.exits]
         return (*incoming, *outgoing)
 
     @functools.cached_property
@@ -150,9 +151,7 @@ def _links(item: Intersection, lane: str) -> tuple[int, ...]:
 
 
 def _following(item: Intersection, lane: str) -> frozenset[str]:
-    return frozenset(
-        link.to_lane.rsplit("_", 1)[0] for link in item.links if link.from_lane == lane
-    )
+    return frozenset(link.to_edge for link in item.links if link.from_lane == lane)
 
 
 def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:

@@ -16,6 +16,7 @@ from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
 from ugat_marl.effects.documents import edit_scenario, is_demand, mentions
 from ugat_marl.effects.places import Places, places_of
 from ugat_marl.errors import UnknownNameError
+from ugat_marl.naming import edge_of
 from ugat_marl.scenario import Scenario
 
 Way = tuple[str, ...]
@@ -156,7 +157,7 @@ def _with_route(item: ET.Element, edges: Way) -> ET.Element:
     for key in ("route", "from", "to", "via", *_ENDS):
         made.attrib.pop(key, None)
     for child in list(made):
-        lane = child.get("lane", "").rpartition("_")[0]
+        lane = edge_of(child.get("lane", ""))
         if child.tag == "route" or (child.tag == "stop" and lane not in edges):
             made.remove(child)
     route = ET.Element("route", {"edges": " ".join(edges)})

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.effects import known_effects
 from ugat_marl.measured.data import Detector, DetectorKind, Finding, Measured, Period, letter
+from ugat_marl.naming import edge_of
 from ugat_marl.network import Network
 from ugat_marl.scenario import Scenario
 from ugat_marl.signals import GREEN, YELLOW
@@ -184,7 +185,7 @@ def _of_kinds(measured: Measured, network: Network) -> Iterator[Finding]:
         )
     kinds = {item.kind for item in measured.detectors if item.id in seen}
     shared = any(
-        len({link.to_lane.rsplit("_", 1)[0] for link in item.links if link.from_lane == lane}) > 1
+        len({link.to_edge for link in item.links if link.from_lane == lane}) > 1
         for item in network.intersections
         for lane in item.incoming_lanes
     )
@@ -290,7 +291,7 @@ class _Silence:
 def _of_silence(measured: Measured) -> Iterator[Finding]:
     roads: dict[str, list[Detector]] = {}
     for item in measured.detectors:
-        roads.setdefault(item.lane.rsplit("_", 1)[0], []).append(item)
+        roads.setdefault(edge_of(item.lane), []).append(item)
     usual = _usual_rates(measured)
     silences: dict[tuple[str, str], list[_Silence]] = {}
     for period in measured.periods:
