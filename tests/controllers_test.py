@@ -30,6 +30,7 @@ from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.network import Intersection, Lane, Network
 from ugat_marl.phases import Link
 from ugat_marl.policy import Policy
+from ugat_marl.signals import SignalTiming
 
 # Two approaches. Lane n_0 goes straight (to s_0) or right (to w_0), lane n_1 left (to e_0 or e_1);
 # lane w_0 goes straight (to e_0). The right turn is green, yielding, in the second phase as well.
@@ -63,7 +64,7 @@ def env(**changes: Any) -> Any:
         intersection_of={AGENT: "x"},
         possible_agents=[AGENT],
         decision_interval_s=10.0,
-        scenario=SimpleNamespace(control=SimpleNamespace(yellow_s=3.0, all_red_s=2.0)),
+        scenario=SimpleNamespace(timing=SignalTiming(3.0, 2.0, 5.0)),
         **changes,
     )
     base.unwrapped = base

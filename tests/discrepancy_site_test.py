@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ugat_marl.discrepancy.features import tally
@@ -157,6 +157,7 @@ def test_greens_are_in_order_and_inside_the_period(log: SignalLog) -> None:
 
 
 @given(LOGS, st.fixed_dictionaries({}, optional={k: some_passages() for k in ("a", "s", "b", "x")}))
+@example(((0.0, "GG"), (0.0, "YG"), (601.0, "GG")), {})  # a yellow beyond the period's end
 def test_features_of_anything_are_finite(log: SignalLog, seen: dict[str, Passages]) -> None:
     lanes = (
         SiteLane("in_0", "in", 0, (0,), 14.0, {"advance": ("a",), "stop": ("s", "b")}),

@@ -170,7 +170,7 @@ def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
         changes, changes[1:], [*changes[2:], (period.end_s, "r")], strict=False
     ):
         if shown in GREEN and start >= period.begin_s and end < period.end_s:
-            red = later if after in YELLOW else end
+            red = min(later, period.end_s) if after in YELLOW else end
             rows.append((start, end, red, shown == "G"))
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     starts = np.array([*(time for time, shown in changes if shown in GREEN), np.inf])
