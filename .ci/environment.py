@@ -32,8 +32,8 @@ WHEELS = VENV / "wheel"
 LOCK = ROOT / ".cache" / "environment.lock"
 OLDEST = (3, 11)
 PROBE = """
-import gymnasium, libsumo, matplotlib, numpy, pettingzoo, polars, pydantic, rich, sumo, sumolib
-import supersuit, tensorboard, torch, tyro
+import gymnasium, lazy_loader, libsumo, matplotlib, numpy, pettingzoo, polars, pydantic, rich
+import scipy, sumo, sumolib, supersuit, tensorboard, torch, tyro
 import ugat_marl
 """
 PROBE_DEV = "import hatchling, hypothesis, pytest, pytest_timeout, xdist"

@@ -32,9 +32,11 @@ from torchrl.data import Composite
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.learners.third_party import (
+from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.policies import (
+    EpisodeCallback,
     LibraryLearner,
     TrainingEnv,
     check_settings,
@@ -42,9 +44,7 @@ from ugat_marl.learners.third_party import (
     linear,
     seed_generators,
 )
-from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
 from ugat_marl.seeding import derive_seed
-from ugat_marl.wrappers import agent_indicator, pad
 
 ALGORITHMS = ("qmix", "vdn")
 _GROUP = "agents"
@@ -180,7 +180,7 @@ class Unwritten(Experiment):
 
 
 class BenchMARL(LibraryLearner):
-    """Learns by QMIX or VDN; a `ugat_marl.policy.Learner`."""
+    """Learns by QMIX or VDN; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: BenchMARLConfig | None = None, seed: int = 0

@@ -24,10 +24,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, UgatMarlError
-from ugat_marl.learners.registry import BASELINES, learner_factory, library_of
+from ugat_marl.policies import BASELINES, learner_factory, library_of
 from ugat_marl.testing import ToyTraffic
-from ugat_marl.traffic_env import parallel_env
 
 EPISODES = 3
 PATIENCE_S = 900.0

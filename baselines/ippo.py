@@ -21,16 +21,23 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
-from ugat_marl.batched import BatchedMLP, one_thread
-from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
+from ugat_marl.data import read_checkpoint, write_checkpoint
+from ugat_marl.envs import AgentSet
+from ugat_marl.envs import AnyParallelEnv as Env
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
-from ugat_marl.learners.agents import AgentSet
-from ugat_marl.learners.dqn_policy import DQNPolicy, header
-from ugat_marl.learners.q_network import SharedMLP, flatten_parameters, reading_unscaled
-from ugat_marl.learners.scaling import InputScale, places
-from ugat_marl.policy import AnyParallelEnv as Env
-from ugat_marl.policy import EpisodeCallback as Callback
+from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.policies import (
+    BatchedMLP,
+    DQNPolicy,
+    InputScale,
+    SharedMLP,
+    flatten_parameters,
+    header,
+    one_thread,
+    places,
+    reading_unscaled,
+)
+from ugat_marl.policies import EpisodeCallback as Callback
 from ugat_marl.seeding import derive_seed, torch_generator
 
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
@@ -74,7 +81,7 @@ def network(
     """Perceptrons from ``(agents, batch, n_in)`` to ``(agents, batch, n_out)``.
 
     Weights are orthogonal, those of the last layer times `gain`, and biases zero. A shared one is
-    told whose input it computes, as by `ugat_marl.wrappers.agent_indicator`.
+    told whose input it computes, as by `ugat_marl.envs.wrappers.agent_indicator`.
     """
     if config.shared:
         made: nn.Module = SharedMLP(len(agents), n_in, config.hidden, n_out, rng)
@@ -114,7 +121,7 @@ class Decision(NamedTuple):
 
 
 class IPPO:
-    """Learns by PPO for all agents of `env`, equal or not; a `ugat_marl.policy.Learner`.
+    """Learns by PPO for all agents of `env`, equal or not; a `Learner` of the suite.
 
     Roll-outs are bootstrapped with the critic's value where an episode is truncated; only where an
     agent terminates, its future counts as zero reward.

@@ -25,29 +25,31 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from ugat_marl.bench.machine import machine_facts
-from ugat_marl.effects import load
+from ugat_marl.data import locked, version_of
+from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError, UgatMarlError
-from ugat_marl.evaluation import rule_factory
-from ugat_marl.files import require_writable, write_whole
-from ugat_marl.learners.registry import BASELINES, DQN_NAME, require_known
-from ugat_marl.learning_curves.page import as_csv, page
-from ugat_marl.learning_curves.training import (
+from ugat_marl.experiments import (
     DOMAIN,
+    LEAST_BUDGET,
+    VERSION,
     Curve,
     Training,
     evaluation_seeds,
     found,
+    machine_facts,
     perform,
     played,
+    rule_factory,
+    tune,
+    tuned_rules,
     word,
 )
-from ugat_marl.lifeline import end_with_input
+from ugat_marl.files import require_writable, write_whole
+from ugat_marl.policies import BASELINES, DQN_NAME, require_known
 from ugat_marl.progress import Bars, Reporter
-from ugat_marl.scenario import Scenario
-from ugat_marl.training import locked
-from ugat_marl.tuning import LEAST_BUDGET, VERSION, tune, tuned_rules
-from ugat_marl.versions import version_of
+from ugat_marl.reporting import curves_as_csv, curves_page
+from ugat_marl.scenarios import Scenario
+from ugat_marl.simulation import end_with_input
 
 JOB, LOG, RULES = "job.json", "job.log", "rules.json"
 
@@ -96,7 +98,7 @@ class Results:
         if self.only is not None:
             return one_of_them(self.only)
         console, failures = Console(), list[str]()
-        scenarios = {name: load(name) for name in self.scenarios}
+        scenarios = {name: load_scenario(name) for name in self.scenarios}
         for name in scenarios:  # what is wrong is said before anything is trained
             require_writable(self.out / f"{word(name)}.md")
         for name, scenario in scenarios.items():
@@ -110,9 +112,9 @@ class Results:
                         curves[one] = curve
             if curves:
                 rules, best = self.rules(scenario, reporter)
-                text = page(scenario.id, curves, rules, best, machine_facts())
+                text = curves_page(scenario.id, curves, rules, best, machine_facts())
                 write_whole(where, text + "\n")
-                write_whole(where.with_suffix(".csv"), as_csv(curves))
+                write_whole(where.with_suffix(".csv"), curves_as_csv(curves))
                 console.print(f"page: {where}, each evaluation: {where.with_suffix('.csv')}")
         for line in failures:
             console.print(line, markup=False, soft_wrap=True)

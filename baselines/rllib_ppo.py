@@ -29,10 +29,11 @@ from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
 from torch import Tensor, nn
 
-from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.envs import AnyParallelEnv, agent_indicator, groups_of, masked_observation
 from ugat_marl.errors import UgatMarlError
-from ugat_marl.learners.agents import groups_of
-from ugat_marl.learners.third_party import (
+from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.policies import (
+    EpisodeCallback,
     LibraryLearner,
     TrainingEnv,
     check_settings,
@@ -42,9 +43,7 @@ from ugat_marl.learners.third_party import (
     linear_layers,
     seed_generators,
 )
-from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
 from ugat_marl.seeding import derive_seed
-from ugat_marl.wrappers import agent_indicator, masked_observation
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ class Seat(ParallelPettingZooEnv):
 
 
 class RLlib(LibraryLearner):
-    """Learns by RLlib's PPO; a `ugat_marl.policy.Learner`."""
+    """Learns by RLlib's PPO; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: RLlibConfig | None = None, seed: int = 0

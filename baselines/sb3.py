@@ -1,6 +1,7 @@
 """Stable-Baselines3's PPO and DQN, and MaskablePPO of sb3-contrib, with one network for all agents.
 
-Every intersection is an environment of its own in `ugat_marl.adapters.sb3.AgentsVecEnv`, padded and
+Every intersection is an environment of its own in `ugat_marl.envs.adapters.sb3.AgentsVecEnv`,
+padded and
 told whose it is. MaskablePPO asks that for masks. PPO and DQN of the library know none: here they
 read them at the end of the observation, where the policies below take them off again and give
 actions that are not allowed no probability, or no value. DQN also explores among what is allowed.
@@ -31,10 +32,11 @@ from stable_baselines3.dqn.policies import DQNPolicy as LibraryPolicy
 from stable_baselines3.dqn.policies import QNetwork
 from torch import Tensor, nn
 
-from ugat_marl.adapters.sb3 import AgentsVecEnv
-from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.envs import AgentsVecEnv, AnyParallelEnv, agent_indicator, pad
 from ugat_marl.errors import EpisodeError, UnknownNameError
-from ugat_marl.learners.third_party import (
+from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.policies import (
+    EpisodeCallback,
     LibraryLearner,
     TrainingEnv,
     check_settings,
@@ -44,8 +46,6 @@ from ugat_marl.learners.third_party import (
     roll_out_length,
     seed_generators,
 )
-from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
-from ugat_marl.wrappers import agent_indicator, pad
 
 ALGORITHMS = ("ppo", "maskable-ppo", "dqn")
 _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -167,7 +167,7 @@ class Seeds(BaseCallback):
 
 
 class SB3(LibraryLearner):
-    """Learns by one of the library's algorithms; a `ugat_marl.policy.Learner`."""
+    """Learns by one of the library's algorithms; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(self, env: AnyParallelEnv, config: SB3Config | None = None, seed: int = 0) -> None:
         self.config = config or SB3Config()

@@ -31,10 +31,11 @@ from skrl.multi_agents.torch.mappo import MAPPO, MAPPO_CFG
 from skrl.trainers.torch import SequentialTrainer
 from torch import Tensor, nn
 
-from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.envs import AnyParallelEnv, appended_mask, groups_of
 from ugat_marl.errors import OptionError
-from ugat_marl.learners.agents import groups_of
-from ugat_marl.learners.third_party import (
+from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.policies import (
+    EpisodeCallback,
     LibraryLearner,
     TrainingEnv,
     check_settings,
@@ -45,8 +46,6 @@ from ugat_marl.learners.third_party import (
     roll_out_length,
     seed_generators,
 )
-from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
-from ugat_marl.wrappers import appended_mask
 
 _PREPROCESSED = ("observation", "state", "value")
 _FORBIDDEN = -1e8  # in the place of logits; not infinite, or the entropy is not a number
@@ -108,7 +107,7 @@ class Critic(DeterministicMixin, Model):
 
 
 class Skrl(LibraryLearner):
-    """Learns by skrl's IPPO or MAPPO; a `ugat_marl.policy.Learner`."""
+    """Learns by skrl's IPPO or MAPPO; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: SkrlConfig | None = None, seed: int = 0

@@ -9,9 +9,9 @@ of SuperSuit 3.11:
 - `concat_vec_envs_v1` copies the environment and never closes the copies, and with worker processes
   loses what they learn of rewards; so it is left out here.
 - `pad_action_space_v0` turns an action that does not exist into action 0, in silence. Here
-  `ugat_marl.wrappers.pad` pads, which refuses it, and masks see to it that it is never chosen.
+  `ugat_marl.envs.wrappers.pad` pads, which refuses it, and masks see to it that it is never chosen.
 - `agent_indicator_v0` takes every step through PettingZoo's other interface and back, and steps a
-  `GroundedEnv` whose episode is over; `ugat_marl.wrappers.agent_indicator` does not.
+  `GroundedEnv` whose episode is over; `ugat_marl.envs.wrappers.agent_indicator` does not.
 - It carries no masks; here they are a part of the observation.
 
     python baselines/supersuit_ppo.py --scenario grid2x2-v1 --episodes 100 --out runs/supersuit
@@ -27,10 +27,9 @@ import tyro
 from supersuit.vector import MarkovVectorEnv
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
-from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
-from ugat_marl.learners.registry import load_baseline
-from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
-from ugat_marl.wrappers import agent_indicator, appended_mask, pad
+from ugat_marl.envs import AnyParallelEnv, agent_indicator, appended_mask, pad
+from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.policies import EpisodeCallback, load_baseline
 
 _sb3: Any = load_baseline("sb3-ppo")
 
@@ -43,7 +42,7 @@ class SuperSuitConfig(_sb3.SB3Config):
 
 
 class SuperSuitPPO(_sb3.SB3):
-    """Learns by PPO in SuperSuit's vector environment; a `ugat_marl.policy.Learner`."""
+    """Learns by PPO in SuperSuit's vector environment; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: SuperSuitConfig | None = None, seed: int = 0

@@ -25,9 +25,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
-from ugat_marl.baseline import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad
 from ugat_marl.errors import OptionError
-from ugat_marl.learners.third_party import (
+from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.policies import (
+    EpisodeCallback,
     LibraryLearner,
     TrainingEnv,
     check_settings,
@@ -36,8 +38,6 @@ from ugat_marl.learners.third_party import (
     perceptron,
     seed_generators,
 )
-from ugat_marl.policy import AnyParallelEnv, EpisodeCallback
-from ugat_marl.wrappers import agent_indicator, pad
 
 _GROUP = "agents"
 
@@ -79,7 +79,7 @@ class Critic(nn.Module):
 
 
 class TorchRLMAPPO(LibraryLearner):
-    """Learns by TorchRL's PPO; a `ugat_marl.policy.Learner`."""
+    """Learns by TorchRL's PPO; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: TorchRLConfig | None = None, seed: int = 0

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
+from ugat_marl.experiments import CONTROL, DIRECT, ORACLE, RULE, TIMED, matched_name
 from ugat_marl.files import write_whole
-from ugat_marl.paper.settings import RULE, matched_name
-from ugat_marl.report.comparison_tables import number, percent, share
-from ugat_marl.transfer import CONTROL, DIRECT, ORACLE, TIMED
+from ugat_marl.reporting import number, percent, share
 
 FOLDER = Path(__file__).parent
 BEGIN, END = "<!-- overview -->\n", "<!-- end of overview -->\n"

@@ -17,7 +17,7 @@ from demand import draw_demand
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
-from ugat_marl.networks.plan import convert, plain_xml, read_plan
+from ugat_marl.scenarios import convert, plain_xml, read_plan
 
 HERE = Path(__file__).resolve().parent
 BEGIN, END = "<!-- headroom: begin -->\n", "<!-- headroom: end -->\n"
@@ -43,15 +43,15 @@ def build(name: str, into: Path) -> list[Path]:
 def measure(name: str, seeds: list[int], workers: int | None) -> Path:
     """Writes the headroom of scenario `name` between the markers of its README."""
     # Building needs no simulation; only this does.
-    from ugat_marl.headroom import headroom, markdown
-    from ugat_marl.scenario import load_scenario
+    from ugat_marl.experiments import headroom, markdown
+    from ugat_marl.scenarios import read_scenario
 
     readme = HERE / name / "README.md"
     text = readme.read_text(encoding="utf-8")
     if BEGIN not in text or END not in text:
         raise ScenarioError(f"{readme}: has no lines {BEGIN.strip()!r} and {END.strip()!r}")
     before, _, rest = text.partition(BEGIN)
-    table = markdown(headroom(load_scenario(HERE / name), seeds=seeds, workers=workers))
+    table = markdown(headroom(read_scenario(HERE / name), seeds=seeds, workers=workers))
     caption = f"Means over the seeds {', '.join(map(str, seeds))}:\n\n"
     write_whole(readme, f"{before}{BEGIN}{caption}{table}{END}{rest.partition(END)[2]}")
     return readme

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.files import xml_bytes
-from ugat_marl.networks.plan import Plan, Road
-from ugat_marl.networks.walks import arrivals, pick
+from ugat_marl.scenarios import Plan, Road, arrivals, pick
 from ugat_marl.seeding import numpy_generator
 
 

@@ -15,6 +15,9 @@ import pytest
 
 import ugat_marl
 
+# `studies` is imported from the checkout; behind all else, so that the installed suite is tested.
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+
 hypothesis.settings.register_profile(
     "suite",
     deadline=None,
@@ -43,7 +46,7 @@ def pytest_report_header() -> str:
     return f"ugat_marl {ugat_marl.__version__} from {Path(ugat_marl.__file__).parent}"
 
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parent / "fixtures"
 
 ROUTES = """<routes>
     <vType id="car" vClass="passenger" length="5" minGap="2.5" accel="2.5" decel="4.5" sigma="0"

@@ -18,14 +18,17 @@ from typing import Any
 
 import pytest
 
-from ugat_marl.commands.arguments import workers_of
-from ugat_marl.discrepancy.engine import Engine
-from ugat_marl.discrepancy.replay import Replay
-from ugat_marl.discrepancy.site import Site
-from ugat_marl.effects import StartupDelay, load
+from ugat_marl.cli.arguments import workers_of
+from ugat_marl.data import TransitionLog
+from ugat_marl.diagnosis.engine import Engine
+from ugat_marl.diagnosis.replay import Replay
+from ugat_marl.diagnosis.site import Site
+from ugat_marl.effects import StartupDelay, load_scenario
+from ugat_marl.envs import TrafficEnv
 from ugat_marl.errors import OptionError, SimulatorCrashed
-from ugat_marl.evaluation import evaluate, rule_factory
-from ugat_marl.executors import (
+from ugat_marl.experiments import evaluate, rule_factory
+from ugat_marl.grounding import RollOut, roll_outs
+from ugat_marl.parallel import (
     RETRIES,
     LocalProcesses,
     RayExecutor,
@@ -36,13 +39,9 @@ from ugat_marl.executors import (
     persistently,
     usable_cores,
 )
-from ugat_marl.loops import standard_detectors
-from ugat_marl.measured.data import Period
-from ugat_marl.network import Network
-from ugat_marl.policy import Policy
-from ugat_marl.traffic_env import TrafficEnv
-from ugat_marl.transitions import TransitionLog
-from ugat_marl.worlds import RollOut, roll_outs
+from ugat_marl.policies import Policy
+from ugat_marl.scenarios import Network, Period
+from ugat_marl.simulation import standard_detectors
 
 LENGTH_S = 100.0
 
@@ -97,7 +96,7 @@ def test_a_stop_is_heard_where_it_was_made() -> None:
 
 def results(workers: Any, policies: Any = None) -> Any:
     policies = policies or {rule: rule_factory(rule) for rule in ("largest-queue:20", "random")}
-    scenario = load("single-v1")
+    scenario = load_scenario("single-v1")
     return evaluate(
         scenario, policies, ["sim", "V4"], [5, 6], duration_s=LENGTH_S, workers=workers
     ).results
@@ -136,7 +135,7 @@ def test_processes_give_what_threads_give() -> None:
 
 
 def test_roll_outs_are_in_the_order_of_their_seeds_whoever_plays_them() -> None:
-    scenario = load("single-v1")
+    scenario = load_scenario("single-v1")
     rule = rule_factory("largest-queue:20")
     each = RollOut(scenario, "V4", {"duration_s": LENGTH_S}, rule, 0.3, "count")
     alone = [each.play(seed, Stop())[0] for seed in (3, 1, 2)]
@@ -148,7 +147,7 @@ def test_roll_outs_are_in_the_order_of_their_seeds_whoever_plays_them() -> None:
 
 
 def engine_of(data: Path, workers: Any) -> Engine:
-    scenario = load(data / "crossing")
+    scenario = load_scenario(data / "crossing")
     network = Network.read(scenario)
     detectors = standard_detectors(network)
     site = Site.of(network, detectors)
@@ -183,7 +182,7 @@ def test_a_day_of_a_diagnosis_whose_simulator_dies_is_simulated_again(
         end = ends.pop(0) if Path(command[0]).stem == "sumo" else 0
         return subprocess.CompletedProcess(command, end, "", "") if end else run(command, **given)
 
-    monkeypatch.setattr("ugat_marl.discrepancy.replay.subprocess.run", killed)
+    monkeypatch.setattr("ugat_marl.diagnosis.replay.subprocess.run", killed)
     (found,) = engine_of(data, 1).replicates([], [0])
     assert (found.tally.sums == expected.tally.sums).all()
     assert len(ends) == 100
@@ -306,6 +305,6 @@ def test_ray_replaces_a_worker_that_dies(ray: Executor, tmp_path: Path) -> None:
 def test_what_is_watched_is_played_here(ray: Executor) -> None:
     with pytest.raises(OptionError, match="must be played here"):
         evaluate(
-            load("single-v1"), {"r": rule_factory("random")}, ["sim"], [1],
+            load_scenario("single-v1"), {"r": rule_factory("random")}, ["sim"], [1],
             workers=ray, watch=lambda name, env: lambda step: None,
         )  # fmt: skip

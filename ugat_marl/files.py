@@ -11,8 +11,10 @@ import contextlib
 import gzip
 import io
 import os
+import secrets
 import shutil
 import tempfile
+import weakref
 import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Iterable, Iterator
@@ -22,7 +24,6 @@ from typing import Any, BinaryIO, NamedTuple
 from xml.parsers import expat
 
 from ugat_marl.errors import OutputError, ScenarioError
-from ugat_marl.own_directory import OwnDirectory
 from ugat_marl.progress import Reporter, Silent, usual, watched
 
 _PIECE = 1 << 20
@@ -396,3 +397,31 @@ class Draft:
             content = self._file.getvalue() if isinstance(self._file, io.BytesIO) else None
             self._file.close()
         return Document(self._name, self._path, content, self._home)
+
+
+class OwnDirectory:
+    """Names a fresh folder for every simulation, and removes the one before.
+
+    The last one goes with this object; not when a forked child lets go of its copy, however.
+    """
+
+    def __init__(self) -> None:
+        self._remove: weakref.finalize[..., OwnDirectory] | None = None
+
+    def fresh(self) -> Path:
+        """The path of another folder; whoever uses it makes it."""
+        self.remove()
+        directory = Path(tempfile.gettempdir()) / f"ugat_marl-{secrets.token_hex(8)}"
+        self._remove = weakref.finalize(self, _remove_tree, directory, os.getpid())
+        return directory
+
+    def remove(self) -> None:
+        """Removes the folder, if there is one."""
+        remove, self._remove = self._remove, None
+        if remove is not None:
+            remove()
+
+
+def _remove_tree(directory: Path, owner: int) -> None:
+    if os.getpid() == owner:
+        shutil.rmtree(directory, ignore_errors=True)

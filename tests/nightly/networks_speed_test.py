@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.__main__ import main
-from ugat_marl.learners.dqn import DQN
-from ugat_marl.learners.dqn_config import DQNConfig
-from ugat_marl.traffic_env import parallel_env
+from ugat_marl.envs import parallel_env
+from ugat_marl.policies import DQN, DQNConfig
 
 LIMIT_S = 60.0
 

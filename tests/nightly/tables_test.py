@@ -11,12 +11,21 @@ from statistics import fmean
 
 import pytest
 
-from ugat_marl.comparison import Comparison
-from ugat_marl.paper.settings import RULE, constant_name
-from ugat_marl.paper.tables import PaperConfig, Planner, compare
+from ugat_marl.data import METRICS, Metrics
+from ugat_marl.experiments import (
+    CONTROL,
+    DIRECT,
+    ORACLE,
+    RULE,
+    TIMED,
+    Comparison,
+    PaperConfig,
+    compare,
+)
+from ugat_marl.experiments.paper.settings import constant_name
+from ugat_marl.experiments.paper.tables import Planner
+from ugat_marl.experiments.transfers import UGAT
 from ugat_marl.progress import Silent
-from ugat_marl.training import METRICS, Metrics
-from ugat_marl.transfer import CONTROL, DIRECT, ORACLE, TIMED, UGAT
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
 

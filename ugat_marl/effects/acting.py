@@ -1,7 +1,7 @@
 """Effects on what becomes of a controller's commands: the action gap.
 
-The controller's cabinet (`ugat_marl.cabinet`) puts them into practice. Whatever it does, the signal
-machine keeps minimum green, yellow and all-red.
+The controller's cabinet (`ugat_marl.envs.actuators`) puts them into practice. Whatever it does,
+the signal machine keeps minimum green, yellow and all-red.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from ugat_marl.effects.base import ControllerEffect, Effect, Parameter, Text
-from ugat_marl.scenario import Scenario
+from ugat_marl.scenarios import Scenario
 
 PHASE_ORDERS = ("cyclic", "barrier-leading", "barrier-lagging", "barrier-both")
-"""Rules for which phase may follow which; `ugat_marl.cabinet.successors` says what they are."""
+"""Rules for which phase may follow which; `ugat_marl.envs.actuators.successors` says what they
+are."""
 
 
 @dataclass(frozen=True)

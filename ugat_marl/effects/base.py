@@ -10,7 +10,7 @@ from numbers import Real
 from typing import Any, ClassVar, Literal
 
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.scenario import Scenario
+from ugat_marl.scenarios import Scenario
 
 EVERYWHERE = "*"
 """As a place: all of them."""

@@ -24,8 +24,7 @@ from ugat_marl.effects.documents import (
     windows,
 )
 from ugat_marl.effects.places import places_of
-from ugat_marl.scenario import Scenario
-from ugat_marl.scenario_settings import seconds_of
+from ugat_marl.scenarios import Scenario, seconds_of
 
 TAGS = ("<vehicle", "<trip", "<flow")
 """A document without these has no demand."""

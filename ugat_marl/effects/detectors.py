@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text, draw
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import UnknownNameError
-from ugat_marl.measured.data import Detector, Passages, Period
-from ugat_marl.scenario import Scenario
+from ugat_marl.scenarios import Detector, Passages, Period, Scenario
 
 _TIME = Parameter("s", 0.0, 1e7)
 _CLOCK = Text("traffic light", everywhere=True)

@@ -14,8 +14,7 @@ from itertools import islice
 from typing import IO
 
 from ugat_marl.files import Draft, child_texts, scratch, xml_bytes
-from ugat_marl.scenario import Document, Scenario
-from ugat_marl.scenario_settings import seconds_of
+from ugat_marl.scenarios import Document, Scenario, seconds_of
 
 DEFAULTS_FILE = "default-types.add.xml"
 """The types SUMO defines itself, written down so that effects can change them."""

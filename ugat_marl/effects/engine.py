@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, Parameter
-from ugat_marl.scenario import Scenario
-from ugat_marl.scenario_settings import validated
+from ugat_marl.scenarios import Scenario, validated
 
 HEADWAY_S = 1.4
 """Net headway of queues that drive on, of drivers who keep 1 s: SUMO multiplies it with theirs.

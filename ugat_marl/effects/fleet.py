@@ -21,7 +21,7 @@ from ugat_marl.effects.documents import (
 )
 from ugat_marl.effects.vehicles import driven_types
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenario import Scenario
+from ugat_marl.scenarios import Scenario
 
 _LEAST, _GREATEST = 0.2, 2.0
 """SUMO cuts speedFactor there unless a type says otherwise."""

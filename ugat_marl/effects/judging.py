@@ -1,7 +1,8 @@
 """Effects on what controllers are judged by: the reward gap.
 
 A domain with an objective has the same traffic and the same rewards; at the end of an episode its
-scores hold what the objective is made of, which no training ever sees (`ugat_marl.judging`).
+scores hold what the objective is made of, which no training ever sees
+(`ugat_marl.envs.objectives`).
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ OBJECTIVES: dict[str, dict[str, float]] = {
     "safety": {"queue": 0.5, "hard_brakings": 5.0, "collisions": 5.0},
     "person-delay": {"person_delay_s": 1.0},
 }
-"""Objectives: the weights of measures, each divided by its `ugat_marl.judging.NORMS`; their sum is
-the cost. The weights of queue, emissions, fairness and safety are those of Sim2Signal."""
+"""Objectives: the weights of measures, each divided by its
+`ugat_marl.envs.objectives.NORMS`; their sum is the cost. The weights of queue, emissions, fairness
+and safety are those of Sim2Signal."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Effects on what controllers see: the observation gap. Traffic and scores are not touched.
 
-`ugat_marl.sensing` puts them into practice. A *count* is what a lane's detector reports: vehicles
-and halting vehicles on the lane, and with them their waiting time.
+`ugat_marl.envs.sensors` puts them into practice. A *count* is what a lane's detector reports:
+vehicles and halting vehicles on the lane, and with them their waiting time.
 """
 
 from __future__ import annotations

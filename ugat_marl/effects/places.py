@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.files import parse_xml
-from ugat_marl.scenario import Scenario
+from ugat_marl.scenarios import Scenario
 
 
 @dataclass(frozen=True)

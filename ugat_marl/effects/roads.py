@@ -18,7 +18,7 @@ from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenario import Document, Scenario
+from ugat_marl.scenarios import Document, Scenario
 from ugat_marl.seeding import numpy_generator
 
 _LENGTH_M = 5.0

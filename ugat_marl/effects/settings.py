@@ -46,7 +46,7 @@ from ugat_marl.effects.vehicles import (
     apply_together,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
-from ugat_marl.scenario import Scenario, load_scenario
+from ugat_marl.scenarios import Scenario, read_scenario
 
 Domain = str | Sequence[Effect]
 """``"sim"``, a named domain or its alias, ``"effect=value+effect=value"``, a scenario directory or
@@ -236,12 +236,12 @@ def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
     return scenario
 
 
-def load(name: str | Path | Scenario) -> Scenario:
-    """Loads a scenario and applies the effects its own file lists (see `load_scenario`).
+def load_scenario(name: str | Path | Scenario) -> Scenario:
+    """Loads a scenario and applies the effects its own file lists (see `read_scenario`).
 
     Those on controllers stay listed in its settings, for the environment to keep.
     """
-    scenario = name if isinstance(name, Scenario) else load_scenario(name)
+    scenario = name if isinstance(name, Scenario) else read_scenario(name)
     where = f" in scenario {scenario.id!r}"
     effects = [effect_from(record, where) for record in scenario.settings.effects]
     plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
@@ -273,7 +273,7 @@ def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
     """The scenario as it is in `domain`.
 
     Args:
-        scenario: What `load` returned.
+        scenario: What `load_scenario` returned.
         domain: Effects, or the name of some, or the path of another scenario on the same network.
 
     Raises:
@@ -282,7 +282,7 @@ def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
         ScenarioError: A scenario named as a domain cannot be read or has other roads.
     """
     if (path := scenario_of(domain)) is not None:
-        other = load(path)
+        other = load_scenario(path)
         if _signals(other) != _signals(scenario):
             raise ScenarioError(
                 f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "

@@ -10,10 +10,8 @@ from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import ScenarioError
-from ugat_marl.scenario import Scenario
-from ugat_marl.scenario_settings import seconds_of, validated
-from ugat_marl.signals import LateGreen as Held
-from ugat_marl.signals import with_late_green
+from ugat_marl.scenarios import LateGreen as Held
+from ugat_marl.scenarios import Scenario, seconds_of, validated, with_late_green
 
 QUEUE_START_S = 2.0
 """What the mesoscopic model lacks at the start of a green: its queues move at once, all of them."""

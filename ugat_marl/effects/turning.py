@@ -16,8 +16,7 @@ from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
 from ugat_marl.effects.documents import edit_scenario, is_demand, mentions
 from ugat_marl.effects.places import Places, places_of
 from ugat_marl.errors import UnknownNameError
-from ugat_marl.naming import edge_of
-from ugat_marl.scenario import Scenario
+from ugat_marl.scenarios import Scenario, edge_of
 
 Way = tuple[str, ...]
 

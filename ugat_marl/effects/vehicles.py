@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, Parameter, Text
 from ugat_marl.effects.documents import edit_scenario, with_default_types
-from ugat_marl.scenario import Scenario
+from ugat_marl.scenarios import Scenario
 
 _NOT_DRIVEN = frozenset(
     {

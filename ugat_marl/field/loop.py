@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ugat_marl.actions import checked_phases
+from ugat_marl.envs import checked_phases
 from ugat_marl.errors import OptionError
 from ugat_marl.field.answering import Answering, Late, NoAnswer
 from ugat_marl.field.safety import Light, Trust, fixed_time, merged
@@ -25,8 +25,8 @@ from ugat_marl.field.site import Site
 from ugat_marl.field.street import LaneCount, Street
 from ugat_marl.field.watchdog import Limits, Watchdog
 from ugat_marl.files import require_writable, write_whole
-from ugat_marl.policy import Policy
-from ugat_marl.signals import GREEN, Segment
+from ugat_marl.policies import Policy
+from ugat_marl.scenarios import GREEN, Segment
 
 _WARM_UP_S = 30.0
 _WRITE_EVERY_S = 1.0

@@ -1,7 +1,8 @@
 """What holds whatever a policy asks for: signal machines, the plan to fall back on, and trust.
 
 No input, no output, no clock of its own. The signal machine is that of the environments
-(`ugat_marl.signals`); here it also begins from whatever a light shows when it is taken over.
+(`ugat_marl.scenarios.signals`); here it also begins from whatever a light shows when it is taken
+over.
 """
 
 from __future__ import annotations
@@ -12,11 +13,9 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl import signals
-from ugat_marl.controllers import FixedTime, Streets
 from ugat_marl.errors import OptionError
-from ugat_marl.network import Network
-from ugat_marl.signals import Segment, SignalState, SignalTiming
+from ugat_marl.policies import FixedTime, Streets
+from ugat_marl.scenarios import Network, Segment, SignalState, SignalTiming, signals
 
 _ENDING = frozenset("yYoO")
 """Yellow, and off: traffic may be in the junction, so that yellow is shown (again) in full."""

@@ -11,13 +11,11 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
+from ugat_marl.envs import Observer
 from ugat_marl.errors import OptionError
 from ugat_marl.field.street import LaneCount
-from ugat_marl.measurements import Snapshot
-from ugat_marl.network import Network, within
-from ugat_marl.observations import Observer
-from ugat_marl.scenario import Scenario
-from ugat_marl.signals import SignalTiming
+from ugat_marl.scenarios import Network, Scenario, SignalTiming, within
+from ugat_marl.simulation import Snapshot
 
 _INCOMING_ONLY = ("count", "queue", "density")
 _HALTING = ("queue", "movements")

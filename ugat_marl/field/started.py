@@ -14,13 +14,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from ugat_marl.effects.signals import late_greens
+from ugat_marl.effects import late_greens
 from ugat_marl.errors import OptionError
-from ugat_marl.measurements import Trips
-from ugat_marl.redraw import sumo_program
-from ugat_marl.scenario import Scenario
-from ugat_marl.simulator import launch_of
-from ugat_marl.trips import read_trips
+from ugat_marl.scenarios import Scenario, sumo_program
+from ugat_marl.simulation import Trips, launch_of, read_trips
 
 _PATIENCE_S = 10.0
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of <linux/prctl.h>

@@ -15,7 +15,6 @@ import math
 import torch
 from torch import Tensor, nn
 
-from ugat_marl.batched import BatchedLinear
 from ugat_marl.grounding.uncertainty import (
     AnswerNet,
     InversePrediction,
@@ -26,6 +25,7 @@ from ugat_marl.grounding.uncertainty import (
     negative_log_likelihood,
     prediction,
 )
+from ugat_marl.policies import BatchedLinear
 
 TEMPERATURE = 0.1
 """Of the relaxed coin, as in the paper."""

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ugat_marl.grounding.arrays import Floats
 from ugat_marl.grounding.calibration import (
     auroc,
     expected_calibration_error,
@@ -23,7 +24,6 @@ from ugat_marl.grounding.inverse import InverseModel
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import StackedTransitions
 from ugat_marl.grounding.uncertainty import InversePrediction, MethodName
-from ugat_marl.intervals import Floats
 
 QUANTILES = 5
 DISCRIMINATES = 0.55

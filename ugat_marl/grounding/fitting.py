@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ugat_marl.batched import one_thread
-from ugat_marl.devices import CPU, placed
+from ugat_marl.data import TransitionLog
 from ugat_marl.errors import LogError
 from ugat_marl.grounding.evidential import annealing
 from ugat_marl.grounding.fit_config import FitConfig
@@ -29,8 +28,8 @@ from ugat_marl.grounding.inverse import AnswerModel, InverseModel
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import StackedTransitions, refuse_other_agents, stack_log
 from ugat_marl.grounding.uncertainty import Lesson
+from ugat_marl.policies import CPU, one_thread, placed
 from ugat_marl.seeding import torch_generator
-from ugat_marl.transitions import TransitionLog
 
 
 @one_thread()

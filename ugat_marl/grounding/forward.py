@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ugat_marl.batched import BatchedMLP, mask_of
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.products import rows_at_once
 from ugat_marl.grounding.scaling import SMALLEST_SPREAD, Standardiser
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.view import View
+from ugat_marl.policies import BatchedMLP, mask_of
 
 
 @dataclass(frozen=True)

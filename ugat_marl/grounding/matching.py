@@ -19,9 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
+from scipy import special
 
-from ugat_marl.intervals import Floats, student_p
-from ugat_marl.transitions import TransitionLog
+from ugat_marl.data import TransitionLog
+from ugat_marl.grounding.arrays import Floats
 
 MATCHED_REWARD = "queue"
 """The reward that can be matched: it falls with every delay, and an episode's mean is one of many
@@ -111,7 +112,7 @@ def chance_of(paid: Paid, delay_s: Floats) -> float:
     beyond = float(street.mean()) - expected
     if beyond == 0.0 or error == 0.0:
         return 1.0 if beyond == 0.0 else 0.0
-    return student_p(beyond / error, degrees)
+    return 2.0 * float(special.stdtr(degrees, -abs(beyond / error)))
 
 
 def _relative_squares(group: Floats) -> float:

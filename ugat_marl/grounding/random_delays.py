@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
 
-from ugat_marl.policy import AnyParallelEnv, Begun, Stepped
+from ugat_marl.envs import AnyParallelEnv, Begun, Stepped
 from ugat_marl.seeding import numpy_generator
 
 LEAST_CHANCE = 0.5

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ugat_marl.batched import mask_of
+from ugat_marl.data import AgentLayout, TransitionLog
 from ugat_marl.errors import LogError
-from ugat_marl.transitions import AgentLayout, TransitionLog
+from ugat_marl.policies import mask_of
 
 
 class Stack:

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ugat_marl.data import AgentLayout
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.delays import DelayedForward, DelayModel, TimedConfig, likely_delay
 from ugat_marl.grounding.forward import ForwardConfig
@@ -26,7 +27,6 @@ from ugat_marl.grounding.transform import Grounding, Transform
 from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours
 from ugat_marl.seeding import torch_generator
-from ugat_marl.transitions import AgentLayout
 
 
 class _Constants(nn.Module):

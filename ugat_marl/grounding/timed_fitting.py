@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ugat_marl.batched import one_thread
-from ugat_marl.devices import CPU
+from ugat_marl.data import TransitionLog
+from ugat_marl.grounding.arrays import Floats
 from ugat_marl.grounding.fit_config import FitConfig
 from ugat_marl.grounding.fit_loop import EpochCallback, Split, split
 from ugat_marl.grounding.fit_report import Calibration, TrainingRecord, with_the_others
@@ -26,9 +26,8 @@ from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.stacked import Stack, StackedTransitions, stack_log
 from ugat_marl.grounding.timed import TimedTransform
 from ugat_marl.grounding.timed_report import DelayReport, TimedReport, mean_error
-from ugat_marl.intervals import Floats
+from ugat_marl.policies import CPU, one_thread
 from ugat_marl.seeding import torch_generator
-from ugat_marl.transitions import TransitionLog
 
 
 @one_thread()

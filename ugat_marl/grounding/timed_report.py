@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ugat_marl.grounding.arrays import Floats
 from ugat_marl.grounding.fit_report import (
     Calibration,
     ForwardReport,
@@ -18,7 +19,6 @@ from ugat_marl.grounding.fit_report import (
 from ugat_marl.grounding.lost_time import LostTime
 from ugat_marl.grounding.matching import Matched
 from ugat_marl.grounding.uncertainty import MethodName
-from ugat_marl.intervals import Floats
 
 END_S = 0.5
 """A best delay so close to the longest one tried may well be longer."""

@@ -17,8 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ugat_marl.batched import one_thread
-from ugat_marl.checkpoints import read_checkpoint, write_checkpoint
+from ugat_marl.data import AgentLayout, read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.gate import Gate, GateConfig
@@ -27,8 +26,8 @@ from ugat_marl.grounding.joint import alone, together, turns
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours, View
+from ugat_marl.policies import one_thread
 from ugat_marl.seeding import torch_generator
-from ugat_marl.transitions import AgentLayout
 
 KIND = "grounding"
 """What a checkpoint file of this module says it is."""

@@ -23,8 +23,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from ugat_marl.batched import BatchedMLP
 from ugat_marl.errors import OptionError
+from ugat_marl.policies import BatchedMLP
 
 MOST = 100
 """Members or passes above which a number is taken for a mistake."""

@@ -15,10 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import LogError, OptionError
 from ugat_marl.grounding.stacked import Stack, StackedTransitions
-from ugat_marl.network import within
-from ugat_marl.policy import AnyParallelEnv
+from ugat_marl.scenarios import within
 
 Neighbours = Mapping[str, Sequence[str]]
 """Agent to the agents around it."""

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from pettingzoo.utils import BaseParallelWrapper
 
+from ugat_marl.envs import AnyParallelEnv, Begun, Stepped
 from ugat_marl.errors import ActionError, OptionError
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import Moment
-from ugat_marl.policy import AnyParallelEnv, Begun, Stepped
 
 Infos = dict[str, dict[str, Any]]
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.policy import Actions, AnyParallelEnv
+from ugat_marl.envs import Actions, AnyParallelEnv
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.testing.results import ConformanceError, Listening, NotChecked
 

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
-from ugat_marl.policy import AnyParallelEnv
-from ugat_marl.simulator import simulates_here
+from ugat_marl.envs import AnyParallelEnv
+from ugat_marl.simulation import simulates_here
 from ugat_marl.testing.episodes import EnvironmentCase, random_actions
 from ugat_marl.testing.results import ConformanceError, Listening, require, said
 

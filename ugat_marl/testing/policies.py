@@ -1,4 +1,4 @@
-"""Checks of a policy: what `ugat_marl.policy.Policy` promises."""
+"""Checks of a policy: what `ugat_marl.policies.protocols.Policy` promises."""
 
 from __future__ import annotations
 
@@ -10,15 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.policy import Policy
+from ugat_marl.policies import Policy
 from ugat_marl.seeding import numpy_generator
-from ugat_marl.testing.episodes import (
-    EnvironmentCase,
-    MakeEnv,
-    Moment,
-    allowed_actions,
-    different,
-)
+from ugat_marl.testing.episodes import EnvironmentCase, MakeEnv, Moment, allowed_actions, different
 from ugat_marl.testing.results import ConformanceError, NotChecked, Result, require, run_checks
 
 Answers = list[Mapping[str, Any]]
@@ -101,7 +95,7 @@ def it_is_a_policy(case: PolicyCase) -> None:
     for name in ("reset", "act"):
         require(
             callable(getattr(case.policy, name, None)),
-            f"the policy has no method {name}(); see ugat_marl.policy.Policy",
+            f"the policy has no method {name}(); see ugat_marl.policies.protocols.Policy",
         )
     options: Any = getattr(case.policy, "env_options", None)
     require(

@@ -9,15 +9,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ugat_marl.demand import Demand, check_demand
-from ugat_marl.effects import SETTINGS, in_domain, load
-from ugat_marl.network import Intersection, Network
-from ugat_marl.phases import conflicting_greens
-from ugat_marl.scenario import Scenario, load_scenario
-from ugat_marl.signals import GREEN
+from ugat_marl.effects import SETTINGS, in_domain, load_scenario
+from ugat_marl.envs import TrafficEnv, parallel_env
+from ugat_marl.scenarios import (
+    GREEN,
+    Demand,
+    Intersection,
+    Network,
+    Scenario,
+    check_demand,
+    conflicting_greens,
+    read_scenario,
+)
 from ugat_marl.testing.episodes import begin, proceed, random_actions
 from ugat_marl.testing.results import NotChecked, Result, require, run_checks
-from ugat_marl.traffic_env import TrafficEnv, parallel_env
 
 Change = Callable[[Scenario, str], Scenario]
 """Puts a scenario into a domain."""
@@ -44,7 +49,7 @@ class ScenarioCase:
 
     @cached_property
     def _scenario(self) -> Scenario:
-        return load(self.name)
+        return load_scenario(self.name)
 
     @cached_property
     def _network(self) -> Network:
@@ -236,7 +241,7 @@ def writing_keeps_it(case: ScenarioCase) -> None:
     for domain in ("sim", "V4"):
         changed = case.in_domain(domain)
         with TemporaryDirectory(prefix="ugat_marl-check-") as folder:
-            again = load_scenario(changed.write(Path(folder) / "written-v1"))
+            again = read_scenario(changed.write(Path(folder) / "written-v1"))
             require(
                 again.hash == changed.hash,
                 f"in {domain}, the scenario that was written and loaded has another hash: "

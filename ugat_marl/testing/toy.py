@@ -14,10 +14,9 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from ugat_marl.data import AgentLayout, Scores
+from ugat_marl.envs import Stepped
 from ugat_marl.errors import ActionError, EpisodeError
-from ugat_marl.metrics import Scores
-from ugat_marl.policy import Stepped
-from ugat_marl.transitions import AgentLayout
 
 CAPACITY = 20
 """Vehicles that fit on a lane."""

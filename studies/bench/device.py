@@ -1,0 +1,133 @@
+"""``bench device``: from how many intersections on a GPU pays, for updates of DQN and for fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from studies.bench.measured import in_fresh_process
+from studies.bench.report import Report, Spread, require_positive
+from ugat_marl.errors import OptionError
+from ugat_marl.policies import device_of
+from ugat_marl.progress import Reporter, Silent
+
+_PROGRAM = ["-m", "studies.bench.device_rounds"]
+
+
+@dataclass(frozen=True)
+class DeviceBench:
+    """What an update of DQN and a fit of f and h take on the CPU and on a GPU, size by size.
+
+    Observations, rewards and transitions are random: nothing is simulated. Every round measures
+    each size on the CPU and directly after it on the GPU. Times are wall time, with all that goes
+    back and forth; the CPU computes on one thread, as it does in training.
+
+    Examples:
+        python -m studies.bench device --device cuda --out device.json
+        python -m studies.bench device --device cuda:1 --sizes 64 256 --rounds 9
+
+    Attributes:
+        device: What is compared with the CPU: cuda, or cuda:N.
+        sizes: Numbers of intersections.
+        rounds: Repetitions; medians and quartiles are over these.
+        updates: Updates that are timed together.
+        batch_size: Transitions per update and intersection.
+        epochs: Passes over the rows in each of the three trainings of a fit.
+        steps: Decisions in each of the four episodes that are fitted.
+        seed: Of all that is drawn.
+        out: JSON file to write.
+    """
+
+    device: str = "cuda"
+    sizes: tuple[int, ...] = (1, 4, 16, 64, 256)
+    rounds: int = 5
+    updates: int = 50
+    batch_size: int = 32
+    epochs: int = 10
+    steps: int = 360
+    seed: int = 1
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not self.sizes:
+            raise OptionError("bench device: sizes is empty; name numbers of intersections")
+        require_positive(
+            "device",
+            sizes=min(self.sizes),
+            rounds=self.rounds,
+            updates=self.updates,
+            batch_size=self.batch_size,
+            epochs=self.epochs,
+            steps=self.steps,
+        )
+        if self.device == "cpu":
+            raise OptionError(
+                "bench device: device = 'cpu' is what it is compared with; name cuda, or cuda:N"
+            )
+
+    def run(self, reporter: Reporter | None = None) -> Report:
+        """Measures, and writes `out` if it is given.
+
+        Args:
+            reporter: Is told what is being measured.
+
+        Raises:
+            OptionError: Torch sees no such GPU.
+            MeasurementError: The measured process failed.
+        """
+        device_of(self.device)
+        asked = {**asdict(self), "out": None, "sizes": sorted(set(self.sizes))}
+        with (reporter or Silent()).task(f"updates and fits on cpu and {self.device}", 1):
+            found = in_fresh_process(_PROGRAM, asked, timeout_s=6 * 3600.0)
+        report = compared(found, asked)
+        if self.out is not None:
+            report.write(self.out)
+        return report
+
+
+def compared(found: dict[str, Any], settings: dict[str, Any]) -> Report:
+    """The times of both as a table, and from which size on the other device is the faster one.
+
+    Args:
+        found: What `device_rounds.measure` returns.
+        settings: Options of the bench.
+    """
+    sizes, device = settings["sizes"], settings["device"]
+    rows: list[dict[str, Any]] = []
+    notes = [f"{device}: {found['name']}. Medians of {settings['rounds']} rounds, wall time."]
+    for what, unit in (("update of DQN", "ms"), ("fit of f and h", "s")):
+        ratios: list[float] = []
+        for size in sizes:
+            own = found["times"][what][str(size)]
+            ratio = Spread.of_ratios(own["cpu"], own["device"])
+            ratios.append(ratio.median)
+            rows.append(
+                {
+                    "what": f"{what} [{unit}]",
+                    "intersections": size,
+                    "cpu": Spread.of(own["cpu"]),
+                    device: Spread.of(own["device"]),
+                    f"cpu / {device}": ratio,
+                }
+            )
+        first = pays_from(sizes, ratios)
+        told = f"does not pay up to {sizes[-1]}" if first is None else f"pays from {first}"
+        notes.append(f"{what}: {device} {told} intersections.")
+    return Report("device", settings, rows, [], notes, by=("what",))
+
+
+def pays_from(sizes: Sequence[int], ratios: Sequence[float]) -> int | None:
+    """The smallest size from which on all are faster than on the CPU; None if the largest is not.
+
+    Args:
+        sizes: Rising.
+        ratios: Time on the CPU over time on the other device, one per size.
+    """
+    first: int | None = None
+    for size, ratio in zip(reversed(sizes), reversed(ratios), strict=True):
+        if ratio <= 1:
+            break
+        first = size
+    return first

@@ -1,0 +1,52 @@
+"""``bench all``: every figure in one report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from studies.bench.fitting import FittingBench
+from studies.bench.learning import LearningBench
+from studies.bench.memory import MemoryBench
+from studies.bench.report import Report
+from studies.bench.speed import EnvBench
+from ugat_marl.progress import Reporter
+
+
+@dataclass(frozen=True)
+class AllBench:
+    """All benches that measure the machine's time and memory, one after the other.
+
+    Examples:
+        python -m studies.bench all --env.rounds 3 --out bench
+
+    Attributes:
+        env: Options of ``bench env``.
+        learning: Options of ``bench learning``.
+        fitting: Options of ``bench fitting``.
+        memory: Options of ``bench memory``.
+        out: Folder for one JSON file per bench.
+    """
+
+    env: EnvBench = field(default_factory=EnvBench)
+    learning: LearningBench = field(default_factory=LearningBench)
+    fitting: FittingBench = field(default_factory=FittingBench)
+    memory: MemoryBench = field(default_factory=MemoryBench)
+    out: Path | None = None
+
+    def run(self, reporter: Reporter | None = None) -> list[Report]:
+        """Measures all of them; each report is written as soon as it is there.
+
+        Args:
+            reporter: Is told how far the measuring has come.
+
+        Raises:
+            MeasurementError: A measured process failed.
+        """
+        reports: list[Report] = []
+        for name in ("env", "learning", "fitting", "memory"):
+            bench: EnvBench | LearningBench | FittingBench | MemoryBench = getattr(self, name)
+            if self.out is not None and bench.out is None:
+                bench = replace(bench, out=self.out / f"{name}.json")
+            reports.append(bench.run(reporter))
+        return reports

@@ -1,0 +1,220 @@
+"""What a blind test consists of on disk: a plan the diagnosis may read, and labels it may not.
+
+A folder of a blind test holds ``plan.json``, one folder per case with its measured data and, in
+time, its diagnosis, and ``labels/<case>.json``, opened by the grading alone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.effects import Effect
+from ugat_marl.errors import BlindTestError, UnknownNameError
+from ugat_marl.files import write_whole
+
+PLAN, LABELS, GRADES, VISIBLE = "plan.json", "labels", "grades.json", "visible.json"
+DIAGNOSIS, RUN = "diagnosis.json", "run.json"
+SCHEMA = "ugat-marl/blind/1"
+
+WINDOW = ("begin_s", "end_s")
+"""Fields of effects that tell when, and not how much."""
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """One effect, in the form in which a diagnosis names it.
+
+    Attributes:
+        name: Name of the effect.
+        place: Its text fields, joined by ``>``; None if it has none.
+        window: Begin and end, s; None if it is always there.
+        parameters: Its other numbers.
+        nominal: The value of each of them without the effect, where there is one.
+    """
+
+    name: str
+    place: str | None = None
+    window: tuple[float, float] | None = None
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    nominal: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, effect: Effect, nominal: Mapping[str, float] | None = None) -> Hidden:
+        """An effect of the library as a diagnosis would write it."""
+        record = effect.record()
+        texts = [str(record[key]) for key in effect.texts]
+        window = None
+        if all(key in record for key in WINDOW):
+            window = (float(record["begin_s"]), float(record["end_s"]))
+        numbers = {
+            key: float(value)
+            for key, value in record.items()
+            if key not in ("name", *WINDOW, *effect.texts)
+        }
+        return cls(effect.name, ">".join(texts) or None, window, numbers, dict(nominal or {}))
+
+    @classmethod
+    def from_dict(cls, raw: Mapping[str, Any]) -> Hidden:
+        """From JSON."""
+        window = raw.get("window")
+        return cls(
+            str(raw["name"]),
+            raw.get("place"),
+            None if window is None else (float(window[0]), float(window[1])),
+            dict(raw.get("parameters") or {}),
+            dict(raw.get("nominal") or {}),
+        )
+
+
+@dataclass(frozen=True)
+class Label:
+    """The truth about one case.
+
+    Attributes:
+        case: Id of the case.
+        scenario: Name of its scenario.
+        group: ``none``, ``single``, ``pair``, ``setting`` or ``outside``.
+        hidden: What is hidden, in a word: an effect, two joined by ``+``, ``V3``, ``bus_stops``.
+        strength: ``small``, ``medium`` or ``large``, where that means something.
+        effects: The hidden effects that a diagnosis can name; for the group ``outside`` there is
+            none that explains the data.
+        leave_out: Effects the diagnosis may not use.
+        lights: Traffic lights that agents control.
+        begin_s: Start of the periods.
+        end_s: End of the periods.
+        periods: Number of periods.
+        speeds: Whether speeds were measured.
+        policy: Who controlled the signals.
+        seed: Seed of the measured data.
+        measured: Hash of the measured data.
+    """
+
+    case: str
+    scenario: str
+    group: str
+    hidden: str
+    strength: str
+    effects: tuple[Hidden, ...]
+    leave_out: tuple[str, ...]
+    lights: tuple[str, ...]
+    begin_s: float
+    end_s: float
+    periods: int
+    speeds: bool
+    policy: str
+    seed: int
+    measured: str
+
+    @classmethod
+    def from_dict(cls, raw: Mapping[str, Any]) -> Label:
+        """From JSON."""
+        values = {item.name: raw[item.name] for item in fields(cls)}
+        values["effects"] = tuple(Hidden.from_dict(item) for item in raw["effects"])
+        for key in ("leave_out", "lights"):
+            values[key] = tuple(raw[key])
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What the diagnosis may know about a case.
+
+    Attributes:
+        case: Its id, which says nothing.
+        scenario: Name of the scenario that is to be corrected.
+        leave_out: Effects the diagnosis has to do without.
+    """
+
+    case: str
+    scenario: str
+    leave_out: tuple[str, ...] = ()
+
+
+def write_plan(directory: Path, cases: tuple[Case, ...]) -> None:
+    """Writes what the diagnosis may know."""
+    content = {"schema": SCHEMA, "cases": [asdict(case) for case in cases]}
+    write_whole(directory / PLAN, json.dumps(content, indent=1) + "\n")
+
+
+def read_plan(directory: Path) -> tuple[Case, ...]:
+    """Reads what the diagnosis may know.
+
+    Raises:
+        BlindTestError: There is no plan, or it is not one.
+    """
+    raw = read_json(directory / PLAN)
+    try:
+        return tuple(
+            Case(str(item["case"]), str(item["scenario"]), tuple(item["leave_out"]))
+            for item in raw["cases"]
+        )
+    except (KeyError, TypeError) as error:
+        raise BlindTestError(
+            f"{directory / PLAN}: not the plan of a blind test ({error}); make one with "
+            "python -m studies.blind generate"
+        ) from None
+
+
+def chosen(directory: Path, only: Sequence[str]) -> tuple[Case, ...]:
+    """The cases with these ids; all of them without any.
+
+    Raises:
+        BlindTestError: Not a blind test.
+        UnknownNameError: No such case.
+    """
+    cases = read_plan(directory)
+    known = [case.case for case in cases]
+    for name in only:
+        if name not in known:
+            raise UnknownNameError("case", name, known)
+    return tuple(case for case in cases if not only or case.case in only)
+
+
+def label_path(directory: Path, case: str) -> Path:
+    """Where the truth about a case lies."""
+    return directory / LABELS / f"{case}.json"
+
+
+def write_label(directory: Path, label: Label) -> None:
+    """Seals the truth about a case."""
+    text = json.dumps(asdict(label), indent=1, allow_nan=False)
+    write_whole(label_path(directory, label.case), text + "\n")
+
+
+def read_label(directory: Path, case: str) -> Label:
+    """Opens the truth about a case.
+
+    Raises:
+        BlindTestError: It is missing or damaged.
+    """
+    path = label_path(directory, case)
+    try:
+        return Label.from_dict(read_json(path))
+    except (KeyError, TypeError, ValueError) as error:
+        raise BlindTestError(f"{path}: not a label ({error}); generate the case again") from None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object a JSON file holds.
+
+    Raises:
+        BlindTestError: Missing, cut short, or not an object.
+    """
+    try:
+        found: Any = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise BlindTestError(
+            f"{path}: no such file; python -m studies.blind generate, run and grade "
+            "write them in turn"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise BlindTestError(
+            f"{path}: cannot be read as JSON ({error}); it may be cut short"
+        ) from None
+    if not isinstance(found, dict):
+        raise BlindTestError(f"{path}: holds {type(found).__name__}, not an object")
+    return found

@@ -1,0 +1,231 @@
+"""``python -m studies.blind``: hide effects, diagnose the data, open the labels, sum up."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from studies.blind.cases import Case
+from studies.blind.drawing import GROUPS
+from studies.blind.generate import Blueprint, generate
+from studies.blind.grade import grade_cases, read_grades
+from studies.blind.run import Diagnose, run_cases
+from studies.blind.strengths import STRENGTHS
+from studies.blind.table import markdown, write_table
+from studies.blind.visible import judge_visibility
+from ugat_marl.cli.arguments import LengthS
+from ugat_marl.data import read_measured
+from ugat_marl.effects import load_scenario
+from ugat_marl.errors import BlindTestError, OptionError
+from ugat_marl.files import require_writable
+from ugat_marl.progress import Bars, Silent
+from ugat_marl.scenarios import Network
+
+
+@dataclass(frozen=True)
+class BlindGenerate:
+    """Hides effects in scenarios, measures them, and seals what was hidden.
+
+    Then follow blind run, blind grade and blind table (docs/blind-tests.md).
+
+    Examples:
+        python -m studies.blind generate --scenario single-v1 --cases 40 --out blind
+        python -m studies.blind generate --scenario single-v1 --classes none --out nulls
+
+    Attributes:
+        scenario: Scenarios the cases are spread over.
+        out: Directory of the blind test; one that is there is gone on with.
+        classes: What is hidden: none, single, pair, setting, outside, and names of effects.
+        strengths: Strengths of single effects: small, medium, large.
+        cases: Number of cases.
+        seed: Root of all seeds.
+        periods: Days per case.
+        speeds: Whether the detectors measure speeds.
+        pressure_share: Share of the cases under max-pressure control, not fixed-time.
+        duration_s: Length of a day in s.
+    """
+
+    scenario: tuple[str, ...]
+    out: Path
+    classes: tuple[str, ...] = tuple(GROUPS)
+    strengths: tuple[str, ...] = STRENGTHS
+    cases: int = 40
+    seed: int = 0
+    periods: int = 5
+    speeds: bool = True
+    pressure_share: float = 0.2
+    duration_s: LengthS = None
+
+    def run(self, console: Console) -> int:
+        """Generates."""
+        blueprint = Blueprint(
+            self.scenario,
+            self.classes,
+            self.strengths,
+            self.cases,
+            self.seed,
+            self.periods,
+            self.speeds,
+            self.pressure_share,
+            self.duration_s,
+        )
+        require_writable(self.out / "plan.json")
+        made = generate(self.out, blueprint, Bars(console))
+        console.print(f"{made} of {self.cases} cases made: {self.out}", soft_wrap=True)
+        return 0
+
+
+@dataclass(frozen=True)
+class BlindRun:
+    """Diagnoses the cases that have no diagnosis yet; the labels stay closed.
+
+    Examples:
+        python -m studies.blind run blind --budget-s 600
+
+    Attributes:
+        directory: Directory of a blind test.
+        jobs: Cases at a time.
+        budget_s: Time for each diagnosis, s.
+        alpha: Chance of finding something where there is nothing.
+        seed: Seed of the diagnoses.
+        only: Names of the cases to diagnose.
+    """
+
+    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    jobs: int = 1
+    budget_s: float = 600.0
+    alpha: float = 0.05
+    seed: int = 0
+    only: Annotated[
+        tuple[str, ...], arg(metavar="CASE ...", help_behavior_hint="(default: all)")
+    ] = ()
+
+    def run(self, console: Console) -> int:
+        """Runs; the exit code is 1 if a diagnosis failed."""
+        if self.jobs < 1 or self.budget_s <= 0:
+            raise OptionError("--jobs must be at least 1 and --budget-s above 0")
+        command = [
+            "blind", "run", str(self.directory), "--budget-s", str(self.budget_s),
+            "--alpha", str(self.alpha), "--seed", str(self.seed),
+        ]  # fmt: skip
+        done, failed = run_cases(
+            self.directory,
+            self._diagnose(),
+            only=self.only,
+            jobs=self.jobs,
+            command=command,
+            reporter=Bars(console),
+        )
+        console.print(f"{done} diagnosed, {failed} failed: {self.directory}", soft_wrap=True)
+        return 1 if failed else 0
+
+    def _diagnose(self) -> Diagnose:
+        try:
+            workflow: Any = importlib.import_module("ugat_marl.diagnosis.workflow")
+        except ModuleNotFoundError as error:
+            raise BlindTestError(f"the diagnosis is not installed ({error})") from None
+
+        def diagnose(case: Case, measured: Path, directory: Path) -> None:
+            scenario = load_scenario(case.scenario)
+            config = workflow.DiagnosisConfig(
+                budget_s=self.budget_s, alpha=self.alpha, seed=self.seed, leave_out=case.leave_out
+            )
+            data = read_measured(measured, scenario, Network.read(scenario))
+            workflow.diagnose(scenario, data, directory, config, Silent())
+
+        return diagnose
+
+
+@dataclass(frozen=True)
+class BlindVisible:
+    """Asks of single effects whether a test that knows them would see them.
+
+    Opens the labels of diagnosed cases, and of no others. Grade them again then.
+
+    Examples:
+        python -m studies.blind visible blind
+
+    Attributes:
+        directory: Directory of a blind test.
+        seed: Seed of the diagnoses, whose simulated days are used again.
+        only: Names of the cases to judge.
+    """
+
+    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    seed: int = 0
+    only: Annotated[
+        tuple[str, ...], arg(metavar="CASE ...", help_behavior_hint="(default: all)")
+    ] = ()
+
+    def run(self, console: Console) -> int:
+        """Judges."""
+        found = judge_visibility(
+            self.directory, only=self.only, seed=self.seed, reporter=Bars(console)
+        )
+        for case, deviations in sorted(found.items()):
+            said = "in the log of the signals" if deviations is None else f"{deviations:.1f} sd"
+            console.print(f"{case}  {said}", soft_wrap=True)
+        return 0
+
+
+@dataclass(frozen=True)
+class BlindGrade:
+    """Opens the labels of the cases that have been diagnosed, and writes grades.json.
+
+    Examples:
+        python -m studies.blind grade blind
+
+    Attributes:
+        directory: Directory of a blind test.
+    """
+
+    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+
+    def run(self, console: Console) -> int:
+        """Grades."""
+        grades = grade_cases(self.directory)
+        for item in grades:
+            wrong = ", confident and wrong" if item.confident_wrong else ""
+            named = " + ".join(item.named) or "nothing"
+            line = f"{item.case}  {item.outcome}{wrong}: {item.hidden} {item.strength}".rstrip()
+            console.print(f"{line}; {item.verdict}, {named}", soft_wrap=True)
+        console.print(f"{len(grades)} cases graded: {self.directory}", soft_wrap=True)
+        return 0
+
+
+@dataclass(frozen=True)
+class BlindTable:
+    """Sums up the grades of one blind test or several.
+
+    Examples:
+        python -m studies.blind table blind nulls --out table.md
+
+    Attributes:
+        directories: Directories of blind tests that have been graded.
+        out: File for the table: Markdown, or JSON if its name ends in .json.
+    """
+
+    directories: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="DIR ...", help_behavior_hint="(required)")
+    ]
+    out: Annotated[
+        Path | None, arg(metavar="PATH", help_behavior_hint="(default: only printed)")
+    ] = None
+
+    def run(self, console: Console) -> int:
+        """Prints, and writes."""
+        if not self.directories:
+            raise OptionError("give at least one blind test")
+        if self.out is not None:
+            require_writable(self.out)
+        grades = [item for directory in self.directories for item in read_grades(directory)]
+        console.print(markdown(grades), soft_wrap=True, markup=False)
+        if self.out is not None:
+            write_table(grades, self.out)
+            console.print(f"table: {self.out}", soft_wrap=True)
+        return 0

@@ -1,0 +1,351 @@
+"""Opens the labels of diagnosed cases and says what was right, by docs/blind-tests.md."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from studies.blind.cases import (
+    DIAGNOSIS,
+    GRADES,
+    RUN,
+    SCHEMA,
+    VISIBLE,
+    Hidden,
+    Label,
+    read_json,
+    read_label,
+    read_plan,
+)
+from studies.blind.equivalence import (
+    canonical,
+    canonical_effect,
+    found_effect,
+    match,
+    required_and_allowed,
+    same_name,
+)
+from ugat_marl.errors import BlindTestError
+from ugat_marl.files import write_whole
+
+Verdict = Literal[
+    "no_discrepancy", "explained", "not_identifiable", "partially_explained", "unknown", "failed"
+]
+Outcome = Literal["right", "missed", "wrong", "abstained", "failed"]
+
+SEEN = 3.2
+"""Standard deviations: a level of 5 % shared by the 32 effects of the library, on two sides."""
+
+NAMING: frozenset[Verdict] = frozenset({"explained", "partially_explained"})
+"""Verdicts that say: this is it."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter of an effect that was named at the right place.
+
+    Attributes:
+        effect: Name of the effect.
+        parameter: Its field.
+        true: The hidden value.
+        value: The value found.
+        relative: Distance of the two over the hidden value; None if that is 0.
+        of_effect: Distance of the two over the distance of the hidden from the nominal value.
+        inside: Whether the interval holds the hidden value; None without an interval.
+    """
+
+    effect: str
+    parameter: str
+    true: float
+    value: float
+    relative: float | None
+    of_effect: float | None
+    inside: bool | None
+
+
+@dataclass(frozen=True)
+class Grade:
+    """How one case was diagnosed.
+
+    Attributes:
+        case: Id of the case.
+        scenario: Its scenario.
+        group: Group of what was hidden.
+        hidden: What was hidden.
+        strength: Its strength.
+        periods: Number of periods.
+        speeds: Whether speeds were measured.
+        lights: Number of traffic lights.
+        verdict: What the diagnosis says.
+        named: Effects it names.
+        outcome: What that is worth.
+        among: Whether the right names are among those it cannot tell apart.
+        found: Share of the hidden effects that it names.
+        confident_wrong: Whether it calls explained what it gets wrong, in name or in place.
+        place_right: Whether all places are right; None where there is none, or the name is wrong.
+        window_iou: Overlap of the windows over their union; None likewise.
+        estimates: Parameters of effects named at the right place.
+        shrink: Share of the held-out gap that is gone.
+        policy_shrink: Share of the policy gap that is gone.
+        wall_s: Time the diagnosis took.
+        visible: Whether a test that knows the effect sees it, or the log of the signals shows it;
+            None where that was not judged.
+    """
+
+    case: str
+    scenario: str
+    group: str
+    hidden: str
+    strength: str
+    periods: int
+    speeds: bool
+    lights: int
+    verdict: Verdict
+    named: tuple[str, ...]
+    outcome: Outcome
+    among: bool
+    found: float
+    confident_wrong: bool
+    place_right: bool | None
+    window_iou: float | None
+    estimates: tuple[Estimate, ...]
+    shrink: float | None
+    policy_shrink: float | None
+    wall_s: float | None
+    visible: bool | None = None
+
+    @classmethod
+    def from_dict(cls, raw: Mapping[str, Any]) -> Grade:
+        """From JSON."""
+        values = dict(raw)
+        values["named"] = tuple(raw["named"])
+        values["estimates"] = tuple(Estimate(**item) for item in raw["estimates"])
+        return cls(**values)
+
+
+def grade_cases(directory: Path) -> tuple[Grade, ...]:
+    """Grades every case whose diagnosis is there, or whose diagnosis failed, and writes them.
+
+    The labels of other cases stay closed.
+
+    Raises:
+        BlindTestError: Not a blind test, or a diagnosis that is none.
+    """
+    grades: list[Grade] = []
+    judged = read_json(directory / VISIBLE) if (directory / VISIBLE).exists() else {}
+    for case in read_plan(directory):
+        folder = directory / case.case
+        run = read_json(folder / RUN) if (folder / RUN).exists() else {}
+        if (folder / DIAGNOSIS).exists():
+            diagnosis = read_json(folder / DIAGNOSIS)
+        elif run.get("error"):
+            diagnosis = {"verdict": "failed"}
+        else:
+            continue
+        try:
+            graded = grade(read_label(directory, case.case), diagnosis, run.get("wall_s"))
+            if case.case in judged:
+                found = _number(judged[case.case])
+                graded = replace(graded, visible=found is None or found >= SEEN)
+            grades.append(graded)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise BlindTestError(
+                f"{folder / DIAGNOSIS}: not a diagnosis ({type(error).__name__}: {error})"
+            ) from None
+    content = {"schema": SCHEMA, "grades": [asdict(item) for item in grades]}
+    write_whole(directory / GRADES, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    return tuple(grades)
+
+
+def read_grades(directory: Path) -> tuple[Grade, ...]:
+    """What `grade_cases` wrote.
+
+    Raises:
+        BlindTestError: It is missing or damaged.
+    """
+    path = directory / GRADES
+    try:
+        return tuple(Grade.from_dict(item) for item in read_json(path)["grades"])
+    except (KeyError, TypeError) as error:
+        raise BlindTestError(
+            f"{path}: not grades ({error}); run python -m studies.blind grade"
+        ) from None
+
+
+def grade(label: Label, diagnosis: Mapping[str, Any], wall_s: float | None = None) -> Grade:
+    """Compares a diagnosis with the truth.
+
+    Args:
+        label: The truth.
+        diagnosis: The content of a ``diagnosis.json``.
+        wall_s: Time it took.
+
+    Raises:
+        ValueError: The verdict is none of those there are.
+    """
+    verdict = diagnosis["verdict"]
+    if verdict not in get_args(Verdict):
+        raise ValueError(f"verdict {verdict!r}; allowed: {', '.join(get_args(Verdict))}")
+    given: list[Mapping[str, Any]] = list(diagnosis.get("effects") or ())
+    named = canonical([found_effect(item) for item in given], label)
+    truth = canonical(label.effects, label)
+    others = [
+        canonical(map(found_effect, other["effects"]), label)
+        for other in diagnosis.get("alternatives") or ()
+        if verdict == "not_identifiable"  # elsewhere they are what was tried, not what is named
+    ]
+    sets = [{item.name for item in effects} for effects in (named, *others)]
+    required, allowed = required_and_allowed(label, truth)
+    outcome = _outcome(label, verdict, sets, required, allowed)
+    fits = [required <= names <= allowed for names in sets]
+    hidden = label.group not in ("none", "outside")
+    names_right = hidden and verdict in NAMING and fits[0]
+    matched = [(x, match(x, named)) for x in truth] if names_right else []
+    place_right, window_iou = _where(matched, named, truth)
+    return Grade(
+        case=label.case,
+        scenario=label.scenario,
+        group=label.group,
+        hidden=label.hidden,
+        strength=label.strength,
+        periods=label.periods,
+        speeds=label.speeds,
+        lights=len(label.lights),
+        verdict=verdict,
+        named=tuple(sorted(sets[0])) if verdict not in ("no_discrepancy", "failed") else (),
+        outcome=outcome,
+        among=verdict == "not_identifiable" and hidden and any(fits),
+        found=len(required & sets[0]) / len(required) if required and verdict in NAMING else 0.0,
+        confident_wrong=verdict == "explained" and (outcome == "wrong" or place_right is False),
+        place_right=place_right,
+        window_iou=window_iou,
+        estimates=tuple(
+            estimate
+            for item, same in matched
+            if same is not None
+            for estimate in _estimates(item, given, same, label)
+        ),
+        shrink=_number((diagnosis.get("heldout") or {}).get("shrink")),
+        policy_shrink=_policy_shrink(diagnosis.get("policy_gap")),
+        wall_s=_number(wall_s),
+    )
+
+
+def _outcome(
+    label: Label,
+    verdict: Verdict,
+    sets: Sequence[set[str]],
+    required: frozenset[str],
+    allowed: frozenset[str],
+) -> Outcome:
+    if verdict == "failed":
+        return "failed"
+    if label.group == "none":
+        if verdict == "no_discrepancy":
+            return "right"
+        return "wrong" if any(sets) or verdict == "explained" else "abstained"
+    if verdict == "no_discrepancy":
+        return "missed"
+    if label.group == "outside":
+        return "wrong" if verdict == "explained" else "abstained"
+    if verdict not in NAMING:
+        return "abstained"
+    return "right" if required <= sets[0] <= allowed else "wrong"
+
+
+def _where(
+    matched: Sequence[tuple[Hidden, Hidden | None]],
+    named: Sequence[Hidden],
+    truth: Sequence[Hidden],
+) -> tuple[bool | None, float | None]:
+    """Whether all places are right and no other is named, and how far the windows overlap."""
+    windows = [
+        _overlap(item.window, other.window)
+        for item, same in matched
+        if item.window is not None and (other := same or same_name(item.name, named)) is not None
+    ]
+    place_right = None
+    if any(item.place for item, _ in matched):
+        extra = any(match(item, truth) is None for item in named)
+        place_right = not extra and all(same is not None for item, same in matched if item.place)
+    return place_right, sum(windows) / len(windows) if windows else None
+
+
+# --- numbers --------------------------------------------------------------------------------------
+
+
+def _overlap(one: tuple[float, float] | None, two: tuple[float, float] | None) -> float:
+    """Intersection over union of two windows."""
+    if one is None or two is None:
+        return 0.0
+    inside = max(min(one[1], two[1]) - max(one[0], two[0]), 0.0)
+    return inside / (max(one[1], two[1]) - min(one[0], two[0]))
+
+
+def _estimates(
+    truth: Hidden, given: Sequence[Mapping[str, Any]], same: Hidden, label: Label
+) -> list[Estimate]:
+    raw = next(
+        (
+            x.get("parameters") or {}
+            for x in given
+            if canonical_effect(found_effect(x), label) == same
+        ),
+        {},
+    )
+    found: list[Estimate] = []
+    for key, true in truth.parameters.items():
+        if key not in same.parameters:
+            continue
+        value = same.parameters[key]
+        nominal = truth.nominal.get(key)
+        low, high = (
+            _number(raw[key].get(end)) if isinstance(raw.get(key), Mapping) else None
+            for end in ("low", "high")
+        )
+        found.append(
+            Estimate(
+                truth.name,
+                key,
+                true,
+                value,
+                abs(value - true) / abs(true) if true else None,
+                abs(value - true) / abs(true - nominal)
+                if nominal is not None and true != nominal
+                else None,
+                low <= true <= high if low is not None and high is not None else None,
+            )
+        )
+    return found
+
+
+def _policy_shrink(gap: Any) -> float | None:
+    """Share of the policy gap that is gone, of a trained policy if there is one.
+
+    Reads ``{policy: {"before": Δ, "after": Δ}}``; a name that holds ``.pt`` or ``trained`` is the
+    trained policy, and without one the mean over all policies is taken.
+    """
+    if not isinstance(gap, Mapping):
+        return None
+    entries: dict[str, Mapping[str, Any]] = {
+        str(name): item
+        for name, item in gap.items()
+        if isinstance(item, Mapping) and _number(item.get("before")) and "after" in item
+    }
+    trained = {k: v for k, v in entries.items() if ".pt" in k or "trained" in k}
+    shrinks = [
+        1 - abs(after) / abs(float(item["before"]))
+        for item in (trained or entries).values()
+        if (after := _number(item["after"])) is not None
+    ]
+    return sum(shrinks) / len(shrinks) if shrinks else None
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)

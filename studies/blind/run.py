@@ -1,0 +1,105 @@
+"""Diagnoses the cases of a blind test, without opening their labels."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from studies.blind.cases import DIAGNOSIS, RUN, Case, chosen, read_json
+from ugat_marl.errors import BlindTestError
+from ugat_marl.files import write_whole
+from ugat_marl.progress import Reporter, Silent
+
+Diagnose = Callable[[Case, Path, Path], None]
+"""Diagnoses a case: the case, its measured data, and the folder that gets ``diagnosis.json``."""
+
+
+def run_cases(
+    directory: Path,
+    diagnose: Diagnose,
+    *,
+    only: Sequence[str] = (),
+    jobs: int = 1,
+    command: Sequence[str] = (),
+    reporter: Reporter | None = None,
+) -> tuple[int, int]:
+    """Diagnoses the cases that have no diagnosis yet; one that fails does not stop the others.
+
+    Args:
+        directory: A blind test.
+        diagnose: Makes one diagnosis.
+        only: Cases; none for all.
+        jobs: Cases at a time, each in a process of its own if there are several.
+        command: The command line that runs one case, its id to be added.
+        reporter: Shows progress.
+
+    Returns:
+        How many were diagnosed, and how many failed.
+
+    Raises:
+        BlindTestError: Not a blind test, or a case that has not been measured.
+        UnknownNameError: No such case.
+    """
+    left = [
+        case for case in chosen(directory, only) if not (directory / case.case / DIAGNOSIS).exists()
+    ]
+    for case in left:
+        if not (directory / case.case / "measured" / "periods.csv").exists():
+            raise BlindTestError(
+                f"{directory / case.case}: not measured yet; go on with "
+                "python -m studies.blind generate"
+            )
+    failed = 0
+    with (reporter or Silent()).task("diagnosing", len(left)) as advance:
+        if jobs == 1:
+            for case in left:
+                failed += not _one(directory, case, diagnose)
+                advance(note=case.case)
+        else:
+            with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
+                runs = [pool.submit(_apart, directory, case, command) for case in left]
+                try:
+                    for run in concurrent.futures.as_completed(runs):
+                        failed += not run.result()
+                        advance()
+                finally:
+                    pool.shutdown(wait=False, cancel_futures=True)
+    return len(left) - failed, failed
+
+
+def _one(directory: Path, case: Case, diagnose: Diagnose) -> bool:
+    """Diagnoses a case here; notes how long it took, or why it failed."""
+    folder = directory / case.case
+    start = time.monotonic()
+    error = None
+    try:
+        diagnose(case, folder / "measured", folder)
+        if not (folder / DIAGNOSIS).exists():
+            error = f"no {DIAGNOSIS} was written"
+    except Exception as found:  # noqa: BLE001 - a bug in one case is a result, not the end
+        error = f"{type(found).__name__}: {found}"
+    _note(folder, time.monotonic() - start, error)
+    return error is None
+
+
+def _apart(directory: Path, case: Case, command: Sequence[str]) -> bool:
+    """Diagnoses a case in a process of its own."""
+    folder = directory / case.case
+    start = time.monotonic()
+    (folder / RUN).unlink(missing_ok=True)
+    call = [sys.executable, "-m", "ugat_marl", *command, "--only", case.case]
+    done = subprocess.run(call, capture_output=True, text=True, check=False)
+    if not (folder / RUN).exists():  # it did not even get so far as to say why
+        said = " ".join(done.stderr.split())[-500:]
+        _note(folder, time.monotonic() - start, f"exit code {done.returncode}: {said}")
+    return read_json(folder / RUN).get("error") is None
+
+
+def _note(folder: Path, wall_s: float, error: str | None) -> None:
+    content = {"wall_s": round(wall_s, 3), "error": error}
+    write_whole(folder / RUN, json.dumps(content, indent=1) + "\n")

@@ -1,0 +1,136 @@
+"""How strong a hidden effect is: the medium strength of every effect, and what is small and large.
+
+Small is half and large twice the distance of the medium strength from the value without the effect.
+What is told by counts alone is at medium strength at least so large that it can be told from them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from ugat_marl.scenarios import Scenario
+
+Strength = Literal["small", "medium", "large"]
+COUNTED = 6.0
+"""A medium change of counts is at least so many standard errors of what is counted."""
+COUNTED_HOURS = 3.0
+"""Hours that are counted: the fitted ones of five periods of an hour."""
+STRENGTHS: tuple[Strength, ...] = ("small", "medium", "large")
+SCALE: Mapping[str, float] = {"small": 0.5, "medium": 1.0, "large": 2.0}
+
+Family = Literal["vehicles", "signals", "demand", "road", "detectors"]
+Where = Literal[
+    "everywhere", "light", "origin", "turn", "closable", "lane", "edge", "detector", "pair", "model"
+]
+"""What has to be drawn to say where an effect is."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How an effect of the library is hidden.
+
+    Attributes:
+        family: Pairs are made of two families.
+        where: What its place is.
+        parameter: The field that has a strength; "" if its window or nothing has.
+        nominal: Value of the field without the effect.
+        medium: Its medium strength.
+        least: Smallest value drawn.
+        greatest: Greatest value drawn.
+        either: Whether it may lie as far on the other side of the nominal value.
+        window_s: Length of its window at medium strength; 0 if it has none.
+        fixed: Fields that are always the same.
+        strengths: The strengths that differ.
+    """
+
+    family: Family
+    where: Where
+    parameter: str = ""
+    nominal: float = 0.0
+    medium: float = 0.0
+    least: float = -1e9
+    greatest: float = 1e9
+    either: bool = False
+    window_s: float = 0.0
+    fixed: Mapping[str, float] | None = None
+    strengths: tuple[Strength, ...] = STRENGTHS
+
+    def value(
+        self, strength: str, other_side: bool = False, per_hour: float | None = None
+    ) -> float:
+        """The value of the field at a strength.
+
+        Args:
+            strength: Which.
+            other_side: On the other side of the nominal value, if there is one.
+            per_hour: Vehicles an hour that tell it, if it is a share of them.
+        """
+        distance = self.medium - self.nominal
+        if per_hour is not None:
+            distance = max(distance, COUNTED / math.sqrt(COUNTED_HOURS * per_hour))
+        distance *= SCALE[strength]
+        value = self.nominal + (-distance if other_side and self.either else distance)
+        return round(min(max(value, self.least), self.greatest), 4)
+
+    def window(self, strength: str) -> float:
+        """Length of the window, s: the strength of an effect that has no other."""
+        return self.window_s if self.parameter else self.window_s * SCALE[strength]
+
+
+MODELS = ("IDM", "EIDM", "W99")
+"""Driver models that are hidden."""
+
+KINDS: Mapping[str, Kind] = {
+    "acceleration": Kind("vehicles", "everywhere", "mps2", 2.6, 1.6, least=0.8),
+    "deceleration": Kind("vehicles", "everywhere", "mps2", 4.5, 2.5, least=1.5),
+    "startup_delay": Kind("vehicles", "everywhere", "seconds", 0.0, 1.0),
+    "headway": Kind("vehicles", "everywhere", "seconds", 1.0, 1.45),
+    "min_gap": Kind("vehicles", "everywhere", "metres", 2.5, 3.5),
+    "imperfection": Kind("vehicles", "everywhere", "sigma", 0.5, 0.8, greatest=1.0),
+    "reaction_step": Kind(
+        "vehicles", "everywhere", "seconds", 1.0, 2.0, strengths=("medium", "large")
+    ),
+    "desired_speed": Kind("vehicles", "everywhere", "factor", 1.0, 0.88, either=True),
+    "speed_spread": Kind("vehicles", "everywhere", "deviation", 0.1, 0.2),
+    "heavy_share": Kind("vehicles", "everywhere", "share", 0.0, 0.12),
+    "yellow_running": Kind("vehicles", "everywhere", "seconds", 0.0, 2.0, greatest=3.0),
+    "red_running": Kind("vehicles", "everywhere", "seconds", 0.0, 1.5),
+    "gap_acceptance": Kind("vehicles", "everywhere", "seconds", 1.0, 2.5),
+    "lane_discipline": Kind("vehicles", "everywhere", "strategic", 1.0, 0.4, least=0.0),
+    "driver_model": Kind("vehicles", "model", strengths=("medium",)),
+    "late_green": Kind("signals", "light", "seconds", 0.0, 2.0),
+    "yellow_time": Kind("signals", "everywhere", "seconds", 3.0, 5.0),
+    "all_red_time": Kind("signals", "everywhere", "seconds", 2.0, 4.0),
+    "demand_level": Kind("demand", "origin", "factor", 1.0, 1.15, least=0.4, either=True),
+    "demand_surge": Kind("demand", "origin", "factor", 1.0, 1.6, window_s=1200.0),
+    "demand_timing": Kind("demand", "origin", "seconds", 0.0, 300.0, either=True),
+    "turning": Kind("demand", "turn", "share", 0.0, 0.2),
+    "lane_closure": Kind("road", "closable", window_s=900.0),
+    "parking": Kind("road", "lane", "per_hour", 0.0, 15.0, fixed={"dwell_s": 40.0}),
+    "local_speed": Kind("road", "edge", "factor", 1.0, 0.7, least=0.3),
+    "undercount": Kind("detectors", "detector", "share", 0.0, 0.15),
+    "signal_clock": Kind("detectors", "light", "seconds", 0.0, 2.0, either=True),
+    "clock_drift": Kind("detectors", "light", "seconds_per_hour", 0.0, 4.0, either=True),
+    "stuck": Kind("detectors", "detector", window_s=900.0),
+    "dropout": Kind("detectors", "detector", window_s=900.0),
+    "swapped": Kind("detectors", "pair", strengths=("medium",)),
+}
+"""Every effect of the library but `emergency_deceleration`, which nobody who drives as usual shows:
+it decides only what happens in an emergency."""
+
+
+def nominal_of(name: str, scenario: Scenario) -> dict[str, float]:
+    """The value of an effect's field without the effect, in a scenario."""
+    kind = KINDS.get(name)
+    if kind is None or not kind.parameter:
+        return {}
+    control, step = scenario.control, scenario.settings.step_length_s
+    own = {
+        "yellow_time": control.yellow_s,
+        "all_red_time": control.all_red_s,
+        "reaction_step": step,
+    }
+    return {kind.parameter: own.get(name, kind.nominal)}

@@ -1,0 +1,173 @@
+"""The command line as a user meets it: help, errors in one line, commands in sequence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.__main__ import COMMANDS, main
+from ugat_marl.cli.evaluate import names_of
+from ugat_marl.data import TransitionLog
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line on standard error of a call that must be refused."""
+    assert main(list(arguments)) == 2
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    lines = err.strip().splitlines()
+    assert len(lines) == 1, err
+    assert lines[0].startswith("ugat-marl: error: ")
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["trian", "single-v1"], "'train'"),
+        (["bench", "enf"], "'env'"),
+        (["train", "singel-v1"], "'single-v1'"),
+        (["train", "single-v1", "--real", "V44"], "'V4'"),
+        (["train", "single-v1", "--real", "sim"], "the simulation itself"),
+        (["train", "single-v1", "--rael", "V4"], "'--real'"),
+        (["train", "single-v1", "--iteratoins", "4"], "'--iterations'"),
+        (["train", "single-v1", "--gate.moed", "static"], "'--gate.mode'"),
+        (["train", "single-v1", "--seed", "one"], "--seed"),
+        (["train", "single-v1", "--observation", "cuont"], "'count'"),
+        (["train", "single-v1", "--iterations", "-1"], "at least 0"),
+        (["train"], "SCENARIO"),
+        (["train", "single-v1", "extra"], "'extra'"),
+        (["train", "single-v1", "--real-log", "nowhere.parquet"], "nowhere.parquet"),
+        (["evaluate", "single-v1", "--policies", "largst-queue:20"], "'largest-queue'"),
+        (["evaluate", "single-v1", "--policies", "nowhere.pt"], "nowhere.pt"),
+        (["evaluate", "single-v1", "--domains", "sim", "snwo"], "'snow'"),
+        (["evaluate", "single-v1", "--domains", "startup_dealy=1"], "'startup_delay'"),
+        (["evaluate", "single-v1", "--domains", "startup_delay=-1"], "[0, 10] s"),
+        (["evaluate", "single-v1", "--seeds", "0"], "at least 1"),
+        (["evaluate", "single-v1", "--domains", "V4", "snow"], "listed twice"),
+        (["evaluate", "single-v1", "--policies", "random", "random"], "twice"),
+        (["check", "nowhere.sumocfg"], "nowhere.sumocfg"),
+        (["rollout", "single-v1"], "--out"),
+        (["rollout", "single-v1", "--out", "."], "is a folder"),
+        (["evaluate", "single-v1", "--out", "/dev/null/x.json"], "cannot be written"),
+        (["evaluate", "single-v1", "--first-seed", "-5"], "negative"),
+        (["evaluate", "single-v1", "--policies", "."], "is a folder"),
+        (["train", "single-v1", "--out", "/dev/null/run"], "cannot be written"),
+        (["train", "single-v1", "--out", ""], "empty"),
+        (["train", "single-v1", "--fit.learning-rate", "inf"], "finite"),
+        (["train", "single-v1", "--fit.uncertainty", "ensembel"], "ensemble"),
+        (["train", "single-v1", "--fit.members", "0"], "1 to 100"),
+    ],
+)
+def test_a_wrong_call_is_one_line_with_the_nearest_name(
+    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert says in complaint(capsys, *arguments)
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_every_command_explains_itself(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as end:
+        main([*command.split(), "--help"])
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    assert f"usage: ugat-marl {command}" in text
+    assert f"    ugat-marl {command}" in text, "no example"
+
+
+MEASURING = ("record", "import-atspm", "diagnose", "policy-gap")
+
+
+@pytest.mark.parametrize(
+    "command", [c for c in COMMANDS if c.split()[0] in (*MEASURING, "blind", "scenario")]
+)
+def test_help_fits_a_terminal_and_says_what_defaults_mean(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    usage, *lines = capsys.readouterr().out.splitlines()
+    assert command in usage
+    assert max(map(len, lines)) <= 80
+    assert not [line for line in lines if "None" in line or "(default: )" in line]
+
+
+def test_help_of_a_group_is_about_the_group(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["blind", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "usage: ugat-marl blind COMMAND [options]" in text
+    assert "ugat-marl blind COMMAND --help" in text
+    assert "train" not in text
+
+
+def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for command in COMMANDS:
+        assert command in text
+    assert main([]) == 2
+
+
+def test_scenarios_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenarios"]) == 0
+    text = capsys.readouterr().out
+    for name in ("single-v1", "grid2x2-v1", "grid4x4-v1", "arterial1x5-v1", "mixed-v1", "snow"):
+        assert name in text
+
+
+def test_evaluate_prints_and_writes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    out = tmp_path / "table.json"
+    call = ["evaluate", "single-v1", "--policies", "largest-queue:20", "programme", "--domains"]
+    call += ["sim", "V4", "--seeds", "2", "--duration-s", "300", "--out", str(out)]
+    assert main(call) == 0
+    text = capsys.readouterr().out
+    for word in ("single-v1 in sim", "single-v1 in V4", "gap to sim", "95 % interval", "regret"):
+        assert word in text
+    table = [line for line in text.splitlines() if not line.startswith("table: ")]
+    assert max(map(len, table)) <= 80
+    content = json.loads(out.read_text())
+    assert len(content["episodes"]) == 2 * 2 * 2
+
+
+def test_a_recorded_log_trains(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "v4.parquet"
+    short = ["--duration-s", "200"]
+    call = ["rollout", "single-v1", "--domain", "V4", "--episodes", "2", "--out", str(log)]
+    assert main([*call, *short]) == 0
+    assert TransitionLog.read(log).provenance.domain == "V4"
+    call = ["train", "single-v1", "--real", "none", "--real-log", str(log), "--out"]
+    call += [str(tmp_path / "run"), "--pretrain-episodes", "1", "--iterations", "1"]
+    call += ["--grounded-episodes", "1", "--fit.epochs", "1", "--tuning-seeds", "1"]
+    assert main([*call, "--evaluation-seeds", "1", "--no-control", *short]) == 0
+    assert "direct transfer" in capsys.readouterr().out
+    picture = (tmp_path / "run" / "gap.png").read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) > 10_000
+
+
+def test_a_sound_scenario_passes_the_check(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "single-v1", "--duration-s", "100"]) == 0
+    assert "single-v1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("policies", "names"),
+    [
+        (("random", "largest-queue:20"), ["random", "largest-queue:20"]),
+        (("policies/ugat.pt", "policies/direct.pt"), ["ugat", "direct"]),
+        (("a/x/ugat.pt", "a/y/ugat.pt", "random"), ["x/ugat", "y/ugat", "random"]),
+    ],
+)
+def test_policies_in_a_table_have_short_names_that_differ(
+    policies: tuple[str, ...], names: list[str]
+) -> None:
+    assert names_of(policies) == names

@@ -1,0 +1,67 @@
+"""Checkpoint files: whole and finite, or refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ugat_marl.data import read_checkpoint, write_checkpoint
+from ugat_marl.errors import CheckpointError
+
+CONTENT = {"weights": torch.arange(50.0), "counters": {"steps": 7}, "rate": 0.5}
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    write_checkpoint(path, "toy", CONTENT)
+    found = read_checkpoint(path, "toy")
+    assert torch.equal(found["weights"], CONTENT["weights"])
+    assert found["counters"] == {"steps": 7}
+
+
+def test_a_flipped_byte_is_noticed_wherever_it_matters(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    write_checkpoint(path, "toy", CONTENT)
+    whole = path.read_bytes()
+    refused: list[str] = []
+    for place in np.random.default_rng(0).choice(len(whole), 300, replace=False):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0x10
+        path.write_bytes(damaged)
+        try:
+            found = read_checkpoint(path, "toy")
+        except CheckpointError as error:
+            refused.append(str(error))
+        else:  # padding, or a date inside the archive
+            assert torch.equal(found["weights"], CONTENT["weights"])
+            assert (found["counters"], found["rate"]) == ({"steps": 7}, 0.5)
+    assert len(refused) > 50
+    assert all(str(path) in message for message in refused)
+
+
+def test_half_a_file_another_file_and_no_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    write_checkpoint(path, "toy", CONTENT)
+    with pytest.raises(CheckpointError, match="expected 'other'"):
+        read_checkpoint(path, "other")
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(CheckpointError, match="cut short"):
+        read_checkpoint(path, "toy")
+    path.write_text("not a checkpoint")
+    with pytest.raises(CheckpointError, match="not a readable"):
+        read_checkpoint(path, "toy")
+    with pytest.raises(CheckpointError, match="no such"):
+        read_checkpoint(tmp_path / "b.pt", "toy")
+
+
+def test_what_is_not_finite_is_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    write_checkpoint(path, "toy", CONTENT)
+    before = path.read_bytes()
+    bad = {"nested": {"weights": torch.tensor([1.0, float("nan")])}}
+    with pytest.raises(CheckpointError, match=r"nested\.weights"):
+        write_checkpoint(path, "toy", bad)
+    assert path.read_bytes() == before

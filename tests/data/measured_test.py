@@ -1,0 +1,497 @@
+"""Measured data: what was written is what is read, and every wrong file is named."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from ugat_marl.data import Measured, as_logged, read_measured, split_periods, write_measured
+from ugat_marl.errors import MeasuredDataError, OutputError
+from ugat_marl.scenarios import (
+    Detector,
+    Network,
+    Passages,
+    Period,
+    Scenario,
+    read_scenario,
+    signal_widths,
+)
+
+Change = Callable[[str], str]
+
+DETECTORS = (
+    Detector("a", "S_C_0", 40.0, 2.0, "advance"),
+    Detector("s", "S_C_0", 90.0, 0.0, "stop"),
+    Detector("w", "W_C_0", 90.0, 0.0, "stop"),
+    Detector("x", "C_N_0", 5.0, 0.0, "exit"),
+)
+SIGNALS = {"C": tuple((20.0 * i, ("Gr", "rG")[i % 2]) for i in range(10))}
+
+
+@pytest.fixture(scope="module")
+def crossing_scenario(data: Path) -> Scenario:
+    return read_scenario(data / "crossing")
+
+
+@pytest.fixture(scope="module")
+def network(crossing_scenario: Scenario) -> Network:
+    return Network.read(crossing_scenario)
+
+
+def vehicles(seed: int, count: int = 12, end: float = 200.0) -> Passages:
+    rng = np.random.default_rng(seed)
+    times = np.sort(rng.choice(int(1000 * end), 2 * count, replace=False)) / 1000
+    return Passages(
+        times[::2],
+        times[1::2],
+        np.round(rng.uniform(1, 15, count), 2),
+        np.where(rng.random(count) < 0.5, np.nan, 5.0),
+    )
+
+
+def recording(periods: int = 3) -> Measured:
+    """Days of a few vehicles per detector on the crossing of tests/data."""
+    days = [
+        Period(
+            f"day{i}",
+            0.0,
+            200.0,
+            split,
+            SIGNALS,
+            {d.id: vehicles(10 * i + j) for j, d in enumerate(DETECTORS)},
+        )
+        for i, split in enumerate(split_periods(periods))
+    ]
+    return Measured(DETECTORS, tuple(days))
+
+
+def edit(file: Path, change: Change) -> None:
+    before = file.read_text()
+    after = change(before)
+    assert after != before, f"the edit of {file.name} changed nothing"
+    file.write_text(after)
+
+
+@pytest.fixture
+def reread(
+    tmp_path: Path, crossing_scenario: Scenario, network: Network
+) -> Callable[..., Measured]:
+    """Writes a recording as CSV, changes files, and reads it."""
+
+    def read(changes: dict[str, Change] | None = None, given: Measured | None = None) -> Measured:
+        directory = write_measured(given or recording(), tmp_path / "street", csv=True)
+        for name, change in (changes or {}).items():
+            edit(directory / name, change)
+        return read_measured(directory, crossing_scenario, network)
+
+    return read
+
+
+def texts(measured: Measured) -> str:
+    return "\n".join(finding.text for finding in measured.findings)
+
+
+@pytest.mark.parametrize("csv", [False, True])
+def test_what_is_read_is_what_was_written(
+    csv: bool, tmp_path: Path, crossing_scenario: Scenario, network: Network
+) -> None:
+    before = recording()
+    lanes = pl.DataFrame(
+        {
+            "period_id": ["day0", "day0"],
+            "time_s": [0, 1],
+            "lane_id": ["S_C_0", "S_C_0"],
+            "vehicles": [0, 2],
+            "halting": [0, 1],
+            "mean_speed_mps": [float("nan"), 3.5],
+        }
+    )
+    counts = pl.DataFrame(
+        {
+            "period_id": ["day0"],
+            "begin_s": [0.0],
+            "end_s": [200.0],
+            "detector_id": ["s"],
+            "count": [7],
+        }
+    )
+    before = replace(before, lanes=lanes, counts=counts)
+    write_measured(before, tmp_path / "street", csv=csv)
+    after = read_measured(tmp_path / "street", crossing_scenario, network)
+    assert after.hash == before.hash
+    assert after.detectors == DETECTORS
+    assert [period.split for period in after.periods] == ["fit", "fit", "heldout"]
+    assert after.periods[1].signals == SIGNALS
+    one, other = before.periods[2].passages["w"], after.periods[2].passages["w"]
+    np.testing.assert_array_equal(one.on_s, other.on_s)
+    np.testing.assert_array_equal(one.off_s, other.off_s)
+    np.testing.assert_array_equal(one.speed_mps, other.speed_mps)
+    np.testing.assert_array_equal(one.length_m, other.length_m)
+    assert after.lanes is not None and after.lanes["mean_speed_mps"].to_list() == [None, 3.5]
+    assert [finding.text.split(" (")[0] for finding in after.findings] == [
+        "periods.csv: 3 periods"  # of 200 s
+    ]
+
+
+def test_the_hash_counts_milliseconds_and_every_passage() -> None:
+    base = recording()
+    day = base.periods[0]
+
+    def with_first(passages: Passages) -> str:
+        changed = replace(day, passages={**day.passages, "s": passages})
+        return replace(base, periods=(changed, *base.periods[1:])).hash
+
+    first = day.passages["s"]
+    assert with_first(replace(first, on_s=first.on_s + 1e-5)) == base.hash
+    assert with_first(replace(first, on_s=first.on_s + 1e-3)) != base.hash
+    assert with_first(first.at(np.arange(len(first) - 1))) != base.hash
+
+
+def test_a_vehicle_that_stands_on_the_detector_when_the_period_begins_or_ends(
+    reread: Callable[..., Measured],
+) -> None:
+    nan = np.nan
+    passages = Passages(
+        np.array([nan, 50.0, 180.0]),
+        np.array([12.0, 51.0, nan]),
+        np.array([nan, 9.0, nan]),
+        np.array([nan, nan, nan]),
+    )
+    base = recording(1)
+    before = replace(base, periods=(replace(base.periods[0], passages={"s": passages}),))
+    after = reread(given=before)
+    assert after.hash == before.hash
+    assert np.isnan(after.periods[0].passages["s"].on_s[0])
+    assert np.isnan(after.periods[0].passages["s"].off_s[2])
+
+
+def test_what_lies_outside_of_the_period_is_not_written(reread: Callable[..., Measured]) -> None:
+    passages = Passages(
+        np.array([-3.0, -1.0, 50.0, 199.5, 201.0]),
+        np.array([-2.0, 1.0, 51.0, 200.5, 202.0]),
+        np.array([1.0, 2.0, 3.0, 4.0, 5.0]),
+        np.full(5, np.nan),
+    )
+    base = recording(1)
+    read = reread(
+        given=replace(base, periods=(replace(base.periods[0], passages={"s": passages}),))
+    ).periods[0]
+    np.testing.assert_array_equal(read.passages["s"].on_s, [np.nan, 50, 199.5])
+    np.testing.assert_array_equal(read.passages["s"].off_s, [1, 51, np.nan])
+    np.testing.assert_array_equal(read.passages["s"].speed_mps, [2, 3, 4])
+
+
+def test_a_detector_is_on_or_off(reread: Callable[..., Measured]) -> None:
+    passages = Passages(
+        np.array([10.0, 11.0]), np.array([11.4, 12.0]), np.array([1.0, 2.0]), np.full(2, np.nan)
+    )
+    base = recording(1)
+    read = reread(
+        given=replace(base, periods=(replace(base.periods[0], passages={"s": passages}),))
+    ).periods[0]
+    np.testing.assert_array_equal(read.passages["s"].on_s, [10, 11])
+    np.testing.assert_array_equal(read.passages["s"].off_s, [11, 12])
+    np.testing.assert_array_equal(read.passages["s"].speed_mps, [1, 2])
+
+
+def test_what_only_a_simulation_knows_is_not_logged(reread: Callable[..., Measured]) -> None:
+    """Ends that are unknown in the middle: a vehicle that changed lanes on the zone."""
+    nan = np.nan
+    passages = Passages(
+        #         first  lost   whole  filled  next  stray  end
+        np.array([nan, 20.0, 40.0, 60.0, 61.5, nan, 190.0]),
+        np.array([3.0, nan, 41.0, nan, 62.0, 70.0, nan]),
+        np.arange(7.0),
+        np.full(7, nan),
+    )
+    expected = Passages(
+        np.array([nan, 40.0, 60.0, 61.5, 190.0]),
+        np.array([3.0, 41.0, 61.5, 62.0, nan]),
+        np.array([0.0, 2.0, 3.0, 4.0, 6.0]),
+        np.full(5, nan),
+    )
+    logged = as_logged(passages.at(np.array([6, 5, 4, 3, 2, 1, 0])), 0.0, 200.0)
+    base = recording(1)
+    read = reread(
+        given=replace(base, periods=(replace(base.periods[0], passages={"s": passages}),))
+    )
+    assert not [f.text for f in read.findings if "without" in f.text or "follows" in f.text]
+    for found in (logged, read.periods[0].passages["s"]):
+        np.testing.assert_array_equal(found.on_s, expected.on_s)
+        np.testing.assert_array_equal(found.off_s, expected.off_s)
+        np.testing.assert_array_equal(found.speed_mps, expected.speed_mps)
+
+
+def test_a_detector_that_is_on_all_the_time(reread: Callable[..., Measured]) -> None:
+    stuck = Passages(np.array([-5.0]), np.array([300.0]), np.full(1, np.nan), np.full(1, np.nan))
+    base = recording(1)
+    read = reread(given=replace(base, periods=(replace(base.periods[0], passages={"s": stuck}),)))
+    np.testing.assert_array_equal(read.periods[0].passages["s"].on_s, [0.0])
+    np.testing.assert_array_equal(read.periods[0].passages["s"].off_s, [np.nan])
+
+
+times = st.one_of(
+    st.just(float("nan")), st.floats(-20, 220), st.integers(-2, 9).map(float), st.just(200.0)
+)
+
+
+@settings(max_examples=100)
+@given(rows=st.lists(st.tuples(times, times), max_size=12))
+def test_what_is_logged_is_what_is_read(
+    rows: list[tuple[float, float]], crossing_scenario: Scenario, network: Network
+) -> None:
+    """Whatever a simulation says, writing and reading it is `as_logged`, and nothing is lost."""
+    table = np.array([row for row in rows if not row[1] < row[0]], np.float64).reshape(-1, 2)
+    table = table[~np.isnan(table).all(1)]
+    nothing = np.full(len(table), np.nan)
+    logged = as_logged(Passages(table[:, 0], table[:, 1], nothing, nothing), 0.0, 200.0)
+    again = as_logged(logged, 0.0, 200.0)
+    np.testing.assert_array_equal(logged.on_s, again.on_s)
+    np.testing.assert_array_equal(logged.off_s, again.off_s)
+    # An off and an on at the very first moment could be a pulse just as well.
+    assume(len(logged) < 2 or np.isfinite(logged.on_s[0]) or logged.off_s[0] < logged.on_s[1])
+    base = recording(1)
+    before = replace(base, periods=(replace(base.periods[0], passages={"s": logged}),))
+    with tempfile.TemporaryDirectory() as directory:
+        street = write_measured(before, Path(directory) / "street")
+        if not len(logged):
+            return
+        read = read_measured(street, crossing_scenario, network)
+    assert read.hash == before.hash
+    assert not [f.text for f in read.findings if "without" in f.text or "follows" in f.text]
+
+
+def test_writing_replaces_measured_data_and_nothing_else(tmp_path: Path) -> None:
+    directory = tmp_path / "street"
+    write_measured(recording(3), directory)
+    write_measured(recording(2), directory, csv=True)
+    names = {path.name for path in directory.iterdir()}
+    assert names == {"periods.csv", "detectors.csv", "signals.csv", "detections.csv"}
+    assert (directory / "periods.csv").read_text().count("day") == 2
+    (directory / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="notes.txt"):
+        write_measured(recording(), directory)
+    assert (directory / "notes.txt").read_text() == "mine"
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match="is a file"):
+        write_measured(recording(), tmp_path / "file")
+    (tmp_path / "empty").mkdir()
+    write_measured(recording(), tmp_path / "empty")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "file", "street"]
+
+
+def test_a_write_that_fails_leaves_the_old_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = write_measured(recording(2), tmp_path / "street")
+    before = {path.name: path.read_bytes() for path in directory.iterdir()}
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pl.DataFrame, "write_parquet", full)
+    with pytest.raises(OutputError, match="No space left"):
+        write_measured(recording(3), directory)
+    assert {path.name: path.read_bytes() for path in directory.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["street"]
+
+
+def test_reading_leaves_the_files_alone(reread: Callable[..., Measured], tmp_path: Path) -> None:
+    reread()
+    before = {
+        p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "street").iterdir()
+    }
+    scenario = read_scenario(Path(__file__).parents[1] / "fixtures" / "crossing")
+    read_measured(tmp_path / "street", scenario, Network.read(scenario))
+    after = {
+        p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "street").iterdir()
+    }
+    assert after == before
+
+
+def test_five_busy_periods_are_read_in_less_than_a_second(
+    tmp_path: Path, crossing_scenario: Scenario, network: Network
+) -> None:
+    base = recording(5)
+    days = tuple(
+        replace(p, passages={d.id: vehicles(10 * i + j, 3750) for j, d in enumerate(DETECTORS)})
+        for i, p in enumerate(base.periods)
+    )
+    directory = write_measured(replace(base, periods=days), tmp_path / "street")
+    began = time.perf_counter()
+    read = read_measured(directory, crossing_scenario, network)
+    assert time.perf_counter() - began < 1.0
+    assert sum(len(p) for day in read.periods for p in day.passages.values()) == 5 * 4 * 3750
+
+
+def test_the_letters_of_every_traffic_light(crossing_scenario: Scenario) -> None:
+    assert signal_widths(crossing_scenario) == {"C": 2}
+    assert signal_widths(read_scenario("grid2x2-v1")).keys() == {
+        item.id for item in Network.read(read_scenario("grid2x2-v1")).intersections
+    }
+
+
+def replaced(old: str, new: str, count: int = 1) -> Change:
+    return lambda text: text.replace(old, new, count)
+
+
+def added(row: str) -> Change:
+    return lambda text: f"{text}{row}\n"
+
+
+WRONG: dict[str, tuple[dict[str, Change], str]] = {
+    "lane that is not there": (
+        {"detectors.csv": replaced("S_C_0", "S_C_1")},
+        r"S_C_1.*mean 'S_C_0'",
+    ),
+    "detector twice": (
+        {"detectors.csv": added("a,S_C_0,10,0,stop")},
+        r"line 2.*'a' occurs twice .and 1 row more.",
+    ),
+    "detector beyond the lane": ({"detectors.csv": replaced("90.0", "900")}, r"position_m 900"),
+    "zone beyond the lane": ({"detectors.csv": replaced("40.0,2.0", "40,460")}, r"at most"),
+    "unknown kind": ({"detectors.csv": replaced("advance", "advanced")}, r"advance, stop, exit"),
+    "text in a number": (
+        {"detectors.csv": replaced("40.0", "forty")},
+        r"line 2: position_m.*forty",
+    ),
+    "decimal comma": ({"detectors.csv": replaced("40.0", '"40,5"')}, r"point, not a comma"),
+    "semicolons": ({"detectors.csv": lambda text: text.replace(",", ";")}, r"semicolons"),
+    "no detectors": ({"detectors.csv": lambda text: text.split("\n")[0] + "\n"}, r"no detectors"),
+    "column missing": (
+        {"periods.csv": replaced("begin_s", "begins")},
+        r"'begin_s' \(is it 'begins'",
+    ),
+    "period twice": ({"periods.csv": added("day0,0,200,fit")}, r"'day0' occurs twice"),
+    "period backwards": ({"periods.csv": replaced("0.0,200.0", "200,100")}, r"not after begin_s"),
+    "period without demand": ({"periods.csv": replaced("200.0", "900")}, r"demand from 0 s to 200"),
+    "unknown split": ({"periods.csv": replaced("heldout", "test")}, r"'test' is unknown"),
+    "split for some": ({"periods.csv": replaced("heldout", "")}, r"no split, though others"),
+    "all held out": ({"periods.csv": replaced("fit", "heldout", 9)}, r"every period is held out"),
+    "no periods": ({"periods.csv": lambda text: text.split("\n")[0] + "\n"}, r"no periods"),
+    "empty file": ({"periods.csv": lambda _: ""}, r"empty"),
+    "unknown traffic light": ({"signals.csv": replaced(",C,", ",D,")}, r"'D' is no traffic light"),
+    "state of another length": (
+        {"signals.csv": replaced("Gr", "Grr")},
+        r"3 letters, but.* 2 links",
+    ),
+    "letters SUMO does not know": ({"signals.csv": replaced("Gr", "GX")}, r"does not know \(X\)"),
+    "no signals in a period": (
+        {"signals.csv": lambda text: "\n".join(x for x in text.split("\n") if "day1" not in x)},
+        r"no signals .* period 'day1'",
+    ),
+    "no detections in a period": (
+        {"detections.csv": lambda text: text[: text.index("day1")]},  # cut short, at a row's end
+        r"no detections in period 'day1', 'day2'.*cut short.*leave the period out",
+    ),
+    "unknown event": ({"detections.csv": replaced(",on,", ",enter,")}, r"'enter' is unknown"),
+    "negative speed": ({"detections.csv": added("day0,100,s,off,-3,")}, r"-3.0' is negative"),
+    "no time": ({"detections.csv": added("day0,,s,off,,")}, r"time_s is empty"),
+    "infinite time": ({"detections.csv": added("day0,1e999,s,off,,")}, r"time_s is '1e999'"),
+    "no known detector": (
+        {"detectors.csv": lambda text: text.replace("\n", "\n9", 4)},
+        r"no row is of a detector in detectors.csv.*is",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_file_is_refused_with_its_place(case: str, reread: Callable[..., Measured]) -> None:
+    changes, message = WRONG[case]
+    name = next(iter(changes)) if case != "no known detector" else "detections.csv"
+    with pytest.raises(MeasuredDataError, match=f"(?s){name}.*{message}"):
+        reread(changes)
+
+
+@pytest.mark.parametrize("name", ["periods", "detectors", "signals", "detections"])
+def test_a_missing_file_is_named(
+    name: str, tmp_path: Path, crossing_scenario: Scenario, network: Network
+) -> None:
+    directory = write_measured(recording(), tmp_path / "street", csv=True)
+    (directory / f"{name}.csv").unlink()
+    with pytest.raises(MeasuredDataError, match=rf"no {name}\..*there is"):
+        read_measured(directory, crossing_scenario, network)
+
+
+def test_a_directory_that_is_none(
+    tmp_path: Path, crossing_scenario: Scenario, network: Network
+) -> None:
+    with pytest.raises(MeasuredDataError, match="no such directory"):
+        read_measured(tmp_path / "nothing", crossing_scenario, network)
+    directory = write_measured(recording(), tmp_path / "street")
+    (directory / "signals.csv").write_text("period_id\n")
+    with pytest.raises(MeasuredDataError, match="both signals.parquet and signals.csv"):
+        read_measured(directory, crossing_scenario, network)
+
+
+def test_damaged_bytes_are_named(
+    tmp_path: Path, crossing_scenario: Scenario, network: Network
+) -> None:
+    directory = write_measured(recording(), tmp_path / "street")
+    whole = (directory / "detections.parquet").read_bytes()
+    for content, message in (
+        (whole[: len(whole) // 2], "cut short"),
+        (b"PAR1" + whole[4:-8] + b"\0\0\0\0PAR1", "damaged Parquet"),
+        (b"something else", "not a Parquet file"),
+        (b"", "not a Parquet file"),
+    ):
+        (directory / "detections.parquet").write_bytes(content)
+        with pytest.raises(MeasuredDataError, match=message):
+            read_measured(directory, crossing_scenario, network)
+    (directory / "detections.parquet").write_bytes(whole)
+    for content, message in ((b"a,b\n\0,1\n", "line 2: a NUL"), (b"a,b\n\xff,1\n", "not UTF-8")):
+        (directory / "periods.csv").write_bytes(content)
+        with pytest.raises(MeasuredDataError, match=message):
+            read_measured(directory, crossing_scenario, network)
+
+
+def test_dates_are_not_seconds_of_the_scenario(
+    tmp_path: Path, crossing_scenario: Scenario, network: Network
+) -> None:
+    directory = write_measured(recording(), tmp_path / "street")
+    file = directory / "detections.parquet"
+    frame = pl.read_parquet(file)
+    frame.with_columns(pl.col("time_s") + 1.7e9).write_parquet(file)
+    with pytest.raises(MeasuredDataError, match=r"these are dates; subtract the moment"):
+        read_measured(directory, crossing_scenario, network)
+    frame.with_columns(pl.from_epoch(pl.col("time_s").cast(pl.Int64))).write_parquet(file)
+    with pytest.raises(MeasuredDataError, match="'time_s' has the type Datetime"):
+        read_measured(directory, crossing_scenario, network)
+
+
+def test_numbers_as_names_and_other_column_types_are_understood(
+    tmp_path: Path, crossing_scenario: Scenario, network: Network
+) -> None:
+    base = recording()
+    digits = {"a": "11", "s": "12", "w": "13", "x": "14"}
+    renamed = replace(
+        base,
+        detectors=tuple(replace(d, id=digits[d.id]) for d in base.detectors),
+        periods=tuple(
+            replace(p, passages={digits[d]: v for d, v in p.passages.items()}) for p in base.periods
+        ),
+    )
+    directory = write_measured(renamed, tmp_path / "street")
+    file = directory / "detections.parquet"
+    frame = pl.read_parquet(file)
+    frame.with_columns(
+        pl.col("detector_id").cast(pl.Int16),
+        pl.col("event").cast(pl.Categorical),
+        pl.col("length_m").cast(pl.Float32),
+    ).write_parquet(file)
+    assert read_measured(directory, crossing_scenario, network).hash == renamed.hash
+
+
+def test_columns_that_nobody_reads_are_said(reread: Callable[..., Measured]) -> None:
+    read = reread({"detections.csv": replaced("speed_mps", "speed_ms")})
+    assert "'speed_ms' is not read; if it means 'speed_mps', rename it" in texts(read)
+    assert "no speeds" in texts(read)

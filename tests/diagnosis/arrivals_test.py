@@ -1,0 +1,235 @@
+"""Measured arrivals: when vehicles came, where they went, and days that have them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ugat_marl.data import follows_traffic
+from ugat_marl.diagnosis import Reference, Tally
+from ugat_marl.diagnosis.arrivals import Arrivals, Due, corrected
+from ugat_marl.diagnosis.engine import Engine
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.inflow import by_lane_left, unhindered
+from ugat_marl.diagnosis.replay import Replay
+from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.effects import Effect, load_scenario, parse_domain
+from ugat_marl.experiments import policy_factory, record
+from ugat_marl.scenarios import Network, Passages, Period, Scenario, redrawn
+from ugat_marl.simulation import standard_detectors
+
+LIMIT = 10.0
+
+
+def a_period(passages: dict[str, Passages] | None = None, end: float = 200.0) -> Period:
+    return Period("day1", 0.0, end, "fit", {"C": ((0.0, "Gr"),)}, passages or {})
+
+
+def seen(times: Sequence[float], speeds: Sequence[float]) -> Passages:
+    on = np.array(times)
+    speed = np.array(speeds)
+    return Passages(on, on + 5.0 / np.where(np.isnan(speed), 1.0, speed), speed, on * np.nan)
+
+
+def test_who_comes_freely_came_when_he_was_seen() -> None:
+    times = [3.0, 50.0, 90.0]
+    found = unhindered(seen(times, [9.0, 10.0, 11.0]), LIMIT, a_period())
+    assert found.tolist() == times
+
+
+def test_who_came_through_a_queue_is_spread_between_free_neighbours_and_never_later() -> None:
+    # Free at 20 and at 60; three between them in a queue: evenly at 30, 40, 50, but the first
+    # was seen at 25 and cannot have come after that.
+    found = unhindered(seen([20.0, 25.0, 45.0, 58.0, 60.0], [9, 1, 2, 3, 9]), LIMIT, a_period())
+    assert found.tolist() == [20.0, 25.0, 40.0, 50.0, 60.0]
+
+
+def test_a_queue_at_the_ends_is_spread_to_the_ends_of_the_period() -> None:
+    found = unhindered(seen([80.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=300.0))
+    np.testing.assert_allclose(found, [80.0, 190.0])  # 100 and 200 would be later than seen
+    found = unhindered(seen([180.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=240.0))
+    np.testing.assert_allclose(found, [80.0, 160.0])
+
+
+def test_who_drives_on_behind_a_queue_belongs_to_it() -> None:
+    close = unhindered(seen([20.0, 40.0, 42.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0))
+    np.testing.assert_allclose(close, [20.0, 40.0, 42.0])  # both spread: 40 and 60, cut to seen
+    far = unhindered(seen([20.0, 40.0, 46.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0))
+    np.testing.assert_allclose(far, [20.0, 33.0, 46.0])  # the last came freely
+
+
+def test_without_speeds_time_on_the_detector_tells() -> None:
+    one = dataclasses.replace(seen([20.0, 39.0, 60.0], [9, 1, 9]), speed_mps=np.full(3, np.nan))
+    assert unhindered(one, LIMIT, a_period()).tolist() == [20.0, 39.0, 60.0]
+    one = dataclasses.replace(seen([20.0, 50.0, 60.0], [9, 1, 9]), speed_mps=np.full(3, np.nan))
+    assert unhindered(one, LIMIT, a_period()).tolist() == [20.0, 40.0, 60.0]
+
+
+def test_a_long_zone_is_left_later() -> None:
+    # 5 m of vehicle and 15 m of zone at 10 m/s: 2 s, and nobody was held up.
+    on = np.array([150.0, 190.0])
+    free = Passages(on, on + 2.0, on * np.nan, on * np.nan)
+    assert unhindered(free, LIMIT, a_period(), 15.0).tolist() == [150.0, 190.0]
+    assert unhindered(free, LIMIT, a_period()).tolist() != [150.0, 190.0]
+
+
+def test_who_changes_lanes_is_counted_where_he_left() -> None:
+    came = [np.array([1.0, 2.0, 3.0]), np.array([4.0])]
+    crossed = [np.array([10.0, 11.0]), np.array([12.0, 13.0])]
+    found = by_lane_left(came, crossed, [2.0, 2.0])
+    assert [item.tolist() for item in found] == [[1.0, 2.0], [3.0, 4.0]]
+
+
+def test_nobody_leaves_before_he_can_have_come() -> None:
+    found = by_lane_left([np.array([9.0]), np.array([1.0])], [np.array([10.0])], [2.0, 2.0])
+    assert [item.tolist() for item in found] == [[1.0, 9.0], []]  # the second still stands there
+    found = by_lane_left([np.array([9.0])], [np.array([10.0])], [2.0])
+    assert found[0].tolist() == [9.0]
+
+
+@pytest.fixture(scope="module")
+def crossing(data: Path) -> tuple[Scenario, Network, Site]:
+    scenario = load_scenario(data / "crossing")
+    network = Network.read(scenario)
+    return scenario, network, Site.of(network, standard_detectors(network))
+
+
+def passages(times: Mapping[str, Sequence[float]]) -> dict[str, Passages]:
+    return {name: seen(found, [13.0] * len(found)) for name, found in times.items()}
+
+
+def departs(scenario: Scenario) -> dict[str, list[float]]:
+    """Departures by origin."""
+    found: dict[str, list[float]] = {}
+    for item in scenario.routes[0].parse().iter("vehicle"):
+        route = item.find("route")
+        assert route is not None
+        origin = route.get("edges", "").split()[0]
+        found.setdefault(origin, []).append(float(item.get("depart", "nan")))
+    return found
+
+
+def test_vehicles_depart_so_that_they_come_when_others_came(
+    crossing: tuple[Scenario, Network, Site],
+) -> None:
+    scenario, network, site = crossing
+    day = redrawn(scenario, 3)
+    came = {"advance:S_C_0": [60.0, 75.0, 99.0], "stop:S_C_0": [65.0, 80.0, 105.0]}
+    period = a_period(passages(came))
+    found, due = Arrivals(site, network).given(day, day, period)
+    position = {item.id: item.position_m for item in site.detectors}["advance:S_C_0"]
+    way = position / network.lanes["S_C_0"].speed_mps
+    rows = departs(found)
+    assert set(rows) == {"S_C"}, "nobody was seen to come from the west"
+    np.testing.assert_allclose(rows["S_C"], np.array([60.0, 75.0, 99.0]) - way, atol=0.006)
+    assert due.given["S_C"].sum() == 3
+    assert due.given["W_C"].sum() == 0
+    assert due.asked["W_C"].sum() > 0, "the demand asks for them all the same"
+
+
+def test_more_came_than_the_model_has(crossing: tuple[Scenario, Network, Site]) -> None:
+    scenario, network, site = crossing
+    day = redrawn(scenario, 3)
+    times = np.linspace(20.0, 180.0, 60).tolist()
+    period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
+    found, _ = Arrivals(site, network).given(day, day, period)
+    names = [item.get("id") for item in found.routes[0].parse().iter("vehicle")]
+    assert len(names) == len(set(names)) == 60
+
+
+def test_effects_on_demand_leave_what_is_simulated_alone(
+    crossing: tuple[Scenario, Network, Site],
+) -> None:
+    scenario, network, site = crossing
+    times = np.linspace(20.0, 180.0, 8).tolist()
+    period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
+    replay = Replay(scenario, network, site.detectors, site.owner, answering=True)
+    plain, more = (replay.simulate(parse_domain(x), period, 1) for x in ("sim", "demand_level=*,3"))
+    for name, item in plain.period.passages.items():
+        np.testing.assert_array_equal(item.on_s, more.period.passages[name].on_s)
+    assert plain.due is not None
+    assert more.due is not None
+    assert more.due.asked["S_C"].sum() > 1.5 * plain.due.asked["S_C"].sum()
+
+
+def test_effects_on_demand_cost_no_simulation(
+    crossing: tuple[Scenario, Network, Site], tmp_path: Path
+) -> None:
+    scenario, network, site = crossing
+    times = np.linspace(20.0, 180.0, 8).tolist()
+    period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
+
+    def engine() -> Engine:
+        replay = Replay(scenario, network, site.detectors, site.owner, answering=True)
+        return Engine(scenario, site, replay, [period], 5, cache=tmp_path)
+
+    first = engine()
+    more = parse_domain("demand_level=*,3+headway=1.5")
+    (found,) = first.replicates(more, [0])
+    assert first.simulated == 1
+    (plain,) = first.replicates(parse_domain("headway=1.5"), [0])
+    assert first.simulated == 1
+    again = engine()
+    (remembered,) = again.replicates(parse_domain("demand_level=*,2+headway=1.5"), [0])
+    assert again.simulated == 0
+    counts = [
+        item.tally.sums[INDEX["count_stop"], :, 0].sum() for item in (plain, remembered, found)
+    ]
+    assert counts[0] < counts[1] < counts[2]
+    for name in ("lost", "gap2", "occupied_in_red"):
+        np.testing.assert_array_equal(found.tally.sums[INDEX[name]], plain.tally.sums[INDEX[name]])
+
+
+def test_detectors_that_missed_vehicles_do_not_keep_them_away(
+    crossing: tuple[Scenario, Network, Site],
+) -> None:
+    scenario, network, site = crossing
+    day = redrawn(scenario, 3)
+    times = np.linspace(5.0, 195.0, 40)
+    few = {"advance:S_C_0": times[::2].tolist(), "stop:S_C_0": (times + 3).tolist()}
+    found, due = Arrivals(site, network).given(day, day, a_period(passages(few)))
+    assert len(departs(found)["S_C"]) >= 38
+    assert due.given["S_C"].sum() >= 36
+
+
+def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, Site]) -> None:
+    _, _, site = crossing
+    place = [lane.id for lane in site.lanes].index("S_C_0")
+    sums = np.zeros((len(FEATURES), len(site.places), 2))
+    bins = np.zeros((len(BIN_FEATURES), len(site.places), 2))
+    sums[INDEX["count_stop"], place] = (8.0, 10.0)
+    sums[INDEX["platoon_gap"], place] = (8.0, 10.0)
+    bins[BIN_FEATURES.index("count_stop"), place] = (6.0, 2.0)
+    none = {edge: np.zeros(2) for _, edge, _ in site.places}
+    due = Due(none | {"S_C": np.array([9.0, 3.0])}, none | {"S_C": np.array([5.0, 5.0])})
+    found = corrected(Tally(sums, bins), site, due)
+    # 8 of 10 that came were counted, so 8 of 10 of the two more that were due would have been.
+    assert found.sums[INDEX["count_stop"], place].tolist() == pytest.approx([9.6, 10.0])
+    assert found.bins[BIN_FEATURES.index("count_stop"), place].tolist() == pytest.approx([9.2, 0.4])
+    assert not found.sums[INDEX["platoon_gap"]].any()
+
+
+def test_days_under_signals_that_answered_others_are_like_the_measured_one(data: Path) -> None:
+    """Closed loop: nothing is hidden, and only measured arrivals make the replay agree."""
+    scenario = load_scenario("single-v1").with_duration(1200.0)
+    measured = record(scenario, "sim", policy_factory("max-pressure:10"), periods=4, seed=21)
+    network = Network.read(scenario)
+    site = Site.of(network, measured.detectors)
+    assert follows_traffic(measured.periods, site.intersections[0])
+
+    def distance(answering: bool) -> float:
+        replay = Replay(scenario, network, measured.detectors, site.owner, answering=answering)
+        engine = Engine(scenario, site, replay, measured.periods, 5)
+        days = [day.tally for day in engine.replicates(NOTHING, range(16))]
+        reference = Reference(Pools.of(site), days)
+        return reference.distance(engine.measured(measured.periods)).parts["network"]
+
+    assert distance(True) < 0.5 * distance(False)
+
+
+NOTHING: tuple[Effect, ...] = ()

@@ -1,0 +1,372 @@
+"""Simulated days: remembered, shared, refused when time is up. A stand-in plays SUMO."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ugat_marl.diagnosis import default_cache
+from ugat_marl.diagnosis import engine as module
+from ugat_marl.diagnosis.engine import Engine, OutOfTime, Replicate
+from ugat_marl.diagnosis.replay import Day, Replay
+from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.unmeasured import Unmeasured
+from ugat_marl.effects import Effect, load_scenario, observed, parse_domain
+from ugat_marl.errors import SimulatorError
+from ugat_marl.scenarios import Network, Passages, Period, Scenario
+from ugat_marl.simulation import standard_detectors
+
+LOG = ((0.0, "Gr"), (30.0, "rG"), (60.0, "Gr"), (90.0, "rG"), (120.0, "Gr"))
+PERIODS = (
+    Period("day1", 0.0, 200.0, "fit", {"C": LOG}, {}),
+    Period("day2", 0.0, 200.0, "fit", {"C": LOG[:-1]}, {}),
+)
+
+
+class Streets(Replay):
+    """Vehicles at random times that depend on the day and on the effects; counts its calls."""
+
+    def __init__(self, site: Site) -> None:
+        self.calls: list[tuple[tuple[str, ...], str, int]] = []
+        self._site = site
+        self._calls = threading.Lock()
+
+    def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
+        names = tuple(map(str, effects))
+        with self._calls:
+            self.calls.append((names, period.id, seed))
+        generator = np.random.default_rng([seed, *"".join(names).encode()])
+        seen: dict[str, Passages] = {}
+        for item in self._site.detectors:
+            on = np.sort(generator.uniform(period.begin_s, period.end_s - 1, 20))
+            seen[item.id] = Passages(on, on + generator.uniform(0.1, 0.9, 20), on % 14, on % 7)
+        return Day(replace(period, passages=seen), float(generator.uniform(50, 60)))
+
+    def observed(self, effects: Sequence[Effect], period: Period) -> Period:
+        return observed(period, effects, self._site.detectors, dict(self._site.owner))
+
+
+@pytest.fixture(scope="module")
+def scenario(data: Path) -> Scenario:
+    return load_scenario(data / "crossing")
+
+
+@pytest.fixture(scope="module")
+def site(scenario: Scenario) -> Site:
+    network = Network.read(scenario)
+    return Site.of(network, standard_detectors(network))
+
+
+def an_engine(
+    scenario: Scenario,
+    site: Site,
+    cache: Path | None,
+    *,
+    seed: int = 3,
+    periods: Sequence[Period] = PERIODS,
+    deadline: float | None = None,
+) -> tuple[Engine, Streets]:
+    streets = Streets(site)
+    made = Engine(scenario, site, streets, periods, seed, cache=cache, deadline=deadline, workers=3)
+    return made, streets
+
+
+def same(one: Replicate, two: Replicate) -> bool:
+    return (
+        bool((one.tally.sums == two.tally.sums).all())
+        and bool((one.tally.bins == two.tally.bins).all())
+        and one.travel_time_s == two.travel_time_s
+    )
+
+
+HEADWAY = parse_domain("headway=1.5")
+FAULTY = parse_domain("undercount=*,0.3")
+
+
+def test_a_remembered_day_is_the_simulated_day_to_the_last_digit(
+    scenario: Scenario, site: Site, tmp_path: Path
+) -> None:
+    first, streets = an_engine(scenario, site, tmp_path)
+    simulated = first.replicates(HEADWAY, range(4))
+    assert len(streets.calls) == first.simulated == 4
+    again, silent = an_engine(scenario, site, tmp_path)
+    remembered = again.replicates(HEADWAY, range(4))
+    assert silent.calls == []
+    assert again.simulated == 0
+    assert all(same(one, two) for one, two in zip(simulated, remembered, strict=True))
+
+
+@pytest.mark.parametrize("speeds", [True, False])
+@pytest.mark.parametrize("lengths", [True, False])
+def test_simulated_days_tell_no_more_than_the_measured_ones(
+    speeds: bool, lengths: bool, scenario: Scenario, site: Site, tmp_path: Path
+) -> None:
+    day = Streets(site).simulate((), PERIODS[0], 7).period
+    told = {
+        name: Passages(
+            item.on_s,
+            item.off_s,
+            item.speed_mps if speeds else np.full(len(item), np.nan),
+            item.length_m if lengths else np.full(len(item), np.nan),
+        )
+        for name, item in day.passages.items()
+    }
+    measured = replace(day, passages=told)
+
+    class SameDay(Streets):
+        def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
+            return Day(day, 50.0)
+
+    made = Engine(scenario, site, SameDay(site), [measured], 3, cache=tmp_path, workers=1)
+    (simulated,) = made.replicates((), [0])
+    (seen,) = made.measured([measured])
+    assert np.allclose(simulated.tally.sums, seen.sums)
+    with_all = Engine(scenario, site, SameDay(site), [day], 3, cache=tmp_path, workers=1)
+    (other,) = with_all.replicates((), [0])
+    assert np.allclose(other.tally.sums, simulated.tally.sums) == (speeds and lengths)
+
+
+def test_a_detector_that_saw_nobody_tells_nothing_of_speeds(site: Site) -> None:
+    names = [item.id for item in site.detectors]
+    none = np.full(3, np.nan)
+    times = np.arange(3.0)
+    passages = {names[0]: Passages.none(), names[1]: Passages(times, times, none, times)}
+    found = Unmeasured.of([replace(PERIODS[0], passages=passages), PERIODS[1]])
+    assert found == Unmeasured((names[1],), ())
+    full = replace(PERIODS[0], passages={names[1]: Passages(times, times, times, times)})
+    assert not Unmeasured.of([replace(PERIODS[0], passages=passages), full])
+    assert np.isnan(found.kept_from(full).passages[names[1]].speed_mps).all()
+    assert (found.kept_from(full).passages[names[1]].length_m == times).all()
+
+
+def test_within_one_run_no_day_is_simulated_twice(scenario: Scenario, site: Site) -> None:
+    made, streets = an_engine(scenario, site, None)
+    made.replicates((), range(3))
+    made.replicates((), range(5))
+    assert len(streets.calls) == 5
+
+
+def test_days_come_in_the_order_asked_for(scenario: Scenario, site: Site) -> None:
+    made, _ = an_engine(scenario, site, None)
+    up, down = made.replicates((), [0, 1, 2]), made.replicates((), [2, 1, 0])
+    assert all(same(one, two) for one, two in zip(up, down[::-1], strict=True))
+    assert not same(up[0], up[1])
+
+
+def test_a_day_is_played_under_the_signals_of_its_period(scenario: Scenario, site: Site) -> None:
+    made, streets = an_engine(scenario, site, None)
+    made.replicates((), range(4))
+    assert sorted(call[1] for call in streets.calls) == ["day1", "day1", "day2", "day2"]
+
+
+def test_models_share_the_seeds_of_their_days(scenario: Scenario, site: Site) -> None:
+    made, streets = an_engine(scenario, site, None)
+    made.replicates((), range(3))
+    made.replicates(HEADWAY, range(3))
+    plain = {seed for names, _, seed in streets.calls if not names}
+    slow = {seed for names, _, seed in streets.calls if names}
+    assert len(plain) == 3
+    assert plain == slow
+
+
+def test_faults_of_detectors_cost_no_simulation(scenario: Scenario, site: Site) -> None:
+    made, streets = an_engine(scenario, site, None)
+    plain = made.replicates((), range(2))
+    faulty = made.replicates(FAULTY, range(2))
+    assert len(streets.calls) == 2
+    assert faulty[0].tally.bins[0].sum() < plain[0].tally.bins[0].sum()
+    assert faulty[0].travel_time_s == plain[0].travel_time_s
+
+
+@pytest.mark.parametrize("damage", ["empty", "half", "text", "flipped", "other"])
+def test_a_damaged_file_is_simulated_again(
+    scenario: Scenario, site: Site, tmp_path: Path, damage: str
+) -> None:
+    first, _ = an_engine(scenario, site, tmp_path)
+    simulated = first.replicates((), [0])[0]
+    (file,) = tmp_path.rglob("*.npz")
+    content = file.read_bytes()
+    flipped = bytearray(content)
+    flipped[len(content) // 3 : len(content) // 3 + 40] = bytes(40)
+    if damage == "other":
+        with file.open("wb") as stream:
+            np.savez(stream, something=np.zeros(3))
+    else:
+        changed = {"empty": b"", "half": content[: len(content) // 2], "text": b"no archive"}
+        file.write_bytes(changed.get(damage, bytes(flipped)))
+    again, streets = an_engine(scenario, site, tmp_path)
+    assert same(again.replicates((), [0])[0], simulated)
+    assert len(streets.calls) == 1
+    third, silent = an_engine(scenario, site, tmp_path)
+    assert same(third.replicates((), [0])[0], simulated), "the file was not written again"
+    assert silent.calls == []
+
+
+def test_what_decides_a_day_decides_which_is_remembered(
+    scenario: Scenario, site: Site, tmp_path: Path
+) -> None:
+    an_engine(scenario, site, tmp_path)[0].replicates((), [0])
+    shorter = replace(PERIODS[0], end_s=180.0)
+    others = {
+        "seed": an_engine(scenario, site, tmp_path, seed=4),
+        "signals": an_engine(scenario, site, tmp_path, periods=PERIODS[1:]),
+        "end": an_engine(scenario, site, tmp_path, periods=[shorter]),
+        "scenario": an_engine(scenario.with_duration(100.0), site, tmp_path),
+        "detectors": an_engine(
+            scenario, replace(site, detectors=site.detectors[::-1]), tmp_path
+        ),
+    }  # fmt: skip
+    for name, (made, streets) in others.items():
+        made.replicates((), [0])
+        assert len(streets.calls) == 1, name
+
+
+def test_another_version_of_the_features_forgets(
+    scenario: Scenario, site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    an_engine(scenario, site, tmp_path)[0].replicates((), [0])
+    monkeypatch.setattr(module, "VERSION", module.VERSION + 1)
+    made, streets = an_engine(scenario, site, tmp_path)
+    made.replicates((), [0])
+    assert len(streets.calls) == 1
+
+
+def test_when_time_is_up_only_what_is_remembered_is_given(
+    scenario: Scenario, site: Site, tmp_path: Path
+) -> None:
+    known = an_engine(scenario, site, tmp_path)[0].replicates((), range(2))
+    late, streets = an_engine(scenario, site, tmp_path, deadline=time.monotonic() - 1)
+    assert same(late.replicates((), [1])[0], known[1])
+    with pytest.raises(OutOfTime, match="budget"):
+        late.replicates((), range(3))
+    with pytest.raises(OutOfTime):
+        late.replicates(HEADWAY, [0])
+    assert streets.calls == []
+
+
+def test_a_failure_of_sumo_is_passed_on(
+    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, streets = an_engine(scenario, site, None)
+
+    def fails(effects: Sequence[Effect], period: Period, seed: int) -> Day:
+        raise SimulatorError("SUMO failed")
+
+    monkeypatch.setattr(streets, "simulate", fails)
+    with pytest.raises(SimulatorError, match="SUMO failed"):
+        made.replicates((), range(5))
+
+
+def test_progress_is_told_day_by_day(scenario: Scenario, site: Site) -> None:
+    made, _ = an_engine(scenario, site, None)
+    told: list[None] = []
+    made.replicates((), range(5), lambda: told.append(None))
+    assert len(told) == 5
+
+
+def test_work_of_unknown_length_is_told_by_the_days_it_adds(scenario: Scenario, site: Site) -> None:
+    made, _ = an_engine(scenario, site, None)
+    made.replicates((), range(3))
+    told: list[int] = []
+    with made.watched(lambda: told.append(1), 4):
+        made.replicates((), range(5))  # three of them are known
+        assert len(told) == 2
+        made.prepare([(HEADWAY, range(9))])
+        assert len(told) == 4
+    made.replicates((), range(7))
+    assert len(told) == 4
+
+
+def test_measured_periods_are_tallied_under_their_own_signals(
+    scenario: Scenario, site: Site
+) -> None:
+    made, _ = an_engine(scenario, site, None)
+    (day,) = made.replicates((), [0])
+    streets = Streets(site)
+    streets.simulate((), PERIODS[0], 0)
+    seen = streets.simulate((), PERIODS[0], 5).period
+    (counted,) = made.measured([seen])
+    assert counted.sums.shape == day.tally.sums.shape
+    assert counted.days == 1
+
+
+def test_the_cache_lies_where_caches_lie(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_cache() == tmp_path / "ugat_marl" / "replicates"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert default_cache().parts[-3:] == (".cache", "ugat_marl", "replicates")
+
+
+# --- days of many models at once -----------------------------------------------------------------
+
+
+def test_days_that_were_set_aside_are_passed_over(scenario: Scenario, site: Site) -> None:
+    made, _ = an_engine(scenario, site, None)
+    assert made.first(4) == [0, 1, 2, 3]
+    assert made.first(0) == []
+    made.set_aside = frozenset({0, 2, 3})
+    assert made.first(4) == [1, 4, 5, 6]
+    other, _ = an_engine(scenario, site, None)
+    assert other.first(2) == [0, 1], "another engine has days of its own"
+
+
+def test_prepared_days_are_those_that_are_simulated_one_by_one(
+    scenario: Scenario, site: Site
+) -> None:
+    made, streets = an_engine(scenario, site, None)
+    told: list[None] = []
+    models = [(HEADWAY, [0, 1, 2]), ((), [0, 3]), (FAULTY, [0, 3])]
+    made.prepare(models, lambda: told.append(None))
+    assert len(told) == len(models)
+    plain, _ = an_engine(scenario, site, None)
+    calls = len(streets.calls)
+    for effects, numbers in models:
+        one, two = made.replicates(effects, numbers), plain.replicates(effects, numbers)
+        assert all(same(a, b) for a, b in zip(one, two, strict=True))
+    assert len(streets.calls) == calls, "it was simulated again"
+
+
+def test_what_sumo_refuses_is_reported_when_it_is_asked_for(
+    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, streets = an_engine(scenario, site, None)
+    plays = streets.simulate
+
+    def refuses(effects: Sequence[Effect], period: Period, seed: int) -> Day:
+        if effects:
+            raise SimulatorError("SUMO failed")
+        return plays(effects, period, seed)
+
+    monkeypatch.setattr(streets, "simulate", refuses)
+    made.prepare([(HEADWAY, [0, 1]), ((), [0])])
+    assert len(streets.calls) == 1, "the other model was simulated"
+    with pytest.raises(SimulatorError, match="SUMO failed"):
+        made.replicates(HEADWAY, [0, 1])
+
+
+def test_a_mistake_while_days_are_prepared_is_not_swallowed(
+    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, streets = an_engine(scenario, site, None)
+
+    def fails(effects: Sequence[Effect], period: Period, seed: int) -> Day:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(streets, "simulate", fails)
+    with pytest.raises(ZeroDivisionError):
+        made.prepare([((), [0, 1])])
+
+
+def test_no_day_is_prepared_when_time_is_up(scenario: Scenario, site: Site, tmp_path: Path) -> None:
+    an_engine(scenario, site, tmp_path)[0].replicates((), range(2))
+    late, streets = an_engine(scenario, site, tmp_path, deadline=time.monotonic() - 1)
+    late.prepare([((), [0, 1])])
+    with pytest.raises(OutOfTime, match="budget"):
+        late.prepare([((), [0, 1]), (HEADWAY, [0])])
+    assert streets.calls == []

@@ -1,0 +1,351 @@
+"""Fits in a world whose statistics are straight lines: the answer is known in advance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ugat_marl.diagnosis import Hypothesis, Reference, Tally
+from ugat_marl.diagnosis.engine import Engine, Replicate
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
+from ugat_marl.diagnosis.fit import FAR, NEARBY, SETTLING_DAYS, SHORTEST_S, Fitter, Members
+from ugat_marl.diagnosis.intervals import uncertainty
+from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.effects import Effect
+
+Array = NDArray[np.float64]
+
+POOLS = Pools({"network": np.ones((1, 1))})
+WIDTH = 20
+HEADWAY = Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05)
+GAP = Hypothesis("min_gap", (), ("metres",), ((3.5,),), (2.5,), 0.2)
+_GENERATOR = np.random.default_rng(1)
+SLOPES = {
+    "headway": 6.0 * _GENERATOR.standard_normal(WIDTH),
+    "min_gap": 2.0 * _GENERATOR.standard_normal(WIDTH),
+}
+NOMINAL = {"headway": 1.0, "min_gap": 2.5}
+
+
+def day(number: int, values: dict[str, float], street: int = 0) -> Tally:
+    """A day of the world, with noise that belongs to the day and not to the model."""
+    noise = np.random.default_rng([street, number]).standard_normal(WIDTH)
+    mean = 20.0 + sum((values[name] - NOMINAL[name]) * SLOPES[name] for name in values)
+    sums = np.zeros((len(FEATURES), 1, 2))
+    sums[:WIDTH, 0] = np.stack([100 * (mean + noise), np.full(WIDTH, 100.0)], axis=-1)
+    return Tally(sums, np.zeros((len(BIN_FEATURES), 1, 1)))
+
+
+class World(Engine):
+    """Simulates by a formula."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, ...]] = []
+
+    def replicates(
+        self,
+        effects: Sequence[Effect],
+        numbers: Sequence[int],
+        advance: Callable[[], None] | None = None,
+    ) -> list[Replicate]:
+        del advance
+        self.asked.append(tuple(map(str, effects)))
+        return [Replicate(self.played(number, effects), 60.0) for number in numbers]
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        """One day of a model."""
+        values = {
+            e.name: float(next(v for k, v in e.record().items() if k != "name")) for e in effects
+        }
+        return day(number, values)
+
+
+def played(world: World) -> dict[int, Tally]:
+    """Days of the scenario as it is."""
+    return {number: item.tally for number, item in world.ordinary((), range(80)).items()}
+
+
+def a_fitter(
+    truth: dict[str, float], street: int, days: int = 8, world: World | None = None
+) -> Fitter:
+    world = world or World()
+    base_days = played(world)
+    base = Reference(POOLS, list(base_days.values()))
+    data = [day(number, truth, street) for number in range(5)]
+    return Fitter(world, POOLS, base, base_days, data, days=days, price=14.0, speeds=True)
+
+
+def start(*members: tuple[Hypothesis, float]) -> Members:
+    return tuple((hypothesis, (value,)) for hypothesis, value in members)
+
+
+def test_a_planted_value_is_found_from_afar() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=7)
+    best = fitter.refine(fitter.simulate(start((HEADWAY, 1.9))))
+    assert best.values[0] == pytest.approx(1.43, abs=0.06)
+    assert best.cost < fitter.simulate(start((HEADWAY, 1.9))).cost
+
+
+def test_two_values_are_fitted_at_once() -> None:
+    fitter = a_fitter({"headway": 1.43, "min_gap": 3.3}, street=8)
+    best = fitter.refine(fitter.simulate(start((HEADWAY, 1.2), (GAP, 4.0))))
+    assert best.values == pytest.approx([1.43, 3.3], abs=0.2)
+
+
+def test_the_true_model_costs_least() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=9)
+    true = fitter.refine(fitter.simulate(start((HEADWAY, 1.5))))
+    wrong = fitter.refine(fitter.simulate(start((GAP, 3.5))))
+    both = fitter.refine(fitter.simulate(start((HEADWAY, 1.5), (GAP, 2.7))))
+    assert true.cost < wrong.cost
+    assert true.cost < both.cost, "an effect that is not there is not worth its price"
+
+
+def test_values_stay_in_range() -> None:
+    fitter = a_fitter({"headway": 1.0}, street=10)
+    allowed = HEADWAY.clipped((-1e9,))[0], HEADWAY.clipped((1e9,))[0]
+    best = fitter.refine(fitter.simulate(start((HEADWAY, allowed[1]))))
+    assert allowed[0] <= best.values[0] <= allowed[1]
+
+
+def test_a_model_without_numbers_has_nothing_to_refine() -> None:
+    fitter = a_fitter({"headway": 1.2}, street=11)
+    plain = fitter.simulate(())
+    assert fitter.refine(plain) is plain
+    errors, extra = uncertainty(fitter, plain)
+    assert len(errors) == 0
+    assert not any(values.any() for values in extra.values())
+
+
+def test_95_percent_intervals_cover_95_percent() -> None:
+    inside = 0
+    errors: list[float] = []
+    estimates: list[float] = []
+    for street in range(100, 160):
+        fitter = a_fitter({"headway": 1.4}, street)
+        best = fitter.refine(fitter.simulate(start((HEADWAY, 1.5))))
+        (error,), _ = uncertainty(fitter, best)
+        errors.append(error)
+        estimates.append(best.values[0])
+        inside += abs(best.values[0] - 1.4) <= 1.96 * error
+    assert 0.85 <= inside / 60 <= 1.0
+    assert np.mean(errors) == pytest.approx(np.std(estimates), rel=0.4)
+
+
+def test_uncertain_values_make_statistics_uncertain() -> None:
+    fitter = a_fitter({"headway": 1.4}, street=12)
+    best = fitter.refine(fitter.simulate(start((HEADWAY, 1.5))))
+    (error,), extra = uncertainty(fitter, best)
+    slopes = SLOPES["headway"]
+    assert extra["network"][0, :WIDTH] == pytest.approx((slopes * error) ** 2, rel=0.02)
+
+
+def test_the_same_days_are_compared() -> None:
+    # Base and model share their noise, so the model's mean is as well known as the base's.
+    fitter = a_fitter({"headway": 1.4}, street=13)
+    found = fitter.simulate(start((HEADWAY, 1.4)))
+    expected = fitter.base.blocks["network"].mean[0, :WIDTH] + 0.4 * SLOPES["headway"]
+    assert found.reference.blocks["network"].mean[0, :WIDTH] == pytest.approx(expected, abs=0.02)
+
+
+def test_a_fit_is_deterministic() -> None:
+    def fitted() -> Array:
+        fitter = a_fitter({"headway": 1.43, "min_gap": 3.3}, street=8)
+        return fitter.refine(fitter.simulate(start((HEADWAY, 1.2), (GAP, 4.0)))).values
+
+    assert (fitted() == fitted()).all()
+
+
+# --- the last step, derivatives and windows ------------------------------------------------------
+
+
+def test_a_fit_that_stopped_early_takes_a_last_step() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=14)
+    early = fitter.simulate(start((HEADWAY, 1.9)))
+    found = fitter.settled(early, np.array([0.03]))
+    assert found.values[0] == pytest.approx(1.43, abs=0.09)  # three standard errors of five days
+    assert found.cost < early.cost
+    assert len(found.tallies) == SETTLING_DAYS > len(early.tallies)
+
+
+class LocksUp(World):
+    """Traffic stands still on one day of every model but the scenario as it is."""
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        found = super().played(number, effects)
+        found.bins[0] = 1000.0 + 10.0 * np.sin(number)
+        if effects and number == 3:
+            found.bins[0] = 500.0
+            found.sums[:WIDTH, 0, 0] += 3000.0
+        return found
+
+
+def test_a_day_on_which_a_model_locks_up_is_no_part_of_it() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=14, world=LocksUp())
+    fitter.engine.day_to_day = 10.0
+    model = fitter.simulate(start((HEADWAY, 1.5)))
+    assert list(model.days) == [0, 1, 2, 4, 5, 6, 7]
+    mean = model.reference.blocks["network"].mean[0, :WIDTH]
+    assert mean == pytest.approx(20.0 + 0.5 * SLOPES["headway"], abs=0.35)
+    found = fitter.settled(fitter.refine(model), np.array([0.03]))
+    assert found.values[0] == pytest.approx(1.43, abs=0.09)
+
+
+def test_a_fit_within_its_errors_stays_where_it_is() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=15)
+    found = fitter.settled(fitter.simulate(start((HEADWAY, 1.46))), np.array([1.0]))
+    assert found.values[0] == 1.46
+    assert len(found.tallies) == SETTLING_DAYS
+    plain = fitter.simulate(())
+    assert fitter.settled(plain, np.empty(0)) is plain
+
+
+def test_a_derivative_is_taken_over_a_move_that_does_something_plain() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=16)
+    model = fitter.simulate(start((HEADWAY, 2.5), (GAP, 3.7)))
+    (strong, far), (weak, farther) = fitter.changes(model)
+    assert far == pytest.approx(NEARBY * 1.5), "a strong effect is moved a little"
+    assert 1.5 * NEARBY * 1.2 < farther <= FAR * 1.2 + 1e-4, "a weak one more"
+    for name, change, delta in (("headway", strong, far), ("min_gap", weak, farther)):
+        assert change["network"][0, :WIDTH] / delta == pytest.approx(SLOPES[name], rel=1e-6)
+
+
+def test_what_does_nothing_is_moved_no_farther_than_nominal() -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    after = (("edge", "a"), ("begin_s", 3600.0), ("end_s", 4200.0))
+    dead = Hypothesis("demand_surge", after, ("factor",), ((1.5,),), (1.0,), 0.05)
+    model = fitter.simulate(start((dead, 1.3)))
+    ((change, delta),) = fitter.changes(model)
+    assert abs(delta) <= FAR * 0.3 + 1e-4
+    assert not change["network"][0].any()
+
+
+class Windows(World):
+    """Every statistic is three minutes of an hour, of which a surge takes some."""
+
+    TRUTH = (900.0, 2400.0)
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        change = np.zeros(WIDTH)
+        for item in (effect.record() for effect in effects):
+            window = float(item["begin_s"]), float(item["end_s"])
+            change += (float(item["factor"]) - 1.0) * surge(*window)
+        return with_surge(number, change)
+
+
+def surge(begin_s: float, end_s: float) -> Array:
+    """Share of the window in every three minutes, times what a factor of 2 does there."""
+    edges = np.linspace(0.0, 3600.0, WIDTH + 1)
+    return 20.0 * np.clip(
+        np.minimum(edges[1:], end_s) - np.maximum(edges[:-1], begin_s), 0.0, None
+    ) / 180.0  # fmt: skip
+
+
+def with_surge(number: int, change: Array, street: int = 0) -> Tally:
+    plain = day(number, {}, street)
+    plain.sums[:WIDTH, 0, 0] += 100.0 * change
+    return plain
+
+
+def a_surge(begin_s: float, end_s: float) -> Members:
+    fixed = (("edge", "a"), ("begin_s", begin_s), ("end_s", end_s))
+    return ((Hypothesis("demand_surge", fixed, ("factor",), ((1.5,),), (1.0,), 0.1), (1.5,)),)
+
+
+def a_fitter_of_windows(truth: tuple[float, float]) -> Fitter:
+    world = Windows()
+    base_days = played(world)
+    data = [with_surge(number, 0.5 * surge(*truth), 18) for number in range(5)]
+    base = Reference(POOLS, list(base_days.values()))
+    return Fitter(world, POOLS, base, base_days, data, days=8, price=14.0, speeds=True)
+
+
+def window_of(members: Members) -> tuple[float, float]:
+    fixed = dict(members[0][0].fixed)
+    return float(fixed["begin_s"]), float(fixed["end_s"])
+
+
+@pytest.mark.parametrize(
+    "first",
+    [(600.0, 2700.0), (1200.0, 2100.0), (600.0, 2100.0), (1200.0, 2700.0), (900.0, 2400.0)],
+)
+def test_a_window_five_minutes_off_at_both_ends_is_found(first: tuple[float, float]) -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    begun = fitter.simulate(a_surge(*first))
+    best = fitter.fitted(begun)
+    assert window_of(best.members) == pytest.approx(Windows.TRUTH, abs=45.0)
+    assert best.values[0] == pytest.approx(1.5, abs=0.05)
+    assert best.cost <= begun.cost
+
+
+def test_the_values_alone_would_not_find_the_window() -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    begun = fitter.simulate(a_surge(600.0, 2700.0))
+    assert fitter.refine(begun).cost > fitter.fitted(begun).cost + 100.0
+
+
+def test_windows_stay_on_the_clock_and_keep_a_minute() -> None:
+    fitter = a_fitter_of_windows((0.0, 180.0))
+    best = fitter.fitted(fitter.simulate(a_surge(120.0, 420.0)))
+    assert window_of(best.members) == pytest.approx((0.0, 180.0), abs=45.0)
+    world = fitter.engine
+    assert isinstance(world, Windows)
+    for text in {item for model in world.asked for item in model}:
+        began, ended = map(float, text.split(",")[1:3])
+        assert began >= 0.0
+        assert ended - began >= SHORTEST_S
+
+
+def test_how_strong_a_surge_was_is_only_known_together_with_how_long_it_lasted() -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    model = fitter.simulate(a_surge(*Windows.TRUTH))
+    (error,), extra = uncertainty(fitter, model)
+    # Least squares by hand: the derivatives in strength, begin and end, and noise of variance 1.
+    strength = surge(*Windows.TRUTH)
+    begin = (surge(960.0, 2400.0) - strength) * 0.5 / 60.0
+    end = (surge(900.0, 2340.0) - strength) * 0.5 / 60.0
+    rows = np.stack([strength, begin, end])
+    covariance = np.linalg.inv(rows @ rows.T) * (1 / 5 + 1 / 8)
+    alone = np.sqrt((1 / 5 + 1 / 8) / (strength @ strength))
+    assert covariance[0, 0] ** 0.5 > 1.02 * alone
+    assert error == pytest.approx(covariance[0, 0] ** 0.5, rel=0.35)
+    edge = int(2400.0 / 180.0)
+    assert extra["network"][0, edge] > 0.0, "the minutes at the ends are uncertain, too"
+
+
+def test_a_value_that_does_nothing_is_not_known_exactly() -> None:
+    fitter = a_fitter_of_windows(Windows.TRUTH)
+    after = (("edge", "a"), ("begin_s", 3600.0), ("end_s", 4200.0))
+    dead = Hypothesis("demand_surge", after, ("factor",), ((1.5,),), (1.0,), 0.05)
+    model = fitter.simulate((*a_surge(*Windows.TRUTH), (dead, (1.3,))))
+    (known, unknown), _ = uncertainty(fitter, model)
+    ((_, delta),) = fitter.changes(fitter.simulate(((dead, (1.3,)),)))
+    assert known < 0.05
+    assert unknown == pytest.approx(abs(delta))
+
+
+class Steps(World):
+    """Whole vehicles: a headway of 1.3 s does what one of 1.7 s does."""
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        values = {e.name: float(e.record()["seconds"]) for e in effects}
+        return day(number, {name: round(2 * value) / 2 for name, value in values.items()})
+
+
+def test_steps_make_an_interval_wide_and_straight_ways_do_not() -> None:
+    straight = a_fitter({"headway": 1.4}, street=17)
+    model = straight.simulate(start((HEADWAY, 1.4)))
+    plain, _ = uncertainty(straight, model)
+    straightly, _ = uncertainty(straight, model, steps=True)
+    assert straightly == pytest.approx(plain, rel=1e-3)
+
+    stepped = a_fitter({"headway": 1.4}, street=17)
+    stepped.engine = Steps()
+    model = stepped.simulate(start((HEADWAY, 1.5)))
+    blind, kept = uncertainty(stepped, model)
+    seen, same = uncertainty(stepped, model, steps=True)
+    assert 3.0 * blind[0] < seen[0] < 0.5
+    assert (same["network"] == kept["network"]).all(), "what the model shows is known as it was"

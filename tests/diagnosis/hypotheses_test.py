@@ -1,0 +1,175 @@
+"""The library: where effects are now, within which ranges, and in which order they are applied."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
+from ugat_marl.diagnosis.hypotheses import LOCAL, library, settings_as_members
+from ugat_marl.effects import SETTINGS, known_effects, load_scenario, parse_domain
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.scenarios import Scenario
+
+Crossing = Callable[..., Path]
+
+
+def by_name(scenario: Scenario) -> dict[str, Hypothesis]:
+    return {item.name: item for item in global_hypotheses(scenario, library())}
+
+
+@pytest.fixture(scope="module")
+def single() -> Scenario:
+    return load_scenario("single-v1")
+
+
+def test_nominal_values_are_those_of_the_vehicle_types(single: Scenario) -> None:
+    found = by_name(single)
+    nominal = {name: item.nominal for name, item in found.items()}
+    assert nominal["acceleration"] == (2.6,)
+    assert nominal["deceleration"] == (4.5,)
+    assert nominal["headway"] == (1.0,)
+    assert nominal["min_gap"] == (2.5,)
+    assert nominal["imperfection"] == (0.5,)
+    assert nominal["startup_delay"] == (0.0,)
+    assert nominal["heavy_share"] == (0.0,)
+
+
+TYPES = """<vType id="slow" vClass="passenger" length="5" minGap="2.5" accel="1.5" decel="4.5"
+    tau="1.4" sigma="0" speedFactor="1" speedDev="0"/>
+    <vType id="odd" vClass="passenger" accel="2.5" decel="4.5" tau="normal(1,0.1)"/>"""
+CARS = '<vehicle id="one" type="car" route="north" depart="0"/>'
+
+
+def test_types_that_disagree_are_averaged(crossing: Crossing) -> None:
+    # accel 2.5 and 1.5; sigma 0 on all that say anything.
+    found = by_name(load_scenario(crossing(vehicles=CARS, types=TYPES)))
+    assert found["acceleration"].nominal == (2.0,)
+    assert found["deceleration"].nominal == (4.5,)
+    assert found["imperfection"].nominal == (0.0,)
+
+
+def test_what_is_no_number_is_taken_as_sumos_default(crossing: Crossing) -> None:
+    found = by_name(load_scenario(crossing(vehicles=CARS, types=TYPES)))
+    assert found["headway"].nominal == (1.0,)
+
+
+def test_levels_that_change_nothing_are_not_tried(crossing: Crossing) -> None:
+    slow = TYPES.split("/>")[0].replace('accel="1.5"', 'accel="0.3"') + "/>"
+    # accel 2.5 and 0.3: mean 1.4, one of the levels.
+    found = by_name(load_scenario(crossing(vehicles=CARS, types=slow)))
+    assert found["acceleration"].nominal == (1.4,)
+    assert (1.4,) not in found["acceleration"].levels
+    assert len(found["acceleration"].levels) == 2
+
+
+def test_the_reaction_step_starts_at_the_step_of_the_simulation(single: Scenario) -> None:
+    item = by_name(single)["reaction_step"]
+    assert item.nominal == (1.0,)
+    assert item.levels == ((2.0,),)
+    assert item.clipped((1.4,)) == (1.0,)
+    assert item.clipped((2.6,)) == (3.0,)
+
+
+def test_drivers_that_are_there_already_are_no_hypothesis(
+    single: Scenario, crossing: Crossing
+) -> None:
+    def models(scenario: Scenario) -> list[str]:
+        found = global_hypotheses(scenario, {"driver_model"})
+        return [dict(item.fixed)["model"] for item in found]
+
+    assert models(single) == ["IDM", "EIDM", "W99"]
+    types = '<vType id="x" vClass="passenger" carFollowModel="IDM"/>'
+    assert models(load_scenario(crossing(vehicles=CARS, types=types))) == ["EIDM", "W99"]
+
+
+def test_effects_that_are_left_out_are_not_examined(single: Scenario) -> None:
+    allowed = library(("headway", "turning"))
+    assert not {"headway", "turning"} & allowed
+    assert "headway" not in {item.name for item in global_hypotheses(single, allowed)}
+    with pytest.raises(UnknownNameError, match="no_such_thing"):
+        library(("no_such_thing",))
+
+
+def test_the_library_holds_every_effect_that_can_be_diagnosed() -> None:
+    # Clearance times are read off the log.
+    assert set(known_effects()) - library() == {"all_red_time", "yellow_time"}
+    assert library() <= set(known_effects())
+
+
+def test_every_level_of_every_hypothesis_is_an_effect(single: Scenario) -> None:
+    for item in global_hypotheses(single, library()):
+        assert item.name not in LOCAL
+        assert item.levels, item.name
+        for level in item.levels:
+            assert item.clipped(level) == pytest.approx(level), "outside its plausible range"
+            assert item.effect(level).name == item.name
+            assert item.nominal is None or item.matters(level)
+
+
+def test_values_are_brought_into_range() -> None:
+    allowed = known_effects()["headway"].ranges["seconds"]
+    item = Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05)
+    assert item.clipped((-5.0,)) == (allowed.low,)
+    assert item.clipped((1e9,)) == (allowed.high,)
+    assert item.clipped((1.23456789,)) == (1.2346,)
+    assert item.effect((1e9,)) == known_effects()["headway"](allowed.high)
+
+
+def test_small_strengths_do_not_matter() -> None:
+    item = Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05)
+    assert not item.matters((1.04,))
+    assert not item.matters((0.96,))
+    assert item.matters((1.06,))
+    assert Hypothesis("driver_model", (("model", "IDM"),), (), ((),), None).matters(())
+
+
+def test_what_may_stand_in_a_model_once() -> None:
+    def surge(edge: str, begin: float) -> Hypothesis:
+        fixed = (("edge", edge), ("begin_s", begin), ("end_s", begin + 600.0))
+        return Hypothesis("demand_surge", fixed, ("factor",), ((1.5,),), (1.0,))
+
+    assert surge("a", 0.0).key == surge("a", 300.0).key, "one surge per place"
+    assert surge("a", 0.0).key != surge("b", 0.0).key
+
+
+def test_roads_and_demand_come_first_and_detectors_last() -> None:
+    wanted = (
+        *parse_domain("demand_level=*,1.2"),
+        *parse_domain("driver_model=IDM"),
+        *parse_domain("headway=1.4"),
+        *parse_domain("heavy_share=0.1"),
+        *parse_domain("undercount=*,0.1"),
+    )
+    for shuffled in itertools.permutations(wanted):
+        assert ordered(shuffled) == wanted
+
+
+def test_trucks_keep_their_own_acceleration() -> None:
+    names = [e.name for e in ordered(parse_domain("heavy_share=0.1") + parse_domain("V1"))]
+    assert names.index("heavy_share") > names.index("acceleration")
+
+
+def test_the_settings_of_the_paper_are_starting_points(single: Scenario) -> None:
+    found = settings_as_members(global_hypotheses(single, library()))
+    assert len(found) == len(SETTINGS)
+    for members, effects in zip(found, SETTINGS.values(), strict=True):
+        values = {hypothesis.name: value for hypothesis, value in members}
+        for effect in effects:
+            if effect.name in values:
+                assert hypothesis_value(effect) == values[effect.name]
+    assert settings_as_members([]) == []
+
+
+def hypothesis_value(effect: object) -> tuple[float, ...]:
+    (value,) = (v for k, v in effect.record().items() if k != "name")  # type: ignore[attr-defined]
+    return (float(value),)
+
+
+def test_a_field_that_an_effect_does_not_have_is_refused() -> None:
+    item = Hypothesis("headway", (), ("metres",), ((1.5,),), (1.0,))
+    with pytest.raises(OptionError, match="headway"):
+        free_values(parse_domain("headway=1.4")[0], item)

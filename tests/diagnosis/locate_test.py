@@ -1,0 +1,134 @@
+"""Where data and model disagree: planted at known places, and nowhere."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ugat_marl.diagnosis import Reference, Tally
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.locate import Disagreement, locate
+from ugat_marl.diagnosis.site import Site, SiteLane
+from ugat_marl.diagnosis.statistics import Pools
+
+Array = NDArray[np.float64]
+
+LANES, BINS, SPAN = 4, 12, (0.0, 3600.0)
+SITE = Site(
+    ("A", "B"),
+    tuple(SiteLane(f"in{i}_0", f"in{i}", i // 2, (0,), 14.0, {}) for i in range(LANES)),
+    ((0, "out0_0", ("x0",)), (1, "out1_0", ("x1",))),
+    (),
+    {},
+)
+PLACES = LANES + 2
+USED = [INDEX[name] for name in ("lost", "gap2", "gap4-5", "free_speed", "count_stop")]
+
+
+def days(
+    seed: int, count: int, shift: Array | None = None, bump: Array | None = None
+) -> list[Tally]:
+    """Gaussian features and Poisson counts; `shift` per feature and lane, `bump` per bin."""
+    generator = np.random.default_rng(seed)
+    found: list[Tally] = []
+    for _ in range(count):
+        values = 10.0 + generator.standard_normal((len(USED), LANES))
+        if shift is not None:
+            values = values + shift
+        sums = np.zeros((len(FEATURES), PLACES, 2))
+        sums[USED, :LANES] = np.stack([40 * values, np.full_like(values, 40)], axis=-1)
+        rate = np.zeros((len(BIN_FEATURES), PLACES, BINS))
+        rate[:2, :LANES] = 25.0
+        if bump is not None:
+            rate = rate + bump
+        found.append(Tally(sums, generator.poisson(rate).astype(np.float64)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def reference() -> Reference:
+    return Reference(Pools.of(SITE), days(1, 150))
+
+
+def found(reference: Reference, data: list[Tally], alpha: float = 0.05) -> list[Disagreement]:
+    return locate(SITE, reference, reference.distance(data), alpha, SPAN)
+
+
+def test_where_nothing_is_wrong_little_is_found(reference: Reference) -> None:
+    wrong = [bool(found(reference, days(100 + seed, 5))) for seed in range(100)]
+    assert np.mean(wrong) <= 0.08
+
+
+def test_false_discoveries_are_few_among_many_true_ones(reference: Reference) -> None:
+    shift = np.zeros((len(USED), LANES))
+    shift[0] = 3.0  # lost time on every lane
+    false = total = 0
+    for seed in range(30):
+        for item in found(reference, days(200 + seed, 5, shift)):
+            total += 1
+            false += item.statistic != "lost"
+    assert total > 60
+    assert false / total <= 0.1
+
+
+def test_a_planted_difference_is_found_with_place_regime_sign_and_size(
+    reference: Reference,
+) -> None:
+    shift = np.zeros((len(USED), LANES))
+    shift[USED.index(INDEX["free_speed"]), 2] = -4.0
+    items = found(reference, days(3, 5, shift))
+    narrow = next(item for item in items if item.lane)
+    assert (narrow.tls, narrow.approach, narrow.lane) == ("B", "in2", "in2_0")
+    assert (narrow.regime, narrow.statistic, narrow.unit) == ("free flow", "free_speed", "m/s")
+    assert narrow.size == pytest.approx(-4.0, abs=1.0)
+    assert narrow.z < -6
+    wide = next(item for item in items if item.lane is None and item.tls == "B")
+    assert wide.size == pytest.approx(-2.0, abs=0.7)  # half of the lanes there
+    assert not any(item.tls == "A" and item.regime == "free flow" for item in items)
+
+
+def test_a_planted_window_is_found_with_its_bins(reference: Reference) -> None:
+    bump = np.zeros((len(BIN_FEATURES), PLACES, BINS))
+    bump[BIN_FEATURES.index("count_advance"), 1, 3:6] = 25.0
+    timed = [item for item in found(reference, days(4, 5, bump=bump)) if item.window]
+    assert len(timed) == 1
+    item = timed[0]
+    assert (item.tls, item.lane, item.regime) == ("A", "in1_0", "volume")
+    assert item.window == (900.0, 1800.0)
+    assert item.size == pytest.approx(75.0, abs=15.0)
+    assert (item.statistic, item.unit) == ("count_advance in time", "vehicles")
+
+
+def test_a_constant_change_is_no_window(reference: Reference) -> None:
+    bump = np.zeros((len(BIN_FEATURES), PLACES, BINS))
+    bump[BIN_FEATURES.index("count_advance"), 1] = 8.0
+    assert [item for item in found(reference, days(5, 5, bump=bump)) if item.window] == []
+
+
+def test_periods_of_different_spans_have_no_windows(reference: Reference) -> None:
+    bump = np.zeros((len(BIN_FEATURES), PLACES, BINS))
+    bump[0, 1, 3:6] = 30.0
+    data = days(6, 5, bump=bump)
+    items = locate(SITE, reference, reference.distance(data), 0.05, None)
+    assert [item for item in items if item.window] == []
+
+
+def test_the_strongest_statistic_speaks_for_its_regime(reference: Reference) -> None:
+    shift = np.zeros((len(USED), LANES))
+    shift[USED.index(INDEX["lost"]), 0] = 4.0
+    shift[USED.index(INDEX["gap2"]), 0] = 8.0
+    items = [item for item in found(reference, days(7, 5, shift)) if item.lane == "in0_0"]
+    assert [(item.regime, item.statistic) for item in items] == [("discharge", "gap2")]
+
+
+def test_disagreements_can_be_written(reference: Reference) -> None:
+    shift = np.full((len(USED), LANES), 5.0)
+    bump = np.zeros((len(BIN_FEATURES), PLACES, BINS))
+    bump[1, 0, :3] = 40.0
+    for item in found(reference, days(8, 5, shift, bump)):
+        again = json.loads(json.dumps(item.as_dict(), allow_nan=False))
+        assert 0 <= again["p"] <= 1
+        assert again["window"] is None or len(again["window"]) == 2

@@ -1,0 +1,194 @@
+"""The workflow around the answer: the same again, from cold, in a hurry, and with poor data."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ugat_marl.data import Finding, Measured
+from ugat_marl.diagnosis import DiagnosisConfig
+from ugat_marl.diagnosis.engine import OutOfTime
+from ugat_marl.diagnosis.select import Effort
+from ugat_marl.errors import MeasuredDataError, OptionError, UnknownNameError
+
+FEW = Effort(base=24, bank=2, fit=5, test=16)
+DETECTORS = {"undercount", "dropout", "swapped"}
+"""Faults of detectors cost no simulation beyond that of plain days."""
+
+
+@pytest.fixture(scope="module")
+def measured(street) -> Measured:
+    return street.measure("undercount=stop:S_C_0,0.3")
+
+
+def run(street, measured: Measured, out: Path, **options: Any) -> dict[str, Any]:
+    return street.diagnose(measured, out, **{"among": DETECTORS, "effort": FEW, **options})
+
+
+def test_the_same_inputs_give_the_same_file(street, measured: Measured, tmp_path: Path) -> None:
+    def once(name: str, **options: Any) -> bytes:
+        run(street, measured, tmp_path / name, **options)
+        return (tmp_path / name / "diagnosis.json").read_bytes()
+
+    cold = once("cold", cache=tmp_path / "days", workers=2)
+    assert once("warm", cache=tmp_path / "days", workers=1) == cold
+    assert once("other", workers=3) == cold
+
+
+def test_the_answer_is_the_file(street, measured: Measured, tmp_path: Path) -> None:
+    found = run(street, measured, tmp_path)
+    assert json.loads((tmp_path / "diagnosis.json").read_text()) == found
+    assert found["schema"] == "ugat-marl/diagnosis/1"
+    assert found["hashes"] == {"scenario": street.scenario.hash, "measured": measured.hash}
+    assert found["periods"] == {"fit": ["day1", "day2", "day3"], "heldout": ["day4", "day5"]}
+    assert not found["verified_on_fitted_periods"]
+    (effect,) = found["effects"]
+    share = effect["parameters"]["share"]
+    assert share["low"] < share["value"] < share["high"]
+    assert found["seed"] == 0
+    assert "NaN" not in (tmp_path / "diagnosis.json").read_text()
+
+
+def test_without_held_out_periods_it_is_said(street, measured: Measured, tmp_path: Path) -> None:
+    alone = replace(measured, periods=(replace(measured.periods[0], split="fit"),))
+    found = run(street, alone, tmp_path)
+    assert found["verified_on_fitted_periods"]
+    assert found["periods"]["heldout"] == []
+
+
+def test_a_budget_that_is_too_small_for_anything_says_so(
+    street, measured: Measured, tmp_path: Path
+) -> None:
+    found = run(street, measured, tmp_path, budget_s=1e-6, cache=tmp_path / "days", seed=1)
+    assert found["verdict"] == "unknown"
+    assert not found["complete"]
+    assert found["effects"] == []
+    assert found["corrected"] is None
+    assert found["untried"] == sorted(DETECTORS)
+    assert "budget" in found["sentence"]
+
+
+def test_when_the_budget_ends_half_way_the_answer_says_so(
+    street, measured: Measured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ugat_marl.diagnosis.engine import Engine
+
+    whole = Engine.replicates
+
+    def short(self: Engine, effects: Any, *rest: Any) -> Any:
+        if effects:
+            raise OutOfTime("the budget of time is spent")
+        return whole(self, effects, *rest)
+
+    monkeypatch.setattr(Engine, "replicates", short)
+    found = run(street, measured, tmp_path)
+    assert found["verdict"] == "unknown"
+    assert found["effects"] == []
+    assert not found["complete"]
+    assert found["where"], "what is known is said"
+    assert found["untried"] == ["dropout", "swapped"], "and what is not"
+    monkeypatch.undo()
+    whole_search = run(street, measured, tmp_path)
+    assert whole_search["verdict"] == "explained"
+    assert whole_search["untried"] == []
+
+
+def test_what_data_rule_out_is_not_examined(street, measured: Measured, tmp_path: Path) -> None:
+    finding = Finding("counts cannot be trusted", rules_out=("undercount", "dropout"))
+    found = run(street, replace(measured, findings=(finding,)), tmp_path)
+    assert found["ruled_out"] == ["dropout", "undercount"]
+    assert found["findings"] == ["counts cannot be trusted"]
+    assert found["verdict"] != "explained"
+    assert all(effect["name"] == "swapped" for effect in found["effects"])
+
+
+def counts_of(measured: Measured, every_s: float) -> Measured:
+    """The same data as counts of all detectors, and nothing else."""
+    rows = [
+        (
+            period.id,
+            begin,
+            begin + every_s,
+            name,
+            int(((on >= begin) & (on < begin + every_s)).sum()),
+        )
+        for period in measured.periods
+        for begin in np.arange(period.begin_s, period.end_s, every_s)
+        for name, on in ((name, item.on_s) for name, item in period.passages.items())
+    ]
+    schema = ("period_id", "begin_s", "end_s", "detector_id", "count")
+    return replace(
+        measured,
+        periods=tuple(replace(period, passages={}) for period in measured.periods),
+        counts=pl.DataFrame(rows, schema=schema, orient="row"),
+    )
+
+
+@pytest.mark.parametrize("every_s", [300.0, 600.0])
+def test_counts_alone_can_show_a_detector_that_misses_vehicles(
+    every_s: float, street, tmp_path: Path
+) -> None:
+    alone = counts_of(street.measure("undercount=stop:S_C_0,0.6"), every_s)
+    found = run(street, alone, tmp_path)
+    assert [(e["name"], e["place"]) for e in found["effects"]] == [("undercount", "stop:S_C_0")]
+
+
+@pytest.mark.parametrize("every_s", [300.0, 600.0])
+def test_counts_of_the_scenario_itself_do_not_contradict_it(
+    every_s: float, street, tmp_path: Path
+) -> None:
+    alone = counts_of(street.measure("sim"), every_s)
+    assert run(street, alone, tmp_path / "all")["verdict"] == "no_discrepancy"
+    assert alone.counts is not None
+    some = alone.counts.filter(
+        (pl.col("begin_s") != 300.0) | (pl.col("detector_id") != "stop:S_C_0")
+    )
+    gap = replace(alone, counts=some)
+    assert run(street, gap, tmp_path / "gap")["verdict"] == "no_discrepancy"
+
+
+def test_counts_alone_can_show_a_surge(street, tmp_path: Path) -> None:
+    alone = counts_of(street.measure("demand_surge=S_C,300,900,0.3"), 300.0)
+    found = run(street, alone, tmp_path, among={"demand_level", "demand_surge", "dropout"})
+    (surge,) = found["effects"]
+    assert (surge["name"], surge["place"]) == ("demand_surge", "S_C")
+    assert surge["window"] == pytest.approx([300.0, 900.0], abs=150.0)
+
+
+def test_data_without_a_single_vehicle_are_refused_or_named(
+    street, measured: Measured, tmp_path: Path
+) -> None:
+    empty = replace(
+        measured, periods=tuple(replace(period, passages={}) for period in measured.periods)
+    )
+    found = run(street, empty, tmp_path)
+    assert found["verdict"] != "no_discrepancy"
+
+
+def test_data_without_a_period_to_fit_are_refused(
+    street, measured: Measured, tmp_path: Path
+) -> None:
+    held = tuple(replace(period, split="heldout") for period in measured.periods)
+    with pytest.raises(MeasuredDataError, match="fit"):
+        run(street, replace(measured, periods=held), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error"),
+    [
+        ({"budget_s": 0.0}, OptionError),
+        ({"alpha": 0.0}, OptionError),
+        ({"alpha": 0.5}, OptionError),
+        ({"seed": -1}, OptionError),
+        ({"leave_out": ("nonsense",)}, UnknownNameError),
+    ],
+)
+def test_impossible_settings_are_refused(wrong: dict[str, Any], error: type[Exception]) -> None:
+    with pytest.raises(error):
+        DiagnosisConfig(**wrong)

@@ -1,0 +1,168 @@
+"""Which effects are left out, in a world where cost and chance are given by hand."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from ugat_marl.diagnosis import Hypothesis, residual
+from ugat_marl.diagnosis.fit import Fitted, Fitter, Members
+from ugat_marl.diagnosis.pruning import NEGLIGIBLE, pruned
+from ugat_marl.progress import Advance, Silent
+
+HEADWAY = (Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05), (1.5,))
+DEMAND = (Hypothesis("demand_level", (), ("factor",), ((1.2,),), (1.0,), 0.02), (0.95,))
+SPEED = (Hypothesis("desired_speed", (), ("factor",), ((1.2,),), (1.0,), 0.02), (1.2,))
+FEW = 500.0
+"""What a model costs more when few days were simulated."""
+
+
+@dataclass
+class Ledger:
+    """Costs and chances of sets of effects, by their names."""
+
+    costs: dict[tuple[str, ...], float]
+    chances: dict[tuple[str, ...], float]
+    luck: dict[tuple[str, ...], float] = field(default_factory=dict)
+    tested: list[tuple[str, ...]] = field(default_factory=list)
+    refined: dict[tuple[str, ...], Members] = field(default_factory=dict)
+
+    def simulate(self, members: Members, days: int | None = None) -> Fitted:
+        cost = self.costs[names(members)]
+        if days is None:
+            cost += FEW + self.luck.get(names(members), 0.0)
+        blank = cast(Any, None)
+        return Fitted(members, {}, blank, blank, cost)
+
+    def refine(self, start: Fitted, rounds: int) -> Fitted:
+        del rounds
+        members = self.refined.get(names(start.members), start.members)
+        return replace(start, members=members)
+
+    def test(self, model: Fitted) -> residual.Tested:
+        self.tested.append(names(model.members))
+        return self.with_chance(self.simulate(model.members, 16))
+
+    def with_chance(self, model: Fitted, errors: float = 0.0) -> residual.Tested:
+        chance = cast(Any, Chance(self.chances[names(model.members)]))
+        return residual.Tested(
+            model, cast(Any, None), chance, np.full(len(model.values), errors), {}
+        )
+
+    def left(self, *members: tuple[Hypothesis, tuple[float, ...]], errors: float = 0.0) -> Members:
+        best = self.with_chance(self.simulate(members, 16), errors)
+        fitter = cast(Fitter, cast(object, self))
+        blank = cast(Any, None)
+        base = residual.Tested(Fitted((), {}, blank, blank, 0.0), blank, blank, np.empty(0), {})
+        return pruned(best, base, fitter, lambda model: model, self.test, 0.05).model.members
+
+
+@dataclass
+class Chance:
+    p: float
+
+
+def names(members: Members) -> tuple[str, ...]:
+    return tuple(hypothesis.name for hypothesis, _ in members)
+
+
+@pytest.mark.parametrize("more", [1.0, 100.0, NEGLIGIBLE - 1.0])
+def test_what_the_other_explains_alone_is_left_out(more: float) -> None:
+    both = ("headway", "demand_level")
+    ledger = Ledger(
+        {both: 1000.0, ("headway",): 1000.0 + more, ("demand_level",): 9000.0},
+        {both: 0.9, ("headway",): 0.8, ("demand_level",): 0.0},
+    )
+    assert ledger.left(HEADWAY, DEMAND) == (HEADWAY,)
+
+
+def test_luck_on_a_few_days_leaves_nothing_out() -> None:
+    both = ("headway", "demand_level")
+    ledger = Ledger(
+        {both: 1000.0, ("headway",): 1400.0, ("demand_level",): 9000.0},
+        {both: 0.9, ("headway",): 0.8, ("demand_level",): 0.0},
+        {("headway",): -700.0},
+    )
+    assert ledger.left(HEADWAY, DEMAND) == (HEADWAY, DEMAND)
+    assert not ledger.tested
+
+
+def test_what_leaves_more_than_chance_behind_stays() -> None:
+    both = ("headway", "demand_level")
+    ledger = Ledger(
+        {both: 1000.0, ("headway",): 1040.0, ("demand_level",): 9000.0},
+        {both: 0.9, ("headway",): 1e-4, ("demand_level",): 0.0},
+    )
+    assert ledger.left(HEADWAY, DEMAND) == (HEADWAY, DEMAND)
+    assert ledger.tested == [("headway",)]
+
+
+def test_no_time_is_lost_on_sets_that_plainly_do_not_suffice() -> None:
+    both = ("headway", "demand_level")
+    ledger = Ledger(
+        {both: 1000.0, ("headway",): 5000.0, ("demand_level",): 9000.0},
+        {both: 0.9, ("headway",): 0.5, ("demand_level",): 0.5},
+    )
+    assert ledger.left(HEADWAY, DEMAND) == (HEADWAY, DEMAND)
+    assert not ledger.tested
+
+
+def test_one_after_the_other_is_left_out() -> None:
+    every = ("headway", "demand_level", "desired_speed")
+    costs: dict[tuple[str, ...], float]
+    costs = {every: 1000.0, every[:2]: 1010.0, ("headway", "desired_speed"): 1020.0}
+    costs |= {every[1:]: 9000.0, ("headway",): 1030.0, ("demand_level",): 9000.0}
+    ledger = Ledger(costs, dict.fromkeys(costs, 0.6))
+    assert ledger.left(HEADWAY, DEMAND, SPEED) == (HEADWAY,)
+
+
+def test_an_effect_whose_interval_holds_the_nominal_value_is_doubted_where_nothing_suffices() -> (
+    None
+):
+    both = ("headway", "demand_level")
+    ledger = Ledger(
+        {both: 1000.0, ("headway",): 1400.0, ("demand_level",): 9000.0},
+        {both: 1e-6, ("headway",): 1e-9, ("demand_level",): 0.0},
+    )
+    assert ledger.left(HEADWAY, DEMAND, errors=0.04) == (HEADWAY,)
+    assert ledger.left(HEADWAY, DEMAND, errors=0.01) == (HEADWAY, DEMAND)
+
+
+def test_an_effect_too_weak_to_matter_is_dropped() -> None:
+    weak = (DEMAND[0], (0.99,))
+    both = ("headway", "demand_level")
+    ledger = Ledger({both: 1000.0, ("headway",): 9000.0}, {both: 0.9, ("headway",): 0.0})
+    assert ledger.left(HEADWAY, weak) == (HEADWAY,)
+
+
+def test_an_effect_that_is_fitted_to_nothing_is_not_named() -> None:
+    both, nothing = ("headway", "demand_level"), (DEMAND[0], (1.0,))
+    ledger = Ledger(
+        {both: 1000.0, ("headway",): 9000.0, ("demand_level",): 900.0},
+        {both: 0.0, ("headway",): 0.0, ("demand_level",): 0.0},
+        refined={("demand_level",): (nothing,)},
+    )
+    assert ledger.left(HEADWAY, DEMAND) == ()
+    assert ledger.left(nothing) == ()
+
+
+def test_progress_is_told_of_every_smaller_set() -> None:
+    both = ("headway", "demand_level")
+    ledger = Ledger({both: 1000.0, ("headway",): 1900.0, ("demand_level",): 9000.0}, {both: 0.9})
+    best = ledger.with_chance(ledger.simulate((HEADWAY, DEMAND), 16))
+    notes: list[str] = []
+
+    class Heard(Silent):
+        @contextlib.contextmanager
+        def task(self, name: str, total: int) -> Iterator[Advance]:
+            assert (name, total) == ("without single effects", 2)
+            yield lambda note="": notes.append(note)
+
+    fitter = cast(Fitter, cast(object, ledger))
+    pruned(best, best, fitter, lambda model: model, ledger.test, 0.05, Heard())
+    assert sorted(notes) == ["demand_level", "headway"]

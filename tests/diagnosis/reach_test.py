@@ -1,0 +1,76 @@
+"""A scenario whose vehicles do not come where vehicles were measured says so before it runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ugat_marl.data import Measured
+from ugat_marl.diagnosis import DiagnosisConfig, Study
+from ugat_marl.diagnosis.reach import unreached
+from ugat_marl.effects import load_scenario
+from ugat_marl.errors import MeasuredDataError
+from ugat_marl.scenarios import Detector, Passages, Period, Scenario
+
+SOUTH, WEST = Detector("s", "S_C_0", 90.0, 0.0, "stop"), Detector("w", "W_C_0", 90.0, 0.0, "stop")
+TIMES = np.arange(5.0)
+SEEN = Passages(TIMES, TIMES + 0.4, TIMES + 9, TIMES + 5)
+DAY = Period("day1", 0.0, 200.0, "fit", {"C": ((0.0, "Gr"), (90.0, "rG"))}, {"s": SEEN, "w": SEEN})
+BOTH = Measured((SOUTH, WEST), (DAY,))
+
+
+@pytest.fixture(scope="module")
+def scenario(data: Path) -> Scenario:
+    return load_scenario(data / "crossing")
+
+
+@pytest.fixture(scope="module")
+def northbound(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Scenario:
+    """The crossing with cars from the south only."""
+    directory = tmp_path_factory.mktemp("crossing") / "northbound"
+    directory.mkdir()
+    for file in (data / "crossing").iterdir():
+        (directory / file.name).write_bytes(file.read_bytes())
+    routes = '<routes><vType id="car"/><route id="north" edges="S_C C_N"/>'
+    routes += '<vehicle id="n" type="car" route="north" depart="1"/></routes>'
+    (directory / "demand.rou.xml").write_text(routes)
+    return load_scenario(directory)
+
+
+def test_where_demand_comes_everywhere_there_is_nothing_to_say(scenario: Scenario) -> None:
+    assert unreached(scenario, BOTH, BOTH.detectors) == ()
+
+
+def test_edges_without_demand_are_named_with_what_was_counted(northbound: Scenario) -> None:
+    (finding,) = unreached(northbound, BOTH, BOTH.detectors)
+    assert "no vehicle of its demand comes over W_C, where detectors counted 5" in finding.text
+    assert not finding.rules_out
+    study = Study.of(northbound, BOTH, DiagnosisConfig())
+    assert study.measured.findings == (finding,)
+    assert study.measured.hash == BOTH.hash
+
+
+def test_edges_on_which_nobody_was_counted_need_no_demand(northbound: Scenario) -> None:
+    quiet = replace(BOTH, periods=(replace(DAY, passages={"s": SEEN}),))
+    assert unreached(northbound, quiet, BOTH.detectors) == ()
+
+
+def test_counts_in_intervals_count_as_well(northbound: Scenario) -> None:
+    counts = pl.DataFrame(
+        {"period_id": ["day1"] * 2, "detector_id": ["w", "s"], "count": [7.0, 3.0]}
+    )
+    alone = Measured((SOUTH, WEST), (replace(DAY, passages={}),), counts=counts)
+    (finding,) = unreached(northbound, alone, alone.detectors)
+    assert "W_C, where detectors counted 7;" in finding.text
+
+
+def test_demand_that_reaches_no_measured_lane_is_refused_before_anything_runs(
+    northbound: Scenario,
+) -> None:
+    west = Measured((WEST,), (replace(DAY, passages={"w": SEEN}),))
+    with pytest.raises(MeasuredDataError, match=r"no vehicle .* \(W_C\); check lane_id"):
+        Study.of(northbound, west, DiagnosisConfig())

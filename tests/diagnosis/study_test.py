@@ -1,0 +1,142 @@
+"""Which detectors a diagnosis compares, over how many days, and what stays in doubt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ugat_marl.data import Measured
+from ugat_marl.diagnosis import Study, Tally
+from ugat_marl.diagnosis.engine import Engine
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.select import Effort
+from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.diagnosis.study import OPEN, effort_for, heard
+from ugat_marl.effects import Effect, Headway
+from ugat_marl.scenarios import Detector, Passages, Period
+
+NAMES = ("one", "two", "three", "four")
+DETECTORS = tuple(Detector(name, f"{name}_0", 1.0, 0.0, "stop") for name in NAMES)
+SEEN = Passages(np.array([1.0]), np.array([1.5]), np.array([10.0]), np.array([5.0]))
+
+
+def measured(*days: tuple[str, ...], silent: Passages | None = None) -> Measured:
+    """Two days, on each of which these detectors saw a vehicle; others are as `silent`."""
+    periods = tuple(
+        Period(
+            f"day{number}",
+            0.0,
+            100.0,
+            "fit",
+            {},
+            {
+                name: SEEN if name in saw else silent
+                for name in NAMES
+                if name in saw or silent is not None
+            },  # pyright: ignore[reportArgumentType]
+        )
+        for number, saw in enumerate(days)
+    )
+    return Measured(DETECTORS, periods)
+
+
+def names(found: tuple[Detector, ...]) -> tuple[str, ...]:
+    return tuple(item.id for item in found)
+
+
+@pytest.mark.parametrize("silent", [None, Passages.none()])
+def test_of_detectors_of_which_half_are_silent_only_the_others_are_compared(
+    silent: Passages | None,
+) -> None:
+    assert names(heard(measured(("one", "three"), silent=silent))) == ("one", "three")
+    assert names(heard(measured(("two",), ("two",), silent=silent))) == ("two",)
+
+
+def test_a_single_silent_detector_is_compared_like_any_other() -> None:
+    assert names(heard(measured(("one", "two", "three")))) == NAMES
+    assert names(heard(measured(NAMES))) == NAMES
+
+
+def test_a_detector_that_saw_something_on_one_day_is_not_silent() -> None:
+    assert names(heard(measured(("one", "two"), ("three",)))) == NAMES
+
+
+def test_where_nobody_saw_anything_all_are_kept() -> None:
+    assert names(heard(measured((), (), silent=Passages.none()))) == NAMES
+
+
+def test_counts_in_intervals_say_nothing_of_silence() -> None:
+    counts = pl.DataFrame({"period_id": ["day0"], "detector_id": ["one"], "count": [3]})
+    data = Measured(DETECTORS, (Period("day0", 0.0, 100.0, "fit", {}, {}),), counts=counts)
+    assert names(heard(data)) == NAMES
+
+
+def test_larger_networks_are_simulated_for_fewer_days() -> None:
+    efforts = [effort_for(count) for count in (1, 4, 5, 8, 9, 64)]
+    assert efforts[0] == efforts[1] == Effort()
+    assert efforts[2] == efforts[3]
+    assert efforts[4] == efforts[5]
+    for more, fewer in ((efforts[0], efforts[2]), (efforts[2], efforts[4])):
+        for name in ("base", "bank", "fit", "test"):
+            assert getattr(fewer, name) <= getattr(more, name)
+    assert all(effort.test <= effort.base for effort in efforts)
+
+
+@dataclass
+class Days:
+    """Simulated days by hand.
+
+    Attributes:
+        counts: Vehicles a minute at the one stop line, with effects and without.
+        aside: Days on which traffic stood still.
+        asked: How often days were asked for.
+    """
+
+    counts: dict[bool, float]
+    aside: tuple[int, ...] = ()
+    asked: list[tuple[Effect, ...]] = field(default_factory=list)
+
+    def ordinary(self, effects: Sequence[Effect], numbers: Sequence[int]) -> dict[int, Any]:
+        self.asked.append(tuple(effects))
+        found: dict[int, Any] = {}
+        for number in numbers:
+            sums = np.zeros((len(FEATURES), 1, 2))
+            # What is set aside would show: on those days there was ten times as much.
+            much = 10.0 if number in (2, 3) else 1.0
+            sums[INDEX["count_stop"], 0] = 60.0 * much * self.counts[bool(effects)], 60.0
+            if number not in self.aside:
+                tally = Tally(sums, np.zeros((len(BIN_FEATURES), 1, 2)))
+                found[number] = cast(Any, type("Replicate", (), {"tally": tally}))
+        return found
+
+
+def study(own: Days, other: Days | None) -> Study:
+    blank = cast(Any, None)
+    pools = Pools({"lane": np.eye(1)})
+    engines = [cast(Engine, cast(object, days)) for days in (own, other)]
+    return Study(
+        blank, blank, blank, blank, blank, engine=engines[0], pools=pools, allowed=frozenset(),
+        hypotheses=(), effort=Effort(base=6), fit=(), heldout=(), other_days=engines[1],
+    )  # fmt: skip
+
+
+def test_what_measured_arrivals_leave_open_is_a_matter_of_the_model() -> None:
+    own = Days({False: 8.0, True: 6.0}, aside=(2,))
+    other = Days({False: 8.0, True: 9.0}, aside=(3,))
+    found = study(own, other)
+    place = 0, INDEX["count_stop"]
+    without, within = found.doubt(), found.doubt((Headway(1.5),))
+    assert without is not None and within is not None
+    assert without["lane"][place] == 0.0
+    assert within["lane"][place] == pytest.approx((OPEN * 3.0) ** 2)
+    found.doubt((Headway(1.5),))
+    assert own.asked == other.asked == [(), (Headway(1.5),)]
+
+
+def test_where_signals_answered_nobody_nothing_is_left_open() -> None:
+    assert study(Days({False: 8.0}), None).doubt() is None

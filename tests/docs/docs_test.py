@@ -1,0 +1,146 @@
+"""What the pages promise is what the code does."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import supersuit
+from gymnasium.spaces import Box
+
+import ugat_marl
+from ugat_marl.__main__ import main
+from ugat_marl.effects import (
+    OBJECTIVES,
+    BlockerPatience,
+    Incident,
+    QueueModel,
+    effect_from,
+    effects_on_controllers,
+    known_effects,
+)
+from ugat_marl.effects.acting import PHASE_ORDERS
+from ugat_marl.envs import HIDDEN
+from ugat_marl.files import xml_bytes
+from ugat_marl.grounding import METHODS, FitConfig
+from ugat_marl.scenarios import validated
+from ugat_marl.scenarios.settings import ControlSettings, IntersectionSettings, ScenarioFile
+
+PAGE = (Path(__file__).parents[2] / "docs" / "scenarios.md").read_text()
+
+
+def test_every_key_of_a_scenario_file_is_documented() -> None:
+    written = set(re.findall(r"^\| `([\w.<>]+)` \|", PAGE, flags=re.MULTILINE))
+    keys = set(ScenarioFile.model_fields) - {"control", "intersections", "sumo"}
+    keys |= {f"control.{name}" for name in ControlSettings.model_fields}
+    keys |= {f"intersections.<id>.{name}" for name in IntersectionSettings.model_fields}
+    assert written == keys | {"sumo.<option>"}
+
+
+def test_the_defaults_on_the_page_are_those_of_the_code() -> None:
+    rows = re.findall(
+        r"^\| `control\.(\w+)` \| [^|]+ \| s \| ([\d.]+) \|", PAGE, flags=re.MULTILINE
+    )
+    assert len(rows) == 5
+    for name, value in rows:
+        assert getattr(ControlSettings(), name) == float(value)
+
+
+def test_the_example_is_a_scenario_file() -> None:
+    example = re.search(r"```toml\n(.*?)```", PAGE, flags=re.DOTALL)
+    assert example is not None
+    settings = validated(tomllib.loads(example[1]), "docs/scenarios.md")
+    assert settings.intersections["C1"].phases == ("GGrr", "rrGG")
+    for record in settings.effects:
+        effect_from(record)
+
+
+def test_what_is_added_in_ten_lines_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    section = PAGE.partition("## Adding something")[2]
+    blocks = re.findall(r"```(\w+)\n(.*?)```", section, flags=re.DOTALL)
+    assert [kind for kind, _ in blocks] == ["sh", "python", "python", "python"]
+    assert all(len(text.splitlines()) <= 10 for _, text in blocks)
+    for line in blocks[0][1].splitlines():
+        program, *words = shlex.split(line)
+        assert program == "ugat-marl"
+        assert main(words) == 0
+    given = {"np": np, "replace": replace, "supersuit": supersuit, "Box": Box} | {
+        "dataclass": dataclass, "ugat_marl": ugat_marl, "xml_bytes": xml_bytes,
+    }  # fmt: skip
+    made = [dict(given) for _ in blocks[1:]]
+    for names, (_, text) in zip(made, blocks[1:], strict=True):
+        exec(text, names)  # the page's own words, in a namespace of their own
+    effect, observation, reward = made
+    whole = reward["env"].demand.vehicles
+    assert effect["env"].demand.vehicles == pytest.approx(0.75 * whole, abs=1)
+    observations, _ = observation["seen"].reset(seed=1)
+    for agent, vector in observations.items():
+        assert vector[-1] == 0.0
+        assert observation["seen"].observation_space(agent).contains(vector)
+        assert len(vector) == observation["env"].observation_space(agent).shape[0] + 1
+    env = reward["env"]
+    env.reset(seed=1)
+    for _ in range(6):
+        _, rewards, *_ = env.step(dict.fromkeys(env.agents, 0))
+        lanes = env.network.lane_table()
+        for agent, value in rewards.items():
+            own = env.network.intersection(env.intersection_of[agent]).incoming_lanes
+            assert value == -env.snapshot.halting[lanes.indices(own)].max()
+    for names in made:
+        names["env"].close()
+
+
+def test_every_uncertainty_is_documented() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "training.md").read_text()
+    table = page.partition("| `--fit.uncertainty` |")[2].partition("\n\n")[0]
+    assert tuple(re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE)) == METHODS
+    assert f"`{FitConfig().uncertainty}` (default)" in table
+
+
+def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
+    assert list(rows) == list(known_effects())
+    for name, kind in known_effects().items():
+        cell = rows[name]
+        assert re.findall(r"`(\w+)`", cell) == [item.name for item in fields(kind)], name
+        for parameter in kind.ranges.values():
+            if parameter.high < 1e6:  # a time of the scenario has no range worth a mention
+                ends = (f"±{parameter.high:g}", f"{parameter.low:g}–{parameter.high:g}")
+                assert any(text in cell for text in ends), (name, parameter)
+            assert parameter.unit.replace("^2", "²") in cell
+        for text in kind.texts.values():
+            assert ("`*`" in cell) == text.everywhere or len(kind.texts) > 1
+    example = re.search(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    assert example is not None
+    (record,) = tomllib.loads(example[1])["effects"]
+    effect_from(record)
+
+
+def test_every_effect_on_controllers_is_documented_with_its_fields_and_ranges() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "gaps.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
+    others = {kind.name: kind for kind in (Incident, QueueModel, BlockerPatience)}
+    for name, kind in {**effects_on_controllers(), **others}.items():
+        cell = rows[name]
+        assert re.findall(r"`(\w+)`", cell) == [item.name for item in fields(kind)], name
+        for parameter in kind.ranges.values():
+            if parameter.high < 1e6:
+                assert f"{parameter.low:g}–{parameter.high:g}" in cell, (name, parameter)
+            assert parameter.unit in cell
+    for rule in PHASE_ORDERS:
+        assert f"`{rule}`" in page
+    for name in HIDDEN:
+        assert f"| `{name}` |" in page
+    for name in OBJECTIVES:
+        assert name in rows["objective"]
+    example = re.search(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    assert example is not None
+    (record,) = tomllib.loads(example[1])["effects"]
+    effect_from(record)

@@ -1,0 +1,56 @@
+"""The README says what is there: its example runs, its tables are complete, its links work."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def names(requirements: list[str]) -> set[str]:
+    """The packages that requirements name, in lower case with hyphens."""
+    return {re.split(r"[<>=\[; ]", text)[0].lower().replace("_", "-") for text in requirements}
+
+
+def test_the_example_runs() -> None:
+    (example,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    command = [sys.executable, "-c", example]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "att_s" in done.stdout
+
+
+def test_every_dependency_is_explained() -> None:
+    table = README.partition("## Dependencies")[2].partition("\n## ")[0]
+    explained = set(re.findall(r"^\| ([\w-]+) \|", table, flags=re.MULTILINE)) - {"package"}
+    assert explained == names(PROJECT["dependencies"])
+
+
+def test_every_scenario_is_listed() -> None:
+    table = README.partition("## Scenarios")[2].partition("\n## ")[0]
+    shipped = {path.parent.name for path in ROOT.glob("scenarios/*/scenario.toml")}
+    assert set(re.findall(r"`([\w]+-v\d+)`", table)) == shipped
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8"))
+    local = [target for target in targets if not target.startswith(("http:", "https:"))]
+    assert not [target for target in local if not (page.parent / target).exists()]
+
+
+@pytest.mark.parametrize("file", ["constraints.txt", "constraints-oldest.txt"])
+def test_constraints_pin_every_dependency_without_local_builds(file: str) -> None:
+    lines = [line for line in (ROOT / file).read_text().splitlines() if not line.startswith("#")]
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in lines)
+    assert names(PROJECT["dependencies"]) <= names(lines)
+    assert "torch==2.13.0" in lines

@@ -1,0 +1,322 @@
+"""Effects on demand and turns: counted by hand, nested by strength, in the order SUMO needs."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.effects import (
+    DemandLevel,
+    DemandSurge,
+    DemandTiming,
+    LaneClosure,
+    Parking,
+    Turning,
+    apply_effects,
+    load_scenario,
+)
+from ugat_marl.errors import UnknownNameError
+from ugat_marl.scenarios import Network, Scenario, check_demand
+
+Crossing = Callable[..., Path]
+EDGE = "east1_A1"
+
+
+def departing(scenario: Scenario) -> dict[str, ET.Element]:
+    items = [
+        item
+        for document in scenario.routes
+        for item in document.parse()
+        if item.tag in ("vehicle", "trip", "flow")
+    ]
+    found = {item.get("id", ""): item for item in items}
+    assert len(found) == len(items), "an id is there twice"
+    return found
+
+
+def edges(item: ET.Element) -> list[str]:
+    route = item.find("route")
+    assert route is not None
+    return route.get("edges", "").split()
+
+
+def sound(scenario: Scenario) -> Scenario:
+    """The scenario, whose routes exist and whose vehicles are in order."""
+    check_demand(scenario, Network.read(scenario))
+    return scenario
+
+
+def of_edge(scenario: Scenario, edge: str = EDGE) -> dict[str, ET.Element]:
+    return {name: item for name, item in departing(scenario).items() if edges(item)[0] == edge}
+
+
+def bounds(count: int, share: float) -> float:
+    return 4 * (count * share * (1 - share)) ** 0.5
+
+
+@pytest.mark.parametrize("edge", [EDGE, "*"])
+def test_fewer_vehicles_are_nested(edge: str) -> None:
+    scenario = load_scenario("single-v1")
+    before = departing(scenario) if edge == "*" else of_edge(scenario)
+    kept = [
+        set(departing(sound(apply_effects(scenario, [DemandLevel(edge, factor)]))))
+        for factor in (0.3, 0.6, 0.8, 1.0)
+    ]
+    assert all(a < b for a, b in pairwise(kept))
+    assert kept[-1] == set(departing(scenario))
+    for factor, names in zip((0.3, 0.6, 0.8), kept, strict=False):
+        assert set(departing(scenario)) - names <= set(before)
+        left = len(names & set(before))
+        assert left == pytest.approx(len(before) * factor, abs=bounds(len(before), factor))
+
+
+def test_more_vehicles_are_twins() -> None:
+    scenario = load_scenario("single-v1")
+    before, all_before = of_edge(scenario), departing(scenario)
+    count = len(before)
+    twins: list[set[str]] = []
+    for factor in (1.0, 1.3, 1.8):
+        after = departing(sound(apply_effects(scenario, [DemandLevel(EDGE, factor)])))
+        assert set(after) >= set(all_before)
+        twins.append(set(after) - set(all_before))
+        assert len(twins[-1]) == pytest.approx(count * (factor - 1), abs=bounds(count, factor - 1))
+        for name in twins[-1]:
+            original = after[name.removesuffix("+1")]
+            assert original.get("id") in before
+            assert edges(after[name]) == edges(original)
+            shift = float(after[name].get("depart", "")) - float(original.get("depart", ""))
+            assert abs(shift) <= 15
+    assert twins[0] == set()
+    assert twins[1] < twins[2]
+    threefold = of_edge(apply_effects(scenario, [DemandLevel(EDGE, 3)]))
+    assert len(threefold) == 3 * count
+
+
+def test_nobody_is_left() -> None:
+    scenario = load_scenario("single-v1")
+    assert not of_edge(apply_effects(scenario, [DemandLevel(EDGE, 0)]))
+    assert not departing(apply_effects(scenario, [DemandLevel("*", 0)]))
+
+
+def test_two_decisions_about_a_vehicle_are_independent() -> None:
+    scenario = load_scenario("single-v1")
+    count = len(of_edge(scenario))
+    both = apply_effects(
+        scenario,
+        [DemandLevel(EDGE, 0.6), DemandSurge(EDGE, 0, 7200, 0.6), DemandLevel("*", 0.6)],
+    )
+    assert len(of_edge(both)) == pytest.approx(count * 0.216, abs=bounds(count, 0.216))
+
+
+def test_a_surge_stays_in_its_window() -> None:
+    scenario = load_scenario("single-v1")
+    surge = sound(apply_effects(scenario, [DemandSurge(EDGE, 600, 1200, 1.8)]))
+    before, after = departing(scenario), departing(surge)
+    new = set(after) - set(before)
+    times = [float(after[name].get("depart", "")) for name in new]
+    assert all(600 <= time < 1200 for time in times)
+    inside = sum(600 <= float(x.get("depart", "")) < 1200 for x in of_edge(scenario).values())
+    assert len(new) == pytest.approx(inside * 0.8, abs=bounds(inside, 0.8))
+    assert {name: ET.tostring(after[name]) for name in before} == {
+        name: ET.tostring(item) for name, item in before.items()
+    }
+
+
+def test_demand_may_grow_more_than_once(crossing: Crossing) -> None:
+    scenario = load_scenario("single-v1")
+    effects = [DemandLevel(EDGE, 1.7), DemandSurge(EDGE, 600, 1200, 2.5), DemandLevel("*", 1.7)]
+    grown = sound(apply_effects(scenario, effects))  # no id is there twice
+    assert len(departing(grown)) > 1.5 * len(departing(scenario))
+    flows = load_scenario(crossing(vehicles=FLOWS))
+    surges = [DemandSurge("W_C", 50, 100, 3), DemandSurge("W_C", 20, 70, 2)]
+    assert len(departing(apply_effects(flows, surges))) > len(departing(flows)) + 8
+
+
+def test_departures_are_shifted() -> None:
+    scenario = load_scenario("single-v1")
+    before = {n: float(x.get("depart", "")) for n, x in of_edge(scenario).items()}
+    for seconds in (300, -300):
+        shifted = sound(apply_effects(scenario, [DemandTiming(EDGE, seconds)]))
+        after = {n: float(x.get("depart", "")) for n, x in of_edge(shifted).items()}
+        assert after == pytest.approx(
+            {n: t + seconds for n, t in before.items() if t + seconds > 0}
+        )
+        others = set(departing(scenario)) - set(before)
+        assert others == set(departing(shifted)) - set(after)
+
+
+FLOWS = (
+    '<flow id="a" route="east" begin="0" end="200" vehsPerHour="360"/>'
+    '<flow id="b" route="east" begin="0" end="200" period="10"/>'
+    '<flow id="c" route="north" begin="0" end="200" period="exp(0.1)"/>'
+    '<flow id="d" route="east" begin="0" end="200" probability="0.1"/>'
+    '<flow id="e" from="W_C" to="C_E" begin="0" end="200" number="20"/>'
+    '<flow id="f" route="north" begin="0" number="20" period="10"/>'
+)
+
+
+def rates(scenario: Scenario) -> dict[str, float]:
+    """Expected number of vehicles of every flow."""
+    found: dict[str, float] = {}
+    for name, flow in departing(scenario).items():
+        lasts = float(flow.get("end", "200")) - float(flow.get("begin", "0"))
+        if number := flow.get("number"):
+            found[name] = float(number)
+        elif hourly := flow.get("vehsPerHour"):
+            found[name] = lasts * float(hourly) / 3600
+        elif probability := flow.get("probability"):
+            found[name] = lasts * float(probability)
+        else:
+            period = flow.get("period", "")
+            rate = float(period[4:-1]) if period.startswith("exp") else 1 / float(period)
+            found[name] = lasts * rate
+    return found
+
+
+def test_flows_are_scaled(crossing: Crossing) -> None:
+    scenario = load_scenario(crossing(vehicles=FLOWS))
+    assert rates(scenario) == pytest.approx(dict.fromkeys("abcdef", 20))
+    for factor in (0.5, 1.5, 20):
+        scaled = rates(sound(apply_effects(scenario, [DemandLevel("*", factor)])))
+        assert scaled == pytest.approx(dict.fromkeys("abcdef", 20 * factor))
+    east = rates(sound(apply_effects(scenario, [DemandLevel("W_C", 0.5)])))
+    assert east == pytest.approx({"a": 10, "b": 10, "c": 20, "d": 10, "e": 10, "f": 20})
+    assert not rates(apply_effects(scenario, [DemandLevel("*", 0)]))
+
+
+def test_a_surge_cuts_flows_into_parts(crossing: Crossing) -> None:
+    scenario = load_scenario(crossing(vehicles=FLOWS))
+    cut = sound(apply_effects(scenario, [DemandSurge("W_C", 50, 100, 3)]))
+    expected = dict.fromkeys("cf", 20.0)
+    for name in "abde":
+        expected |= {name: 5, f"{name}+surge": 15, f"{name}+after": 10}
+    assert rates(cut) == pytest.approx(expected)
+    none = apply_effects(scenario, [DemandSurge("W_C", 50, 100, 0)])
+    assert sum(rates(none).values()) == pytest.approx(40 + 4 * 15)
+
+
+def test_flows_are_shifted(crossing: Crossing) -> None:
+    scenario = load_scenario(crossing(vehicles=FLOWS))
+    later = departing(sound(apply_effects(scenario, [DemandTiming("W_C", 30)])))
+    assert (later["a"].get("begin"), later["a"].get("end")) == ("30", "230")
+    earlier = departing(sound(apply_effects(scenario, [DemandTiming("W_C", -30)])))
+    assert (earlier["a"].get("begin"), earlier["a"].get("end")) == ("0", "170")
+
+
+def test_who_stands_on_the_street_is_no_demand() -> None:
+    scenario = load_scenario("single-v1")
+    blocked = apply_effects(
+        scenario, [LaneClosure(f"{EDGE}_0", 600, 900), Parking(f"{EDGE}_1", 20, 60)]
+    )
+    extra = set(departing(blocked)) - set(departing(scenario))
+    assert len(extra) == 1 + 20
+    for effect in (DemandLevel("*", 0), DemandSurge(EDGE, 0, 3600, 3), DemandTiming("*", 60)):
+        after, before = departing(apply_effects(blocked, [effect])), departing(blocked)
+        for name in extra:
+            assert ET.tostring(after[name]) == ET.tostring(before[name])
+        assert not [name for name in after if name.removesuffix("+1") in extra - {name}]
+
+
+# --- turns
+
+
+def turns(scenario: Scenario) -> Counter[str]:
+    """Where the vehicles that come from EDGE go."""
+    return Counter(
+        edges(item)[1] for item in departing(scenario).values() if edges(item)[0] == EDGE
+    )
+
+
+def test_a_share_turns_otherwise() -> None:
+    scenario = load_scenario("single-v1")
+    before, ways = turns(scenario), {n: edges(x) for n, x in departing(scenario).items()}
+    to = "A1_northA"
+    others = before.total() - before[to]
+    turned: list[set[str]] = []
+    for share in (0.0, 0.2, 0.5, 1.0):
+        after = sound(apply_effects(scenario, [Turning(EDGE, to, share)]))
+        assert len(departing(after)) == len(departing(scenario))
+        assert turns(after).total() == before.total()
+        gained = turns(after)[to] - before[to]
+        assert gained == pytest.approx(others * share, abs=bounds(others, share))
+        turned.append({n for n, x in departing(after).items() if edges(x) != ways[n]})
+        assert len(turned[-1]) == gained
+    assert all(a < b for a, b in pairwise(turned))
+
+
+def test_those_who_turn_go_on_like_others() -> None:
+    """At the first intersection of an arterial, vehicles go on to the same places as others."""
+    scenario = load_scenario("arterial1x5-v1")
+    before = {name: tuple(edges(item)) for name, item in departing(scenario).items()}
+    ways = set(before.values())
+    pair, tails = next(
+        (pair, found)
+        for pair in sorted({p for way in ways for p in pairwise(way)})
+        if len(found := {way[way.index(pair[0]) + 1 :] for way in ways if pair in pairwise(way)})
+        > 3
+        and any(pair[0] in way[:-1] and pair not in pairwise(way) for way in ways)
+    )
+    after = sound(apply_effects(scenario, [Turning(*pair, 0.5)]))
+    for name, item in departing(after).items():
+        way, old = tuple(edges(item)), before[name]
+        if way != old:
+            place = old.index(pair[0])
+            assert way[: place + 1] == old[: place + 1]
+            assert way[place + 1 :] in tails
+
+
+def test_where_nobody_turned_they_leave_the_network() -> None:
+    scenario = load_scenario("single-v1")
+    to = "A1_northA"
+    elsewhere = apply_effects(scenario, [Turning(EDGE, "A1_southA", 1)])
+    assert not turns(elsewhere)[to]
+    back = sound(apply_effects(elsewhere, [Turning(EDGE, to, 0.5)]))
+    assert turns(back)[to] > 20
+
+
+def test_flows_and_trips_turn_too() -> None:
+    scenario = load_scenario("single-v1")
+    routes = scenario.routes[0]
+    text = (
+        '<routes><route id="r" edges="east1_A1 A1_west1"/>'
+        '<flow id="f" route="r" begin="0" end="1000" period="10"/>'
+        + "".join(
+            f'<trip id="t{n}" from="east1_A1" to="A1_west1" depart="{n}" arrivalLane="0"/>'
+            for n in range(100)
+        )
+        + "</routes>"
+    )
+    made = replace(scenario, routes=(routes.edited(text.encode()),))
+    found = departing(sound(apply_effects(made, [Turning(EDGE, "A1_northA", 0.25)])))
+    assert float(found["f"].get("period", "")) == pytest.approx(40 / 3)
+    assert float(found["f+turning"].get("period", "")) == pytest.approx(40)
+    assert edges(found["f+turning"]) == [EDGE, "A1_northA"]
+    moved = [item for item in found.values() if item.tag == "vehicle"]
+    assert len(moved) == pytest.approx(25, abs=18)
+    assert all(edges(item) == [EDGE, "A1_northA"] for item in moved)
+    assert all("to" not in item.attrib and "arrivalLane" not in item.attrib for item in moved)
+
+
+@pytest.mark.parametrize(
+    ("effect", "message"),
+    [
+        (DemandLevel("east_A1", 2), r"unknown edge 'east_A1'\. Did you mean 'east1_A1'"),
+        (DemandSurge("x", 0, 1, 2), r"unknown edge 'x'.*Known: .*east1_A1.*'demand_surge' names"),
+        (DemandTiming("x", 1), "unknown edge 'x'"),
+        (Turning("x", EDGE, 0.1), "unknown edge 'x'"),
+        (Turning(EDGE, "x", 0.1), "unknown edge 'x'"),
+        (
+            Turning(EDGE, "west1_A1", 0.1),
+            "unknown edge behind 'east1_A1': 'west1_A1'.*Known: .*A1_northA",
+        ),
+    ],
+)
+def test_unknown_edges(effect: DemandLevel, message: str) -> None:
+    with pytest.raises(UnknownNameError, match=message):
+        effect.apply(load_scenario("single-v1"))

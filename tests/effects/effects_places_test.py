@@ -1,0 +1,356 @@
+"""Effects on roads and signals, at work in the running simulation."""
+
+from __future__ import annotations
+
+import subprocess
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import libsumo
+import numpy as np
+import pytest
+import sumo
+
+from ugat_marl import parallel_env
+from ugat_marl.effects import (
+    AllRedTime,
+    Effect,
+    LaneClosure,
+    LateGreen,
+    LocalSpeed,
+    Parking,
+    YellowTime,
+    apply_effects,
+    known_effects,
+    late_greens,
+    load_scenario,
+    parked_at_other_times,
+    parse_domain,
+    with_late_programmes,
+)
+from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
+from ugat_marl.scenarios import Network, Scenario, check_demand
+from ugat_marl.simulation import LibsumoSimulator, launch_of
+
+Crossing = Callable[..., Path]
+
+EDGE, LANE = "east1_A1", "east1_A1_1"
+MIDDLE_M = 286.4 - 30
+
+
+@pytest.fixture
+def simulator() -> Iterator[LibsumoSimulator]:
+    made = LibsumoSimulator()
+    yield made
+    made.close()
+
+
+def run(scenario: Scenario, own: Path, *options: str) -> Path:
+    """The scenario in plain sumo; returns its folder."""
+    launch = launch_of(scenario, 1, own, ())
+    launch.write()
+    program = Path(sumo.SUMO_HOME) / "bin" / "sumo"
+    subprocess.run(
+        [program, *launch.arguments, *options], check=True, capture_output=True, timeout=100
+    )
+    return own
+
+
+# --- lanes
+
+
+def passing(
+    simulator: LibsumoSimulator, scenario: Scenario, own: Path, until: int
+) -> tuple[dict[str, list[int]], dict[str, tuple[int, int]]]:
+    """Seconds at which MIDDLE_M is passed on each lane of EDGE, and when blockers stand."""
+    own.mkdir()
+    simulator.start(launch_of(scenario, 1, own, ()))
+    last: dict[str, tuple[str, float]] = {}
+    passed: dict[str, list[int]] = {f"{EDGE}_{n}": [] for n in range(3)}
+    stood: dict[str, tuple[int, int]] = {}
+    api = libsumo.vehicle
+    for second in range(until):
+        simulator.advance(1, {})
+        assert not libsumo.simulation.getStartingTeleportIDList()
+        assert not libsumo.simulation.getCollidingVehiclesIDList()
+        for name in libsumo.edge.getLastStepVehicleIDs(EDGE):
+            lane, position = api.getLaneID(name), api.getLanePosition(name)
+            if name.startswith(("closure.", "parking.")):
+                if api.getStopState(name) & 1:
+                    assert position == pytest.approx(MIDDLE_M, abs=0.01)
+                    assert api.getLength(name) == 5
+                    stood[name] = (stood.get(name, (second, 0))[0], second)
+                continue
+            before = last.get(name)
+            if before is not None and before[0] == lane and before[1] < MIDDLE_M <= position:
+                passed[lane].append(second)
+            last[name] = (lane, position)
+    return passed, stood
+
+
+def test_a_closed_lane_is_blocked_then_and_free_before_and_after(
+    simulator: LibsumoSimulator, tmp_path: Path
+) -> None:
+    scenario = load_scenario("single-v1")
+    plain, _ = passing(simulator, scenario, tmp_path / "plain", 1500)
+    closed = apply_effects(scenario, [LaneClosure(LANE, 600, 1000)])
+    check_demand(closed, Network.read(closed))
+    passed, stood = passing(simulator, closed, tmp_path / "closed", 1500)
+
+    def inside(times: list[int], begin: int, end: int) -> int:
+        return sum(begin <= time < end for time in times)
+
+    ((begin, end),) = stood.values()
+    assert 601 <= begin <= 615  # as soon as the queue leaves room
+    assert end == 999
+    assert inside(plain[LANE], 602, 1000) > 10
+    assert inside(passed[LANE], begin + 1, 1000) == 0
+    assert inside(passed[LANE], 0, 595) == inside(plain[LANE], 0, 595)
+    assert inside(passed[LANE], 1000, 1500) > 10
+    others = [lane for lane in passed if lane != LANE]
+    assert sum(inside(passed[lane], 620, 1000) for lane in others) > 20
+
+
+def test_parking_blocks_a_lane_again_and_again(simulator: LibsumoSimulator, tmp_path: Path) -> None:
+    scenario = apply_effects(load_scenario("single-v1"), [Parking(LANE, 30, 40)])
+    check_demand(scenario, Network.read(scenario))
+    passed, stood = passing(simulator, scenario, tmp_path / "own", 1200)
+    assert len(stood) == pytest.approx(10, abs=1)  # one in every two minutes
+    for begin, end in stood.values():
+        assert end - begin == pytest.approx(40, abs=1)
+        assert not [time for time in passed[LANE] if begin < time <= end]
+    starts = sorted(begin for begin, _ in stood.values())
+    assert all(120 * n <= begin < 120 * (n + 1) + 40 for n, begin in enumerate(starts))
+    assert len(passed[LANE]) > 20
+
+
+def test_blocked_lanes_can_be_blocked_twice_and_be_written(tmp_path: Path) -> None:
+    scenario = load_scenario("single-v1").with_duration(900)
+    effects = [
+        LaneClosure(LANE, 100, 200), LaneClosure(LANE, 300, 400), Parking(LANE, 20, 30),
+        Parking(LANE, 20, 30), LaneClosure(LANE, 2000, 3000), Parking(LANE, 0, 30),
+    ]  # fmt: skip
+    once = apply_effects(scenario, effects[:3])
+    again = load_scenario(once.write(tmp_path / "written"))
+    assert again.hash == once.hash
+    twice = apply_effects(again, effects[3:])
+    assert (
+        len(twice.write(tmp_path / "again").parts)
+        and load_scenario(tmp_path / "again").hash == twice.hash
+    )
+    report = run(twice, tmp_path / "own", "--end", "900") / "trips.xml"
+    names = {item.get("id", "") for item in ET.parse(report).iter("tripinfo")}
+    assert len([name for name in names if name.startswith("closure.")]) == 2
+    assert len([name for name in names if name.startswith("parking.")]) == 10
+
+
+def departures(scenario: Scenario) -> dict[str, float]:
+    """Of every vehicle, in the order of the files."""
+    return {
+        item.get("id", ""): float(item.get("depart", "nan"))
+        for document in scenario.routes
+        for item in document.parse().iter("vehicle")
+    }
+
+
+def parked(scenario: Scenario) -> list[float]:
+    return [time for name, time in departures(scenario).items() if name.startswith("parking.")]
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 25200.0])
+def test_parking_at_other_times_is_as_frequent_and_as_long(
+    crossing: Crossing, begin_s: float
+) -> None:
+    toml = lambda text: text.replace("duration_s", f"begin_s = {begin_s:g}\nduration_s")  # noqa: E731
+    directory = crossing(vehicles="", toml=toml if begin_s else None)
+    scenario = apply_effects(load_scenario(directory), [Parking("S_C_0", 180, 5)])
+    one, again, other = (parked_at_other_times(scenario, seed) for seed in (1, 1, 2))
+    assert len(parked(scenario)) == 10  # 200 s of 180 an hour
+    for day in (one, other):
+        assert len(parked(day)) == 10
+        assert all(begin_s <= time < begin_s + 200.0 for time in parked(day))
+        assert parked(day) == sorted(parked(day)), "SUMO wants departures in order"
+        assert sorted(departures(day)) == sorted(departures(scenario))
+    assert parked(one) == parked(again)
+    assert parked(one) != parked(other)
+    assert not set(parked(one)) & set(parked(scenario))
+    # Turned about the day: what lies between two of them, round the clock, stays.
+    rows = [np.array(parked(item)) for item in (scenario, one)]
+    gaps = [np.sort(np.diff([*row, row[0] + 200.0])) for row in rows]
+    assert gaps[1] == pytest.approx(gaps[0], abs=0.03)
+
+
+def test_only_parking_is_moved_to_other_times(crossing: Crossing) -> None:
+    plain = load_scenario(crossing())
+    assert parked_at_other_times(plain, 1).hash == plain.hash
+    closed = apply_effects(plain, [LaneClosure("S_C_0", 60, 90)])
+    assert parked_at_other_times(closed, 1).hash == closed.hash
+    both = apply_effects(closed, [Parking("W_C_0", 180, 5)])
+    moved = parked_at_other_times(both, 1)
+    others = [
+        {name: time for name, time in departures(item).items() if not name.startswith("parking.")}
+        for item in (both, moved)
+    ]
+    assert others[0] == others[1]
+    assert parked(both) != parked(moved)
+
+
+def test_a_lane_too_short_to_stand_on(crossing: Crossing) -> None:
+    short = lambda text: text.replace('length="490.00" shape="0.00', 'length="9" shape="0.00')  # noqa: E731
+    with pytest.raises(OptionError, match="lane 'W_C_0' is 9 m long, too short for a vehicle"):
+        LaneClosure("W_C_0", 0, 10).apply(load_scenario(crossing(edit=short)))
+
+
+def test_traffic_on_an_edge_is_slower(
+    simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
+) -> None:
+    car = (
+        '<vehicle id="v" type="car" route="north" depart="0" departSpeed="max"/>'
+        '<vehicle id="w" type="car" route="east" depart="0" departSpeed="max"/>'
+    )
+    scenario = load_scenario(crossing(vehicles=car))
+
+    def speeds(effects: Sequence[Effect], name: str) -> tuple[float, float]:
+        own = tmp_path / name
+        own.mkdir()
+        simulator.start(launch_of(apply_effects(scenario, effects), 1, own, ()))
+        simulator.advance(20, {})
+        return libsumo.vehicle.getSpeed("v"), libsumo.vehicle.getSpeed("w")
+
+    assert speeds([], "plain") == (10, 10)
+    assert speeds([LocalSpeed("S_C", 0.6)], "slow") == pytest.approx((6, 10))
+    both = [LocalSpeed("S_C", 0.6), LocalSpeed("W_C", 0.9), LocalSpeed("S_C", 0.5)]
+    assert speeds(both, "twice") == pytest.approx((3, 9))
+
+
+# --- signals
+
+STANDING = '<vehicle id="v" type="car" route="east" depart="0" departPos="490" departSpeed="0"/>'
+
+
+def crossed_at(directory: Path, effects: Sequence[Effect], **options: str) -> tuple[int, list[int]]:
+    """Second in which the car crosses a light that turns green in second 40, and what is seen."""
+    env = parallel_env(load_scenario(directory), effects, simulator="inprocess", **options)
+    env.reset(seed=1)
+    seen: list[int] = []
+    for second in range(100):
+        observations, *_ = env.step({"signal_0": int(second >= 40)})
+        seen.append(int(observations["signal_0"][-1]))
+        if libsumo.vehicle.getRoadID("v") != "W_C":
+            env.close()
+            return second, seen
+    raise AssertionError("it never crossed")
+
+
+@pytest.mark.parametrize("signals", ["actions", "programme"])
+def test_the_first_crossing_is_later_by_the_late_green(signals: str, crossing: Crossing) -> None:
+    fast = lambda text: text.replace("decision_interval_s = 10", "decision_interval_s = 1")  # noqa: E731
+    directory = crossing(vehicles=STANDING, toml=fast)
+    at_once, observed = crossed_at(directory, [], signals=signals)
+    for place in ("*", "C"):
+        for late in (1, 2, 5):
+            effects = [LateGreen(place, late)]
+            second, seen = crossed_at(directory, effects, signals=signals)
+            assert second == at_once + late
+            assert seen[: len(observed)] == observed  # the agent sees the green it asked for
+    assert crossed_at(directory, [LateGreen("*", 0)], signals=signals)[0] == at_once
+
+
+def test_late_green_is_a_setting(crossing: Crossing, tmp_path: Path) -> None:
+    plain = load_scenario(crossing())
+    scenario = apply_effects(plain, [LateGreen("*", 2)])
+    assert late_greens(plain) == {}
+    assert with_late_programmes(plain) is plain
+    assert late_greens(scenario) == {"C": 2}
+    own = apply_effects(scenario, [LateGreen("C", 3.5)])
+    assert late_greens(own) == {"C": 3.5}
+    assert late_greens(apply_effects(own, [LateGreen("C", 0)])) == {}
+    assert late_greens(apply_effects(own, [LateGreen("*", 1)])) == {"C": 1}
+    for item in (scenario, own):
+        again = load_scenario(item.write(tmp_path / f"{late_greens(item)['C']:g}"))
+        assert again.hash == item.hash != plain.hash
+        assert late_greens(again) == late_greens(item)
+        assert Network.read(again).intersections == Network.read(plain).intersections
+
+
+def test_a_programme_that_is_late(crossing: Crossing) -> None:
+    def states(scenario: Scenario) -> list[tuple[float, str]]:
+        logic = next(iter(with_late_programmes(scenario).network.parse().iter("tlLogic")))
+        return [(float(x.get("duration", "")), x.get("state", "")) for x in logic]
+
+    scenario = load_scenario(crossing())
+    assert states(scenario) == [(40, "Gr"), (10, "rG")]
+    late = apply_effects(scenario, [LateGreen("C", 3)])
+    assert states(late) == [(3, "rr"), (37, "Gr"), (3, "rr"), (7, "rG")]
+    jumping = lambda text: text.replace('state="Gr"/>', 'state="Gr" next="1"/>')  # noqa: E731
+    with pytest.raises(ScenarioError, match="phases name their successors"):
+        states(apply_effects(load_scenario(crossing(edit=jumping)), [LateGreen("C", 3)]))
+
+
+def test_clearance_times() -> None:
+    scenario = apply_effects(load_scenario("single-v1"), [YellowTime(4.2), AllRedTime(1)])
+    assert (scenario.control.yellow_s, scenario.control.all_red_s) == (4, 1)
+    assert scenario.applied == ("yellow_time=4.2", "all_red_time=1")
+
+
+# --- all of them
+
+EXAMPLES = (
+    "acceleration=1", "deceleration=3", "emergency_deceleration=6", "startup_delay=0.5",
+    "headway=1.3", "min_gap=3", "imperfection=0.7", "reaction_step=2", "desired_speed=0.9",
+    "speed_spread=0.15", "yellow_running=1", "red_running=1", "gap_acceptance=2",
+    "lane_discipline=0.5", "heavy_share=0.15", "driver_model=EIDM", "late_green=A1,1.5",
+    "yellow_time=4", "all_red_time=1", "demand_level=east1_A1,1.2",
+    "demand_surge=west1_A1,100,300,1.7", "demand_timing=southA_A1,60",
+    "turning=east1_A1,A1_northA,0.2", "lane_closure=west1_A1_0,100,200",
+    "parking=east1_A1_0,30,20", "local_speed=northA_A1,0.8", "undercount=*,0.1",
+    "signal_clock=A1,-1.25", "clock_drift=*,2", "stuck=d1,10,20", "dropout=d1,10,20",
+    "swapped=d1,d2",
+)  # fmt: skip
+
+
+def test_every_effect_has_an_example() -> None:
+    assert [text.partition("=")[0] for text in EXAMPLES] == list(known_effects())
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_all_effects_compose_in_any_order_and_survive_writing(order: int, tmp_path: Path) -> None:
+    scenario = load_scenario("single-v1").with_duration(400)
+    changed = apply_effects(scenario, parse_domain("+".join(EXAMPLES[::order])))
+    assert changed.applied == EXAMPLES[::order]
+    check_demand(changed, Network.read(changed))
+    again = load_scenario(changed.write(tmp_path / "written"))
+    assert again.hash == changed.hash
+    report = run(again, tmp_path / "own", "--end", "400") / "trips.xml"
+    kinds = {item.get("vType") for item in ET.parse(report).iter("tripinfo")}
+    assert {"car", "heavy.car"} <= kinds
+    assert len(list(ET.parse(report).iter("tripinfo"))) > 100
+
+
+@pytest.mark.parametrize("text", EXAMPLES)
+def test_an_effect_in_a_scenario_file(text: str, tmp_path: Path) -> None:
+    scenario = load_scenario("single-v1")
+    (effect,) = parse_domain(text)
+    record = effect.record()
+    settings = scenario.settings.model_copy(update={"effects": (record,)})
+    written = replace(scenario, settings=settings).write(tmp_path / "written")
+    assert load_scenario(written).applied == (text,)
+    assert load_scenario(written).hash == effect.apply(scenario).hash
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lane_closure=east1_A1,0,10", r"unknown lane 'east1_A1'\. Did you mean 'east1_A1_[012]'"),
+        ("parking=x,1,1", r"unknown lane 'x'.*'parking' names it"),
+        ("local_speed=x,1", "unknown edge 'x'"),
+        ("late_green=x,1", r"unknown traffic light 'x'\. Known: A1"),
+        ("signal_clock=x,1", r"unknown traffic light 'x'\. Known: A1"),
+        ("clock_drift=x,1", r"unknown traffic light 'x'\. Known: A1"),
+    ],
+)
+def test_unknown_places(text: str, message: str) -> None:
+    with pytest.raises(UnknownNameError, match=message):
+        apply_effects(load_scenario("single-v1"), parse_domain(text))

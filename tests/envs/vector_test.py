@@ -1,0 +1,570 @@
+"""Many simulations together: the same as alone, whatever dies, and nothing left behind."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import vector as gymnasium_vector
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+from ugat_marl import parallel_env, vector_env
+from ugat_marl.effects import StartupDelay, load_scenario
+from ugat_marl.envs import AgentSet, VectorEnv, agent_indicator, pad
+from ugat_marl.envs.vector.arrays import Arrays, Shape, shared_memory
+from ugat_marl.envs.vector.gymnasium_env import GymnasiumVectorEnv
+from ugat_marl.envs.vector.nursery import Nursery
+from ugat_marl.envs.vector.spec import in_turn
+from ugat_marl.errors import (
+    ActionError,
+    EpisodeError,
+    OptionError,
+    ScenarioError,
+    SimulatorCrashed,
+    SimulatorError,
+    UnknownNameError,
+    WorkerError,
+)
+
+Crossing = Callable[..., Path]
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
+needs_proc = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
+LENGTH_S = 100
+DECISIONS = 10
+
+
+@pytest.fixture(scope="module", autouse=True)
+def warm() -> Iterator[None]:
+    """Keeps the parent between tests, so that each does not wait for SUMO to load."""
+    parent = Nursery.acquire()
+    yield
+    parent.release()
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], str]:
+    """Writes a module that workers can import; returns its name."""
+
+    def make(text: str) -> str:
+        name = f"own_{uuid.uuid4().hex}"
+        (tmp_path / f"{name}.py").write_text(text)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        return name
+
+    return make
+
+
+def chosen(masks: np.ndarray, seed: int, decision: int) -> np.ndarray:
+    """Random permitted actions that depend on nothing but the numbers given."""
+    draws = np.random.default_rng([seed, decision]).random(masks.shape)
+    return (draws * masks).argmax(axis=-1)
+
+
+def alone(env: Any, seed: int) -> str:
+    """A digest of a plain environment's episode, in the arrays of a vector."""
+    agents = AgentSet.of(env)
+    digest = hashlib.sha256()
+    observations, infos = env.reset(seed=seed)
+    decision = 0
+    while True:
+        masks = agents.masks(infos).astype(np.int8)
+        digest.update(agents.stack(observations).tobytes() + masks.tobytes())
+        if not env.agents:
+            break
+        actions = agents.actions(chosen(masks, seed, decision))
+        observations, rewards, _, _, infos = env.step(actions)
+        digest.update(np.array([rewards[name] for name in agents.names]).tobytes())
+        executed = [infos[name]["executed_action"] for name in agents.names]
+        digest.update(np.array(executed, dtype=np.int64).tobytes())
+        decision += 1
+    digest.update(repr(env.unwrapped.scores()).encode())
+    return digest.hexdigest()
+
+
+def together(
+    env: VectorEnv,
+    seed: int,
+    episodes: int = 1,
+    at: Callable[[int], None] = lambda step: None,
+) -> list[list[str]]:
+    """Digests of the episodes of each environment; `at` is called before each step."""
+    batch = env.reset(seed)
+    digests = [hashlib.sha256() for _ in range(env.n)]
+    found: list[list[str]] = [[] for _ in range(env.n)]
+    decisions = [0] * env.n
+    for row, digest in enumerate(digests):
+        digest.update(batch.observations[row].tobytes() + batch.masks[row].tobytes())
+    step = 0
+    while any(len(own) < episodes for own in found):
+        seeds = [episode.seed for episode in env.episodes if episode is not None]
+        actions = np.array(
+            [chosen(batch.masks[row], seeds[row], decisions[row]) for row in range(env.n)]
+        )
+        at(step)
+        batch = env.step(actions)
+        ended = {one.environment: one for one in batch.ended}
+        for row in range(env.n):
+            digests[row].update(batch.rewards[row].tobytes() + batch.executed[row].tobytes())
+            decisions[row] += 1
+            if row in ended:
+                last = ended[row]
+                digests[row].update(last.observations.tobytes() + last.masks.tobytes())
+                digests[row].update(repr(last.scores).encode())
+                found[row].append(digests[row].hexdigest())
+                digests[row], decisions[row] = hashlib.sha256(), 0
+            digests[row].update(batch.observations[row].tobytes() + batch.masks[row].tobytes())
+        step += 1
+    return [own[:episodes] for own in found]
+
+
+def pids(env: VectorEnv) -> list[int]:
+    return [lane._worker._pid for lane in env._lanes if lane._worker is not None]
+
+
+def gone(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+def eventually(condition: Callable[[], bool], within_s: float = 5.0) -> bool:
+    deadline = time.monotonic() + within_s
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return condition()
+
+
+# --- the same as alone
+
+
+@pytest.mark.parametrize("domain", ["sim", "V4"])
+def test_one_is_a_plain_environment_to_the_bit(domain: str, temporary: Path) -> None:
+    plain = parallel_env("mixed-v1", domain, duration_s=LENGTH_S)
+    with vector_env("mixed-v1", 1, domain, duration_s=LENGTH_S) as env:
+        ((found,),) = together(env, 3)
+    assert found == alone(plain, 3)
+    plain.close()
+    assert list(temporary.iterdir()) == []
+
+
+def test_an_episode_depends_on_its_seed_and_domain_alone() -> None:
+    domains = in_turn(["sim", "V4", [StartupDelay(0.1 + 0.2)]])
+    options: dict[str, Any] = {"duration_s": LENGTH_S, "observation": "density"}
+    found: dict[int, list[list[str]]] = {}
+    for n in (1, 3):
+        with vector_env("grid2x2-v1", n, domains, **options) as env:
+            found[n] = together(env, 7, episodes=3)
+            last = env.episodes
+    assert found[1][0] == found[3][0]
+    assert [one and one.domain for one in last] == ["sim", "V4", "startup_delay=0.3"]
+    assert len({digest for own in found[3] for digest in own}) == 9
+    # Every one can be played again: the third of the last environment was in V4.
+    env = vector_env("grid2x2-v1", 3, domains, **options)
+    env.reset(7)
+    lane = env._lanes[2]
+    lane.begin(None, domains)
+    lane.answer()
+    lane.begin(None, domains)
+    lane.answer()
+    episode = lane.episode
+    env.close()
+    assert episode is not None
+    assert episode.domain == "V4"
+    plain = parallel_env("grid2x2-v1", "V4", **options)
+    assert alone(plain, episode.seed) == found[3][2][2]
+    plain.close()
+
+
+def test_two_halves_are_the_whole() -> None:
+    with vector_env("single-v1", 3, duration_s=LENGTH_S) as env:
+        whole = together(env, 5)
+        first, second = env.halves()
+        assert (first.n, second.n) == (1, 2)
+        assert together(first, 5) + together(second, 6) == whole
+        # One goes on while the other is looked at.
+        one, two = first.reset(1), second.reset(1)
+        first.step_async(one.masks.argmax(axis=-1))
+        second.step_async(two.masks.argmax(axis=-1))
+        with pytest.raises(EpisodeError, match="environment 0 is in the middle of a step"):
+            env.step(np.zeros((3, 1), dtype=np.int64))
+        assert second.step_wait().rewards[0] == first.step_wait().rewards[0]
+        with pytest.raises(EpisodeError, match="step_wait\\(\\) without step_async"):
+            first.step_wait()
+
+
+def test_wrappers_rewards_and_effects_reach_the_workers(module: Callable[[str], str]) -> None:
+    own = module("def alike(before, after):\n    return float(after.vehicles.sum())\n")
+    reward = __import__(own).alike
+    wrap = ["ugat_marl.envs.wrappers:pad", agent_indicator]
+    with vector_env(
+        "mixed-v1", 1, [[StartupDelay(0.7)]], wrap=wrap, reward=reward, duration_s=LENGTH_S
+    ) as env:
+        ((found,),) = together(env, 2)
+    inner = parallel_env("mixed-v1", [StartupDelay(0.7)], reward=reward, duration_s=LENGTH_S)
+    plain = agent_indicator(pad(inner))
+    assert found == alone(plain, 2)
+    plain.close()
+
+
+def test_what_was_warned_of_is_heard(crossing: Crossing) -> None:
+    late = '<vehicle id="a" type="car" depart="150" route="east"/>'
+    with vector_env(crossing(vehicles=late), 2, duration_s=200) as env:
+        env.reset(1)
+        env.step(np.zeros((2, 1), dtype=np.int64))
+        with pytest.warns(UserWarning, match="no vehicle has entered the network"):
+            env.step(np.zeros((2, 1), dtype=np.int64))
+
+
+# --- deaths
+
+
+@pytest.mark.parametrize("moment", ["between", "under way", "at the reset", "with the parent"])
+def test_a_killed_simulation_is_taken_up_again(moment: str, temporary: Path) -> None:
+    options: dict[str, Any] = {"duration_s": LENGTH_S}
+    killed: list[int] = []
+    with vector_env("grid2x2-v1", 2, **options) as env:
+        unharmed = together(env, 4, episodes=2)
+
+        def kill(step: int) -> None:
+            if step in (3, 4, 13):
+                victim = pids(env)[step % 2]
+                os.kill(victim, signal.SIGSTOP if moment == "under way" else signal.SIGKILL)
+                killed.append(victim)
+                if moment == "under way":
+                    subprocess.Popen(["/bin/sh", "-c", f"sleep 0.2; kill -9 {victim}"])
+                if moment == "with the parent":
+                    parent = env._home._parent  # type: ignore[union-attr]
+                    parent._process.kill()  # type: ignore[union-attr]
+                    parent._process.wait()  # type: ignore[union-attr]
+
+        if moment == "at the reset":
+            begin = env._lanes[1]._start
+
+            def start() -> None:
+                begin()
+                if len(killed) < 2:
+                    killed.append(env._lanes[1]._worker._pid)  # type: ignore[union-attr]
+                    os.kill(killed[-1], signal.SIGKILL)
+
+            env._lanes[1]._start = start  # type: ignore[method-assign]
+            assert together(env, 4, episodes=2) == unharmed
+        else:
+            assert together(env, 4, episodes=2, at=kill) == unharmed
+    assert len(killed) >= 2
+    assert eventually(lambda: all(map(gone, killed)))
+    assert list(temporary.iterdir()) == []
+
+
+def test_one_that_dies_each_time_is_given_up(module: Callable[[str], str]) -> None:
+    own = module(
+        "import os\n"
+        "def reward(before, after):\n"
+        "    if after.time_s >= 30: os._exit(3)\n"
+        "    return 0.0\n"
+    )
+    reward = __import__(own).reward
+    with vector_env("single-v1", 2, reward=reward, duration_s=LENGTH_S) as env:
+        batch = env.reset(1)
+        for _ in range(2):
+            batch = env.step(chosen(batch.masks, 0, 0))
+        with pytest.raises(SimulatorCrashed, match="decision 3 of Episode.*replaced 3 times"):
+            env.step(chosen(batch.masks, 0, 0))
+        with pytest.raises(EpisodeError, match="no episode under way; call reset"):
+            env.step(chosen(batch.masks, 0, 0))
+
+
+def test_errors_of_the_users_own_functions_are_told_whole(module: Callable[[str], str]) -> None:
+    own = module("def reward(before, after):\n    return 1 / 0\n")
+    reward = __import__(own).reward
+    with vector_env("single-v1", 1, reward=reward, duration_s=LENGTH_S) as env:
+        batch = env.reset(1)
+        with pytest.raises(WorkerError, match="(?s)by the reward or the wrapper.*ZeroDivisionErr"):
+            env.step(chosen(batch.masks, 0, 0))
+        batch = env.reset(2)  # it goes on
+
+
+def test_sumo_s_words_come_through(crossing: Crossing) -> None:
+    lost = (
+        '<vehicle id="a" depart="0" route="east"/>'
+        '<vehicle id="lost" depart="50"><route edges="W_C C_N"/></vehicle>'
+    )
+    with vector_env(crossing(vehicles=lost), 2, duration_s=200) as env:
+        env.reset(1)
+
+        def play() -> None:
+            for _ in range(20):
+                env.step(np.zeros((2, 1), dtype=np.int64))
+
+        with pytest.raises(SimulatorError, match="SUMO failed after .* 'lost' has no valid route"):
+            play()
+
+
+def test_a_domain_with_other_phases_is_refused(crossing: Crossing) -> None:
+    scenario = load_scenario(crossing())
+    env = vector_env(scenario, 1, lambda environment, episode: ["sim", "V1"][episode])
+    env.close()
+    env = vector_env(scenario, 1)
+    env._home.agents = AgentSet.of(parallel_env("single-v1"))  # type: ignore[union-attr]
+    with pytest.raises(ScenarioError, match="has other agents, observations or phases"):
+        env.reset(1)
+    env.close()
+
+
+# --- nothing is left
+
+
+@needs_proc
+def test_opened_and_closed_twenty_times(crossing: Crossing, temporary: Path) -> None:
+    directory = crossing()
+
+    def once(number: int) -> list[int]:
+        env = vector_env(directory, 2, ["sim", "V1"], duration_s=LENGTH_S)
+        env.reset(number)
+        env.step(np.zeros((2, 1), dtype=np.int64))
+        mine = pids(env)
+        env.close()
+        env.close()
+        return mine
+
+    def entries(folder: str) -> set[Path]:
+        return set(Path(folder).iterdir()) if Path(folder).exists() else set()
+
+    once(0)
+    gc.collect()
+    before, shared = len(entries("/proc/self/fd")), entries("/dev/shm")
+    seen = [pid for number in range(20) for pid in once(number)]
+    assert len(set(seen)) == 40
+    assert eventually(lambda: all(map(gone, seen)))
+    assert len(entries("/proc/self/fd")) <= before
+    assert list(temporary.iterdir()) == []
+    assert entries("/dev/shm") <= shared
+
+
+SCRIPT = """
+import numpy as np
+from ugat_marl import vector_env
+env = vector_env({path!r}, 3, duration_s=10**6)
+env.reset(1)
+print("running", flush=True)
+while {forever}:
+    env.step(np.zeros((3, 1), dtype=np.int64))
+"""
+
+
+@needs_proc
+@pytest.mark.parametrize("how", ["SIGKILL", "SIGINT", "end"])
+def test_nothing_is_left_when_the_user_s_process_ends(
+    how: str, crossing: Crossing, temporary: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "script.py"
+    file.write_text(SCRIPT.format(path=str(crossing()), forever=how != "end"))
+    mark = uuid.uuid4().hex
+    environment = {
+        **os.environ,
+        "MARK": mark,
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+    }
+    process = subprocess.Popen(
+        [sys.executable, str(file)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=environment,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "running\n", process.communicate()[1]
+
+    def relatives() -> list[int]:
+        found: list[int] = []
+        for folder in Path("/proc").iterdir():
+            if folder.name.isdigit():
+                try:
+                    if mark.encode() in (folder / "environ").read_bytes():
+                        found.append(int(folder.name))
+                except OSError:
+                    continue
+        return found
+
+    if how != "end":
+        assert len(relatives()) == 1 + 1 + 3  # the script, the parent, three simulations
+        time.sleep(0.3)
+        os.killpg(process.pid, getattr(signal, how))
+    _, said = process.communicate(timeout=30)
+    assert eventually(lambda: not relatives() and not list(temporary.iterdir()), 10)
+    assert "vector.worker" not in said
+    assert how != "end" or (said == "" and process.returncode == 0)
+
+
+def test_an_unused_one_starts_and_leaves_nothing(crossing: Crossing, temporary: Path) -> None:
+    env = vector_env(crossing(), 4)
+    assert pids(env) == []
+    assert list(temporary.iterdir()) == []
+    env.close()
+    with pytest.raises(EpisodeError, match="this vector_env is closed"):
+        env.reset(1)
+
+
+def test_halves_outlive_the_name_of_the_whole(crossing: Crossing, temporary: Path) -> None:
+    first, second = vector_env(crossing(), 2, duration_s=20).halves()
+    gc.collect()
+    for half in (first, second):
+        half.reset(1)
+        half.step([[0]])
+    first.close()
+    second.step([[0]])
+    del first, second, half
+    gc.collect()
+    assert list(temporary.iterdir()) == []
+
+
+# --- ends of episodes
+
+
+@pytest.mark.parametrize("mode", ["same-step", "next-step", "disabled"])
+def test_the_three_conventions_at_the_end_of_an_episode(mode: Any, crossing: Crossing) -> None:
+    none = np.zeros((2, 1), dtype=np.int64)
+    with vector_env(crossing(), 2, duration_s=20, autoreset=mode) as env:
+        first = env.reset(1)
+        env.step(none)
+        last = env.step(none)
+        assert last.truncated.all()
+        assert [one.environment for one in last.ended] == [0, 1]
+        assert last.ended[0].scores is not None
+        if mode == "same-step":
+            assert np.array_equal(last.observations, first.observations)
+            assert not np.array_equal(last.ended[0].observations, first.observations[0])
+            return
+        assert np.array_equal(last.observations[0], last.ended[0].observations)
+        if mode == "next-step":
+            begun = env.step(none)
+            assert not begun.truncated.any() and not begun.rewards.any()
+            assert np.array_equal(begun.observations, first.observations)
+            assert [one and one.number for one in env.episodes] == [1, 1]
+            return
+        with pytest.raises(EpisodeError, match="environment 0 has no episode under way"):
+            env.step(none)
+        env.reset(where=[1])
+        assert [one and one.number for one in env.episodes] == [0, 1]
+        env.reset(where=[True, False])
+        env.step(none)
+
+
+def test_gymnasium_s_vector_env() -> None:
+    vector = vector_env("mixed-v1", 2, duration_s=20)
+    env = GymnasiumVectorEnv(vector)
+    agents = len(vector.agents)
+    assert isinstance(env, gymnasium_vector.VectorEnv)
+    assert env.num_envs == 2 * agents
+    observations, infos = env.reset(seed=1)
+    assert observations in env.observation_space
+    for step in range(2):
+        actions = chosen(infos["action_mask"], 1, step)
+        assert actions in env.action_space
+        observations, rewards, terminations, truncations, infos = env.step(actions)
+        assert observations in env.observation_space
+        assert rewards.shape == terminations.shape == truncations.shape == (env.num_envs,)
+        assert not terminations.any()
+    assert truncations.all()
+    assert infos["_final_obs"].all()
+    assert all(one in env.single_observation_space for one in infos["final_obs"])
+    assert (infos["final_info"]["att_s"] > 0).all()
+    assert env.metadata["autoreset_mode"] == gymnasium_vector.AutoresetMode.SAME_STEP
+    with pytest.raises(OptionError, match="reset_mask must be"):
+        env.reset(options={"reset_mask": np.arange(env.num_envs) == 0})
+    with pytest.raises(ActionError, match="allowed: \\(.*,\\)"):
+        env.step([0])
+    env.close()
+    env.close()
+    assert pids(vector) == []
+
+
+def test_gymnasium_s_own_wrappers_take_it() -> None:
+    vector = GymnasiumVectorEnv(vector_env("grid2x2-v1", 1, duration_s=20))
+    env = RecordEpisodeStatistics(vector)
+    _, infos = env.reset(seed=1)
+    paid = np.zeros(env.num_envs)
+    for step in range(2):
+        _, rewards, _, _, infos = env.step(chosen(infos["action_mask"], 1, step))
+        paid += rewards
+    np.testing.assert_allclose(infos["episode"]["r"], paid)
+    assert infos["episode"]["l"].tolist() == [2] * env.num_envs
+    env.close()
+
+
+# --- wrong calls
+
+
+def test_wrong_calls(crossing: Crossing) -> None:
+    directory = crossing()
+    for n in (0, -1, 1.5, True):
+        with pytest.raises(OptionError, match="n = .*must be a number of environments"):
+            vector_env(directory, n)  # type: ignore[arg-type]
+    for options, error, words in (
+        ({"autoreset": "later"}, UnknownNameError, "autoreset.*same-step"),
+        ({"simulator": "process"}, OptionError, "simulator = 'process'.*use parallel_env"),
+        ({"render_mode": "rgb_array"}, OptionError, "render_mode"),
+        ({"observatoin": "count"}, UnknownNameError, "Did you mean 'observation'"),
+        ({"domains": ["sim"]}, OptionError, "domains has 1 entries for 2 .*in_turn"),
+        ({"domains": "V44"}, UnknownNameError, "Did you mean 'V4'"),
+        ({"domains": ["sim", "V44"]}, UnknownNameError, "Did you mean 'V4'"),
+        ({"domains": ["sim", StartupDelay(1.0)]}, OptionError, "mixes domains and single effects"),
+        ({"wrap": lambda env: env}, OptionError, "wrap = .*move it to a module"),
+        ({"wrap": "ugat_marl.envs.wrappers:padd"}, OptionError, "cannot be imported .*module:name"),
+        ({"reward": lambda a, b: 0.0}, OptionError, "reward = .*move it to a module"),
+    ):
+        with pytest.raises(error, match=words):
+            vector_env(directory, 2, **options)
+    with pytest.raises(OptionError, match="at least one domain"):
+        in_turn([])
+    with vector_env(directory, 2, duration_s=20) as env:
+        with pytest.raises(EpisodeError, match="no episode under way; call reset"):
+            env.step([[0], [0]])
+        for seed in (-1, [1], [1, 2, 3], [1, -2], 1.5, [1.5, 2.5], "ab"):
+            with pytest.raises(OptionError, match="seed = .*from 0 on, or 2 of them"):
+                env.reset(seed)
+        for where in ([2], [0, 0], [], [False, False], 1):
+            with pytest.raises(OptionError, match="where = .*different numbers below 2"):
+                env.reset(1, where)
+        env.reset(1)
+        for actions in ([0, 0], [[0.0], [0.0]], [[0], [0], [0]]):
+            with pytest.raises(ActionError, match="integers of shape \\(2, 1\\)"):
+                env.step(actions)
+        with pytest.raises(
+            ActionError, match="'signal_0' in environment 1 is 2; allowed: .* 0 to 1"
+        ):
+            env.step([[0], [2]])
+        with pytest.raises(OptionError, match="at least two"):
+            env.halves()[0].halves()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            env.step([[0], [1]])  # nothing has happened in between
+
+
+def test_the_arrays_do_not_overlap() -> None:
+    shape = Shape(2, 3, 5, 4)
+    descriptor = shared_memory(shape)
+    one, two = Arrays.over(descriptor, shape), Arrays.over(descriptor, shape)
+    os.close(descriptor)
+    for number, name in enumerate(one.__dataclass_fields__, 1):
+        getattr(one, name)[:] = number
+    for number, name in enumerate(one.__dataclass_fields__, 1):
+        assert (getattr(two, name) == number).all()
+    two.part(1).observations[0] = 9
+    assert one.observations[1, 0, 0] == 9
+    assert one.observations[0].max() == 1

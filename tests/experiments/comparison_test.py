@@ -1,0 +1,121 @@
+"""Intervals, paired tests and shares of regret, against tables and sums done by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from ugat_marl.data import Scores
+from ugat_marl.experiments import Comparison, Trial
+from ugat_marl.reporting import as_csv, gap_picture, markdown, seeds_csv
+
+BLANK = Scores(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+FACTS = {
+    "command": "ugat-marl paper main", "cpu": "some", "cores": 2, "python": "3.11",
+    "versions": {"torch": "2"}, "date": "2026-01-02T03:04:05",
+}  # fmt: skip
+
+
+def trials(setting: str, by_seed: dict[int | None, tuple[float, float]]) -> list[Trial]:
+    """Two episodes per domain whose mean is the ATT asked for, as (sim, V4)."""
+    return [
+        Trial(setting, "V4", domain, training, seed, replace(BLANK, att_s=att + off))
+        for training, both in by_seed.items()
+        for domain, att in zip(("sim", "V4"), both, strict=True)
+        for seed, off in ((1, -1.0), (2, 1.0))
+    ]
+
+
+@pytest.fixture
+def found() -> Comparison:
+    rows = [
+        *trials("direct transfer", {0: (70.0, 200.0), 1: (72.0, 240.0)}),
+        *trials("UGAT", {1: (71.0, 150.0), 0: (71.0, 130.0)}),
+        *trials("constant delay 2 s", {0: (70.0, 120.0), 1: (70.0, 160.0)}),
+        *trials("best rule, tuned there", {None: (80.0, 120.0)}),
+    ]
+    return Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
+
+
+def test_values_are_in_the_order_of_the_training_seeds(found: Comparison) -> None:
+    assert found.training_seeds == [0, 1]
+    assert found.values("UGAT", "V4", "att_s").tolist() == [130.0, 150.0]
+    assert found.values("best rule, tuned there", "V4", "att_s").tolist() == [120.0, 120.0]
+    assert found.gaps("direct transfer", "V4", "att_s").tolist() == [130.0, 168.0]
+
+
+def test_regret_won_back_by_hand(found: Comparison) -> None:
+    assert found.best("V4") == "best rule, tuned there"
+    assert found.won_back("UGAT", "V4", "direct transfer") == pytest.approx((220 - 140) / 100)
+    assert found.won_back("direct transfer", "V4", "direct transfer") == 0.0
+    assert found.won_back("best rule, tuned there", "V4", "direct transfer") == 1.0
+    assert found.regret_s("UGAT", "V4").tolist() == [10.0, 30.0]
+    # the gap: 149 s before, (130 - 71 + 150 - 71) / 2 = 69 after
+    assert found.reduction("UGAT", "V4", "direct transfer") == pytest.approx(1 - 69 / 149)
+
+
+def test_nothing_to_win_has_no_share() -> None:
+    rows = trials("direct transfer", {0: (70.0, 80.0)}) + trials("UGAT", {0: (70.0, 90.0)})
+    found = Comparison("toy", "0", "sim", tuple(rows), {"table": "main"})
+    assert math.isnan(found.won_back("UGAT", "V4", "direct transfer"))
+
+
+def test_what_loses_nothing_on_the_way_has_no_gap_to_make_smaller() -> None:
+    rows = trials("direct transfer", {0: (90.0, 80.0)}) + trials("UGAT", {0: (70.0, 290.0)})
+    found = Comparison("toy", "0", "sim", tuple(rows), {"table": "main"})
+    assert math.isnan(found.reduction("UGAT", "V4", "direct transfer"))
+    served = [
+        replace(row, scores=replace(row.scores, throughput=30.0 if row.domain == "V4" else 50.0))
+        for row in rows
+    ]
+    found = Comparison("toy", "0", "sim", tuple(served), {"table": "main"})
+    assert found.reduction("UGAT", "V4", "direct transfer", "throughput") == 0.0  # fewer: a gap
+
+
+def test_episodes_that_broke_down_are_counted_one_by_one() -> None:
+    def episode(target: str, training: int | None, att_s: float, arrived: float) -> Trial:
+        scores = replace(BLANK, att_s=att_s, throughput=arrived, due=200.0)
+        return Trial("direct transfer", "V4", target, training, 1, scores)
+
+    rows = [
+        episode("V4", 0, 100.0, 190.0), episode("V4", 0, 120.0, 180.0),
+        episode("V4", 1, 700.0, 179.0), episode("sim", 1, 60.0, 0.0),
+    ]  # fmt: skip
+    found = Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
+    assert found.median_s("direct transfer", "V4") == 120.0
+    assert found.unserved("direct transfer", "V4") == pytest.approx(1 / 3)
+    assert "| direct transfer | 120, 33 % |" in markdown(found, "direct transfer", FACTS)
+
+
+@pytest.mark.parametrize("shared", ["", "+blocker_patience=60+reach=100", "+reach=100" * 6])
+def test_bars_are_told_apart_within_the_picture(shared: str, tmp_path: Path) -> None:
+    rows = [
+        Trial("direct transfer", domain, domain, 0, 1, replace(BLANK, att_s=100.0))
+        for domain in (f"V{number}{shared}" for number in (1, 2, 3, 4))
+    ]
+    rows += [replace(row, domain="sim") for row in rows]
+    found = Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
+    path = tmp_path / "gaps.png"
+    gap_picture(found, path)
+    pixels = matplotlib.image.imread(path)[-130:, :, :3]
+    edges = np.concatenate((pixels[:, :3], pixels[:, -3:]), axis=1)
+    assert pixels.min() < 0.5 and edges.min() == 1.0  # a legend, and none of it cut off
+
+
+def test_pages_hold_the_numbers(found: Comparison) -> None:
+    page = markdown(found, "direct transfer", FACTS)
+    assert "# toy: main" in page
+    assert "| UGAT | −54 % |" in page
+    assert "| UGAT | 0.80 |" in page
+    assert "| direct transfer | 100 (-154 to 354) |" in page  # t = 12.71, 20 s apart from the mean
+    assert "| best constant | 2 s |" in page
+    assert "| UGAT | -80.0 (" in page
+    table = as_csv(found).splitlines()
+    assert len(table) == 5
+    assert table[0].startswith("scenario,setting,domain,training_seeds,att_s,")
+    assert "UGAT,V4,0,130.0,71.0,0.0" in seeds_csv(found).splitlines()

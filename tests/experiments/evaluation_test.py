@@ -1,0 +1,116 @@
+"""Scores over policies, domains and seeds: arithmetic by hand, and real episodes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ugat_marl.data import Scores
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import CheckpointError, UnknownNameError
+from ugat_marl.experiments import Evaluation, best_rules, evaluate, policy_factory, rule_factory
+from ugat_marl.experiments.evaluation import Result
+from ugat_marl.policies import DQN
+
+BASE = Scores(100.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 5.0)
+
+
+def scores(att_s: float) -> Scores:
+    return replace(BASE, att_s=att_s)
+
+
+@pytest.fixture
+def found() -> Evaluation:
+    table = {
+        ("slow", "sim"): (100.0, 110.0),
+        ("slow", "V4"): (150.0, 170.0),
+        ("fast", "sim"): (90.0, 94.0),
+        ("fast", "V4"): (130.0, 140.0),
+    }
+    results = tuple(
+        Result(policy, domain, seed, scores(value))
+        for (policy, domain), values in table.items()
+        for seed, value in enumerate(values)
+    )
+    return Evaluation("toy", "0", results, {})
+
+
+def test_gap_is_paired_by_seed_and_regret_is_against_the_best_there(found: Evaluation) -> None:
+    assert found.policies == ["slow", "fast"]
+    assert found.estimate("slow", "sim", "att_s").mean == 105.0
+    assert found.gap("slow", "V4", "att_s").mean == 55.0
+    assert found.regret("slow", "V4").mean == 25.0
+    assert found.estimate("slow", "V4", "att_s").median == 160.0
+    assert found.regret("fast", "V4").mean == 0.0
+    gap = found.gap("slow", "V4", "att_s")  # the two differences are 50 and 60
+    half = 12.7062 * 5  # t of one degree of freedom, and the error of the mean
+    assert (gap.low, gap.high) == pytest.approx((55 - half, 55 + half), abs=1e-3)
+
+
+def test_a_single_seed_has_no_interval(found: Evaluation) -> None:
+    single = Evaluation("toy", "0", tuple(r for r in found.results if r.seed == 0), {})
+    estimate = single.estimate("slow", "V4", "att_s")
+    assert estimate.mean == 150.0
+    assert np.isnan(estimate.low)
+
+
+def test_everything_is_written(found: Evaluation, tmp_path: Path) -> None:
+    found.write(tmp_path / "table.json")
+    content = json.loads((tmp_path / "table.json").read_text())
+    assert len(content["episodes"]) == 8
+    row = next(r for r in content["summary"] if (r["policy"], r["domain"]) == ("slow", "V4"))
+    assert row["att_s_gap"]["mean"] == 55.0
+    assert row["regret_s"]["mean"] == 25.0
+    single = Evaluation("toy", "0", found.results[:1], {})
+    single.write(tmp_path / "table.json")  # without an interval
+    assert '"low": null' in (tmp_path / "table.json").read_text()
+
+
+def test_how_many_run_at_once_changes_nothing() -> None:
+    scenario = load_scenario("single-v1")
+    policies = {rule: rule_factory(rule) for rule in ("largest-queue:20", "random", "programme")}
+    one, two = (
+        evaluate(scenario, policies, ["sim", "V4"], [5, 6], duration_s=200, workers=workers)
+        for workers in (1, 2)
+    )
+    assert one.results == two.results
+    assert one.domains == ["sim", "V4"]
+
+
+def test_the_best_rule_is_the_one_with_the_smallest_travel_time() -> None:
+    scenario = load_scenario("single-v1")
+    rules = ("random", "largest-queue:20")
+    assert best_rules(
+        scenario, ["sim"], rules=rules, seeds=[1], duration_s=600
+    ) == {"sim": "largest-queue:20"}  # fmt: skip
+
+
+def test_a_wrong_name_is_refused_before_anything_runs() -> None:
+    scenario = load_scenario("single-v1")
+    with pytest.raises(UnknownNameError, match="V4"):
+        evaluate(scenario, {"r": rule_factory("random")}, ["sim", "V44"], [1])
+    with pytest.raises(UnknownNameError, match="largest-queue"):
+        policy_factory("largest-que:20")
+
+
+def test_a_policy_of_another_scenario_is_refused(tmp_path: Path) -> None:
+    learner = DQN.of(parallel_env("grid2x2-v1"))
+    learner.policy().save(tmp_path / "policy.pt")
+    factory = policy_factory(str(tmp_path / "policy.pt"))
+    with pytest.raises(CheckpointError, match="other intersections than those of scenario"):
+        evaluate(load_scenario("single-v1"), {"p": factory}, ["sim"], [1], duration_s=100)
+
+
+def test_a_trained_policy_is_played_from_its_file(tmp_path: Path) -> None:
+    learner = DQN.of(parallel_env("single-v1"))
+    learner.policy().save(tmp_path / "policy.pt")
+    found = evaluate(
+        load_scenario("single-v1"), {"p": policy_factory(str(tmp_path / "policy.pt"))}, ["sim"],
+        [1], duration_s=100,
+    )  # fmt: skip
+    assert found.results[0].scores.due > 0

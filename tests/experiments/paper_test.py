@@ -1,0 +1,260 @@
+"""The tables of the paper: which trainings they need, which they share, and how they are run."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ugat_marl.__main__ import main
+from ugat_marl.data import Scores, locked
+from ugat_marl.errors import MeasurementError, OptionError, UnknownNameError
+from ugat_marl.experiments import DIRECT, QUEUES, TIMED, PaperConfig, read_queues
+from ugat_marl.experiments.paper.job import JOB, SCORES, read_scores
+from ugat_marl.experiments.paper.runner import LOG, Planned, done, perform_all
+from ugat_marl.experiments.paper.settings import TABLES, Setting, settings_of
+from ugat_marl.experiments.paper.tables import Planner
+from ugat_marl.grounding import FitConfig, GateConfig, InputsConfig, TimedConfig, UgatConfig
+from ugat_marl.progress import Silent
+
+SHORT = PaperConfig(episodes=10, iterations=2, grounded_episodes=5, real_rollouts=3, seeds=2)
+
+
+def planner(config: PaperConfig = SHORT, table: str = "main") -> Planner:
+    return Planner(table, "single-v1", config)
+
+
+def row(name: str, config: PaperConfig = SHORT, table: str = "main") -> Setting:
+    (found,) = [setting for setting in config.settings(table) if setting.name == name]
+    return found
+
+
+def test_main_has_the_controls_an_honest_table_needs() -> None:
+    names = [setting.name for setting in SHORT.settings("main")]
+    assert names == [
+        "direct transfer", "UGAT", "UGAT, timed", "UGAT, timed: rewards matched", "more plain sim",
+        "domain randomisation", "random delay", *(f"constant delay {s} s" for s in (1, 2, 3, 4, 5)),
+        "fine-tuned on the same data", "trained in real", "best rule, tuned there",
+    ]  # fmt: skip
+
+
+def test_rewards_are_matched_in_the_row_that_says_so_alone() -> None:
+    matching = {
+        setting.name
+        for table in TABLES
+        for setting in SHORT.settings(table)
+        if setting.kind == "grounded" and setting.ugat.matches
+    }
+    assert matching == {"UGAT, timed: rewards matched"}
+
+
+def test_rows_share_what_is_given_and_keep_what_they_are_named_for() -> None:
+    config = replace(
+        SHORT, inputs=InputsConfig(hops=1), gate=GateConfig(window_epochs=3),
+        fit=FitConfig(uncertainty="dropout"),
+    )  # fmt: skip
+    rows = {setting.name: setting.ugat for setting in config.settings("ablation")}
+    grounded = {name: own for name, own in rows.items() if name.startswith("UGAT")}
+    assert all(own.inputs.hops == 1 for own in grounded.values())
+    assert all(own.gate.window_epochs == 3 for own in grounded.values())
+    named = {name: own.fit.uncertainty for name, own in grounded.items()}
+    assert {named.pop(f"{name}: no uncertainty (GAT)") for name in ("UGAT", TIMED)} == {"none"}
+    assert set(named.values()) == {"dropout"}
+    pairs = {name for name, own in grounded.items() if own.fit.pairs == "smoothed"}
+    assert pairs == {"UGAT: h on smoothed pairs"}
+    without = {name for name, own in grounded.items() if own.timed.answer == "constant"}
+    assert without == {f"{TIMED}: lost times without h"}
+
+
+def test_rewards_that_cannot_be_matched_have_no_such_row() -> None:
+    names = [setting.name for setting in replace(SHORT, reward="pressure").settings("main")]
+    assert "UGAT, timed" in names and "UGAT, timed: rewards matched" not in names
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_rows_of_a_table_have_names_of_their_own_and_begin_with_direct_transfer(table: str) -> None:
+    names = [setting.name for setting in SHORT.settings(table)]
+    assert len(set(names)) == len(names)
+    assert names[0] == DIRECT
+
+
+def test_rows_can_be_picked_and_keep_their_order() -> None:
+    some = replace(SHORT, rows=("trained in real", "UGAT, timed"))
+    assert [x.name for x in some.settings("main")] == [DIRECT, TIMED, "trained in real"]
+    with pytest.raises(UnknownNameError, match="trained in real"):
+        replace(SHORT, rows=("traned in real",)).settings("main")
+
+
+def test_what_does_not_know_the_domain_is_trained_once_for_all_of_them() -> None:
+    def trained(name: str) -> int:
+        return len({planned.name for planned in planner().jobs(row(name))})
+
+    assert trained(DIRECT) == 2  # seeds
+    assert trained("constant delay 3 s") == 2
+    assert trained(TIMED) == 8  # and domains
+    assert trained("best rule, tuned there") == 4  # a rule has no seed
+
+
+def test_every_policy_has_as_many_episodes() -> None:
+    def episodes(name: str) -> int:
+        return planner().jobs(row(name))[0].job.episodes
+
+    assert episodes(DIRECT) == 10
+    assert episodes("more plain sim") == episodes("trained in real") == 20
+    assert episodes("fine-tuned on the same data") == 10 + 2 * 3  # as many as UGAT saw
+
+
+def test_tables_share_trainings() -> None:
+    main_names = {planned.name for planned in planner().jobs(row("UGAT"))}
+    for table, name in (
+        ("ablation", "UGAT"),
+        ("alpha", "UGAT"),
+        ("uncertainty", "UGAT: evidential"),
+    ):
+        one_domain = replace(SHORT, domains=("V1",))
+        own = planner(one_domain, table).jobs(row(name, one_domain, table))
+        assert {planned.name for planned in own} <= main_names
+
+
+def test_what_decides_a_policy_decides_its_folder() -> None:
+    (first, *_) = planner().jobs(row("UGAT"))
+    for change in (
+        {"seed": 7},
+        {"target": "V2"},
+        {"options": {**first.job.options, "duration_s": 600.0}},
+        {"ugat": UgatConfig(grounded_episodes=6)},
+    ):
+        assert Planned.of(replace(first.job, **change)).name != first.name
+    for judging in ({"evaluation_seeds": (1,)}, {"domains": ("V1",)}):
+        assert Planned.of(replace(first.job, **judging)).name == first.name
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"seeds": 0}, "seeds = 0"),
+        ({"scenario": ()}, "scenario is empty"),
+        ({"domains": ("V3", "rain")}, "listed twice"),
+        ({"domains": ("sim",)}, "the simulation itself"),
+        ({"grounded_episodes": 0}, "grounded_episodes = 0"),
+        ({"timed": TimedConfig(match=True)}, "a row of its own"),
+    ],
+)
+def test_impossible_tables_are_refused(wrong: dict[str, Any], says: str) -> None:
+    with pytest.raises(OptionError, match=says):
+        PaperConfig(**wrong)
+
+
+def test_impossible_rows_are_refused() -> None:
+    with pytest.raises(OptionError, match="delays are whole seconds"):
+        settings_of("main", UgatConfig(), "sim", constants=(0, 2))
+    with pytest.raises(OptionError, match="phase and timed"):
+        settings_of("main", UgatConfig(), "sim", groundings=("fase",))
+
+
+def test_greens_are_late_in_the_simulation_that_is_trained_in(tmp_path: Path) -> None:
+    def worlds(sim: str) -> list[str | None]:
+        rows = settings_of("main", UgatConfig(), sim, constants=(3,))
+        return [row.world for row in rows if row.name == "constant delay 3 s"]
+
+    assert worlds("sim") == ["late_green=*,3"]
+    assert worlds("meso") == ["meso+late_green=*,3"]
+    (tmp_path / "scenario.toml").touch()
+    with pytest.raises(OptionError, match="--constants"):
+        worlds(str(tmp_path))
+    assert settings_of("main", UgatConfig(), str(tmp_path), constants=())
+
+
+def test_the_simulation_is_no_real_domain_of_its_own_table() -> None:
+    assert PaperConfig(sim="V1").targets("main") == ["V2", "V3", "V4"]
+    with pytest.raises(OptionError, match="name domains"):
+        PaperConfig(sim="light-loads").targets("alpha")
+
+
+def test_a_failed_job_says_why_and_the_next_call_starts_it_again(tmp_path: Path) -> None:
+    broken = replace(planner().bases[0].job, options={"observation": "conut"})
+    planned = Planned(broken, "broken")
+    with pytest.raises(MeasurementError, match="conut"):
+        perform_all([planned], tmp_path, 1, Silent(), "test")
+    assert "conut" in (tmp_path / "broken" / LOG).read_text()
+    assert json.loads((tmp_path / "broken" / JOB).read_text())["kind"] == "direct"
+
+
+def test_two_tables_do_not_train_in_one_folder(tmp_path: Path) -> None:
+    lock = locked(tmp_path)
+    with pytest.raises(OptionError, match="another process"):
+        perform_all([], tmp_path, 1, Silent(), "test")
+    lock.close()
+    perform_all([], tmp_path, 1, Silent(), "test")
+
+
+def test_a_job_ends_with_whoever_started_it(tmp_path: Path) -> None:
+    endless = replace(planner().bases[0].job, episodes=10**6)
+    (tmp_path / JOB).write_text(json.dumps(asdict(endless)))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ugat_marl.experiments.paper.job", str(tmp_path)],
+        stdin=subprocess.PIPE,
+    )
+    assert process.stdin is not None
+    process.stdin.close()
+    assert process.wait(60) == 1
+
+
+def test_what_a_killed_job_was_writing_is_cleared(tmp_path: Path) -> None:
+    planned = planner(replace(SHORT, evaluation_seeds=1)).bases[0]
+    scores = asdict(Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1))
+    rows = [{"domain": domain, "seed": 1000, **scores} for domain in planned.job.domains]
+    (tmp_path / SCORES).write_text(json.dumps(rows))  # nothing is left to do
+    (tmp_path / JOB).write_text(json.dumps(asdict(planned.job)))
+    (tmp_path / ".learner.pt.x1y2z3.tmp").write_bytes(b"half")
+    command = [sys.executable, "-m", "ugat_marl.experiments.paper.job", str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        assert process.wait(60) == 0  # its input stays open: it would end with whoever started it
+    assert {path.name for path in tmp_path.iterdir()} == {SCORES, JOB}
+
+
+@pytest.mark.parametrize("content", ["", "[{}]", '[{"domain": "sim"}]', '{"a": 1}', "[1]"])
+def test_broken_scores_are_no_scores(tmp_path: Path, content: str) -> None:
+    (tmp_path / SCORES).write_text(content)
+    assert read_scores(tmp_path) == {}
+
+
+def test_a_job_is_done_when_everything_was_played(tmp_path: Path) -> None:
+    planned = planner(replace(SHORT, evaluation_seeds=1)).bases[0]
+    scores = asdict(Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1))
+    rows = [{"domain": domain, "seed": 1000, **scores} for domain in planned.job.domains]
+    folder = tmp_path / planned.name
+    folder.mkdir()
+    (folder / SCORES).write_text(json.dumps(rows[:-1]))
+    assert done(planned, tmp_path) is None
+    (folder / SCORES).write_text(json.dumps(rows))
+    assert done(planned, tmp_path) is not None
+
+
+def test_a_table_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    call = [
+        "paper", "gap", "--domains", "V4", "--episodes", "1", "--seeds", "1", "--duration-s", "120",
+        "--evaluation-seeds", "2", "--rule-budget", "2",
+        "--out", str(tmp_path / "results"), "--runs", str(tmp_path / "runs"),
+    ]  # fmt: skip
+    assert main(call) == 0
+    said = capsys.readouterr().out
+    assert "best rule, tuned there" in said
+    tables = said.partition("table and pictures")[0]
+    assert max(map(len, tables.splitlines())) <= 80
+    folder = tmp_path / "results" / "single-v1" / "gap"
+    assert {path.name for path in folder.iterdir()} == {
+        "table.md", "table.csv", "seeds.csv", "radar.png", "gaps.png",
+    }  # fmt: skip
+    before = (folder / "table.csv").read_bytes()
+    trained = sorted(path for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    assert all(set(read_queues(path / QUEUES)["domain"]) >= {"V4"} for path in trained)
+    times = [path.joinpath(SCORES).stat().st_mtime_ns for path in trained]
+    assert main(call) == 0  # nothing is trained again
+    assert [path.joinpath(SCORES).stat().st_mtime_ns for path in trained] == times
+    assert (folder / "table.csv").read_bytes() == before

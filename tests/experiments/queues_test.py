@@ -1,0 +1,112 @@
+"""Where and when vehicles stand: counted by hand, and in episodes that are played."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ugat_marl.effects import load_scenario
+from ugat_marl.errors import CheckpointError
+from ugat_marl.experiments import evaluate, read_queues, rule_factory
+from ugat_marl.experiments.queues import QueueRecord
+from ugat_marl.scenarios import Network
+
+
+def stub(decisions: int, interval_s: float) -> Any:
+    """An environment of grid2x2-v1 whose snapshot the test writes."""
+    network = Network.read(load_scenario("grid2x2-v1"))
+    env = SimpleNamespace(
+        network=network, decision_interval_s=interval_s,
+        scenario=SimpleNamespace(decisions=decisions), snapshot=None,
+    )  # fmt: skip
+    env.unwrapped = env
+    return env
+
+
+def test_queues_are_means_by_minute_and_intersection() -> None:
+    env = stub(decisions=9, interval_s=10.0)
+    lanes = env.network.lane_table()
+    record = QueueRecord()
+    look = record.watch("rule", "V4", env)
+    first, second = env.network.intersections[:2]
+    for step in range(1, 10):
+        halting = np.zeros(len(lanes.ids))
+        halting[lanes.indices(first.incoming_lanes[:2])] = step, 1.0
+        halting[lanes.indices(first.outgoing_lanes[:1])] += 0.0
+        halting[lanes.indices(second.incoming_lanes[:1])] = 2.0
+        env.snapshot = SimpleNamespace(halting=halting)
+        look(step)
+    rows = {(m, tls): queue for _, _, m, tls, queue, _ in record.frame().rows()}
+    # 6 decisions in the first minute, 3 in the second
+    assert rows[0, first.id] == np.mean([1, 2, 3, 4, 5, 6]) + 1
+    assert rows[1, first.id] == np.mean([7, 8, 9]) + 1
+    assert rows[0, second.id] == rows[1, second.id] == 2.0
+    assert {m for m, _ in rows} == {0, 1} and len(rows) == 8
+    assert {(row[2], row[5]) for row in record.frame().rows()} == {(0, 6), (1, 3)}
+
+
+def test_long_intervals_leave_minutes_out() -> None:
+    env = stub(decisions=2, interval_s=90.0)
+    look = (record := QueueRecord()).watch("rule", "V4", env)
+    env.snapshot = SimpleNamespace(halting=np.ones(len(env.network.lane_table().ids)))
+    look(1)
+    look(2)
+    assert set(record.frame()["minute"]) == {1, 2}
+
+
+def test_an_evaluation_fills_it(tmp_path: Path) -> None:
+    record = QueueRecord()
+    rules = {name: rule_factory(name) for name in ("fixed-time:30", "max-pressure:20")}
+    found = evaluate(
+        load_scenario("single-v1"), rules, ["sim", "V4"], [1, 2], duration_s=300, watch=record.watch
+    )
+    record.write(tmp_path / "queues.parquet")
+    frame = read_queues(tmp_path / "queues.parquet")
+    assert len(frame) == 2 * 2 * 5
+    for policy in rules:
+        for domain in ("sim", "V4"):
+            own = frame.filter(policy=policy, domain=domain)
+            # 6 decisions in each of 5 minutes: the mean of the means is that of the scores
+            mean = found.values(policy, domain, "queue").mean()
+            assert own["queue"].mean() == pytest.approx(mean)
+
+
+def test_another_evaluation_adds_its_episodes(tmp_path: Path) -> None:
+    path = tmp_path / "queues.parquet"
+
+    def write(domain: str, *episodes: float, keep: bool = True) -> None:
+        env = stub(decisions=2, interval_s=60.0)
+        look = (record := QueueRecord()).watch("policy", domain, env)
+        for halting in episodes:
+            lanes = len(env.network.lane_table().ids)
+            env.snapshot = SimpleNamespace(halting=np.full(lanes, halting))
+            look(1)
+        record.write(path, keep=keep)
+
+    path.write_bytes(b"broken")
+    write("sim", 1.0)
+    write("V4", 2.0)
+    first = read_queues(path)
+    assert set(first["domain"]) == {"sim", "V4"}
+    write("V4", 4.0, 6.0)
+    again = read_queues(path)
+    assert len(again) == len(first)
+    assert again.filter(domain="sim").equals(first.filter(domain="sim"))
+    assert again.filter(domain="V4")["queue"].sum() == 2 * first.filter(domain="V4")["queue"].sum()
+    write("V1", 1.0, keep=False)
+    assert set(read_queues(path)["domain"]) == {"V1"}
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1 no more"])
+def test_a_damaged_file_is_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "q.parquet").write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"q\.parquet: cannot be read"):
+        read_queues(tmp_path / "q.parquet")
+    pl.DataFrame({"a": [1]}).write_parquet(tmp_path / "q.parquet")
+    with pytest.raises(CheckpointError, match="not the queues of a run"):
+        read_queues(tmp_path / "q.parquet")

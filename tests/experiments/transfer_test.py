@@ -1,0 +1,294 @@
+"""Controls and negative controls of `train`: what each is trained in, from what, for how long."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+
+import ugat_marl.experiments.transfers as transfer_module
+from ugat_marl.__main__ import main
+from ugat_marl.data import Metrics, TransitionLog
+from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
+from ugat_marl.experiments import TransferConfig, transfer
+from ugat_marl.experiments.randomised import RandomisedEnv
+from ugat_marl.experiments.recipes import file_names
+from ugat_marl.grounding import FitConfig, RandomDelays, TimedConfig, UgatConfig
+from ugat_marl.policies import DQNConfig, DQNPolicy
+from ugat_marl.progress import Silent
+
+SMALL = TransferConfig(
+    scenario="single-v1",
+    duration_s=100,
+    evaluation_seeds=1,
+    tuning_seeds=1,
+    control=False,
+    ugat=UgatConfig(
+        pretrain_episodes=2,
+        iterations=2,
+        grounded_episodes=3,
+        sim_rollouts=2,
+        real_rollouts=2,
+        least_accuracy=None,  # so little training proves nothing
+        fit=FitConfig(epochs=2),
+    ),
+    dqn=DQNConfig(warmup_decisions=5, epsilon_decay_decisions=50),
+)
+
+
+@dataclass
+class Judged:
+    """Takes the place of an evaluation, which is not under test here."""
+
+    policies: list[str]
+    domains: list[str]
+
+    def write(self, path: Path) -> None:
+        path.write_text("{}")
+
+
+@pytest.fixture(autouse=True)
+def unjudged(monkeypatch: pytest.MonkeyPatch) -> None:
+    def judge(config: TransferConfig, scenario: Any, policies: dict[str, Any], *_: Any) -> Judged:
+        del scenario
+        return Judged(list(policies), config.domains)
+
+    monkeypatch.setattr(transfer_module, "judge", judge)
+    monkeypatch.setattr(transfer_module, "evaluate", lambda *_, **__: Judged([], []))
+
+
+def weights(folder: Path, name: str) -> np.ndarray[Any, Any]:
+    return DQNPolicy.load(folder / "policies" / f"{name}.pt").parameters
+
+
+def episodes(folder: Path, name: str) -> int:
+    saved = torch.load(folder / f"{name}-learner.pt", weights_only=True)
+    return int(saved["counters"]["episodes"])
+
+
+class KillIn(Silent):
+    """Raises after some episodes of one task."""
+
+    def __init__(self, name: str, after: int) -> None:
+        self._name, self._left = name, after
+
+    @contextlib.contextmanager
+    def task(self, name: str, total: int) -> Any:
+        with super().task(name, total) as advance:
+
+            def one(*args: Any, **note: Any) -> None:
+                advance(*args, **note)
+                self._left -= name == self._name
+                if not self._left:
+                    raise KeyboardInterrupt
+
+            yield one
+
+
+CONTROLS: dict[str, Any] = {
+    "control": True,
+    "randomised": True,
+    "random_delay_s": 5,
+    "fine_tuned": True,
+    "oracle": True,
+}
+
+
+def test_without_iterations_there_is_no_ugat_to_judge(tmp_path: Path) -> None:
+    plain = replace(SMALL, ugat=replace(SMALL.ugat, iterations=0))
+    assert transfer(plain, tmp_path / "run").policies == ["direct transfer"]
+    assert [path.name for path in (tmp_path / "run/policies").iterdir()] == ["direct-transfer.pt"]
+
+
+def test_every_control_is_trained_as_long_as_it_says_where_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worlds: list[str] = []
+    late: list[int] = []
+    reset, step = RandomisedEnv.reset, RandomDelays.step
+
+    def drawing(self: Any, *args: Any, **options: Any) -> Any:
+        outcome = reset(self, *args, **options)
+        worlds.append(self.env.domain)
+        return outcome
+
+    def delaying(self: Any, actions: Any) -> Any:
+        late.append(self._most_s)
+        return step(self, actions)
+
+    monkeypatch.setattr(RandomisedEnv, "reset", drawing)
+    monkeypatch.setattr(RandomDelays, "step", delaying)
+    config = replace(SMALL, **CONTROLS)
+    found = transfer(config, tmp_path)
+    names = [
+        "direct transfer", "UGAT", "more plain sim", "random delay 0-5 s",
+        "fine-tuned on the same data", "domain randomisation", "trained in real",
+    ]  # fmt: skip
+    assert found.policies == names
+    assert config.episodes == 8
+    for name in ("control", "random-delay-0-5-s", "domain-randomisation", "oracle"):
+        assert episodes(tmp_path, name) == 8
+    # UGAT saw two roll-outs of the real domain in each of two iterations.
+    assert episodes(tmp_path, "fine-tuned-on-the-same-data") == 2 + 4
+    assert len(worlds) == len(set(worlds)) == 8
+    for world in worlds:
+        parts = {part.partition("=")[0] for part in world.split("+")}
+        assert parts == {
+            "acceleration", "deceleration", "emergency_deceleration", "startup_delay",
+        }  # fmt: skip
+    assert set(late) == {5} and len(late) == 6 * 10  # six episodes of ten decisions
+    policies = [weights(tmp_path, file) for file in file_names(names)]
+    for i, one in enumerate(policies):
+        assert not any(np.array_equal(one, other) for other in policies[:i])
+
+
+def test_controls_are_the_trainings_that_go_by_other_names(tmp_path: Path) -> None:
+    """The oracle is a correction that is right; fine-tuning goes on in the real domain."""
+    ugat = replace(SMALL.ugat, grounded_episodes=2)  # as many as roll-outs of the real domain
+    config = replace(
+        SMALL, ugat=ugat, oracle=True, fine_tuned=True, corrected="V4", further=("V4",)
+    )
+    transfer(config, tmp_path)
+    for one, other in (
+        ("trained-in-real", "corrected-sim"),
+        ("fine-tuned-on-the-same-data", "further-in-v4"),
+    ):
+        assert np.array_equal(weights(tmp_path, one), weights(tmp_path, other))
+
+
+def test_domains_whose_names_differ_by_a_sign_are_trained_in_one_by_one(tmp_path: Path) -> None:
+    domains = ("acceleration=0.5+demand_timing=*,-60", "acceleration=0.5+demand_timing=*,60")
+    transfer(replace(SMALL, further=domains), tmp_path)
+    assert len(list(tmp_path.glob("further-in-*-learner.pt"))) == 2
+    first = "further-in-acceleration-0.5-demand-timing-60"
+    one, two = (weights(tmp_path, name) for name in (first, f"{first}-2"))
+    assert not np.array_equal(one, two)
+
+
+def test_controls_can_be_added_to_a_run_and_change_nothing_else(tmp_path: Path) -> None:
+    transfer(SMALL, tmp_path / "run")
+    policies = ("ugat", "direct-transfer", "trained-in-real", "random-delay-0-5-s")
+    before = weights(tmp_path / "run", "ugat")
+    more = replace(SMALL, oracle=True, random_delay_s=5)
+    transfer(more, tmp_path / "run", resume=True)
+    transfer(more, tmp_path / "at once")
+    assert np.array_equal(before, weights(tmp_path / "run", "ugat"))
+    for name in policies:
+        one, two = (weights(tmp_path / run, name) for run in ("run", "at once"))
+        assert np.array_equal(one, two), name
+
+
+def test_domain_randomisation_resumes(tmp_path: Path) -> None:
+    ugat = replace(SMALL.ugat, pretrain_episodes=8, iterations=1, grounded_episodes=4)
+    config = replace(SMALL, ugat=ugat, randomised=True)
+    transfer(config, tmp_path / "unbroken")
+    with pytest.raises(KeyboardInterrupt):
+        transfer(config, tmp_path / "run", reporter=KillIn("domain randomisation", 11))
+    assert episodes(tmp_path / "run", "domain-randomisation") == 10
+    transfer(config, tmp_path / "run", resume=True)
+    name = "domain-randomisation"
+    assert np.array_equal(weights(tmp_path / "run", name), weights(tmp_path / "unbroken", name))
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"random_delay_s": 0}, "random_delay_s = 0: must be at least 1"),
+        ({"real": "none", "real_log": Path("x"), "oracle": True}, "oracle needs a real domain"),
+        ({"real": "none", "real_log": Path("x"), "fine_tuned": True}, "needs a real domain"),
+        ({"real_log": Path("x"), "fine_tuned": True}, "which a real_log does not allow"),
+        (
+            {"real_log": Path("x"), "ugat": UgatConfig("timed", timed=TimedConfig(match=True))},
+            "timed match acts in the real domain",
+        ),
+        ({"real": "sim"}, '"same-world"'),
+        ({"real": "sim", "placebo": "noise"}, "is the simulation itself"),
+        ({"real": "sim", "placebo": "same-world", "oracle": True}, "oracle needs a real domain"),
+        ({"placebo": "same-world", "real_log": Path("x")}, "takes the place of a real_log"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(options: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(OptionError, match=complaint):
+        replace(SMALL, **options)
+    with pytest.raises(UnknownNameError, match=r"placebo 'shufled'.*'shuffled'"):
+        replace(SMALL, placebo="shufled")  # pyright: ignore[reportArgumentType]
+
+
+def numbers(folder: Path) -> dict[tuple[int, str], float]:
+    """What was logged, by iteration and name."""
+    rows = Metrics.read(folder / "metrics.parquet").rows
+    return {(step, name): value for stage, step, name, value in rows if stage == "iteration"}
+
+
+def follows(folder: Path) -> float:
+    """Share of the rows of D_real after which the next row begins where they ended."""
+    log = TransitionLog.read(folder / "checkpoint" / "real-000.parquet")
+    rows = log.transitions("signal_0")
+    goes_on = rows.episode[1:] == rows.episode[:-1]
+    same = (rows.next_observation[:-1] == rows.observation[1:]).all(1)
+    return float(same[goes_on].mean())
+
+
+def test_with_the_same_world_nothing_real_is_ever_seen(tmp_path: Path) -> None:
+    alone = transfer(replace(SMALL, real="sim", placebo="same-world"), tmp_path / "alone")
+    assert alone.domains == ["sim"]
+    judged = transfer(replace(SMALL, placebo="same-world"), tmp_path / "judged")
+    assert judged.domains == ["sim", "V4"]
+    for run in ("alone", "judged"):
+        log = TransitionLog.read(tmp_path / run / "checkpoint" / "real-000.parquet")
+        assert log.provenance.domain == "sim" and follows(tmp_path / run) == 1.0
+    # Where a policy is judged decides nothing about its training.
+    assert np.array_equal(weights(tmp_path / "alone", "ugat"), weights(tmp_path / "judged", "ugat"))
+
+
+def test_shuffled_data_of_the_street_lead_nowhere(tmp_path: Path) -> None:
+    transfer(replace(SMALL, placebo="shuffled"), tmp_path / "run")
+    assert follows(tmp_path / "run") < 0.4
+    with pytest.raises(CheckpointError, match="its placebo"):
+        transfer(SMALL, tmp_path / "run", resume=True)
+
+
+def test_a_run_with_noise_for_f_says_so_and_resumes(tmp_path: Path) -> None:
+    config = replace(SMALL, placebo="noise")
+    transfer(config, tmp_path / "unbroken")
+    assert numbers(tmp_path / "unbroken")[2, "forward/ratio"] > 1.2
+    with pytest.raises(KeyboardInterrupt):
+        transfer(config, tmp_path / "run", reporter=KillIn("grounded, round 2", 2))
+    transfer(config, tmp_path / "run", resume=True)
+    one, two = (pl.read_parquet(tmp_path / n / "metrics.parquet") for n in ("run", "unbroken"))
+    assert one.equals(two)
+
+
+@pytest.mark.parametrize("crossings", [True, False])
+def test_timed_grounding_learns_from_a_log_of_fixed_time(crossings: bool, tmp_path: Path) -> None:
+    """The street was driven by another controller, and nobody explored."""
+    path = tmp_path / "fixed.parquet"
+    call = ["rollout", "single-v1", "--domain", "V4", "--policy", "fixed-time:30", "--out"]
+    call += [str(path), "--epsilon", "0", "--episodes", "2", "--duration-s", "300"]
+    assert main([*call, *(["--crossings"] if crossings else [])]) == 0
+    log = TransitionLog.read(path)
+    rows, layout = log.transitions("signal_0"), log.provenance.layouts["signal_0"]
+    assert rows.served_features.shape == (60, layout.features if crossings else 0)
+    assert np.array_equal(rows.action, rows.executed)
+    assert [len(set(rows.action[k : k + 3])) for k in range(0, 30, 3)] == [1] * 10
+    ugat = replace(SMALL.ugat, grounding="timed", iterations=1)
+    transfer(replace(SMALL, real_log=path, ugat=ugat), tmp_path / "run")
+    begun = (rows.observation[:, -layout.phases :].argmax(1) != rows.executed).sum()
+    assert begun == 2 * 9  # every 30 s but at the beginning
+    kept = TransitionLog.read(tmp_path / "run" / "checkpoint" / "real-000.parquet")
+    assert kept.frame.equals(log.frame)
+    assert not (tmp_path / "run" / "checkpoint" / "real-001.parquet").exists()
+    found = numbers(tmp_path / "run")
+    assert 0 <= found[1, "lost_time/low_s"] <= found[1, "lost_time/best_s"] <= 5
+
+
+def test_names_of_policies_are_names_of_files_of_their_own() -> None:
+    names = ["direct transfer", "further in a=-1", "further in a=1", "further in a-1"]
+    expected = ["direct-transfer", "further-in-a-1", "further-in-a-1-2", "further-in-a-1-3"]
+    assert file_names(names) == expected

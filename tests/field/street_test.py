@@ -1,0 +1,277 @@
+"""The field loop at a SUMO that runs as a program of its own and is reached over TraCI."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ugat_marl.__main__ import main
+from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import OptionError, SimulatorError
+from ugat_marl.policies import controller_for
+from ugat_marl.scenarios import GREEN
+
+pytest.importorskip("traci")
+
+from ugat_marl.field import FieldLoop, Site, StartedSumo, TraciStreet
+
+
+class Watched(TraciStreet):
+    """The street, with somebody who writes down what its lights show in every second."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.by_second = [self.shown()]
+
+    def wait(self, until_s: float) -> None:
+        for second in range(round(self.now_s()) + 1, round(until_s) + 1):
+            super().wait(float(second))
+            self.by_second.append(self.shown())
+
+
+class Remembering:
+    """A policy, and what it saw."""
+
+    def __init__(self, policy: Any) -> None:
+        self.policy = policy
+        self.env_options: Mapping[str, Any] = policy.env_options
+        self.seen: list[dict[str, Any]] = []
+
+    def reset(self, seed: int) -> None:
+        self.seen = []
+        self.policy.reset(seed)
+
+    def act(self, observations: Any, infos: Any) -> dict[str, int]:
+        self.seen.append({agent: seen.copy() for agent, seen in observations.items()})
+        return self.policy.act(observations, infos)
+
+
+@pytest.fixture
+def running() -> Iterator[Callable[..., tuple[StartedSumo, Watched]]]:
+    """Starts SUMO with a scenario and connects to it."""
+    ends: list[Callable[[], None]] = []
+
+    def run(scenario: Any, site: Site, **options: Any) -> tuple[StartedSumo, Watched]:
+        sumo = StartedSumo(scenario, seed=3)
+        sumo.__enter__()
+        ends.append(lambda: sumo.__exit__(None, None, None))
+        street = Watched(tuple(site.capacity), sumo.port, process=sumo.process, **options)
+        ends.append(street.close)
+        return sumo, street
+
+    yield run
+    for end in reversed(ends):
+        end()
+
+
+def test_minutes_of_single_v1_in_snow(running: Callable[..., Any]) -> None:
+    scenario = in_domain(load_scenario("single-v1"), "V4")
+    policy = controller_for("largest-queue:10", parallel_env(scenario))
+    site = Site.of(scenario, policy.env_options)
+    sumo, street = running(scenario, site)
+    loop = FieldLoop(site, policy, street)
+    summary = loop.run(240.0)
+    assert (summary.decisions, summary.fallback_share) == (24, 0)
+    assert summary.latency_ms(0.5) < 50
+    assert street.now_s() == 240
+    assert len(street.by_second) == 241
+    (light,) = site.lights
+    shown = [states[light] for states in street.by_second]
+    assert len({state for state in shown if "y" not in state}) > 2, "it never switched"
+    for before, after in pairwise(shown):
+        assert not any(
+            a in GREEN and b not in GREEN | {"y"} for a, b in zip(before, after, strict=True)
+        )
+    yellow = "".join("y" if "y" in state else "-" for state in shown)
+    assert set(map(len, re.findall("y+", yellow))) == {3}
+    street.close()
+    trips = sumo.trips()
+    assert trips.entered.sum() > 50
+    assert 20 < trips.travel_time_s.mean() < 240
+
+
+def test_a_policy_sees_in_the_field_what_it_sees_in_an_environment(
+    running: Callable[..., Any], crossing: Callable[..., Path]
+) -> None:
+    scenario = load_scenario(crossing())  # no clearance and no minimum green: both begin alike
+    env = parallel_env(scenario, observation="movements")
+    here = Remembering(controller_for("fixed-time:20", env))
+    there = Remembering(controller_for("fixed-time:20", env))
+    options = {"observation": "movements"}
+    site = Site.of(scenario, options)
+    _, street = running(scenario, site)
+    FieldLoop(site, there, street).run(200.0)
+    observations, infos = env.reset(seed=3)
+    here.reset(0)
+    while env.agents:
+        observations, _, _, _, infos = env.step(here.act(observations, infos))
+    env.close()
+    assert len(here.seen) == len(there.seen) == 20
+    for place, (a, b) in enumerate(zip(here.seen, there.seen, strict=True)):
+        for agent in a:
+            np.testing.assert_array_equal(a[agent], b[agent], err_msg=f"decision {place}")
+    assert any(seen[agent][:2].any() for seen in here.seen for agent in seen), "no traffic"
+
+
+AREAS = """<additional>
+    <laneAreaDetector id="near" lane="S_C_0" pos="-40" endPos="-1" period="3600" file="NUL"/>
+    <laneAreaDetector id="far" lane="S_C_0" pos="-80" endPos="-40" period="3600" file="NUL"/>
+</additional>
+"""
+
+
+def test_areas_count_where_they_lie_and_other_lanes_are_missing(
+    running: Callable[..., Any], crossing: Callable[..., Path], tmp_path: Path
+) -> None:
+    def with_areas(text: str) -> str:
+        return text.replace("duration_s", 'additional = ["areas.add.xml"]\nduration_s', 1)
+
+    directory = crossing(toml=with_areas)
+    (directory / "areas.add.xml").write_text(AREAS.replace("NUL", str(tmp_path / "areas.xml")))
+    scenario = load_scenario(directory)
+    policy = controller_for("random", parallel_env(scenario))
+    site = Site.of(scenario, policy.env_options)
+    _, street = running(scenario, site, detectors="areas")
+    assert set(street.read()) == {"S_C_0"}
+    loop = FieldLoop(site, policy, street)
+    (light,) = site.lights
+    reasons: list[str] = []
+    loop.run(60.0, lambda decision: reasons.append(decision.fallback[light]))
+    assert all("missing: no count of lane W_C_0" in reason for reason in reasons)
+
+
+def test_a_simulation_of_another_network_is_refused(running: Callable[..., Any]) -> None:
+    site = Site.of(load_scenario("grid2x2-v1"), {})
+    with pytest.raises(SimulatorError, match="own network"):
+        running(load_scenario("single-v1"), site)
+
+
+def test_nobody_at_the_port_is_said_so() -> None:
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        port = int(probe.getsockname()[1])
+    with pytest.raises(SimulatorError, match=f"--remote-port {port}"):
+        TraciStreet(["a"], port, patience_s=0.1)
+
+
+def test_a_street_that_goes_away_is_told(running: Callable[..., Any]) -> None:
+    scenario = load_scenario("single-v1")
+    policy = controller_for("random", parallel_env(scenario))
+    site = Site.of(scenario, policy.env_options)
+    sumo, street = running(scenario, site)
+    loop = FieldLoop(site, policy, street)
+
+    def end(decision: Any) -> None:
+        if decision.time_s >= 20:
+            sumo.process.kill()
+
+    with pytest.raises(SimulatorError, match="Connection closed by SUMO"):
+        loop.run(100.0, end)
+    assert loop.summary.decisions == 3
+    assert street.now_s() == 30
+
+
+def test_late_greens_are_refused() -> None:
+    scenario = in_domain(load_scenario("single-v1"), "late_green=*,1")
+    with pytest.raises(OptionError, match="late"):
+        StartedSumo(scenario, seed=0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children with their parent")
+def test_sumo_does_not_outlive_the_process_that_started_it(
+    python: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # nobody is left to clear away
+    code = (
+        "import time\n"
+        "from ugat_marl.effects import load\n"
+        "from ugat_marl.field.started import StartedSumo\n"
+        "with StartedSumo(load_scenario('single-v1'), 0) as sumo:\n"
+        "    print(sumo.process.pid, flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    with subprocess.Popen([*python, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        os.kill(child, 0)
+        parent.send_signal(signal.SIGKILL)
+        until = time.monotonic() + 10
+        while _alive(child) and time.monotonic() < until:
+            time.sleep(0.05)
+        assert not _alive(child)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_the_command_drives_and_sums_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "field.jsonl"
+    call = ["field", "single-v1", "--policy", "fixed-time:30", "--start", "--seconds", "60"]
+    assert main([*call, "--log", str(log)]) == 0
+    said = capsys.readouterr().out
+    assert "6 decisions for 1 light;" in said
+    assert "fixed time in 0.0%" in said
+    assert re.search(r"ATT \d+\.\d s", said)
+    assert len(log.read_text().splitlines()) == 6
+
+
+def test_an_interrupted_command_leaves_its_log_and_nothing_else(
+    python: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    log = tmp_path / "field.jsonl"
+    call = ["-m", "ugat_marl", "field", "single-v1", "--policy", "fixed-time:30", "--start"]
+    with subprocess.Popen(
+        [*python, *call, "--seconds", "1e7", "--log", str(log)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as command:
+        until = time.monotonic() + 60
+        while not log.exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        command.send_signal(signal.SIGINT)
+        _, said = command.communicate(timeout=30)
+    assert command.returncode == 130, said
+    assert said.strip().splitlines()[-1] == "ugat-marl: interrupted"
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [row["time_s"] for row in rows] == [10.0 * n for n in range(len(rows))]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["field.jsonl"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--policy", "random"], "--port is missing"),
+        (["--policy", "random", "--start", "--host", "far"], "--host far"),
+        (["--policy", "random", "--start", "--seconds", "0"], "above 0"),
+        (["--policy", "programme", "--start"], "programme"),
+        (["--policy", "longest-waiting", "--start"], "waiting times"),
+        (["--policy", "random", "--start", "--limits.answer-ms", "5"], "reserve_ms"),
+    ],
+)
+def test_wrong_calls_are_one_line(
+    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["field", "single-v1", *arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert says in error
+    assert len(error.splitlines()) == 1

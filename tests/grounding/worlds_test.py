@@ -1,0 +1,88 @@
+"""Worlds whose data say nothing: what is shuffled, and what stays where it is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.grounding import ShuffledWorld
+from ugat_marl.grounding.worlds import shuffled
+from ugat_marl.policies import Policy
+
+LAYOUTS = {"a_0": AgentLayout(2, 2), "b_0": AgentLayout(1, 2, 1)}
+ROWS = 60
+
+
+def numbered() -> TransitionLog:
+    """Every outcome carries the number of the row it belongs to, and its agent's."""
+    recorder = TransitionRecorder(Provenance("numbered", "", "V4", (), 10.0, "count", LAYOUTS))
+    for row in range(ROWS):
+        one = np.eye(2, dtype=np.float32)[row % 2]
+        seen = {"a_0": np.array([row, 0, *one]), "b_0": np.array([row, *one, 9])}
+        then = {"a_0": np.array([row, 1, *one]), "b_0": np.array([row + 100, *one, 9])}
+        served = {"a_0": np.array([row, 2.0]), "b_0": np.array([row + 100.0])}
+        did = dict.fromkeys(LAYOUTS, row % 2)
+        got = dict.fromkeys(LAYOUTS, float(row))
+        held = dict.fromkeys(LAYOUTS, 0.0)
+        place = row // 20, row % 20
+        recorder.record(*place, seen, did, did, got, then, held, served)
+    return recorder.log()
+
+
+LOG = numbered()
+
+
+def test_outcomes_are_dealt_out_anew_among_the_rows_of_an_agent() -> None:
+    found = shuffled(LOG, seed=3)
+    for agent, offset in (("a_0", 0), ("b_0", 100)):
+        rows, before = found.transitions(agent), LOG.transitions(agent)
+        numbers = rows.next_observation[:, 0] - offset
+        assert sorted(numbers) == list(range(ROWS))  # each once, and none of another agent's
+        assert (numbers == np.arange(ROWS)).sum() < 6  # one row is expected to find its own
+        # What was served stays with what was seen afterwards.
+        assert (rows.served_features[:, 0] - offset == numbers).all()
+        # And all else stays in its place.
+        for name in ("observation", "action", "executed", "reward", "episode", "step"):
+            assert np.array_equal(getattr(rows, name), getattr(before, name)), name
+    assert found.provenance == LOG.provenance
+    one, two = (found.transitions(a).next_observation[:, 0] % 100 for a in LAYOUTS)
+    assert not np.array_equal(one, two)
+
+
+def test_the_order_follows_the_seed() -> None:
+    assert shuffled(LOG, 3).frame.equals(shuffled(LOG, 3).frame)
+    assert not shuffled(LOG, 3).frame.equals(shuffled(LOG, 4).frame)
+
+
+class Counting:
+    """A world with one log, that counts how it is treated."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+
+    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
+        self.done.append(f"collect {policy} {iteration} {seed}")
+        return LOG if iteration < 2 else None
+
+    def stop(self) -> None:
+        self.done.append("stop")
+
+    def close(self) -> None:
+        self.done.append("close")
+
+
+def test_a_shuffled_world_asks_the_other_one() -> None:
+    world = Counting()
+    nobody: Any = "nobody"
+    made = ShuffledWorld(world)
+    first, second = (made.collect(nobody, i, 5) for i in (0, 1))
+    assert first is not None and second is not None
+    assert not first.frame.equals(LOG.frame) and not first.frame.equals(second.frame)
+    assert first.frame.select(pl.col("reward").sum()).item() == 2 * sum(range(ROWS))
+    assert made.collect(nobody, 2, 5) is None
+    made.stop()
+    made.close()
+    assert world.done == [*(f"collect nobody {i} 5" for i in range(3)), "stop", "close"]

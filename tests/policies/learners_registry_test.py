@@ -1,0 +1,205 @@
+"""Learners by name: what is found, what is refused, and that UGAT trains any of them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ugat_marl.experiments.transfers as transfer_module
+from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
+from ugat_marl.experiments import TransferConfig, policy_factory, transfer
+from ugat_marl.grounding import FitConfig, UgatConfig
+from ugat_marl.policies import BASELINES, DQN, DQNPolicy, Learner, learner_factory
+from ugat_marl.policies.learners import registry
+from ugat_marl.policies.learners.dqn import DQNConfig
+from ugat_marl.policies.learners.registry import Baseline
+from ugat_marl.progress import Silent
+from ugat_marl.testing import ToyTraffic
+
+if not registry.baselines_folder().is_dir():
+    pytest.skip("baselines/ is neither here nor in the package", allow_module_level=True)
+
+PLAIN = """
+from dataclasses import dataclass
+
+@dataclass(frozen=True)
+class Config:
+    rate: float = 0.1
+    sizes: tuple[int, ...] = (1, 2)
+    deep: bool = False
+    scale: float | None = 1.0
+    kind: str = "one"
+
+class Plain:
+    def __init__(self, env, config, seed):
+        self.config, self.seed = config, seed
+"""
+SMALL = TransferConfig(
+    scenario="single-v1",
+    duration_s=100,
+    evaluation_seeds=1,
+    tuning_seeds=1,
+    learner="ippo",
+    learner_settings=("hidden=16", "update_every=5", "epochs=2"),
+    ugat=UgatConfig(
+        pretrain_episodes=2,
+        iterations=2,
+        grounded_episodes=2,
+        sim_rollouts=2,
+        real_rollouts=2,
+        least_accuracy=None,  # so little training proves nothing
+        fit=FitConfig(epochs=2),
+    ),
+)
+
+
+@pytest.fixture
+def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of baselines, in place of the suite's own."""
+    (tmp_path / "plain.py").write_text(PLAIN)
+    (tmp_path / "needy.py").write_text("import no_such_library.inside\n")
+    (tmp_path / "broken.py").write_text("raise ValueError('its own')\n")
+    named = {
+        "plain": Baseline("plain", "Plain", "Config"),
+        "second": Baseline("plain", "Plain", "Config", settings={"kind": "two"}),
+        "needy": Baseline("needy", "Plain", "Config", "needs"),
+        "broken": Baseline("broken", "Plain", "Config"),
+        "gone": Baseline("gone", "Plain", "Config"),
+    }
+    monkeypatch.setattr(registry, "BASELINES", named)
+    monkeypatch.setattr(registry, "baselines_folder", lambda: tmp_path)
+    for name in named:
+        monkeypatch.delitem(sys.modules, f"ugat_marl_baseline_{name}", raising=False)
+    return tmp_path
+
+
+def made(name: str, *settings: str) -> Any:
+    return learner_factory(name, settings)(ToyTraffic(), 7)
+
+
+@pytest.mark.usefixtures("planted")
+def test_settings_are_of_their_type() -> None:
+    learner = made("plain", "rate=1e-3", "sizes=8,9,10", "deep=true", "scale=none", "kind=x=y")
+    assert vars(learner.config) == {
+        "rate": 1e-3, "sizes": (8, 9, 10), "deep": True, "scale": None, "kind": "x=y"
+    }  # fmt: skip
+    assert learner.seed == 7
+    assert made("plain", "sizes=4").config.sizes == (4,)
+    assert made("second").config.kind == "two"
+
+
+@pytest.mark.usefixtures("planted")
+@pytest.mark.parametrize(
+    ("name", "settings", "kind", "says"),
+    [
+        ("plane", [], UnknownNameError, "'plain'"),
+        ("plain", ["raet=1"], UnknownNameError, "'rate'"),
+        ("plain", ["rate"], OptionError, "NAME=VALUE"),
+        ("plain", ["rate="], OptionError, "NAME=VALUE"),
+        ("plain", ["rate=fast"], OptionError, "rate=fast"),
+        ("plain", ["sizes=1,x"], OptionError, "sizes=1,x"),
+        ("second", ["kind=three"], UnknownNameError, "kind"),  # its name has said it
+        ("needy", [], OptionError, "no_such_library.*ugat-marl.needs"),
+        ("gone", [], OptionError, "gone.py"),
+        ("broken", [], ValueError, "its own"),
+        ("dqn", ["hidden=3"], OptionError, "--dqn"),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    name: str, settings: list[str], kind: type[Exception], says: str
+) -> None:
+    for _ in range(2):  # a failed import leaves nothing behind
+        with pytest.raises(kind, match=says):
+            made(name, *settings)
+
+
+def test_dqn_is_the_suites_own() -> None:
+    learner = learner_factory("dqn", dqn=DQNConfig(hidden=(5,)))(ToyTraffic(), 3)
+    assert isinstance(learner, DQN) and learner.config.hidden == (5,)
+    assert np.array_equal(
+        learner.policy().parameters,
+        DQN.of(ToyTraffic(), DQNConfig(hidden=(5,)), 3).policy().parameters,
+    )
+
+
+def test_every_baseline_has_a_file_and_an_extra() -> None:
+    import tomllib
+
+    folder = registry.baselines_folder()
+    assert {f"{item.file}.py" for item in BASELINES.values()} <= {p.name for p in folder.iterdir()}
+    project = Path(__file__).resolve().parents[2] / "pyproject.toml"
+    extras = tomllib.loads(project.read_text())["project"]["optional-dependencies"]
+    assert {item.extra for item in BASELINES.values() if item.extra} <= set(extras)
+
+
+def test_names_choose_the_settings() -> None:
+    for name, centralised in (("ippo", False), ("mappo", True)):
+        learner: Any = made(name)
+        assert isinstance(learner, Learner)
+        assert learner.config.centralised is centralised
+
+
+def test_importing_the_names_imports_no_library() -> None:
+    code = (
+        "import sys, ugat_marl.experiments.transfers; "
+        "sys.exit(bool({'stable_baselines3', 'torchrl', 'skrl', 'ray'} & {*sys.modules}))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.fixture
+def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search for the best rule is not under test here."""
+    search = transfer_module.best_rules
+
+    def short(*args: Any, **options: Any) -> dict[str, str]:
+        return search(*args, **options, rules=("largest-queue:20",))
+
+    monkeypatch.setattr(transfer_module, "best_rules", short)
+
+
+class KillIn(Silent):
+    """Raises when some task begins."""
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+
+    def task(self, title: str, total: int) -> Any:
+        if title == self.title:
+            raise KeyboardInterrupt
+        return super().task(title, total)
+
+
+@pytest.mark.usefixtures("few_rules")
+def test_ugat_trains_a_baseline_and_takes_it_up_again(tmp_path: Path) -> None:
+    found = transfer(SMALL, tmp_path / "whole")
+    assert found.policies[:3] == ["direct transfer", "UGAT", "more plain sim"]
+    assert found.notes["learner"] == "ippo"
+    files = sorted(path.name for path in (tmp_path / "whole" / "policies").iterdir())
+    assert files == ["direct-transfer.pt", "more-plain-sim.pt", "ugat.pt"]
+    for name in files:
+        path = tmp_path / "whole" / "policies" / name
+        assert DQNPolicy.load(path).hidden == (16,)
+        assert policy_factory(str(path))  # as evaluate reads it
+    with pytest.raises(KeyboardInterrupt):
+        transfer(SMALL, tmp_path / "broken", reporter=KillIn("grounded, round 2"))
+    for other in ({"learner": "dqn", "learner_settings": ()}, {"learner_settings": ("hidden=8",)}):
+        with pytest.raises(CheckpointError, match="another run"):
+            transfer(replace(SMALL, **other), tmp_path / "broken", resume=True)
+    transfer(SMALL, tmp_path / "broken", resume=True)
+    for name in files:
+        one, other = (
+            DQNPolicy.load(tmp_path / run / "policies" / name).parameters
+            for run in ("whole", "broken")
+        )
+        assert np.array_equal(one, other), name
+    direct, grounded = (
+        DQNPolicy.load(tmp_path / "whole" / "policies" / name).parameters for name in files[::2]
+    )
+    assert not np.array_equal(direct, grounded)

@@ -1,0 +1,383 @@
+"""The page of a diagnosis and its summary: every verdict, hostile names, and a real browser."""
+
+from __future__ import annotations
+
+import html
+import io
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import pytest
+from rich.console import Console
+
+from ugat_marl.diagnosis import statistic
+from ugat_marl.diagnosis.features import FEATURES
+from ugat_marl.diagnosis.wording import STATISTICS
+from ugat_marl.effects import load_scenario
+from ugat_marl.reporting import commands_on_page, diagnosis_summary, write_diagnosis_page
+from ugat_marl.reporting import diagnosis_words as words
+from ugat_marl.reporting.diagnosis_page import diagnosis_page
+from ugat_marl.scenarios import Network
+
+LANES = ("S_C_0", "W_C_0", "C_N_0", "C_E_0")
+NASTY = "</style><script>alert(1)</script>\"'><img src=x onerror=alert(2)>&amp;"
+VERDICTS = ("no_discrepancy", "explained", "not_identifiable", "partially_explained", "unknown")
+
+
+def parameter(value: float, low: Any = None, high: Any = None, unit: str = "s") -> dict[str, Any]:
+    return {"value": value, "low": low, "high": high, "unit": unit}
+
+
+def effect(name: str, place: Any = None, window: Any = None, **parameters: Any) -> dict[str, Any]:
+    return {"name": name, "place": place, "window": window, "parameters": parameters}
+
+
+def disagreement(statistic: str, regime: str, z: float, lane: Any = None) -> dict[str, Any]:
+    return {
+        "tls": "C", "approach": None, "lane": lane, "regime": regime, "statistic": statistic,
+        "window": [300.0, 900.0] if "time" in statistic else None, "size": z / 100, "unit": "s",
+        "z": z, "p": 1e-9,
+    }  # fmt: skip
+
+
+def record_of(verdict: str = "explained", *, complete: bool = True, **more: Any) -> dict[str, Any]:
+    """A record as `diagnose` makes it."""
+    headway = effect("headway", None, None, seconds=parameter(1.4512, 1.4431, 1.4593))
+    surge = effect("demand_surge", "S_C", [300.0, 900.0], factor=parameter(1.8, 1.7, 1.9, ""))
+    same = verdict == "no_discrepancy"
+    named = verdict in ("explained", "not_identifiable", "partially_explained")
+    evidence = {"distance": 118.2, "runner_up_is_worse_by": 4021.0}
+    record: dict[str, Any] = {
+        "schema": "ugat-marl/diagnosis/1", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
+        "budget_s": 600.0, "left_out": [], "ruled_out": ["speed_spread"],
+        "findings": ["detections.csv: no speeds"], "verified_on_fitted_periods": False,
+        "periods": {"fit": ["day1", "day2"], "heldout": ["day3"]}, "policy_gap": None,
+        "hashes": {"scenario": "a" * 64, "measured": "b" * 64},
+        "versions": {"ugat-marl": "0.1.0", "eclipse-sumo": "1.28.0"},
+        "corrected": "corrected" if named else None, "verdict": verdict, "complete": complete,
+        "sentence": f"A sentence for {verdict}.",
+        "effects": [item | {"evidence": evidence} for item in (headway, surge)] if named else [],
+        "where": [] if same else [
+            disagreement("gap4-5", "discharge", 41.5),
+            disagreement("gap6-8", "discharge", 40.5, "S_C_0"),
+            disagreement("count_stop in time", "volume", -7.0, "W_C_0"),
+            disagreement("something new", "storage", 3.2),
+        ],
+        "left": [disagreement("speed1", "discharge", 4.1, "S_C_0")] if named else [],
+        "alternatives": [] if same else [
+            {"effects": [headway], "distance": 4200.0, "cost": 4214.0},
+            {"effects": [effect("swapped", "stop:1>stop:2")], "distance": 9000.0, "cost": 9014.0},
+        ],
+        "heldout": {
+            "before": 120.0 if same else 59688.5, "after": 120.0 if same else 131.4,
+            "floor": 180.0, "expected": 110.0, "shrink": None if same else 0.99964,
+            "p_before": 0.4 if same else 1e-90, "p_after": 0.4 if same else 0.33,
+        },
+        "evidence": {"p_fit": 0.4 if same else 1e-99},
+        "next_measurement": "speeds at the stop line" if verdict == "not_identifiable" else None,
+        "statistics": [
+            {
+                "statistic": name, "regime": regime, "unit": unit, "measured": 2.2, "before": 2.0,
+                "after": 2.0 if same else 2.21, "noise": 0.02,
+                "z_before": z, "z_after": z if same else 0.3,
+            }
+            for (name, regime, unit), z in zip(
+                FEATURES, [1.5] * 46 if same else [139.7, -24.0, *[1.0] * 44], strict=True
+            )
+        ],
+        "lanes": [
+            {"lane": lane, "tls": "C", "before": 1.0 if same else 8.0 * i, "after": 1.0}
+            for i, lane in enumerate(LANES)
+        ],
+        "courtesy": {
+            "before": {"geh_below_5": 1.0, "geh_largest": 1.4, "within_1_sigma": 0.6,
+                       "within_2_sigma": 0.98, "absolute_error": 0.9, "systematic_error": 0.5,
+                       "saturation_headway_s": 2.03},
+            "after": {"geh_below_5": 1.0, "geh_largest": 1.1, "within_1_sigma": 0.7,
+                      "within_2_sigma": 0.97, "absolute_error": None, "systematic_error": None,
+                      "saturation_headway_s": None},
+            "measured": {"saturation_headway_s": 2.25},
+        },
+        "travel_time": {"before_s": 102.5, "after_s": 133.6},
+    }  # fmt: skip
+    if not complete:
+        for key in ("statistics", "lanes", "courtesy", "travel_time"):
+            del record[key]
+    return record | more
+
+
+@pytest.fixture(scope="module")
+def network(data: Path) -> Network:
+    return Network.read(load_scenario(data / "crossing"))
+
+
+class Page(HTMLParser):
+    """Tags, attributes and texts of a page; every tag must be closed."""
+
+    VOID = ("meta", "br", "img")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, Any]]] = []
+        self.open: list[str] = []
+        self.texts: list[str] = []
+        self.feed(text)
+        assert not self.open, self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open[-1:]:
+            self.texts.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.texts).split())
+
+
+def printed(record: dict[str, Any]) -> str:
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(diagnosis_summary(record))
+    return console.export_text()
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_a_page_for_every_verdict(verdict: str, network: Network) -> None:
+    record = record_of(verdict)
+    text = diagnosis_page(record, network)
+    page = Page(text)
+    for part in (f"A sentence for {verdict}.", words.MEANINGS[verdict], "GEH", "a" * 64):
+        assert part in page.text
+    assert "Partial" not in page.text
+    assert ("No statistic speaks" in page.text) == (verdict == "no_discrepancy")
+    maps = [tag for tag, _ in page.tags if tag == "polyline"]
+    assert len(maps) == len(LANES) * (1 if verdict == "no_discrepancy" else 2)
+    assert ("does not see this gap" in page.text) == (verdict != "no_discrepancy")
+    if record["effects"]:
+        assert "1.451 s (1.443 to 1.459)" in page.text
+        assert "0:05:00 – 0:15:00" in page.text
+        assert "99.96 %" in page.text
+        assert "--sim DIR/corrected" in page.text
+    if verdict == "unknown":
+        assert "the best attempt, which is not named" in page.text
+
+
+@pytest.mark.parametrize("verdict", ["unknown", "partially_explained"])
+def test_a_partial_result_says_so_first(verdict: str, network: Network) -> None:
+    record = record_of(verdict, complete=False)
+    page = Page(diagnosis_page(record, network))
+    assert page.text.index("Partial result: the budget of 600 s") < page.text.index("A sentence")
+    assert "Partial result" not in "".join(page.texts[:1])
+    lines = " ".join(printed(record).split())
+    assert lines.startswith("Partial result: the budget of 600 s ended")
+    assert "Not examined" not in lines
+    names = [f"effect_{number}" for number in range(words.UNTRIED + 2)]
+    lines = " ".join(printed({**record, "untried": names}).split())
+    assert "Not examined yet: effect 0, effect 1, " in lines
+    assert f", … ({words.UNTRIED + 2} in all)." in lines
+    assert "The same command goes on" in lines
+
+
+def test_the_page_does_not_contradict_its_sentence(network: Network) -> None:
+    cut = diagnosis_page(record_of("partially_explained", complete=False), network)
+    assert not any(text in Page(cut).text for text in words.MEANINGS.values())
+    # A value at its end, where what is left is no more than chance, is partially explained, too.
+    assert "more than chance" not in words.MEANINGS["partially_explained"]
+    logged = record_of("explained")["effects"][:1]
+    found = Page(diagnosis_page(record_of("unknown", effects=logged), network)).text
+    assert "No effect is named" not in found
+    assert "stands in the log of the signals" in found
+
+
+def test_a_result_without_any_simulation_has_a_page(network: Network) -> None:
+    record = record_of("unknown", complete=False, heldout=None, where=[], alternatives=[])
+    record["evidence"] = {}
+    assert "Partial result" in Page(diagnosis_page(record, network)).text
+    assert "Partial result" in printed(record)
+
+
+def test_the_page_needs_nothing_else_and_forbids_scripts(network: Network) -> None:
+    text = diagnosis_page(record_of(), network)
+    assert not re.findall(r"https?:|src=|url\(|@import|<script|<link", text)
+    assert "default-src 'none'" in text
+
+
+def test_lanes_are_coloured_by_class(network: Network) -> None:
+    page = Page(diagnosis_page(record_of(), network))
+    classes = [attrs["class"] for tag, attrs in page.tags if tag == "polyline"]
+    assert classes == [f"lane d{n}" for n in (0, 3, 4, 4)] + ["lane d0"] * 4
+
+
+def texts_in(value: Any) -> Iterator[Any]:
+    """Replaces every text below a value, as names from somebody's files might."""
+    if isinstance(value, dict):
+        yield {key: next(texts_in(item)) for key, item in value.items()}
+    elif isinstance(value, list):
+        yield [next(texts_in(item)) for item in value]
+    else:
+        yield NASTY if isinstance(value, str) else value
+
+
+def test_hostile_names_stay_text(network: Network) -> None:
+    harmless = record_of("not_identifiable", policy_gap=GAP)
+    record = next(texts_in(harmless)) | {"verdict": NASTY, "effects": harmless["effects"]}
+    record["effects"][0]["place"] = NASTY
+    record["versions"] = {NASTY: NASTY}
+    page = Page(diagnosis_page(record, network))
+    assert NASTY in " ".join(page.texts)
+    assert {tag for tag, _ in page.tags} == {
+        tag for tag, _ in Page(diagnosis_page(harmless, network)).tags
+    } - {"figure", "figcaption", "path", "polyline", "i", "text"} | {"text"}
+    assert not [name for _, attrs in page.tags for name in attrs if name.startswith("on")]
+    assert printed(record)
+
+
+def test_nothing_of_what_a_lane_is_called_breaks_the_map(crossing: Any) -> None:
+    name = "a&lt;&quot;b"
+
+    def renamed(text: str) -> str:
+        return text.replace("S_C", name)
+
+    directory: Path = crossing(edit=renamed)
+    routes = directory / "demand.rou.xml"
+    routes.write_text(renamed(routes.read_text()))
+    network = Network.read(load_scenario(directory))
+    lane = html.unescape(name) + "_0"
+    record = record_of(lanes=[{"lane": lane, "tls": "C", "before": 9.0, "after": 1.0}])
+    page = Page(diagnosis_page(record, network))
+    assert page.text.count(f"{lane}: 9 standard deviations") == 1
+
+
+GAP = {
+    "max-pressure:20": {
+        "sim": {"mean": 100.0, "low": 98.0, "high": 102.0},
+        "corrected": {"mean": 148.0, "low": None, "high": None},
+        "real": {"mean": 151.0, "low": 148.0, "high": 154.0},
+        "before": 51.0, "after": 3.0, "shrink": 0.941,
+    }
+}  # fmt: skip
+
+
+def test_the_policy_gap_is_shown_where_it_was_measured(network: Network) -> None:
+    assert "Policy gap" not in Page(diagnosis_page(record_of(), network)).text
+    page = Page(diagnosis_page(record_of(policy_gap=GAP), network))
+    for cell in ("max-pressure:20", "100 (98 to 102)", "148", "51", "94 %"):
+        assert cell in page.text
+
+
+def test_a_page_tells_its_commands(network: Network, tmp_path: Path) -> None:
+    commands = [f"ugat-marl diagnose '{NASTY}' --out found", "ugat-marl train ..."]
+    page = tmp_path / "report.html"
+    write_diagnosis_page(record_of(sentence=NASTY), network, page, commands)
+    assert commands_on_page(page) == commands
+    page.write_bytes(b"\xff no page")
+    assert commands_on_page(page) == []
+
+
+def test_nothing_held_out_is_said(network: Network) -> None:
+    record = record_of(verified_on_fitted_periods=True)
+    assert "the numbers flatter" in Page(diagnosis_page(record, network)).text
+    assert "flatter" in printed(record)
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_the_summary_fits_80_columns(verdict: str) -> None:
+    record = record_of(verdict)
+    text = printed(record)
+    assert max(map(len, text.splitlines())) <= 80
+    flat = " ".join(text.split())
+    assert f"A sentence for {verdict}." in flat
+    assert "GEH < 5" in flat
+    if verdict == "explained":
+        for part in ("headway", "1.451 s (1.443 to 1.459)", "S_C", "0:05:00 – 0:15:00", "+41.5",
+                     "59 688", "99.96 %", "does not see this gap"):  # fmt: skip
+            assert part in flat
+        assert "something new" not in flat or flat.count("discharge:") == 2
+
+
+def test_long_names_do_not_widen_the_summary() -> None:
+    record = record_of()
+    record["effects"][1]["place"] = "x" * 90
+    record["where"][0]["tls"] = "cluster_" * 12
+    assert max(map(len, printed(record).splitlines())) <= 80
+
+
+def test_every_statistic_has_words() -> None:
+    assert set(STATISTICS) == {name for name, _, _ in FEATURES} | {"occupied"}
+    assert statistic("count_stop in time") == ("flow at stop detectors in some stretch of time")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.0, "100 %"), (0.99999, "99.99 %"), (0.9991, "99.9 %"), (0.5, "50 %"), (-0.2, "−20 %")],
+)
+def test_a_share_is_only_whole_where_nothing_is_missing(value: float, text: str) -> None:
+    assert words.share(value) == text
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+FRAME = """<!DOCTYPE html><body style="margin:0"><iframe id="f" width="{width}" height="4000"
+style="border:0" srcdoc="{page}"></iframe><p id="out"></p><script>
+f.onload = () => {{ const d = f.contentDocument, w = d.documentElement;
+  const wide = [...d.querySelectorAll("body *")].filter(
+    e => e.getBoundingClientRect().right > w.clientWidth + 1 && !e.closest("svg, thead")
+  ).map(e => e.tagName + "." + e.className);
+  out.textContent = JSON.stringify({{scroll: w.scrollWidth, width: w.clientWidth, wide,
+    opened: d.querySelectorAll("details").length, height: w.scrollHeight}}); }};
+</script></body>"""
+
+
+def browse(directory: Path, *options: str) -> str:
+    assert CHROMIUM is not None
+    command = [
+        CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
+        "--hide-scrollbars", f"--user-data-dir={directory / 'profile'}", *options,
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    return done.stdout
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+@pytest.mark.parametrize("width", [360, 390, 700, 1280])
+def test_nothing_sticks_out_in_a_browser(width: int, network: Network, tmp_path: Path) -> None:
+    record = record_of(policy_gap=GAP)
+    record["effects"][1]["place"] = "cluster_1098574052_1098574061_" * 6
+    record["where"][0]["lane"] = "cluster_1098574052_1098574061_" * 4
+    text = diagnosis_page(record, network).replace("<details>", "<details open>")
+    frame = tmp_path / "frame.html"
+    frame.write_text(FRAME.format(width=width, page=html.escape(text, quote=True)))
+    dom = browse(tmp_path, "--virtual-time-budget=3000", "--dump-dom", frame.as_uri())
+    (found,) = re.findall(r'<p id="out">(.*?)</p>', dom)
+    seen = json.loads(html.unescape(found))
+    assert seen["width"] == width
+    assert seen["scroll"] <= width, seen["wide"]
+    assert not seen["wide"]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+@pytest.mark.parametrize("dark", [False, True])
+def test_the_page_is_drawn_in_a_browser(dark: bool, network: Network, tmp_path: Path) -> None:
+    page, picture = tmp_path / "report.html", tmp_path / "report.png"
+    write_diagnosis_page(record_of(), network, page)
+    options = ["--blink-settings=preferredColorScheme=0"] if dark else []
+    browse(tmp_path, *options, "--window-size=1280,1600", f"--screenshot={picture}", page.as_uri())
+    pixels = matplotlib.image.imread(picture)
+    assert pixels.shape[:2] == (1600, 1280)
+    assert pixels.std() > 0.05
+    assert (pixels[:, :, :3].mean() < 0.5) == dark

@@ -1,0 +1,694 @@
+"""The page of trainings: whole, under way and broken ones, several at once, hostile names."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import polars as pl
+import pytest
+import tyro
+
+from ugat_marl.__main__ import main
+from ugat_marl.cli.report import again, train_options
+from ugat_marl.cli.train import Train
+from ugat_marl.data import Metrics, Scores, write_settings
+from ugat_marl.effects import load_scenario
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import Evaluation, Interval, TransferConfig, transfer
+from ugat_marl.experiments.paper.settings import TABLES, settings_of
+from ugat_marl.experiments.scores import Result
+from ugat_marl.grounding import FitConfig, UgatConfig
+from ugat_marl.reporting import RunRecord, palette, read_records, runs_page, write_pictures
+from ugat_marl.reporting import diagnosis_words as words
+from ugat_marl.reporting.drawing import Drawing
+from ugat_marl.reporting.job_names import job_name
+from ugat_marl.reporting.run_maps import minutes_picture, node_map
+from ugat_marl.reporting.run_page import RunPage
+from ugat_marl.reporting.run_pictures import binned, joined, radar_picture
+from ugat_marl.scenarios import Network
+
+RESULTS = Path(__file__).parents[2] / "results"
+NASTY = "</style><script>alert(1)</script>\"'><img src=x onerror=alert(2)>&amp;$\\frac{x}"
+ATT = {
+    "direct transfer": ((100.0, 102.0), (150.0, 154.0)),
+    "UGAT": ((99.0, 101.0), (130.0, 134.0)),
+    "more plain sim": ((98.0, 99.0), (155.0, 160.0)),
+    "rule largest-queue:40": ((120.0, 121.0), (125.0, 126.0)),
+}
+LIGHTS = ("A1", "A2", "B1", "B2")
+AGENTS = tuple(f"signal_{n}" for n in range(4))
+FILES = (
+    "run.json", "settings.json", "table.json", "metrics.parquet", "queues.parquet",
+    "checkpoint/state.json",
+)  # fmt: skip
+
+
+def scores(att: float) -> Scores:
+    return Scores(att, att - 5, 5e4 / att, -att / 30, att / 30, 0.3, att - 60, 520.0, 515.0, 0.0)
+
+
+def evaluation(shift: float = 0.0, real: str = "V4") -> Evaluation:
+    results = tuple(
+        Result(policy, domain, 1000 + seed, scores(att + shift))
+        for policy, domains in ATT.items()
+        for domain, values in zip(("sim", real), domains, strict=True)
+        for seed, att in enumerate(values)
+    )
+    notes = {f"best rule in {real}": "largest-queue:40", "training seed": "0"}
+    return Evaluation("grid2x2-v1", "h" * 64, results, notes)
+
+
+def metrics(iterations: int = 2, episodes: int = 24, shift: float = 0.0) -> Metrics:
+    found = Metrics()
+    for episode in range(episodes):
+        found.add("episode", episode, {"return": -4000.0 + 50 * episode + shift})
+    found.add("iteration", 0, {"att_s/sim": 100.0, "att_s/V4": 152.0 + shift})
+    for iteration in range(1, iterations + 1):
+        numbers = {"att_s/sim": 100.0, "att_s/V4": 150.0 - 10 * iteration + shift}
+        for name, mean in (("acceptance", 0.5), ("mean_u", 0.3), ("change_rate", 0.2)):
+            numbers[f"gate/{name}"] = mean
+            numbers |= {f"gate/{name}/{a}": mean + 0.1 * k for k, a in enumerate(AGENTS)}
+        numbers |= {"gate/alpha": np.inf if iteration == 1 else 0.35}
+        numbers |= {f"gate/alpha/{a}": numbers["gate/alpha"] for a in AGENTS}
+        found.add("iteration", iteration, numbers)
+    return found
+
+
+def queues() -> pl.DataFrame:
+    rows = [
+        (policy, domain, minute, tls, float(k + (minute if tls == "B2" else 0)) * factor, 6)
+        for policy, factor in (("direct transfer", 2.0), ("UGAT", 1.0))
+        for domain in ("sim", "V4")
+        for minute in range(10)
+        for k, tls in enumerate(LIGHTS)
+    ]
+    names = ["policy", "domain", "minute", "intersection", "queue", "looks"]
+    return pl.DataFrame(rows, schema=names, orient="row")
+
+
+def make_run(directory: Path, *, seed: int = 0, real: str = "V4", **changes: Any) -> Path:
+    """A folder such as a run leaves; `changes` are of the configuration."""
+    ugat = UgatConfig(pretrain_episodes=14, iterations=2, grounded_episodes=5)
+    config = TransferConfig("grid2x2-v1", real, seed=seed, ugat=ugat, **changes)
+    directory.mkdir(parents=True)
+    (directory / "checkpoint").mkdir()
+    scenario = load_scenario("grid2x2-v1")
+    if config.duration_s is not None:
+        scenario = scenario.with_duration(config.duration_s)
+    hashes = {"sim": scenario.hash, "real": "r" * 64}
+    identity = {**asdict(config), "scenario_hash": hashes, "domains": ["sim", real]}
+    (directory / "run.json").write_text(json.dumps(identity))
+    write_settings(directory, asdict(config))
+    evaluation(3.0 * seed, real).write(directory / "table.json")
+    metrics(shift=float(seed)).write(directory / "metrics.parquet")
+    metrics(1).write(directory / "checkpoint" / "metrics.parquet")
+    queues().write_parquet(directory / "queues.parquet")
+    state = {"pretrained": 14, "iteration": 2}
+    (directory / "checkpoint" / "state.json").write_text(json.dumps(state))
+    return directory
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return make_run(tmp_path / "first")
+
+
+class Page(HTMLParser):
+    """Tags, attributes and texts of a page; every tag must be closed."""
+
+    VOID = ("meta", "br", "img")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, Any]]] = []
+        self.open: list[str] = []
+        self.texts: list[str] = []
+        self.cells: list[list[str]] = []
+        self.feed(text)
+        assert not self.open, self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag == "tr":
+            self.cells.append([])
+        elif tag == "td":
+            self.cells[-1].append("")
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1:] == ["td"]:
+            self.cells[-1][-1] += data.replace("\u00a0", " ")
+        if "style" not in self.open[-1:]:
+            self.texts.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.texts).split())
+
+    def row(self, first: str) -> list[str]:
+        """The first row of a table that begins with a cell."""
+        return next(row for row in self.cells if row[:1] == [first])
+
+
+def page_of(*paths: Path) -> tuple[RunPage, Page]:
+    records = read_records(paths)
+    made = runs_page(records, {record.directory: again(record) for record in records})
+    return made, Page(made.text)
+
+
+# --- one training ---------------------------------------------------------------------------------
+
+
+def test_a_whole_run_is_shown_with_the_numbers_of_its_records(run: Path) -> None:
+    made, page = page_of(run)
+    found = evaluation()
+    row = page.row("UGAT")
+    real = found.estimate("UGAT", "V4", "att_s")
+    assert (
+        row[2] == f"{words.number(real.mean)} (107 to 157)" and real.mean == 132
+    )  # t of one degree of freedom: 12.7
+    assert row[3] == words.signed(found.gap("UGAT", "V4", "att_s").mean) == "+32"
+    assert row[4] == words.number(found.regret("UGAT", "V4").mean) == "6.5"
+    assert page.row("direct transfer")[2].startswith("152 (127 to 177)")
+    # (152 - 101) of gap before, (132 - 100) after
+    assert words.share(1 - 32 / 51) in page.text
+    for part in ("Travel time in V4: direct transfer 152 s, UGAT 132 s", "whole",
+                 "grid2x2-v1", "rule largest-queue:40"):  # fmt: skip
+        assert part in page.text
+    assert "Missing here" not in page.text
+    gate = page.row("signal_3")
+    assert gate[:4] == ["signal_3", "B2", "80 %", "0.6"] and gate[4] == "0.35"
+    worst = page.row("B2")
+    # B2 has 3 + minute vehicles under UGAT: 7.5 in the mean, 12 in the last minute
+    assert worst == ["B2", "7.5", "12", "minute 9", "15", "24", "minute 9"]
+    names = [drawing.name for drawing in made.pictures]
+    assert names == list(dict.fromkeys(names))
+    assert {"first-radar-V4", "first-gate", "first-map-acceptance", "first-map-queue"} <= set(names)
+
+
+def test_the_page_needs_nothing_else_and_every_picture_has_words(run: Path) -> None:
+    _, page = page_of(run)
+    text = (run / "report.html").read_text() if (run / "report.html").exists() else ""
+    text = text or page_of(run)[0].text
+    assert not re.findall(r"https?:|src=|url\(|@import|<script|<link|xlink|href=", text)
+    assert "default-src 'none'" in text
+    pictures = [attrs for tag, attrs in page.tags if tag == "svg"]
+    assert len(pictures) >= 8
+    assert all(attrs["role"] == "img" and len(attrs["aria-label"]) > 5 for attrs in pictures)
+    captions = sum(tag == "figcaption" for tag, _ in page.tags)
+    assert captions == len(pictures) == sum(tag == "figure" for tag, _ in page.tags)
+
+
+def test_a_run_under_way_shows_how_far_it_is(run: Path) -> None:
+    for name in ("table.json", "queues.parquet"):
+        (run / name).unlink()
+    _, page = page_of(run)
+    assert "not finished" in page.text
+    assert (
+        "So far: 14 of 14 episodes of plain training, 2 of 2 iterations. Last written" in page.text
+    )
+    assert "table.json is not there: the run is under way, or was stopped" in page.text
+    assert "--resume" in page.text
+    assert "Learning curves" in page.text and "The gate" in page.text
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("how", ["gone", "empty", "half", "other"])
+def test_what_is_broken_is_named(run: Path, name: str, how: str) -> None:
+    path = run / name
+    content = path.read_bytes()
+    if how == "gone":
+        path.unlink()
+    else:
+        broken = {"empty": b"", "half": content[: len(content) // 2], "other": b"[1, 2]"}
+        path.write_bytes(broken[how])
+    made, page = page_of(run)
+    if how == "gone" and name == "settings.json":  # as runs were before it was kept
+        assert "are not on record" in page.text and "Missing here" not in page.text
+    elif how == "gone" and name == "run.json":
+        assert "Missing here" not in page.text  # its settings are known all the same
+    elif name != "run.json":
+        assert "Missing here" in page.text and name in page.text
+    if name == "metrics.parquet":
+        assert "checkpoint/metrics.parquet is shown instead" in page.text
+        assert any(drawing.name == "first-gate" for drawing in made.pictures)
+
+
+def test_no_damage_is_a_traceback(run: Path, tmp_path: Path) -> None:
+    """Every file cut at, and disturbed at, many places."""
+    draw = np.random.default_rng(0)
+    for name in FILES:
+        path = run / name
+        content = path.read_bytes()
+        for _ in range(25):
+            place = int(draw.integers(len(content)))
+            if draw.random() < 0.5:
+                path.write_bytes(content[:place])
+            else:
+                other = bytearray(content)
+                other[place] = int(draw.integers(256))
+                path.write_bytes(bytes(other))
+            page_of(run)
+        path.write_bytes(content)
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_a_file_that_makes_its_reader_panic_is_broken(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seen in one of a hundred files with a wrong byte; polars then raises a BaseException."""
+
+    def panic(path: Path) -> None:
+        raise pl.exceptions.PanicException("assertion failed")
+
+    monkeypatch.setattr(pl, "read_parquet", panic)
+    _, page = page_of(run)
+    for name in ("metrics.parquet", "queues.parquet"):
+        assert f"{name} cannot be used (cannot be read (assertion failed)" in page.text
+
+
+def test_values_of_a_wrong_kind_are_no_traceback(run: Path) -> None:
+    table = json.loads((run / "table.json").read_text())
+    table["episodes"][0]["att_s"] = None
+    table["episodes"][9]["queue"] = None
+    (run / "table.json").write_text(json.dumps(table))
+    _, page = page_of(run)
+    assert page.row("direct transfer")[1] == "–"
+    for settings in ({"scenario": 3, "ugat": [], "seed": {}}, {"ugat": {"iterations": "x"}}, []):
+        for name in ("settings.json", "run.json"):
+            (run / name).write_text(json.dumps({"settings": settings}))
+        page_of(run)
+    metrics = Metrics([("iteration", 1, f"gate/acceptance/{a}", np.nan) for a in AGENTS])
+    metrics.add("iteration", 1, {"gate/acceptance": np.nan, "att_s/sim": np.nan})
+    metrics.add("episode", 0, {"return": np.nan})
+    metrics.write(run / "metrics.parquet")
+    page_of(run)
+
+
+def test_what_only_an_objective_measures_is_shown_with_its_unit(run: Path) -> None:
+    found = evaluation()
+    results = tuple(
+        replace(r, scores=replace(r.scores, hidden={"co2_g": 250.0})) if r.domain == "V4" else r
+        for r in found.results
+    )
+    replace(found, results=results).write(run / "table.json")
+    _, page = page_of(run)
+    assert "CO2 [g/veh]" in page.text
+    rows = [row for row in page.cells if row[:1] == ["UGAT"] and len(row) == 10]
+    assert [row[-1] for row in rows] == ["–", "250"]
+
+
+def test_an_episode_of_another_length_is_no_change_of_the_scenario(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "first", duration_s=600.0)
+    assert "The scenario has changed since" not in page_of(run)[1].text
+
+
+def test_a_scenario_that_is_gone_or_changed_is_said(run: Path) -> None:
+    assert "The scenario has changed since" not in page_of(run)[1].text
+    settings = json.loads((run / "settings.json").read_text())
+    identity = json.loads((run / "run.json").read_text())
+    identity["scenario_hash"]["sim"] = "0" * 64
+    (run / "run.json").write_text(json.dumps(identity))
+    assert "The scenario has changed since" in page_of(run)[1].text
+    settings["settings"]["scenario"] = "/nowhere/at/all.sumocfg"
+    (run / "settings.json").write_text(json.dumps(settings))
+    assert "no map: scenario '/nowhere/at/all.sumocfg' cannot be read here" in page_of(run)[1].text
+
+
+def test_hostile_names_stay_text(tmp_path: Path) -> None:
+    harmless = make_run(tmp_path / "harmless")
+    run = make_run(tmp_path / "<script>alert(3)<" / "script>")
+    found = replace(evaluation(), scenario=NASTY, notes={NASTY: NASTY, "best rule in V4": NASTY})
+    results = tuple(replace(r, policy=f"{NASTY}{r.policy}", domain=f"{NASTY}{r.domain}")
+                    for r in found.results)  # fmt: skip
+    replace(found, results=results).write(run / "table.json")
+    names = [(f"{NASTY}{p}", f"{NASTY}{d}", m, f"{NASTY}\x1b{t}", *means)
+             for p, d, m, t, *means in queues().rows()]  # fmt: skip
+    pl.DataFrame(names, schema=queues().schema, orient="row").write_parquet(run / "queues.parquet")
+    numbers = Metrics([(s, n, f"{k}{NASTY}\x07", v) for s, n, k, v in metrics().rows])
+    Metrics([*metrics().rows, *numbers.rows]).write(run / "metrics.parquet")
+    (run / "settings.json").unlink()
+    identity = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps({**identity, NASTY: "\ud800\x00", "real": NASTY}))
+    made, page = page_of(run)
+    assert NASTY in " ".join(page.texts)
+    _, plain = page_of(harmless)
+    assert {tag for tag, _ in page.tags} <= {tag for tag, _ in plain.tags} | {"ul", "li"}
+    assert not [name for _, attrs in page.tags for name in attrs if name.startswith("on")]
+    made.text.encode()
+    for drawing in made.pictures:
+        ET.fromstring(drawing.svg_file())
+        assert re.fullmatch(r"[\w=+.-]+", drawing.name)
+    write_pictures(made.pictures[:2], tmp_path / "pictures")
+
+
+# --- several ------------------------------------------------------------------------------------
+
+
+def test_seeds_are_put_together_with_intervals(tmp_path: Path) -> None:
+    for seed in range(3):
+        make_run(tmp_path / "runs" / f"s{seed}", seed=seed)
+    made, page = page_of(tmp_path / "runs")
+    interval = Interval.of(np.array([132.0, 135.0, 138.0]))
+    row = next(row for row in page.cells if row[:1] == ["UGAT"] and len(row) == 2)
+    assert row[1] == f"135 ({words.number(interval.low)} to {words.number(interval.high)})"
+    assert "3 training seeds" in page.text and "best rule there" in page.text
+    assert page.row("s1")[3:6] == ["UGAT", "1", "whole"]
+    curves = [d.name for d in made.pictures if "seeds" in d.name]
+    assert curves == [f"grid2x2-v1-V4-phase-seeds-{w}" for w in ("learning", "att", "gate")]
+
+
+def test_domains_stand_in_columns_and_what_differs_stays_apart(tmp_path: Path) -> None:
+    make_run(tmp_path / "rain", real="V3")
+    make_run(tmp_path / "snow", real="V4")
+    make_run(tmp_path / "other", duration_s=600.0)
+    _, page = page_of(tmp_path / "rain", tmp_path / "snow", tmp_path / "other")
+    assert page.text.count("Over training seeds") == 1  # one of its own is no group
+    row = next(row for row in page.cells if row[:1] == ["UGAT"] and len(row) == 3)
+    assert row == ["UGAT", "132", "132"]  # a single seed has no interval
+    assert "1 training seed; no intervals" in page.text
+
+
+def make_job(folder: Path, name: str, played: Sequence[str], **job: Any) -> None:
+    options = {"observation": "count", "neighbours": 0}
+    options = {"observation": "count", "neighbours": 0}
+    usual = {
+        "kind": "direct", "scenario": "single-v1", "sim": "sim", "target": None, "world": None,
+        "seed": 0, "options": options, "ugat": None,
+    }  # fmt: skip
+    (folder / name).mkdir(parents=True)
+    (folder / name / "job.json").write_text(json.dumps({**usual, **job}))
+    base = 100.0 + 10 * (job.get("seed") or 0)
+    rows = [
+        {"domain": d, "seed": s, **asdict(scores(base + 50 * (d != "sim") + s))}
+        for d in played
+        for s in (0, 1)
+    ]
+    if rows:
+        (folder / name / "scores.json").write_text(json.dumps(rows))
+
+
+def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        make_job(tmp_path, f"direct-{seed}", ("sim", "V1", "V4"), seed=seed)
+        ugat = {"grounding": "timed", "gate": {"mode": "dynamic"}}
+        make_job(tmp_path, f"timed-{seed}", ("sim", "V4"), kind="grounded", target="V4", seed=seed,
+                 ugat=ugat)  # fmt: skip
+    static = {"grounding": "timed", "gate": {"mode": "static"}}
+    make_job(tmp_path, "static", ("sim", "V4"), kind="grounded", target="V4", ugat=static)
+    make_job(tmp_path, "waiting", (), kind="scratch", target="V1")
+    make_job(tmp_path, "half", ("sim",), kind="scratch", target="V4")
+    _, page = page_of(tmp_path)
+    row = next(row for row in page.cells if row[:1] == ["direct transfer"] and len(row) == 3)
+    interval = Interval.of(np.array([150.5, 160.5]))
+    assert row[1] == f"156 ({words.number(interval.low)} to {words.number(interval.high)})"
+    assert next(r for r in page.cells if r[:1] == ["UGAT, timed (gate.mode static)"])[2] == "150"
+    assert "Left out, since not judged in both domains: half, waiting" in page.text
+    assert page.row("waiting")[5] == "not finished"
+
+
+def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
+    make_job(tmp_path, "direct-0", ("sim", "V4"), seed=0)
+    rows = [("policy", d, m, "A1", 3.0 + m, 6) for d in ("sim", "V4") for m in range(5)]
+    schema = ["policy", "domain", "minute", "intersection", "queue", "looks"]
+    pl.DataFrame(rows, schema=schema, orient="row").write_parquet(
+        tmp_path / "direct-0" / "queues.parquet"
+    )
+    _, page = page_of(tmp_path / "direct-0")
+    assert "The worst intersections and minutes" in page.text
+    assert "direct transfer in V4" in page.text
+
+
+@pytest.mark.parametrize("sim", ["sim", "meso"])
+@pytest.mark.parametrize("table", TABLES)
+def test_jobs_are_called_as_in_the_tables_of_the_paper(table: str, sim: str) -> None:
+    for row in settings_of(table, UgatConfig(), sim):
+        job = {"kind": row.kind, "world": row.world, "sim": sim,
+               "ugat": asdict(row.ugat) if row.kind == "grounded" else None}  # fmt: skip
+        assert row.name.split(":")[0] == job_name(job)
+
+
+def test_a_finished_table_is_shown_with_its_command() -> None:
+    (record,) = read_records([RESULTS / "single-v1" / "main"])
+    made, page = page_of(RESULTS / "single-v1" / "main")
+    assert "ugat-marl paper main" in page.text
+    rows = pl.read_csv(RESULTS / "single-v1" / "main" / "table.csv").rows(named=True)
+    for setting in ("direct transfer", "UGAT, timed"):
+        values = [r for r in rows if r["setting"] == setting]
+        shown = page.row(setting)[1:]
+        for row, cell in zip(values, shown, strict=True):
+            low, high = (words.number(row[f"att_s_{end}"]) for end in ("low", "high"))
+            assert cell == f"{words.number(row['att_s'])} ({low} to {high})"
+    assert sum("radar" in drawing.name for drawing in made.pictures) == len(shown)
+    assert not record.missing
+
+
+def test_a_folder_of_nothing_and_a_file_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="neither a run"):
+        read_records([tmp_path])
+    with pytest.raises(OptionError, match="no such folder"):
+        read_records([tmp_path / "x"])
+    (tmp_path / "table.json").write_text("{}")
+    with pytest.raises(OptionError, match="is a file; give the folder"):
+        read_records([tmp_path / "table.json"])
+
+
+# --- the command --------------------------------------------------------------------------------
+
+
+def test_the_command_writes_page_and_pictures(run: Path, tmp_path: Path) -> None:
+    assert main(["report", str(run), "--pictures", str(tmp_path / "p")]) == 0
+    assert Page((run / "report.html").read_text()).text
+    files = sorted(path.name for path in (tmp_path / "p").iterdir())
+    assert len(files) >= 16 and {Path(f).suffix for f in files} == {".svg", ".png"}
+    for path in (tmp_path / "p").glob("*.png"):
+        assert matplotlib.image.imread(path)[:, :, :3].std() > 0.02, path
+    for path in (tmp_path / "p").glob("*.svg"):
+        assert ET.parse(path).getroot().tag.endswith("svg")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"seed": 3, "real": "V2", "control": False, "oracle": True, "further": ("V4", "V3")},
+        {"duration_s": 600.0, "evaluation_seeds": 2, "corrected": "some dir/x", "sim": "V1"},
+        {"ugat": UgatConfig(grounding="timed", iterations=7, least_accuracy=None)},
+    ],
+)
+def test_the_command_on_the_page_makes_the_same_run(change: dict[str, Any], tmp_path: Path) -> None:
+    config = TransferConfig("grid2x2-v1", **change)
+    write_settings(tmp_path, asdict(config))
+    (tmp_path / "run.json").write_text("{}")
+    (record,) = read_records([tmp_path])
+    assert isinstance(record, RunRecord)
+    options = train_options(record.settings)
+    assert tyro.cli(Train, args=["grid2x2-v1", *options]).config == config
+
+
+def test_nested_settings_come_back_too() -> None:
+    settings = asdict(TransferConfig("x"))
+    settings["ugat"]["fit"]["warm_start"] = not settings["ugat"]["fit"]["warm_start"]
+    settings["ugat"]["gate"]["mode"] = "static"
+    settings["dqn"]["hidden"] = [16, 8]
+    settings = json.loads(json.dumps(settings, default=str))
+    options = train_options(settings)
+    config = tyro.cli(Train, args=["x", *options]).config
+    assert config.ugat.gate.mode == "static" and config.dqn.hidden == (16, 8)
+    assert config.ugat.fit.warm_start is settings["ugat"]["fit"]["warm_start"]
+
+
+# --- pictures -----------------------------------------------------------------------------------
+
+
+def test_stretches_of_episodes_have_students_interval() -> None:
+    rows = binned([[(k, float(k)) for k in range(8)]])
+    assert [row[0] for row in rows] == [2.0, 6.0]
+    own = Interval.of(np.arange(4.0))
+    assert rows[0][1:] == (own.mean, own.low, own.high)
+    two = binned([[(k, 1.0) for k in range(8)], [(k, 3.0) for k in range(8)]])
+    over = Interval.of(np.array([1.0, 3.0]))
+    assert two[0][1:] == (over.mean, over.low, over.high)
+    assert binned([]) == []
+
+
+def test_steps_are_joined_over_series() -> None:
+    rows = joined([[(0, 1.0), (1, np.inf)], [(0, 3.0)]])
+    assert rows[0][1] == 2.0 and rows[0][2] < 1.0
+    assert np.isnan(rows[1][1])  # what is infinite once is no mean
+
+
+def test_the_rim_of_a_radar_is_the_best_value() -> None:
+    drawing = radar_picture("t", {"a": [10, 100, -1, 1, 0.1], "b": [20, 50, -2, 2, 0.2]}, "n")
+    assert drawing is not None
+    text = drawing.svg()
+    for best in ("best: 10 s", "best: 100 veh", "best: −1 per step", "best: 1 veh", "best: 0.1<"):
+        assert best in text
+    assert radar_picture("t", {"a": [np.nan] * 5}, "n") is None
+
+
+def colours(drawing: Drawing, tag: str = "polygon") -> list[str]:
+    return re.findall(rf'<{tag} points="[^"]+" fill="var\(--(\w+)\)"', drawing.svg())
+
+
+def test_intersections_have_the_colour_of_their_number() -> None:
+    network = Network.read(load_scenario("grid2x2-v1"))
+    values = {"A1": (0.0, "0"), "A2": (0.5, "50"), "B1": (1.0, "100"), "B2": (np.nan, "")}
+    drawing = node_map("m", "shares", network, values, (0.0, 1.0), "share")
+    assert colours(drawing)[:4] == ["q0", "q3", "q6", "paper"]
+    texts = re.findall(r">([^<]+)</text>", drawing.svg())
+    assert {"A1", "50", "–", "shares"} <= set(texts)
+
+
+def test_the_longest_queues_come_first_minute_by_minute() -> None:
+    drawing = minutes_picture("m", "queues", {"a": [0.0, 0.0], "b": [7.0, 0.1], "c": [3.5] * 2})
+    texts = re.findall(r">([^<]+)</text>", drawing.svg())
+    assert [t for t in texts if t in "abc"] == ["b", "c", "a"]
+    # b: q6 then q0; c: one run of q3; a: one run of q0; then the scale
+    assert colours(drawing) == ["q6", "q0", "q3", "q0", *palette.STEPS]
+
+
+MACHADO = {  # Machado, Oliveira and Fernandes (2009), severity 1
+    "protan": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+               [-0.003882, -0.048116, 1.051998]],
+    "deutan": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+               [-0.011820, 0.042940, 0.968881]],
+    "tritan": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
+               [0.004733, 0.691367, 0.303900]],
+}  # fmt: skip
+
+
+def lab(colour: str, sight: str | None) -> np.ndarray:
+    """CIE L*a*b* of a colour as somebody sees it."""
+    srgb = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    if sight is not None:
+        linear = np.clip(np.array(MACHADO[sight]) @ linear, 0, 1)
+    to_xyz = np.array(
+        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    )
+    xyz = to_xyz @ linear / (0.9505, 1.0, 1.089)
+    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize("colours", [palette.LIGHT, palette.DARK])
+@pytest.mark.parametrize("sight", [None, "protan", "deutan", "tritan"])
+def test_colours_are_told_apart(colours: dict[str, str], sight: str | None) -> None:
+    curves = [lab(colours[name], sight) for name in palette.CURVES]
+    for i, one in enumerate(curves):
+        for other in curves[:i]:
+            assert np.linalg.norm(one - other) > 10
+        assert np.linalg.norm(one - lab(colours["paper"], sight)) > 35
+    steps = [lab(colours[name], sight)[0] for name in palette.STEPS]
+    changes = np.diff(steps)
+    assert (changes < -4).all() or (changes > 4).all()  # lighter or darker all the way
+
+
+def test_red_and_green_would_be_confused() -> None:
+    assert np.linalg.norm(lab("#e45756", "deutan") - lab("#9a9a3a", "deutan")) < 25
+
+
+# --- in a browser -------------------------------------------------------------------------------
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+FRAME = """<!DOCTYPE html><body style="margin:0"><iframe id="f" width="{width}" height="4000"
+style="border:0" srcdoc="{page}"></iframe><p id="out"></p><script>
+const errors = []; addEventListener("error", e => errors.push(String(e.message)));
+f.onload = () => {{ const d = f.contentDocument, w = d.documentElement;
+  let clicks = 0;
+  for (const s of d.querySelectorAll("summary")) {{ s.click(); clicks += 1; }}
+  const inside = e => e.closest("thead");
+  const wide = [...d.querySelectorAll("body *")].filter(
+    e => e.getBoundingClientRect().right > w.clientWidth + 1 && !inside(e)
+  ).map(e => e.tagName + "." + e.getAttribute("class"));
+  const cut = [...d.querySelectorAll("svg text")].filter(t => {{
+    const a = t.getBoundingClientRect(), b = t.closest("svg").getBoundingClientRect();
+    return a.left < b.left - 1 || a.right > b.right + 1 || a.bottom > b.bottom + 1; }}
+  ).map(t => t.textContent);
+  const small = [...d.querySelectorAll("svg text")].filter(
+    t => t.getBoundingClientRect().height < 8).map(t => t.textContent);
+  out.textContent = JSON.stringify({{scroll: w.scrollWidth, width: w.clientWidth, wide, cut, small,
+    clicks, open: d.querySelectorAll("details[open]").length, errors}}); }};
+</script></body>"""
+
+
+def browse(directory: Path, *options: str) -> str:
+    assert CHROMIUM is not None
+    command = [
+        CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
+        "--hide-scrollbars", "--enable-logging=stderr", f"--user-data-dir={directory / 'profile'}",
+        *options,
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    assert "CONSOLE" not in done.stderr, done.stderr
+    return done.stdout
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+@pytest.mark.parametrize("width", [390, 700, 1440])
+def test_nothing_is_clipped_in_a_browser(width: int, tmp_path: Path) -> None:
+    for seed in (0, 1):
+        make_run(tmp_path / "runs" / f"a-rather-long-name-of-a-run-{seed}", seed=seed)
+    page = page_of(tmp_path / "runs")[0].text
+    frame = tmp_path / "frame.html"
+    frame.write_text(FRAME.format(width=width, page=html.escape(page, quote=True)))
+    dom = browse(tmp_path, "--virtual-time-budget=3000", "--dump-dom", frame.as_uri())
+    (found,) = re.findall(r'<p id="out">(.*?)</p>', dom)
+    seen = json.loads(html.unescape(found))
+    assert seen["width"] == width
+    assert seen["scroll"] <= width and not seen["wide"], seen["wide"]
+    assert not seen["cut"] and not seen["errors"]
+    assert not seen["small"] or width < 400
+    assert seen["clicks"] == seen["open"] > 3
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+@pytest.mark.parametrize("dark", [False, True])
+def test_the_page_is_drawn_in_light_and_dark(dark: bool, run: Path, tmp_path: Path) -> None:
+    page, picture = tmp_path / "report.html", tmp_path / "report.png"
+    page.write_text(page_of(run)[0].text)
+    options = ["--blink-settings=preferredColorScheme=0"] if dark else []
+    browse(tmp_path, *options, "--window-size=1280,1600", f"--screenshot={picture}", page.as_uri())
+    pixels = matplotlib.image.imread(picture)
+    assert pixels.std() > 0.05
+    assert (pixels[:, :, :3].mean() < 0.5) == dark
+
+
+# --- a real training ----------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_run_leaves_all_that_its_page_wants(tmp_path: Path) -> None:
+    ugat = UgatConfig(pretrain_episodes=1, iterations=1, grounded_episodes=1, sim_rollouts=1,
+                      real_rollouts=1, fit=FitConfig(epochs=1))  # fmt: skip
+    config = TransferConfig("grid2x2-v1", duration_s=100, evaluation_seeds=2, tuning_seeds=1,
+                            control=False, ugat=ugat)  # fmt: skip
+    found = transfer(config, tmp_path / "run")
+    made, page = page_of(tmp_path / "run")
+    assert "Missing here" not in page.text and "whole" in page.text
+    assert "The scenario has changed since" not in page.text
+    record = read_records([tmp_path / "run"])[0]
+    assert isinstance(record, RunRecord) and record.evaluation == found
+    assert record.queues is not None and set(record.queues["domain"]) == {"sim", "V4"}
+    assert "run-map-queue" in [drawing.name for drawing in made.pictures]
+    assert tyro.cli(Train, args=["grid2x2-v1", *train_options(record.settings)]).config == config

@@ -1,0 +1,112 @@
+"""Tables and pictures of evaluations."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+from matplotlib.figure import Figure
+from rich.console import Console, RenderableType
+
+from ugat_marl.data import Metrics, Scores
+from ugat_marl.experiments import Evaluation
+from ugat_marl.experiments.evaluation import Result
+from ugat_marl.reporting import (
+    calibration_picture,
+    measures_table,
+    pictures,
+    transfer_picture,
+    transfer_table,
+)
+
+BASE = Scores(0.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 0.0)
+ATT = {
+    "direct transfer": ((100.0, 102.0, 101.0), (150.0, 151.0, 900.0)),
+    "UGAT": ((99.0, 100.0, 98.0), (130.0, 131.0, 132.0)),
+    "rule largest-queue:40": ((120.0, 121.0, 119.0), (125.0, 126.0, 124.0)),
+}
+
+
+@pytest.fixture
+def found() -> Evaluation:
+    results = tuple(
+        Result(policy, domain, seed, replace(BASE, att_s=att, backlog=7.0 * (att > 800)))
+        for policy, domains in ATT.items()
+        for domain, values in zip(("sim", "V4"), domains, strict=True)
+        for seed, att in enumerate(values)
+    )
+    return Evaluation("grid2x2-v1", "0", results, {"best rule in V4": "largest-queue:40"})
+
+
+def printed(table: RenderableType) -> str:
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(table)
+    return console.export_text()
+
+
+def test_the_transfer_table_says_it_all_in_80_columns(found: Evaluation) -> None:
+    text = printed(transfer_table(found))
+    assert max(map(len, text.splitlines())) <= 80
+    row = next(line for line in text.splitlines() if "UGAT" in line)
+    for cell in ("99.0", "131", "+32.0", "6.0"):
+        assert cell in row
+    assert "best rule in V4: largest-queue:40" in text
+    assert "medians in V4: direct transfer 151" in " ".join(text.split())
+    assert "medians in sim" not in text
+
+
+def test_six_policies_have_room(found: Evaluation) -> None:
+    """The table says where the corrected policy was trained; names in the picture do not meet."""
+    more = ("more plain sim", "corrected sim", "rule max-pressure:20")
+    results = [*found.results]
+    for policy in more:
+        results += [replace(r, policy=policy) for r in found.results if r.policy == "UGAT"]
+    six = Evaluation(
+        found.scenario, "0", tuple(results), {"corrected sim": "runs/v4-diagnosis/corrected"}
+    )
+    text = printed(transfer_table(six))
+    assert max(map(len, text.splitlines())) <= 80
+    assert "corrected sim: trained in runs/v4-diagnosis/corrected" in " ".join(text.split())
+    figure = Figure(figsize=(10, 4.2), dpi=120, layout="constrained")
+    axes = figure.subplots(1, 2, width_ratios=(1.5, 1))[0]
+    pictures._bars(axes, six)  # pyright: ignore[reportPrivateUsage]
+    figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
+    assert len(boxes) == 6
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))
+
+
+def test_the_measures_table_tells_who_was_kept_out(found: Evaluation) -> None:
+    text = printed(measures_table(found))
+    assert max(map(len, text.splitlines())) <= 80
+    assert "never entered: direct transfer 2.3" in text
+    assert "gap to sim" in text
+    assert text.count("95 % interval") == 6
+
+
+def test_the_picture_is_a_picture(found: Evaluation, tmp_path: Path) -> None:
+    metrics = Metrics(
+        [("iteration", i, f"att_s/{d}", 100.0) for i in (0, 1) for d in ("sim", "V4")]
+    )
+    path = tmp_path / "deep" / "gap.png"
+    transfer_picture(found, metrics, path)
+    pixels = matplotlib.image.imread(path)
+    assert pixels.shape[:2] == (504, 1200)
+    assert pixels.std() > 0.05
+
+
+def test_the_calibration_is_drawn_if_there_was_an_iteration(tmp_path: Path) -> None:
+    numbers = {f"calibration/risk_by_coverage/{i}": 0.05 * i for i in range(5)}
+    numbers |= {
+        f"calibration/{name}": 0.6 for name in ("auroc", "ece", "mean_u", "mean_u_off_data")
+    }
+    metrics, path = Metrics(), tmp_path / "calibration.png"
+    assert not calibration_picture(metrics, path) and not path.exists()
+    for iteration in (1, 2, 3):
+        metrics.add("iteration", iteration, numbers)
+        assert calibration_picture(metrics, path)
+        assert matplotlib.image.imread(path).std() > 0.05

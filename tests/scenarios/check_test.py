@@ -1,0 +1,275 @@
+"""`scenario check` and `scenario draw`: hand counts, planted mistakes, what pictures show."""
+
+from __future__ import annotations
+
+import json
+import struct
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.__main__ import main
+from ugat_marl.effects import load_scenario
+from ugat_marl.experiments import Run, left_outside, problems
+from ugat_marl.progress import Silent
+from ugat_marl.reporting import draw
+from ugat_marl.reporting.network_drawing import STYLES
+from ugat_marl.scenarios import Document, Network, Scenario, resco_maps, survey
+from ugat_marl.scenarios.inspection import SATURATION_VPH
+
+
+@pytest.fixture(scope="module")
+def single() -> Scenario:
+    return load_scenario("single-v1")
+
+
+def test_an_intersection_is_counted(single: Scenario) -> None:
+    """Four arms, two lanes for straight on, one for left: three movements each."""
+    facts = survey(single)
+    (item,) = facts.intersections
+    assert (item.lanes, item.movements, len(item.phases)) == (12, 12, 8)
+    assert item.unserved_lanes == item.unserved_links == ()
+    assert item.junctions == ("A1",)
+    assert (item.u_turns, item.crossings, item.uncontrolled, item.right_on_red) == (0, 0, 0, 0)
+    both_through = item.phases[0]
+    assert both_through.permitted == ()
+    assert {name.split()[1] for name in both_through.protected} == {"s", "r"}
+    assert facts.vehicles == 2000 or 1900 < facts.vehicles < 2100
+
+
+def test_traffic_is_counted_by_approach(single: Scenario) -> None:
+    routes = [Document("r.rou.xml", None, b"<routes/>")]
+    network = Network.read(single)
+    item = network.intersections[0]
+    lane = network.lanes[item.incoming_lanes[0]]
+    leads = next(k.to_edge for k in item.links if k.from_edge == lane.edge)
+    vehicles = "".join(
+        f'<vehicle id="{i}" depart="{100 + i}"><route edges="{lane.edge} {leads}"/></vehicle>'
+        for i in range(360)
+    )
+    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
+    facts = survey(replace(single, routes=routes).with_duration(1800))
+    road = next(a for a in facts.intersections[0].approaches if a.edge == lane.edge)
+    assert road.vph == 720
+    assert road.flow_ratio == pytest.approx(720 / (road.lanes * SATURATION_VPH), abs=1e-3)
+    assert road.saturation is not None
+    assert road.saturation > road.flow_ratio
+    assert facts.first_s == 100
+    both = lane.length_m / lane.speed_mps * 2
+    assert facts.fill_s == pytest.approx(both, rel=0.1)
+    assert facts.shortest_episode_s >= 100 + 3 * facts.fill_s
+    assert sum(a.vph for a in facts.intersections[0].approaches) == 720
+
+
+def test_flows_are_counted_too(single: Scenario) -> None:
+    (item,) = Network.read(single).intersections
+    start, goal = item.links[0].from_edge, item.links[0].to_edge
+    flow = f'<flow id="f" begin="0" end="1800" number="90" from="{start}" to="{goal}"/>'
+    routes = (Document("r.rou.xml", None, f"<routes>{flow}</routes>".encode()),)
+    facts = survey(replace(single, routes=routes).with_duration(1800))
+    assert (facts.vehicles, facts.flows) == (0, 1)
+    road = next(a for a in facts.intersections[0].approaches if a.edge == start)
+    assert road.vph == pytest.approx(180, abs=2)
+
+
+def test_lanes_that_a_phase_serves_in_part_are_counted() -> None:
+    """RESCO's arterial has left turns and straight on in one lane; single-v1 has lanes for each."""
+    (item,) = survey(load_scenario("single-v1")).intersections
+    assert item.partly_served == ()
+    facts = survey(load_scenario("mixed-v1").with_control(phases="conflict-free"))
+    shared = {item.id: len(item.partly_served) for item in facts.intersections}
+    assert shared["P"] == 0
+    assert shared["S"] == 4  # one lane for everything on each of its four arms
+
+
+def spoilt(single: Scenario, phases: list[str]) -> Scenario:
+    settings = single.settings.model_dump() | {"intersections": {"A1": {"phases": phases}}}
+    return replace(single, settings=type(single.settings).model_validate(settings))
+
+
+def test_what_no_phase_serves_is_named(single: Scenario) -> None:
+    (item,) = Network.read(single).intersections
+    facts = survey(spoilt(single, list(item.phases[:2])))
+    assert facts.intersections[0].unserved_lanes
+    (text,) = problems(facts, ())
+    assert "no phase gives green to the lanes" in text
+    for lane in facts.intersections[0].unserved_lanes:
+        assert lane in text
+
+
+def test_a_short_episode_and_a_full_road_are_named(single: Scenario) -> None:
+    facts = survey(single.with_duration(60))
+    assert "shorter than the shortest useful one" in problems(facts, ())[0]
+    runs = [Run("programme", 100, 1000, 800, 700, 200), Run("rule", 90, 1000, 980, 900, 20)]
+    (text,) = problems(survey(single), runs)
+    assert "20 of 1000 vehicles cannot enter even under rule" in text
+    runs[1] = Run("rule", 90, 1000, 995, 900, 5)
+    assert problems(survey(single), runs) == []
+
+
+def test_phases_a_rule_cannot_work_with_are_named() -> None:
+    mixed = load_scenario("mixed-v1")
+    runs = [
+        Run("programme", 90, 1000, 1000, 900, 0),
+        Run("largest-queue:20", 270, 1000, 1000, 9, 0),
+    ]
+    (text,) = problems(survey(mixed.with_control(phases="conflict-free")), runs)
+    assert "takes 270 s where the programme takes 90 s" in text
+    assert 'phases = "permitted"' in text
+    assert problems(survey(load_scenario("single-v1")), runs) == []  # it has lanes for every turn
+
+
+def test_roads_where_vehicles_wait_outside_are_named(single: Scenario) -> None:
+    """3 000 vehicles an hour want onto one road, a handful onto another."""
+    (item,) = Network.read(single).intersections
+    full, free, *_ = dict.fromkeys(link.from_edge for link in item.links)
+    goal = {k.from_edge: k.to_edge for k in item.links if k.direction == "s"}
+    vehicles = "".join(
+        f'<vehicle id="v{i}" depart="{i * 0.3:.1f}"><route edges="{road} {goal[road]}"/></vehicle>'
+        for i in range(1000)
+        for road in [free if i % 100 == 0 else full]
+    )
+    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
+    crowded = replace(single, routes=routes).with_duration(300)
+    outside = left_outside(crowded, 1)
+    assert set(outside) == {full}
+    assert outside[full] > 300
+    runs = [Run("programme", 100, 1000, 500, 100, 500)]
+    (text,) = problems(survey(crowded), runs, outside)
+    assert f"they wait at {full} ({outside[full]})" in text
+
+
+def test_the_command_prints_tables(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["scenario", "check", "single-v1", "--duration-s", "600"]) == 0
+    text = capsys.readouterr().out
+    for word in ("1 agents, 8 green phases", "Saturation by approach", "largest-queue:20",
+                 "left outside", "headroom: not measured", "nothing to mend"):  # fmt: skip
+        assert word in text
+    assert max(len(line) for line in text.splitlines()) <= 80
+
+
+def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["scenario", "check", "mixed-v1", "--json", "--no-simulate"]
+    assert main(words) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert [len(item["phases"]) for item in facts["intersections"]] == [8, 3, 6, 2, 2, 4, 3]
+    assert facts["headroom"] is None
+    assert facts["problems"] == []
+
+
+def test_a_scenario_to_mend_is_an_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenario", "check", "single-v1", "--no-simulate", "--duration-s", "60"]) == 1
+    assert "to mend: an episode of 60 s" in capsys.readouterr().out
+
+
+def test_headroom_is_measured_on_request(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ugat_marl.experiments.trial.DOMAINS", ("sim", "V4"))
+    monkeypatch.setattr("ugat_marl.experiments.trial.HOLDS_S", (10, 20, 30, 40))
+    words = ["scenario", "check", "single-v1", "--headroom", "1", "--duration-s", "200"]
+    assert main([*words, "--no-simulate"]) == 0
+    text = capsys.readouterr().out
+    assert "Headroom" in text
+    assert "V4" in text
+
+
+def test_old_names_still_work(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenarios"]) == 0
+    assert "grid4x4-v1" in capsys.readouterr().out
+    assert main(["scenario", "--help"]) == 0
+    text = capsys.readouterr().out
+    for name in ("list", "new", "check", "draw"):
+        assert f"  {name} " in text
+
+
+needs_resco = pytest.mark.skipif(not resco_maps(), reason="sumo-rl is not installed")
+MAPS = ("arterial4x4", "cologne1", "cologne3", "cologne8", "grid4x4", "ingolstadt1",
+        "ingolstadt21", "ingolstadt7")  # fmt: skip
+
+
+@needs_resco
+@pytest.mark.parametrize("phases", ["programme", "conflict-free", "permitted"])
+@pytest.mark.parametrize("name", MAPS)
+def test_every_resco_map_goes_through(name: str, phases: str) -> None:
+    assert name in resco_maps()
+    facts = survey(load_scenario(f"resco:{name}").with_control(phases=phases))
+    assert facts.intersections
+    assert problems(facts, ()) == []
+    assert all(not item.unserved_links for item in facts.intersections)
+
+
+# --- pictures -------------------------------------------------------------------------------------
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def texts(path: Path) -> list[str]:
+    return ["".join(item.itertext()) for item in ET.parse(path).iter(f"{SVG}text")]
+
+
+def test_every_intersection_is_drawn_with_its_phases(tmp_path: Path) -> None:
+    scenario = load_scenario("mixed-v1")
+    files = draw(scenario, tmp_path, Silent())
+    network = Network.read(scenario)
+    names = {"network", *(item.id for item in network.intersections)}
+    assert {path.name for path in files} == {f"{n}.{end}" for n in names for end in ("svg", "png")}
+    for item in network.intersections:
+        words = texts(tmp_path / f"{item.id}.svg")
+        assert [w for w in words if w.startswith("phase ")] == [
+            f"phase {i}" for i in range(len(item.phases))
+        ]
+        assert any(item.id in word for word in words)
+        for edge in {link.from_edge for link in item.links}:
+            assert any(edge[:15] in word for word in words)
+    width, height = struct.unpack(">II", (tmp_path / "network.png").read_bytes()[16:24])
+    assert width >= 1000
+    assert height >= 300
+
+
+def test_green_is_drawn_in_the_colour_of_the_legend(tmp_path: Path) -> None:
+    """As many strokes in the colour of protected green as there are links with it, and the key."""
+    scenario = load_scenario("single-v1")
+    draw(scenario, tmp_path, Silent())
+    (item,) = Network.read(scenario).intersections
+    green = sum(phase[link.index] == "G" for phase in item.phases for link in item.links)
+    text = (tmp_path / "A1.svg").read_text()
+    curves = text.count(f"stroke: {STYLES['G'][0].lower()}; stroke-width: 1.7")
+    assert curves == green
+    assert "stroke-dasharray" not in text.partition("<defs>")[0]
+
+
+def test_the_same_drawing_is_the_same_file(tmp_path: Path) -> None:
+    for name in "ab":
+        draw(load_scenario("single-v1"), tmp_path / name, Silent())
+    assert (tmp_path / "a" / "A1.svg").read_bytes() == (tmp_path / "b" / "A1.svg").read_bytes()
+
+
+def test_many_phases_go_to_several_pages(tmp_path: Path, single: Scenario) -> None:
+    (item,) = Network.read(single).intersections
+    width = len(item.phases[0])
+    phases = ["r" * i + "G" + "r" * (width - i - 1) for i in range(width)]
+    phases += [p.replace("G", "g") for p in phases]
+    draw(spoilt(single, phases), tmp_path, Silent())
+    pages = sorted(path.name for path in tmp_path.glob("A1-*.png"))
+    assert len(pages) == -(-len(phases) // 15)
+
+
+def test_names_become_files_that_any_system_takes(tmp_path: Path) -> None:
+    from ugat_marl.reporting.network_drawing import _file_name
+
+    taken = {"network"}
+    found = [_file_name(name, taken) for name in ("a/b", "A:B", "a b", "..", "network", "x" * 300)]
+    assert len({name.lower() for name in found}) == len(found)
+    assert all(name and len(name) < 100 and "/" not in name for name in found)
+    assert tmp_path.is_dir()
+
+
+def test_a_place_that_cannot_be_written(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenario", "draw", "single-v1", "--out", "/dev/null/x"]) == 2
+    assert "cannot be written" in capsys.readouterr().err

@@ -1,0 +1,131 @@
+"""Demand from counts and from origins and destinations, against hand counts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.__main__ import main
+from ugat_marl.errors import ScenarioError
+from ugat_marl.progress import Silent
+from ugat_marl.scenarios import read_scenario
+from ugat_marl.scenarios.importers.counted import read_rows
+
+
+def made(target: Path, *words: str | Path) -> int:
+    return main(["scenario", "new", str(target), "--grid", "1x2", *map(str, words)])
+
+
+def drives(target: Path) -> list[tuple[float, tuple[str, ...]]]:
+    root = read_scenario(target).routes[0].parse()
+    return [
+        (float(item.get("depart", "")), tuple(item[0].get("edges", "").split()))
+        for item in root.iter("vehicle")
+    ]
+
+
+def test_counts_on_roads_are_met(tmp_path: Path) -> None:
+    counts = {"west1_A1": 300, "A1_B1": 280, "B1_east1": 260}
+    text = "edge,count\n" + "".join(f"{edge},{count}\n" for edge, count in counts.items())
+    (tmp_path / "counts.csv").write_text(text)
+    assert made(tmp_path / "city", "--counts", tmp_path / "counts.csv") == 0
+    found = Counter(road for _, route in drives(tmp_path / "city") for road in route)
+    assert {edge: found[edge] for edge in counts} == pytest.approx(counts, rel=0.02)
+    assert "3 of 3 counts of counts.csv are met" in (tmp_path / "city" / "README.md").read_text()
+
+
+def test_counts_of_turns_in_parts_of_the_day(tmp_path: Path) -> None:
+    (tmp_path / "c ü.csv").write_text(
+        "from;to;count;begin_s;end_s\nwest1_A1;A1_B1;100;0;900\nwest1_A1;A1_northA;40;900;1800\n",
+        encoding="utf-8-sig",
+    )
+    words = ["--counts", tmp_path / "c ü.csv", "--duration-s", "1800"]
+    assert made(tmp_path / "city", *words) == 0
+    found = drives(tmp_path / "city")
+    early = [route[:2] for depart, route in found if depart < 900]
+    late = [route[:2] for depart, route in found if depart >= 900]
+    assert early.count(("west1_A1", "A1_B1")) == pytest.approx(100, abs=2)
+    assert late.count(("west1_A1", "A1_northA")) == pytest.approx(40, abs=2)
+    assert early.count(("west1_A1", "A1_northA")) == 0
+
+
+def test_origins_and_destinations(tmp_path: Path) -> None:
+    (tmp_path / "od.csv").write_text(
+        "from,to,count\nwest1_A1,B1_east1,50\nnorthA_A1,A1_southA,20\nnorthA_A1,A1_west1,0\n"
+    )
+    assert made(tmp_path / "city", "--od", tmp_path / "od.csv", "--duration-s", "600") == 0
+    found = drives(tmp_path / "city")
+    ways = Counter(route for _, route in found)
+    assert ways == {("west1_A1", "A1_B1", "B1_east1"): 50, ("northA_A1", "A1_southA"): 20}
+    assert all(0 <= depart < 600 for depart, _ in found)
+    departs = [depart for depart, _ in found]
+    assert departs == sorted(departs)
+    assert made(tmp_path / "again", "--od", tmp_path / "od.csv", "--duration-s", "600") == 0
+    assert read_scenario(tmp_path / "again").hash == read_scenario(tmp_path / "city").hash
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "says"),
+    [
+        ("--counts", "road,count\na,1\n", "t.csv, line 1: the columns count and edge, or"),
+        ("--counts", f"edge,count\n{'x' * 200_000},1\n", "line 2: not CSV (field larger than"),
+        ("--counts", "edge,count\nwest1_A1,6e6\n", "line 2: more than 5000000 vehicles; keep"),
+        ("--od", "from,to,count\nwest1_A1,B1_east1,1e18\n", "line 2: more than 5000000 veh"),
+        ("--od", "edge,count\na,1\n", "t.csv, line 1: the columns from, to and count are needed"),
+        ("--counts", "edge,count\nwest1_A1,many\n", "line 2: count = 'many' is not a number"),
+        ("--counts", "edge,count\nwest1_A1,-1\n", "line 2: count = '-1' is not a number of at"),
+        ("--counts", "edge,count\nwest1_A1\n", "line 2: count = None is not a number"),
+        ("--counts", "edge,count\nwest1_A1,5\nhere,5\n", "line 3: 'here' is not a road for cars"),
+        ("--counts", "edge,count\nwest1_A1,0\n", "no row counts a vehicle"),
+        ("--counts", "from,to,count\nwest1_A1,B1_east1,5\n", "no way through the network comes by"),
+        (
+            "--counts",
+            "edge,count,begin_s,end_s\nwest1_A1,5,9,9\n",
+            "end_s (9) is not after begin_s",
+        ),
+        ("--od", "from,to,count\nA1_west1,west1_A1,5\n", "line 2: there is no way from 'A1_west1'"),
+        ("--od", "from,to,count\nwest1_A1,up,5\n", "line 2: 'up' is not a road for cars"),
+    ],
+)
+def test_tables_that_are_wrong(
+    option: str, text: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    assert made(tmp_path / "city", option, tmp_path / "t.csv") == 2
+    assert says in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
+
+
+def test_a_table_that_is_no_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "t.csv").write_bytes(b"edge,count\n\xff\xfe,1\n")
+    assert made(tmp_path / "city", "--counts", tmp_path / "t.csv") == 2
+    assert "t.csv: is not UTF-8" in capsys.readouterr().err
+    assert made(tmp_path / "city", "--counts", tmp_path / "gone.csv") == 2
+    assert "gone.csv: no such file" in capsys.readouterr().err
+
+
+def test_long_tables_are_read_row_by_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ugat_marl.files._PIECE", 7)
+    text = "edge,count\r\n" + "".join(f'"ä {i}",{i}\r\n' for i in range(40)) + "\r\nz,1"
+    (tmp_path / "t.csv").write_bytes(text.encode())
+    rows = read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
+    assert [(row.roads, row.count) for row in rows[:-1]] == [((f"ä {i}",), i) for i in range(40)]
+    assert (rows[-1].roads, rows[-1].count, rows[-1].line) == (("z",), 1, 43)
+    monkeypatch.setattr("ugat_marl.scenarios.importers.counted._MOST_ROWS", 9)
+    with pytest.raises(ScenarioError, match=r"t\.csv, line 11: more than 9 rows"):
+        read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
+    monkeypatch.setattr("ugat_marl.scenarios.importers.reading._MOST", 100)
+    (tmp_path / "t.csv").write_bytes(b"edge,count\n" + b"x" * 200)
+    with pytest.raises(ScenarioError, match=r"t\.csv, line 2: is longer than a line of a table"):
+        read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
+
+
+def test_rows_are_for_the_episode_unless_they_say_more(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("edge,count,begin_s,end_s\na,1,,\nb,2,100,200\n")
+    rows = read_rows(tmp_path / "t.csv", 60, 660, Silent(), pairs=False)
+    assert [(r.roads, r.begin_s, r.end_s, r.line) for r in rows] == [
+        (("a",), 60, 660, 2),
+        (("b",), 100, 200, 3),
+    ]

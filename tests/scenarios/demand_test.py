@@ -1,0 +1,160 @@
+"""Demand: what departs in an episode is counted, and what cannot be driven is refused."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import libsumo
+import pytest
+
+from ugat_marl.effects import load_scenario
+from ugat_marl.errors import ScenarioError
+from ugat_marl.scenarios import Demand, Network, check_demand, explicit, shipped_scenarios, survey
+
+Crossing = Callable[..., Path]
+
+
+def check(directory: Path) -> Demand:
+    scenario = load_scenario(directory)
+    return check_demand(scenario, Network.read(scenario))
+
+
+def car(name: str, depart: object) -> str:
+    return f'<vehicle id="{name}" type="car" route="east" depart="{depart}"/>'
+
+
+def test_vehicles_trips_and_flows_are_counted(crossing: Crossing) -> None:
+    vehicles = (
+        car("a", 0)
+        + '<trip id="b" depart="10" from="W_C" to="C_E"/>'
+        + '<vehicle id="c" depart="0:00:20"><route edges="S_C C_N"/></vehicle>'
+        + '<flow id="d" begin="30" end="60" period="5" from="S_C" to="C_N" via="S_C C_N"/>'
+        + '<flow id="e" begin="1:00:00" end="2:00:00" period="5" route="east"/>'
+    )
+    assert check(crossing(vehicles=vehicles)) == Demand(vehicles=3, flows=1)
+
+
+def test_only_the_episode_counts(crossing: Crossing) -> None:
+    vehicles = "".join(car(f"v{depart}", depart) for depart in (99, 100, 299.9, 300, 5000))
+    vehicles = '<flow id="f" begin="0" end="99" period="9" route="east"/>' + vehicles
+    directory = crossing(
+        vehicles=vehicles, toml=lambda text: text.replace("duration_s", "begin_s = 100\nduration_s")
+    )
+    assert check(directory) == Demand(vehicles=2, flows=0)
+
+
+def test_triggered_departures_are_no_times(crossing: Crossing) -> None:
+    vehicles = car("a", 50) + car("b", "triggered") + car("c", 60)
+    assert check(crossing(vehicles=vehicles)) == Demand(vehicles=3, flows=0)
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "routed"),
+    [
+        ('<vehicle id="a" depart="0"><route edges="S_C C_N"/></vehicle>' * 2, True),
+        (car("a", 0), False),
+        ('<trip id="b" depart="10" from="W_C" to="C_E"/>', False),
+        ('<flow id="d" begin="30" end="60" period="5" from="S_C" to="C_N"/>', False),
+    ],
+)
+def test_what_needs_no_router_is_known(vehicles: str, routed: bool, crossing: Crossing) -> None:
+    directory = crossing(vehicles=vehicles)
+    assert check(directory).routed is routed
+    assert (explicit(load_scenario(directory)).routes[0].path is not None) is routed
+
+
+def test_an_episode_need_not_know_what_comes_long_after_it(crossing: Crossing) -> None:
+    """A mistake a day later: `scenario check` says so, an environment drives until then."""
+    late = '<vehicle id="late" depart="86400"><route edges="W_C C_X"/></vehicle>'
+    soon = car("a", 10) + car("b", 2000)
+    scenario = load_scenario(crossing(vehicles=soon + late))
+    network = Network.read(scenario)
+    assert check_demand(scenario, network, whole=False).vehicles == 1
+    with pytest.raises(ScenarioError, match="C_X"):
+        check_demand(scenario, network)
+    scenario = load_scenario(crossing(vehicles=car("a", 10) + late.replace("86400", "500")))
+    with pytest.raises(ScenarioError, match="C_X"):  # SUMO reads so far ahead
+        check_demand(scenario, network, whole=False)
+
+
+def test_a_long_file_is_never_in_memory(crossing: Crossing) -> None:
+    """20 MB of vehicles: counted, looked at and hashed in a few MB."""
+    line = '<vehicle id="v{0}" depart="{1:.3f}"><route edges="W_C C_E"/></vehicle>' + " " * 900
+    vehicles = "\n".join(line.format(i, i / 100) for i in range(20_000))
+    directory = crossing(vehicles=vehicles)
+    size = load_scenario(directory).routes[0].read()
+    assert len(size) > 19_000_000
+    del size
+    scenario = load_scenario(directory)
+    tracemalloc.start()
+    try:
+        survey(scenario)
+        assert scenario.hash
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 8_000_000
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "message"),
+    [
+        (
+            '<vehicle id="v" depart="0"><route edges="W_C C_X"/></vehicle>',
+            r"<route> uses the edge 'C_X', which .*network\.net\.xml does not have; were the rout",
+        ),
+        ('<trip id="v" depart="0" from="W_C" to="C_X"/>', "<trip id='v'> uses the edge 'C_X'"),
+        ('<trip id="v" depart="0" from="X" to="C_E"/>', "<trip id='v'> uses the edge 'X'"),
+        ('<route id="r" edges="W_C C_E X"/>', "<route id='r'> uses the edge 'X'"),
+        (
+            '<flow id="v" begin="0" end="9" number="2" from="W_C" to="C_E" via="X"/>',
+            "<flow id='v'> uses the edge 'X'",
+        ),
+        (car("v", "soon"), "depart='soon' of <vehicle id='v'> is not a time; give seconds or h:m"),
+        ('<vehicle id="v" route="east"/>', "depart='' of <vehicle id='v'> is not a time"),
+        ('<flow id="v" begin="x" route="east"/>', "begin='x' of <flow id='v'> is not a time"),
+        ("", r"no vehicle departs between 0 s and 200 s; check begin_s and duration_s"),
+        (car("v", 200), "no vehicle departs between 0 s and 200 s"),
+        (
+            car("a", 50) + car("b", 20),
+            "<vehicle id='b'> departs at 20 s but stands after one of 50 s, and SUMO would leave",
+        ),
+        (
+            car("a", 50) + '<flow id="b" begin="0" end="90" period="5" route="east"/>',
+            "<flow id='b'> departs at 0 s but stands after one of 50 s",
+        ),
+    ],
+)
+def test_what_cannot_be_driven_is_refused(vehicles: str, message: str, crossing: Crossing) -> None:
+    with pytest.raises(ScenarioError, match=rf"demand\.rou\.xml(, line \d+)?: {message}"):
+        check(crossing(vehicles=vehicles))
+
+
+def test_sumo_does_leave_out_what_is_not_sorted(crossing: Crossing) -> None:
+    """The reason for the rule: SUMO warns, and the suite runs it without warnings."""
+    directory = crossing(vehicles=car("a", 50) + car("b", 20) + car("c", 60))
+    files = ["-n", str(directory / "network.net.xml"), "-r", str(directory / "demand.rou.xml")]
+    libsumo.start(["sumo", *files, "--no-warnings", "--no-step-log"])
+    try:
+        libsumo.simulation.step(100)
+        assert set(libsumo.vehicle.getIDList()) == {"a", "c"}
+    finally:
+        libsumo.close()
+
+
+def test_additional_files_are_read_whole_and_need_no_order(crossing: Crossing) -> None:
+    directory = crossing(vehicles="", toml=lambda text: 'additional = ["more.add.xml"]\n' + text)
+    more = '<additional><route id="r" edges="W_C C_E"/>{}</additional>'
+    cars = (car("a", 50) + car("b", 20)).replace(' type="car"', "").replace("east", "r")
+    (directory / "more.add.xml").write_text(more.format(cars))
+    assert check(directory) == Demand(vehicles=2, flows=0)
+
+
+@pytest.mark.parametrize("name", [name for name, _ in shipped_scenarios()])
+def test_shipped_demand_can_be_driven(name: str) -> None:
+    scenario = load_scenario(name)
+    demand = check_demand(scenario, Network.read(scenario))
+    assert demand.flows == 0  # written out vehicle by vehicle
+    assert demand.vehicles > 1500

@@ -1,0 +1,183 @@
+"""Phases derived from networks with crossings, shared lanes and right turns on red."""
+
+from __future__ import annotations
+
+import subprocess
+from itertools import combinations, product
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.effects import load_scenario
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import parse_xml
+from ugat_marl.scenarios import Intersection, Link, Network, Scenario, sumo_program, turn_of
+from ugat_marl.scenarios.junctions import crossings_of, foes_of, has_bit, links_of, yields_of
+from ugat_marl.scenarios.phases import RightOfWay, are_foes, conflict_free_phases
+
+ARMS = {"N": (0, 200), "E": (200, 0), "S": (0, -200), "W": (-200, 0)}
+
+
+def junction(
+    folder: Path, *options: str, arms: str = "NESW", kind: str = "traffic_light", lanes: int = 1
+) -> Scenario:
+    """A light in the middle of straight roads, with the phases of its own programme."""
+    nodes = f'<node id="M" x="0" y="0" type="{kind}"/>' + "".join(
+        f'<node id="{a}" x="{ARMS[a][0]}" y="{ARMS[a][1]}"/>' for a in arms
+    )
+    edges = "".join(
+        f'<edge id="{x}{y}" from="{x}" to="{y}" numLanes="{lanes}" speed="13"/>'
+        for a in arms
+        for x, y in ((a, "M"), ("M", a))
+    )
+    (folder / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / "n.edg.xml").write_text(f"<edges>{edges}</edges>")
+    subprocess.run(
+        [str(sumo_program("netconvert")), "-n", "n.nod.xml", "-e", "n.edg.xml", "-o", "n.net.xml",
+         "--no-turnarounds", *options],
+        cwd=folder, check=True, capture_output=True,
+    )  # fmt: skip
+    (folder / "r.rou.xml").write_text("<routes/>")
+    (folder / "scenario.toml").write_text('network = "n.net.xml"\nroutes = ["r.rou.xml"]\n')
+    return load_scenario(folder)
+
+
+def derived(scenario: Scenario, phases: str) -> tuple[Intersection, RightOfWay]:
+    root = scenario.network.parse()
+    (item,) = Network.read(scenario.with_control(phases=phases)).intersections
+    return item, RightOfWay(foes_of(root), yields_of(root))
+
+
+def green(item: Intersection, state: str, letters: str = "Gg") -> list[Link]:
+    return [link for link in (*item.links, *item.crossings) if state[link.index] in letters]
+
+
+def check_rules(item: Intersection, rules: RightOfWay) -> None:
+    """Nobody has protected green in somebody's way; whoever has permitted green waits for one."""
+    for state in item.phases:
+        for a, b in combinations(green(item, state, "G"), 2):
+            assert a.from_edge == b.from_edge or not are_foes(a, b, rules.foes), (state, a, b)
+        for link in green(item, state, "g"):
+            assert any(has_bit(link, b, rules.yields) for b in green(item, state)), (state, link)
+    for link in (*item.links, *item.crossings):
+        assert any(state[link.index] in "Gg" for state in item.phases), f"{link} is never green"
+
+
+WALKS = ("--sidewalks.guess", "--crossings.guess")
+
+
+@pytest.mark.parametrize("phases", ["conflict-free", "permitted"])
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_people_cross_while_turning_traffic_waits(phases: str, lanes: int, tmp_path: Path) -> None:
+    item, rules = derived(junction(tmp_path, *WALKS, lanes=lanes), phases)
+    assert len(item.crossings) == 4
+    check_rules(item, rules)
+    for state in item.phases:
+        walks = [crossing for crossing in item.crossings if state[crossing.index] in "Gg"]
+        for crossing, link in product(walks, item.links):
+            if state[link.index] in "Gg" and are_foes(crossing, link, rules.foes):
+                assert turn_of(link) in "rl", "through traffic meets people on foot"
+                assert state[link.index] == "g"
+
+
+def test_crossings_are_found_where_the_matrix_has_them(tmp_path: Path) -> None:
+    """A crossing conflicts with every link that begins or ends at its arm, and with no other."""
+    scenario = junction(tmp_path, *WALKS)
+    root = scenario.network.parse()
+    foes = foes_of(root)
+    arms = {
+        f":M_c{n}": set((edge.get("crossingEdges") or "").split())
+        for n, edge in enumerate(e for e in root.iter("edge") if e.get("function") == "crossing")
+    }
+    assert len(arms) == 4
+    for crossing in crossings_of(root)["M"]:
+        edges = arms[crossing.to_lane.rsplit("_", 1)[0]]
+        for link in links_of(root)["M"]:
+            touches = link.from_edge in edges or link.to_edge in edges
+            assert are_foes(crossing, link, foes) == touches, (crossing, link)
+
+
+def test_a_light_for_a_crossing_alone_is_an_agent_only_if_its_phases_are_listed(
+    tmp_path: Path,
+) -> None:
+    nodes = '<node id="M" x="0" y="0" type="traffic_light"/><node id="E" x="200" y="0"/>'
+    (tmp_path / "n.nod.xml").write_text(f'<nodes>{nodes}<node id="W" x="-200" y="0"/></nodes>')
+    edges = "".join(f'<edge id="{n}" from="{n[0]}" to="{n[1]}"/>' for n in ("WM", "MW", "ME", "EM"))
+    (tmp_path / "n.edg.xml").write_text(f"<edges>{edges}</edges>")
+    (tmp_path / "n.con.xml").write_text(
+        '<connections><crossing node="M" edges="WM MW"/></connections>'
+    )
+    subprocess.run(
+        [str(sumo_program("netconvert")), "-n", "n.nod.xml", "-e", "n.edg.xml", "-x", "n.con.xml",
+         "-o", "n.net.xml", "--no-turnarounds", "--sidewalks.guess"],
+        cwd=tmp_path, check=True, capture_output=True,
+    )  # fmt: skip
+    (tmp_path / "r.rou.xml").write_text("<routes/>")
+    (tmp_path / "scenario.toml").write_text('network = "n.net.xml"\nroutes = ["r.rou.xml"]\n')
+    with pytest.raises(ScenarioError, match="fewer than two green phases"):
+        derived(load_scenario(tmp_path), "conflict-free")
+    with (tmp_path / "scenario.toml").open("a") as file:
+        file.write('[intersections.M]\nphases = ["GGr", "rrG"]\n')
+    item, rules = derived(load_scenario(tmp_path), "conflict-free")
+    assert len(item.crossings) == 1
+    assert item.phases == ("GGr", "rrG")
+    check_rules(item, rules)
+
+
+def test_permitted_left_turns_wait_for_the_traffic_opposite(tmp_path: Path) -> None:
+    """On four arms with one lane each, two phases serve all, and nobody blocks a lane."""
+    item, rules = derived(junction(tmp_path), "permitted")
+    check_rules(item, rules)
+    assert len(item.phases) == 2
+    for state in item.phases:
+        shown = green(item, state)
+        assert sorted(map(turn_of, shown)) == ["l", "l", "r", "r", "s", "s"]
+        assert {turn_of(link) for link in shown if state[link.index] == "g"} == {"l"}
+    protected, _ = derived(junction(tmp_path), "conflict-free")
+    assert all("g" not in state for state in protected.phases)
+    assert len(protected.phases) > 2
+
+
+def test_at_a_t_junction_only_the_main_road_has_traffic_opposite(tmp_path: Path) -> None:
+    item, rules = derived(junction(tmp_path, arms="ESW"), "permitted")
+    check_rules(item, rules)
+    (main, stem) = sorted(item.phases, key=lambda state: -state.count("G") - state.count("g"))
+    assert {link.from_edge for link in green(item, main)} >= {"EM", "WM"}
+    assert {link.from_edge for link in green(item, stem)} >= {"SM"}
+    assert [turn_of(link) for link in green(item, main, "g")] == ["l"]
+
+
+def test_right_turns_on_red_are_kept(tmp_path: Path) -> None:
+    scenario = junction(tmp_path, kind="traffic_light_right_on_red", lanes=2)
+    item, _ = derived(scenario, "conflict-free")
+    rights = {link.index for link in item.links if turn_of(link) == "r"}
+    for state in item.phases:
+        assert all(state[index] in "Ggs" for index in rights)
+        assert all(letter != "s" for i, letter in enumerate(state) if i not in rights)
+
+
+def test_unserved_movements_of_a_hand_made_matrix() -> None:
+    """Two crossings and a left turn that crosses both, straight on that crosses one."""
+    left, ahead = (Link(i, f"a{i}_0", f"b{i}_0", d, "J", i) for i, d in enumerate("ls"))
+    walks = [Link(2 + i, f":J_w{i}_0", f":J_c{i}_0", "c", "J", 2 + i) for i in range(2)]
+    foes = {"J": [0b1110, 0b0101, 0b0011, 0b0001]}
+    yields = {"J": [0b1110, 0, 0b0010, 0]}
+    rules = RightOfWay(foes, yields)
+    states = conflict_free_phases([left, ahead], rules, 4, "here", crossings=walks)
+    # Crossing 3 goes with straight on; crossing 2 only with the left turn, which waits for it.
+    assert states == ("rGrG", "grGr")
+
+
+def test_crossings_of_a_network_without_any() -> None:
+    root = parse_xml(b"<net><edge id='a'/><junction id='J'/></net>", "net")
+    assert crossings_of(root) == {}
+
+
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_permitted_phases_are_those_netconvert_draws_up(lanes: int, tmp_path: Path) -> None:
+    """Letter by letter: who is protected, who waits, and which crossings go along."""
+    scenario = junction(tmp_path, *WALKS, lanes=lanes)
+    own = {state for _, state in Network.read(scenario).intersections[0].programme}
+    item, _ = derived(scenario, "permitted")
+    assert len(item.phases) == 2
+    assert set(item.phases) <= own

@@ -1,0 +1,25 @@
+"""Processes that end with whoever started them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+START = "from ugat_marl.simulation.lifeline import end_with_input; end_with_input(); "
+
+
+def started(program: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-c", START + program]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def test_a_process_whose_work_is_done_ends_in_order_though_its_input_is_open() -> None:
+    process = started("import time; time.sleep(0.2)")
+    assert process.stderr is not None
+    assert (process.wait(60), process.stderr.read()) == (0, b"")
+
+
+def test_a_process_ends_with_its_input() -> None:
+    process = started("import time; time.sleep(600)")
+    process.communicate(timeout=60)
+    assert process.returncode == 1

@@ -1,0 +1,388 @@
+"""Blind cases: sealed, drawn by the seed alone, and gone on with where they were left."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from studies.blind.busy import Busy, busy_places, telling
+from studies.blind.cases import Case, read_label, read_plan
+from studies.blind.consequence import Consequences, differing
+from studies.blind.drawing import OUTSIDE, Drawn, Task, deck, draw_hidden, hidden_effect
+from studies.blind.generate import Blueprint, generate
+from studies.blind.outside import BusStops, Driveway
+from studies.blind.run import run_cases
+from studies.blind.strengths import KINDS
+from ugat_marl.__main__ import main
+from ugat_marl.data import read_measured
+from ugat_marl.diagnosis import IN_THE_LOG, Routes
+from ugat_marl.diagnosis.hypotheses import library
+from ugat_marl.effects import effect_from, known_effects, load_scenario
+from ugat_marl.errors import BlindTestError, OptionError, UnknownNameError
+from ugat_marl.experiments import policy_factory, record
+from ugat_marl.scenarios import Network, Passages, Period, Scenario
+
+
+@pytest.fixture(scope="module")
+def test_folder(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Blueprint]:
+    directory = tmp_path_factory.mktemp("blind") / "test"
+    blueprint = Blueprint(
+        (str(data / "crossing"),), ("none", "headway", "undercount"), cases=4, periods=2, seed=3
+    )
+    assert generate(directory, blueprint) == 4
+    return directory, blueprint
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(directory)): path.read_bytes()
+        for path in sorted(directory.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_cases_are_sealed(test_folder: tuple[Path, Blueprint]) -> None:
+    directory, _ = test_folder
+    cases = read_plan(directory)
+    assert [case.case for case in cases] == ["case001", "case002", "case003", "case004"]
+    labels = [read_label(directory, case.case) for case in cases]
+    assert Counter(item.group for item in labels)["none"] >= 1
+    for item in labels:
+        folder = directory / item.case
+        names = {path.name for path in folder.rglob("*")}
+        assert names == {
+            "measured", "periods.csv", "detectors.csv", "signals.parquet", "detections.parquet",
+        }  # fmt: skip
+    plan = (directory / "plan.json").read_text()
+    given = json.loads(plan)["cases"][0]
+    assert set(given) == {"case", "scenario", "leave_out"}
+    assert "seed" not in plan
+    assert "policy" not in plan
+
+
+def test_the_data_hold_what_the_label_says(test_folder: tuple[Path, Blueprint]) -> None:
+    directory, blueprint = test_folder
+    scenario = load_scenario(blueprint.scenarios[0])
+    for case in read_plan(directory):
+        label = read_label(directory, case.case)
+        found = read_measured(directory / case.case / "measured", scenario, Network.read(scenario))
+        assert len(found.periods) == 2
+        effects = tuple(f"{x.name}={','.join(_values(x))}" for x in label.effects)
+        again = record(
+            scenario, "+".join(effects) or "sim", policy_factory(label.policy), periods=2,
+            seed=label.seed,
+        )  # fmt: skip
+        assert again.hash == label.measured
+
+
+def _values(item: object) -> list[str]:
+    place, parameters = getattr(item, "place", None), getattr(item, "parameters", {})
+    return [x for x in (place,) if x] + [f"{value:.12g}" for value in parameters.values()]
+
+
+def test_the_same_seed_draws_the_same_test(
+    test_folder: tuple[Path, Blueprint], tmp_path: Path
+) -> None:
+    directory, blueprint = test_folder
+    generate(tmp_path / "again", blueprint)
+    first, second = contents(directory), contents(tmp_path / "again")
+    assert first == second
+    generate(tmp_path / "other", replace(blueprint, seed=4))
+    assert contents(tmp_path / "other") != first
+
+
+def test_a_test_is_gone_on_with_and_no_other_is_mixed_in(
+    test_folder: tuple[Path, Blueprint], tmp_path: Path
+) -> None:
+    directory, blueprint = test_folder
+    assert generate(directory, blueprint) == 0
+    with pytest.raises(BlindTestError, match="another blind test"):
+        generate(directory, replace(blueprint, seed=4))
+    (tmp_path / "mine.txt").write_text("something else")
+    with pytest.raises(BlindTestError, match="not empty"):
+        generate(tmp_path, blueprint)
+
+
+def test_shares_are_kept_and_nothing_hidden_is_rounded_up() -> None:
+    tasks = deck(("none", "single", "pair", "setting", "outside"), ("medium",), 50, rng())
+    counts = Counter(task.group for task in tasks)
+    assert counts["none"] >= 0.25 * 50
+    assert counts.total() == 50
+    names = Counter(task.member for task in tasks if task.group == "single")
+    assert max(names.values()) <= min(names.values()) + 1
+    tasks = deck(("headway", "none"), ("small", "large"), 7, rng())
+    assert {task.strength for task in tasks if task.member == "headway"} <= {"small", "large"}
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def single() -> tuple[Scenario, Busy]:
+    scenario = load_scenario("single-v1").with_duration(900)
+    return scenario, busy_places(scenario, 0)
+
+
+def test_places_are_busy(single: tuple[Scenario, Busy]) -> None:
+    _, busy = single
+    assert busy.lights == ("A1",)
+    assert set(busy.origins) == {"east1_A1", "northA_A1", "southA_A1", "west1_A1"}
+    assert ("northA_A1", "A1_west1") in busy.turns
+    assert set(busy.closable) <= set(busy.lanes)
+    assert busy.several_lanes
+
+
+@pytest.mark.parametrize("member", OUTSIDE)
+def test_what_is_outside_the_library_stays_outside(
+    member: str, single: tuple[Scenario, Busy]
+) -> None:
+    drawn = draw_hidden(Task("outside", member), *single, rng())
+    if member == "without gap_acceptance":  # nobody yields on this network's greens
+        assert drawn is None
+        return
+    assert isinstance(drawn, Drawn)
+    unknown = {effect.name for effect in drawn.effects} & {"bus_stops", "driveway"}
+    assert unknown or {effect.name for effect in drawn.effects} & set(drawn.leave_out)
+
+
+def test_pairs_are_of_two_families_and_leaving_out_says_nothing(
+    single: tuple[Scenario, Busy],
+) -> None:
+    left_out = 0
+    for number in range(30):
+        generator = np.random.default_rng(number)
+        drawn = draw_hidden(Task("pair"), *single, generator)
+        assert isinstance(drawn, Drawn)
+        names = {effect.name for effect in drawn.effects}
+        assert len(names) == 2
+        assert not names & set(drawn.leave_out)
+        left_out += bool(drawn.leave_out)
+    assert 0 < left_out < 30
+
+
+def test_buses_stop_and_cars_turn_off(single: tuple[Scenario, Busy]) -> None:
+    scenario, _ = single
+    policy = policy_factory("fixed-time:30")
+    plain, buses, cut = (
+        record(scenario, effects, policy, periods=1, seed=1).periods[0]
+        for effects in ((), (BusStops("northA_A1", 20.0, 25.0),), (Driveway("northA_A1", 0.5),))
+    )
+
+    def length(period: object) -> float:
+        passages = getattr(period, "passages", {})
+        return max(float(np.nanmax(item.length_m)) for item in passages.values())
+
+    assert length(plain) == 5.0
+    assert length(buses) == 12.0
+    lanes = [f"northA_A1_{lane}" for lane in range(3)]
+    before, after = (
+        [sum(len(x.passages.get(f"{kind}:{lane}", ())) for lane in lanes) for x in (plain, cut)]
+        for kind in ("advance", "stop")
+    )
+    assert before[1] >= 0.9 * before[0]
+    assert after[1] <= 0.7 * after[0]
+
+
+def test_buses_go_where_demand_is_written_as_flows(data: Path) -> None:
+    scenario = load_scenario(data / "crossing")
+    buses = (BusStops("S_C", 60.0, 10.0),)
+    found = record(scenario, buses, policy_factory("fixed-time:20"), periods=1)
+    lengths = found.periods[0].passages["exit:C_N_0"].length_m
+    assert 12.0 in lengths
+
+
+@pytest.mark.usefixtures("python")
+def test_cases_are_diagnosed_once_and_a_failure_is_noted(
+    test_folder: tuple[Path, Blueprint],
+) -> None:
+    directory, _ = test_folder
+    seen: list[str] = []
+
+    def diagnose(case: Case, measured: Path, folder: Path) -> None:
+        assert (measured / "periods.csv").is_file()
+        seen.append(case.case)
+        if case.case == "case002":
+            raise ZeroDivisionError("a bug")
+        (folder / "diagnosis.json").write_text('{"verdict": "no_discrepancy"}')
+
+    assert run_cases(directory, diagnose, only=("case001", "case002")) == (1, 1)
+    assert run_cases(directory, diagnose) == (2, 1)
+    assert seen == ["case001", "case002", "case002", "case003", "case004"]
+    note = json.loads((directory / "case002" / "run.json").read_text())
+    assert note["error"] == "ZeroDivisionError: a bug"
+    assert main(["blind", "grade", str(directory)]) == 0
+    assert main(["blind", "table", str(directory), "--out", str(directory / "table.md")]) == 0
+    assert "| failed | 4 | 1 of 4" in (directory / "table.md").read_text()
+    # In processes of their own; one that does not even start is a failure with a reason.
+    (directory / "case004" / "diagnosis.json").unlink()
+    command = ("blind", "run", str(directory), "--no-such-option")
+    assert run_cases(directory, diagnose, jobs=2, command=command) == (0, 2)
+    note = json.loads((directory / "case004" / "run.json").read_text())
+    assert "no-such-option" in note["error"]
+    with pytest.raises(UnknownNameError, match="case009"):
+        run_cases(directory, diagnose, only=("case009",))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"cases": 0}, "at least 1"),
+        ({"scenarios": ()}, "at least one"),
+        ({"classes": ("none", "none")}, "twice"),
+        ({"pressure_share": 2.0}, "from 0 to 1"),
+    ],
+)
+def test_impossible_blueprints_are_refused(change: dict[str, object], says: str) -> None:
+    base = Blueprint(("single-v1",))
+    with pytest.raises(OptionError, match=says):
+        replace(base, **change)  # pyright: ignore[reportArgumentType]
+
+
+def test_unknown_classes_and_hopeless_places_are_named(
+    crossing: Callable[..., Path], tmp_path: Path
+) -> None:
+    with pytest.raises(UnknownNameError, match="headway"):
+        deck(("hedway",), ("medium",), 2, rng())
+    with pytest.raises(UnknownNameError, match="medium"):
+        deck(("headway",), ("medum",), 2, rng())
+    blueprint = Blueprint((str(crossing()),), ("turning",), cases=1)
+    with pytest.raises(BlindTestError, match="'turning'"):
+        generate(tmp_path / "none", blueprint)
+
+
+# --- how strong, and where -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("per_hour", "factor"),
+    [(120.0, 1 + 6 / math.sqrt(3 * 120)), (400.0, 1 + 6 / math.sqrt(3 * 400)), (1600.0, 1.15)],
+)
+def test_demand_differs_by_what_can_be_counted(per_hour: float, factor: float) -> None:
+    # Six standard errors of three hours of vehicles that come by chance, or 15 % if that is more.
+    kind = KINDS["demand_level"]
+    assert kind.value("medium", per_hour=per_hour) == pytest.approx(factor, abs=1e-4)
+    assert kind.value("medium", True, per_hour) == pytest.approx(2 - factor, abs=1e-4)
+    assert kind.value("small", per_hour=per_hour) - 1 == pytest.approx((factor - 1) / 2, abs=1e-4)
+    assert kind.value("medium") == 1.15
+
+
+def test_the_demand_that_is_hidden_is_what_can_be_counted(single: tuple[Scenario, Busy]) -> None:
+    scenario, busy = single
+    quiet = replace(busy, origins={"east1_A1": 120.0})
+    found = set[float]()
+    for number in range(10):
+        generator = np.random.default_rng(number)
+        effect = hidden_effect("demand_level", "medium", scenario, quiet, generator)
+        assert effect is not None
+        found.add(effect.record()["factor"])
+    assert found == {1.3162, 0.6838}
+
+
+def test_vehicles_among_others_tell_less_than_alone() -> None:
+    # 120 of the 480 an hour on "shared" come from A: their change is as hard to see as one of
+    # 120**2 / 480 = 30 alone. On "own", where no detector is, they would be 120.
+    routes = Routes(
+        origins={"A": 120.0, "B": 360.0},
+        passing={"A": {"own": 120.0, "shared": 120.0}, "B": {"shared": 360.0}},
+        turns={},
+        joint={"own": {"own": 120.0}, "shared": {"shared": 480.0}},
+    )
+    assert telling(routes, "A", ["shared"]) == pytest.approx(30.0)
+    assert telling(routes, "A", ["shared", "own"]) == pytest.approx(120.0)
+    assert telling(routes, "B", ["shared"]) == pytest.approx(270.0)
+    assert telling(routes, "B", ["own"]) == 0.0
+
+
+@pytest.mark.parametrize(("gap_s", "shown"), [(20.0, False), (15.0, True)])
+def test_how_drivers_yield_is_hidden_where_enough_of_them_do(
+    crossing: Callable[..., Path], gap_s: float, shown: bool
+) -> None:
+    # A vehicle every 20 s is 180 an hour, one every 15 s more than 200; both times with a green
+    # on which they yield.
+    count = math.ceil(200 / gap_s)
+    vehicles = "".join(
+        f'<vehicle id="{road}{i}" type="car" route="{road}" depart="{gap_s * i:g}"/>'
+        for i in range(count)
+        for road in ("north", "east")
+    )
+    yields = lambda text: text.replace('state="Gr"', 'state="gr"')  # noqa: E731
+    scenario = load_scenario(crossing(vehicles=vehicles, edit=yields))
+    busy = busy_places(scenario, 0)
+    assert busy.permitted == shown
+    drawn = draw_hidden(Task("single", "gap_acceptance", "medium"), scenario, busy, rng())
+    assert (drawn is not None) == shown
+    priority = load_scenario(crossing(vehicles=vehicles))
+    assert not busy_places(priority, 0).permitted, "nobody yields there"
+
+
+def test_every_effect_that_is_left_out_for_show_can_be_left_out(
+    single: tuple[Scenario, Busy],
+) -> None:
+    shown = set[str]()
+    for number in range(300):
+        generator = np.random.default_rng(number)
+        drawn = draw_hidden(Task("none"), *single, generator)
+        assert isinstance(drawn, Drawn)
+        assert not library(drawn.leave_out) & set(drawn.leave_out)
+        shown |= set(drawn.leave_out)
+    assert set(IN_THE_LOG) <= shown, "the log's effects are among them"
+    for name in known_effects():
+        assert name not in library((name,))
+
+
+@pytest.mark.parametrize("last_s", [200.0, 800.0])
+def test_only_vehicles_of_the_day_make_an_origin_busy(
+    crossing: Callable[..., Path], last_s: float
+) -> None:
+    # Ten in 200 s are 180 an hour, whatever comes afterwards.
+    vehicles = "".join(
+        f'<vehicle id="v{i}" type="car" depart="{20 * i}"><route edges="S_C C_N"/></vehicle>'
+        for i in range(int(last_s / 20))
+    )
+    directory = crossing(vehicles=vehicles)
+    demand = directory / "demand.rou.xml"
+    lines = demand.read_text().splitlines()
+    demand.write_text("\n".join(line for line in lines if "<route id=" not in line))
+    assert busy_places(load_scenario(directory), 0).origins == pytest.approx({"S_C": 180.0})
+
+
+def test_what_changes_no_detection_is_not_hidden(crossing: Callable[..., Path]) -> None:
+    scenario = load_scenario(crossing()).with_duration(300)
+    consequences = Consequences(3)
+
+    def has(*records: dict[str, str | float], group: str = "pair") -> bool:
+        effects = tuple(effect_from(item) for item in records)
+        return consequences.has(scenario, Drawn(group, "", "", effects), "fixed-time:20")
+
+    nobody_weaves = {"name": "lane_discipline", "strategic": 0.0}  # every approach has one lane
+    headway = {"name": "headway", "seconds": 1.6}
+    assert not has(nobody_weaves)
+    assert has(headway)
+    assert not has(headway, nobody_weaves)
+    assert has(headway, nobody_weaves, group="setting")  # all of it together
+    assert not has(nobody_weaves, group="setting")
+    assert has({"name": "undercount", "place": "*", "share": 0.1})
+
+
+def test_detections_that_differ_are_counted_both_ways() -> None:
+    def period(**times: list[float]) -> Period:
+        seen = {
+            name: Passages(np.array(off) - 0.5, np.array(off), np.full(len(off), np.nan),
+                           np.full(len(off), np.nan))
+            for name, off in times.items()
+        }  # fmt: skip
+        return Period("day1", 0.0, 60.0, "fit", {}, seen)
+
+    one = period(a=[1.0, 2.0, 3.0], b=[5.0])
+    assert differing(one, one) == 0
+    assert differing(one, period(a=[1.0, 2.02, 3.0], b=[5.0])) == 0
+    assert differing(one, period(a=[1.0, 2.5, 3.0], b=[5.0])) == 2
+    assert differing(one, period(a=[1.0, 3.0])) == 2

@@ -1,0 +1,3 @@
+from .arguments import LengthS as LengthS
+from .frame import CommandLine as CommandLine
+from .frame import run as run

@@ -1,0 +1,168 @@
+"""``ugat-marl diagnose``: where simulation and measurement disagree, and what is missing."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.cli.arguments import Ray, Workers, workers_of
+from ugat_marl.data import Measured, read_measured
+from ugat_marl.diagnosis import CORRECTED, FILE, DiagnosisConfig, default_cache, diagnose
+from ugat_marl.effects import DetectorEffect, known_effects, load_scenario
+from ugat_marl.errors import OptionError, OutputError
+from ugat_marl.files import require_writable
+from ugat_marl.progress import Bars
+from ugat_marl.reporting import diagnosis_summary, write_diagnosis_page
+from ugat_marl.scenarios import Network
+
+REPORT = "report.html"
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """Compares measured data with a scenario, names what is missing, and adds it.
+
+    Examples:
+        ugat-marl diagnose single-v1 measured --out found
+        ugat-marl diagnose my.sumocfg street --out found --leave-out parking
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        measured: Directory of measured data, as record or import-atspm writes it
+            (docs/measured-data.md); it is never written to.
+        out: Directory for diagnosis.json, report.html and the corrected scenario; an earlier
+            diagnosis in it is replaced.
+        budget_s: Time in s after which no further simulation is begun. The result is marked as
+            partial then; the same command goes on from there.
+        alpha: Chance of naming an effect where there is none.
+        seed: Root of the simulated days; the same data and seed give the same diagnosis.
+        leave_out: Names of effects (docs/effects.md) that are not examined.
+        cache: Folder of remembered simulations.
+        workers: Simulations at a time.
+        ray: Simulate on Ray instead.
+        report: Write the page report.html.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    measured: Annotated[Positional[Path], arg(metavar="MEASURED")]
+    out: Path
+    budget_s: float = 600.0
+    alpha: float = 0.05
+    seed: int = 0
+    leave_out: Annotated[
+        tuple[str, ...], arg(metavar="EFFECT ...", help_behavior_hint="(default: none)")
+    ] = ()
+    cache: Annotated[
+        Path | None, arg(metavar="PATH", help_behavior_hint="(default: the user's cache folder)")
+    ] = None
+    workers: Workers = None
+    ray: Ray = None
+    report: bool = True
+
+    def run(self, console: Console) -> int:
+        """Diagnoses; the exit code is 0 whatever is found."""
+        config = self._config()
+        self._check_out()
+        scenario = load_scenario(self.scenario)
+        network = Network.read(scenario)
+        measured = read_measured(self.measured, scenario, network)
+        require_writable(self.out / FILE)
+        self._check_cache()
+        _say_what_cannot_be_seen(measured, console)
+        try:
+            with workers_of(self.workers, self.ray) as workers:
+                config = replace(config, workers=workers)
+                record = diagnose(scenario, measured, self.out, config, Bars(console))
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("the same command goes on where it stopped") from None
+        console.print(diagnosis_summary(record))
+        if self.report:
+            write_diagnosis_page(record, network, self.out / REPORT, self._commands(record))
+        self._say_where(record, console)
+        return 0
+
+    def _config(self) -> DiagnosisConfig:
+        if self.workers is not None and self.workers < 1:
+            raise OptionError(f"workers = {self.workers} must be at least 1")
+        return DiagnosisConfig(
+            budget_s=self.budget_s,
+            alpha=self.alpha,
+            seed=self.seed,
+            leave_out=self.leave_out,
+            cache=self.cache,
+        )
+
+    def _check_out(self) -> None:
+        """Measured data stay as they are, so nothing is written among them."""
+        out, measured = self.out.resolve(), self.measured.resolve()
+        if out == measured or measured in out.parents:
+            raise OptionError(
+                f"--out {str(self.out)!r} lies in the measured data, which are never written to; "
+                "give another directory"
+            )
+
+    def _check_cache(self) -> None:
+        """Better now than after the first simulated day."""
+        place = self.cache or default_cache()
+        try:
+            require_writable(place / "writable")
+        except OutputError:
+            raise OutputError(
+                f"{place}: simulated days cannot be remembered there; give another folder by "
+                "--cache"
+            ) from None
+
+    def _commands(self, record: Mapping[str, Any]) -> list[str]:
+        """The command itself, and what comes next."""
+        given = ["ugat-marl", "diagnose", self.scenario, str(self.measured), "--out", str(self.out)]
+        given += ["--budget-s", f"{self.budget_s:g}", "--alpha", f"{self.alpha:g}"]
+        given += ["--seed", str(self.seed)]
+        if self.leave_out:
+            given += ["--leave-out", *self.leave_out]
+        return [shlex.join(given), *self._next(record)]
+
+    def _next(self, record: Mapping[str, Any]) -> list[str]:
+        """The command that uses the corrected scenario, if anything in it is corrected."""
+        if record["corrected"] is None or not any(map(_in_the_model, record["effects"])):
+            return []
+        corrected = str(self.out / CORRECTED)
+        return [
+            shlex.join(["ugat-marl", "train", self.scenario, "--sim", corrected]) + " --real REAL"
+        ]
+
+    def _say_where(self, record: Mapping[str, Any], console: Console) -> None:
+        lines = [f"diagnosis: {self.out / FILE}"]
+        if self.report:
+            lines.append(f"page:      {self.out / REPORT}")
+        if record["corrected"] is not None:
+            lines.append(f"corrected: {self.out / CORRECTED}")
+        if following := self._next(record):
+            lines.append(f"use it:    {following[0]}")
+        elif record["effects"]:
+            lines.append("The effects are faults of detectors; the simulation stays as it is.")
+        console.print("\n" + "\n".join(lines), soft_wrap=True, markup=False)
+
+
+def _say_what_cannot_be_seen(measured: Measured, console: Console) -> None:
+    """Which effects are ruled out before anything runs; what was found in the files follows."""
+    ruled_out = {name for finding in measured.findings for name in finding.rules_out}
+    if not ruled_out:
+        return
+    listed = ", ".join(sorted(ruled_out))
+    if not measured.has_events:
+        rest = ", ".join(sorted(set(known_effects()) - ruled_out))
+        text = f"Counts only: no more than {rest} can be examined. Ruled out: {listed}."
+    else:
+        text = f"Ruled out by what the data lack: {listed}."
+    console.print(text, markup=False)
+
+
+def _in_the_model(effect: Mapping[str, Any]) -> bool:
+    """Whether an effect changes the simulation, and not only what detectors see."""
+    return not issubclass(known_effects()[effect["name"]], DetectorEffect)

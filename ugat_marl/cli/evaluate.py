@@ -1,0 +1,129 @@
+"""``ugat-marl evaluate``: any policies and rules in any domains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.cli.arguments import Ray, workers_of
+from ugat_marl.effects import NAMED, load_scenario, spelled_out
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.experiments import evaluate, gaps_of, policy_factory
+from ugat_marl.files import require_writable
+from ugat_marl.progress import Bars
+from ugat_marl.reporting import hidden_tables, matrix_table, measures_table
+from ugat_marl.scenarios import Scenario
+
+MOST_IN_DETAIL = 8
+"""More domains than these, named ones among them, are shown as a matrix of controllers and gaps."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Plays policies in domains with several seeds; prints measures, gaps and regret.
+
+    Examples:
+        ugat-marl evaluate single-v1 --policies largest-queue:20 max-pressure programme
+        ugat-marl evaluate grid2x2-v1 --policies runs/demo/policies/ugat.pt --domains sim V4
+        ugat-marl evaluate single-v1 --domains all --seeds 1 --duration-s 900
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        policies: Rules (such as fixed-time:30, actuated:40, largest-queue:20, max-pressure:10,
+            programme; docs/controllers.md has them all) and files of trained policies.
+        domains: Domains; gaps are taken against the first. "all" is sim and every named domain,
+            observation, action, transition or reward all of that gap: see ugat-marl domains.
+        seeds: Number of episodes of each policy in each domain.
+        first_seed: Seed of the first of them.
+        duration_s: Length of an episode in s; default: the scenario's own.
+        workers: Simulations at a time; default: one per core.
+        ray: Play on Ray instead.
+        out: JSON file for the table and every episode.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    policies: tuple[str, ...] = ("programme", "largest-queue:20", "max-pressure:10", "random")
+    domains: tuple[str, ...] = ("sim", "V1", "V2", "V3", "V4")
+    seeds: int = 5
+    first_seed: int = 1000
+    duration_s: float | None = None
+    workers: int | None = None
+    ray: Ray = None
+    out: Path | None = None
+
+    def run(self, console: Console) -> int:
+        """Evaluates and prints."""
+        for name in ("policies", "domains"):
+            if not getattr(self, name):
+                raise OptionError(f"--{name} needs at least one value")
+        if len(set(self.policies)) < len(self.policies):
+            raise OptionError(f"--policies holds one twice: {' '.join(self.policies)}")
+        if self.out is not None:
+            require_writable(self.out)
+        if self.first_seed < 0:
+            raise OptionError("--first-seed must not be negative")
+        if self.seeds < 1 or (self.workers is not None and self.workers < 1):
+            raise OptionError("--seeds and --workers must be at least 1")
+        scenario = load_scenario(self.scenario)
+        domains = self._domains(scenario, console)
+        with workers_of(self.workers, self.ray) as workers:
+            found = evaluate(
+                scenario,
+                dict(zip(names_of(self.policies), map(policy_factory, self.policies), strict=True)),
+                domains,
+                range(self.first_seed, self.first_seed + self.seeds),
+                duration_s=self.duration_s,
+                workers=workers,
+                reporter=Bars(console),
+            )
+        if len(domains) > MOST_IN_DETAIL and gaps_of(found):
+            console.print(matrix_table(found))
+        else:
+            console.print(measures_table(found))
+        for table in hidden_tables(found):
+            console.print(table)
+        if self.out is not None:
+            found.write(self.out)
+            console.print(f"table: {self.out}", soft_wrap=True)
+        return 0
+
+    def _domains(self, scenario: Scenario, console: Console) -> list[str]:
+        """The domains spelled out, without those of a list that the network does not allow."""
+        found: list[str] = []
+        for name in spelled_out(self.domains):
+            if name in NAMED and name not in self.domains and _may_not_fit(name):
+                try:
+                    parallel_env(scenario, name, duration_s=self.duration_s)
+                except ScenarioError as error:
+                    console.print(f"{name} is left out: {error}", style="dim", markup=False)
+                    continue
+            found.append(name)
+        return found
+
+
+def _may_not_fit(name: str) -> bool:
+    """Whether a named domain asks for something not every network has: a barrier, a long lane.
+
+    Or not every episode: vehicles that come later may all come too late for a short one.
+    """
+    words = ("phase_order=barrier", "incident=", "demand_timing=")
+    return any(word in NAMED[name].effects for word in words)
+
+
+def names_of(policies: Sequence[str]) -> list[str]:
+    """What to call policies in the table: files by the shortest path endings that differ."""
+    paths = [Path(spec.removesuffix(".pt")).parts for spec in policies]
+    for length in range(1, max(map(len, paths)) + 1):
+        names = ["/".join(parts[-length:]) for parts in paths]
+        if len(set(names)) == len(names):
+            break
+    else:
+        names = list(policies)
+    files = [Path(spec).suffix == ".pt" for spec in policies]
+    return [name if file else spec for name, file, spec in zip(names, files, policies, strict=True)]

@@ -1,0 +1,43 @@
+"""``ugat-marl export``: a trained policy as a file that runs without the suite."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import parallel_env
+from ugat_marl.policies import DQNPolicy, export_policy
+
+
+@dataclass(frozen=True)
+class Export:
+    """Writes a trained policy as TorchScript, ONNX or plain matrices; docs/export.md reads them.
+
+    Examples:
+        ugat-marl export runs/demo/policies/ugat.pt --out ugat.onnx --scenario grid2x2-v1
+        ugat-marl export runs/demo/policies/ugat.pt --out ugat.npz
+
+    Attributes:
+        policy: File of a trained policy.
+        out: The model; its suffix is the format: .ts, .onnx or .npz. A .json is written beside it.
+        scenario: The scenario it was trained in; adds the decision interval and the traffic lights.
+    """
+
+    policy: Annotated[Positional[Path], arg(metavar="POLICY")]
+    out: Path
+    scenario: str | None = None
+
+    def run(self, console: Console) -> int:
+        """Exports and says where."""
+        policy, env = DQNPolicy.load(self.policy), None
+        if self.scenario is not None:
+            env = parallel_env(load_scenario(self.scenario), **policy.env_options)
+        side_car = export_policy(policy, self.out, env)
+        console.print(f"model: {self.out}", soft_wrap=True)
+        console.print(f"its inputs and outputs: {side_car}", soft_wrap=True)
+        return 0

@@ -1,0 +1,153 @@
+"""``ugat-marl paper``: the tables of the UGAT paper, and those it lacks."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from rich.console import Console
+from tyro.conf import arg
+
+from ugat_marl.cli.arguments import Ray, workers_of
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import (
+    DIRECT,
+    GROUNDED_NAME,
+    Comparison,
+    PaperConfig,
+    compare,
+    machine_facts,
+    matched_name,
+)
+from ugat_marl.files import require_writable, write_whole
+from ugat_marl.policies import device_of
+from ugat_marl.progress import Bars
+from ugat_marl.reporting import (
+    as_csv,
+    gap_picture,
+    markdown,
+    radar_picture,
+    seeds_csv,
+    terminal_tables,
+)
+
+
+@dataclass(frozen=True)
+class _Paper:
+    """What all tables have in common.
+
+    Attributes:
+        config: What is trained, how often, and how it is judged.
+        out: Folder of the tables.
+        runs: Folder of the trainings.
+        jobs: Trainings at a time; default: one per core.
+        ray: Train on Ray instead, on machines that share the folder of the trainings.
+    """
+
+    config: Annotated[PaperConfig, arg(name="")]
+    out: Path = Path("results")
+    runs: Path = Path("runs/paper")
+    jobs: int | None = None
+    ray: Ray = None
+
+    table: ClassVar[str]
+
+    def run(self, console: Console) -> int:
+        """Trains, plays, prints the table, writes it as Markdown, CSV and PNG."""
+        if self.jobs is not None and self.jobs < 1:
+            raise OptionError(f"jobs = {self.jobs}: must be at least 1")
+        if self.ray is not None and self.config.device != "cpu":
+            raise OptionError(
+                f"device = {self.config.device!r}: trainings on Ray have a core each and no GPU; "
+                "leave --ray or --device out"
+            )
+        device_of(self.config.device)  # what is not there is an error now, not in a job's log
+        for scenario in self.config.scenario:
+            folder = self.out / self._folder(scenario)
+            require_writable(folder / "table.md")
+            with workers_of(self.jobs, self.ray, "--jobs") as workers:
+                found = compare(
+                    self.table, scenario, self.config, self.runs, workers, Bars(console)
+                )
+            _write(found, folder)
+            console.print(terminal_tables(found, DIRECT))
+            console.print(f"table and pictures: {folder}\ntrainings: {self.runs}", soft_wrap=True)
+        return 0
+
+    def _folder(self, scenario: str) -> str:
+        name = Path(scenario).name.removesuffix(".sumocfg")
+        return f"{re.sub(r'[^A-Za-z0-9_.+-]+', '-', name).strip('-')}/{self.table}"
+
+
+@dataclass(frozen=True)
+class Main(_Paper):
+    """UGAT beside direct transfer and every control an honest table needs.
+
+    Trained on in plain sim, under domain randomisation, with random and with constant delays of
+    greens, fine-tuned on as much real data, trained in the real domain, and the best rule tuned
+    there. Finished trainings are kept in --runs and used again, by the other tables, too; a killed
+    run goes on where it was.
+
+    Examples:
+        ugat-marl paper main
+        ugat-marl paper main --scenario grid4x4-v1 --domains V3 V4 --seeds 3 --episodes 40
+    """
+
+    table: ClassVar[str] = "main"
+
+
+@dataclass(frozen=True)
+class Ablation(_Paper):
+    """UGAT without its parts: static α, no gate, no uncertainty, no grounding (paper, Table 3).
+
+    Examples:
+        ugat-marl paper ablation
+        ugat-marl paper ablation --domains V1 V4 --groundings phase
+    """
+
+    table: ClassVar[str] = "ablation"
+
+
+@dataclass(frozen=True)
+class Alpha(_Paper):
+    """Static thresholds α against the dynamic one (paper, Table 4).
+
+    Examples:
+        ugat-marl paper alpha
+    """
+
+    table: ClassVar[str] = "alpha"
+
+
+@dataclass(frozen=True)
+class Uncertainty(_Paper):
+    """Evidential, Concrete Dropout, Deep Ensembles and none, as bars of the gaps (paper, Fig. 4).
+
+    Examples:
+        ugat-marl paper uncertainty --domains V1 V2 V3 V4
+    """
+
+    table: ClassVar[str] = "uncertainty"
+
+
+@dataclass(frozen=True)
+class Gap(_Paper):
+    """What direct transfer loses in each real domain, as radar charts (paper, Fig. 3).
+
+    Examples:
+        ugat-marl paper gap --scenario single-v1 grid2x2-v1
+    """
+
+    table: ClassVar[str] = "gap"
+
+
+def _write(found: Comparison, folder: Path) -> None:
+    write_whole(folder / "table.md", markdown(found, DIRECT, machine_facts()) + "\n")
+    write_whole(folder / "table.csv", as_csv(found))
+    write_whole(folder / "seeds.csv", seeds_csv(found))
+    grounded = [*GROUNDED_NAME.values(), matched_name("timed")]
+    drawn = [DIRECT, *(name for name in grounded if name in found.settings)]
+    radar_picture(found, drawn, folder / "radar.png")
+    gap_picture(found, folder / "gaps.png")

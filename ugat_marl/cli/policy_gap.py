@@ -1,0 +1,96 @@
+"""``ugat-marl policy-gap``: what a diagnosis is worth to policies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.cli.arguments import LengthS, Workers
+from ugat_marl.cli.diagnose import REPORT
+from ugat_marl.cli.evaluate import names_of
+from ugat_marl.diagnosis import FILE
+from ugat_marl.effects import describe, load_scenario
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import policy_factory, policy_gap, read_diagnosis, write_policy_gap
+from ugat_marl.files import require_writable
+from ugat_marl.progress import Bars
+from ugat_marl.reporting import commands_on_page, policy_gap_table, write_diagnosis_page
+from ugat_marl.scenarios import Network
+
+
+@dataclass(frozen=True)
+class PolicyGap:
+    """How much nearer a diagnosis brings policies to what they do in the real domain.
+
+    They are played in sim, in the corrected scenario and in the real domain.
+
+    The travel times are printed, and added to DIR/diagnosis.json and report.html.
+
+    Examples:
+        ugat-marl policy-gap single-v1 found --real V4
+        ugat-marl policy-gap single-v1 found --real V4 --policies mine.pt
+
+    Attributes:
+        scenario: The scenario that was diagnosed.
+        directory: What diagnose wrote, its --out.
+        real: The domain the data were recorded in, as given to record. A street cannot be
+            played in.
+        policies: Rules (fixed-time:30, largest-queue:20, max-pressure:10, programme, random)
+            and files of trained policies.
+        seeds: Number of episodes of each policy in each world.
+        first_seed: Seed of the first of them.
+        duration_s: Length of an episode in s.
+        workers: Simulations at a time.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    real: str
+    policies: tuple[str, ...] = ("fixed-time:30", "max-pressure:20")
+    seeds: int = 5
+    first_seed: int = 1000
+    duration_s: LengthS = None
+    workers: Workers = None
+
+    def run(self, console: Console) -> int:
+        """Plays, writes and prints."""
+        if not self.policies:
+            raise OptionError("--policies needs at least one value")
+        if len(set(self.policies)) < len(self.policies):
+            raise OptionError(f"--policies holds one twice: {' '.join(self.policies)}")
+        if self.seeds < 1 or (self.workers is not None and self.workers < 1):
+            raise OptionError("--seeds and --workers must be at least 1")
+        if self.first_seed < 0:
+            raise OptionError("--first-seed must not be negative")
+        scenario = load_scenario(self.scenario)
+        record, corrected = read_diagnosis(self.directory, scenario)
+        require_writable(self.directory / FILE)
+        if corrected.hash == scenario.hash:
+            console.print("note: only detectors were at fault; the traffic was not corrected")
+        files = [Path(spec).suffix == ".pt" for spec in self.policies]
+        names = [
+            f"{name}.pt" if file else name
+            for name, file in zip(names_of(self.policies), files, strict=True)
+        ]
+        gap = policy_gap(
+            scenario,
+            corrected,
+            self.real,
+            dict(zip(names, map(policy_factory, self.policies), strict=True)),
+            range(self.first_seed, self.first_seed + self.seeds),
+            Bars(console),
+            duration_s=self.duration_s,
+            workers=self.workers,
+        )
+        record = write_policy_gap(self.directory, record, gap)
+        page = self.directory / REPORT
+        if page.is_file():  # without it, none was wanted
+            commands = commands_on_page(page)
+            write_diagnosis_page(record, Network.read(scenario), page, commands)
+        title = f"{scenario.id}: average travel time in s, real: {describe(self.real)}"
+        console.print(policy_gap_table(title, gap, self.seeds))
+        return 0

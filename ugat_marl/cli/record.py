@@ -1,0 +1,90 @@
+"""``ugat-marl record``: measured data of any domain under any controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.cli.arguments import LengthS, Workers
+from ugat_marl.data import require_replaceable, write_measured
+from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.experiments import policy_factory, record
+from ugat_marl.files import require_writable
+from ugat_marl.progress import Bars
+
+
+@dataclass(frozen=True)
+class Record:
+    """Measures a simulated world as a street is measured: detections and signals.
+
+    Examples:
+        ugat-marl record single-v1 --domain V4 --out measured
+        ugat-marl record single-v1 --domain headway=1.4 --periods 3 --out slow
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        out: Directory to write (docs/measured-data.md); measured data in it are replaced.
+        domain: World to measure: sim, V1 to V4, effects (headway=1.4+acceleration=1), or the
+            directory of another scenario on the same network.
+        policy: Who controls the signals: a rule (fixed-time:30, largest-queue:20,
+            max-pressure:10, programme, random) or the file of a trained policy.
+        periods: Number of days. The last 40 % are marked as held out: a diagnosis is judged on
+            them.
+        seed: Root of the seeds of all days.
+        duration_s: Length of a day in s.
+        same_demand: Every day has the scenario's own vehicles; without it they are drawn again.
+        detector_length_m: Length of the detection zones in m; 0 for points.
+        speeds: Whether the detectors measure speeds and lengths.
+        lanes: Also vehicles, halting and mean speed per lane and second.
+        trajectories: Also the position of every vehicle at every second.
+        workers: Simulations at a time.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    out: Path
+    domain: str = "sim"
+    policy: str = "fixed-time:30"
+    periods: int = 5
+    seed: int = 0
+    duration_s: LengthS = None
+    same_demand: bool = False
+    detector_length_m: float = 0.0
+    speeds: bool = True
+    lanes: bool = False
+    trajectories: bool = False
+    workers: Workers = None
+
+    def run(self, console: Console) -> int:
+        """Records and writes."""
+        scenario = load_scenario(self.scenario)
+        in_domain(scenario, self.domain)  # a wrong name is an error before anything is written
+        policy = policy_factory(self.policy)
+        require_replaceable(self.out)
+        require_writable(self.out / "periods.csv")
+        measured = record(
+            scenario,
+            self.domain,
+            policy,
+            periods=self.periods,
+            seed=self.seed,
+            duration_s=self.duration_s,
+            same_demand=self.same_demand,
+            detector_length_m=self.detector_length_m,
+            speeds=self.speeds,
+            lanes=self.lanes,
+            trajectories=self.trajectories,
+            workers=self.workers,
+            reporter=Bars(console),
+        )
+        write_measured(measured, self.out)
+        seen = sum(len(item) for period in measured.periods for item in period.passages.values())
+        console.print(
+            f"{seen} passages over {len(measured.detectors)} detectors in {self.periods} "
+            f"period(s): {self.out}",
+            soft_wrap=True,
+        )
+        return 0

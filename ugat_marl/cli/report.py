@@ -1,0 +1,142 @@
+"""``ugat-marl report``: trainings as one page."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.data import SETTINGS
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import TransferConfig
+from ugat_marl.files import require_writable, write_whole
+from ugat_marl.reporting import RunRecord, TableRecord, read_records, runs_page, write_pictures
+
+PAGE = "report.html"
+_FLAT = ("ugat",)
+"""Parts of the configuration whose options have no prefix."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Puts trainings on one page of HTML that needs no network: open it, print it, send it.
+
+    Folders of `ugat-marl train`, jobs and tables of `ugat-marl paper`, or folders of these. A
+    training may be under way or broken; the page says what is missing.
+
+    Examples:
+        ugat-marl report runs/first
+        ugat-marl report runs/first runs/second --out both.html
+        ugat-marl report runs/paper --out paper.html --pictures pictures
+
+    Attributes:
+        runs: Folders, one or more.
+        out: Page to write.
+        pictures: Folder for the pictures as SVG and PNG, too.
+    """
+
+    runs: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="RUN", help_behavior_hint="(required)")
+    ]
+    out: Annotated[
+        Path | None,
+        arg(
+            metavar="FILE",
+            help_behavior_hint="(default: report.html, in the folder if one is given)",
+        ),
+    ] = None
+    pictures: Annotated[
+        Path | None, arg(metavar="DIR", help_behavior_hint="(default: no files)")
+    ] = None
+
+    def run(self, console: Console) -> int:
+        """Reads, writes the page, says what is missing."""
+        if not self.runs:
+            raise OptionError("name at least one folder of a run, such as runs/first")
+        records = read_records(self.runs)
+        out = self.out or (self.runs[0] / PAGE if len(self.runs) == 1 else Path(PAGE))
+        require_writable(out)
+        if self.pictures is not None:
+            require_writable(self.pictures / "picture.svg")
+        page = runs_page(records, {r.directory: again(r) for r in records})
+        write_whole(out, page.text)
+        for record in records:
+            for text in record.missing:
+                console.print(f"{record.name}: {text}", soft_wrap=True, markup=False)
+        lines = [f"page: {out}"]
+        if self.pictures is not None:
+            write_pictures(page.pictures, self.pictures)
+            lines.append(f"{len(page.pictures)} pictures, as SVG and PNG: {self.pictures}")
+        console.print("\n".join(lines), soft_wrap=True, markup=False)
+        return 0
+
+
+def again(record: RunRecord | TableRecord) -> list[str]:
+    """How to run something again, and what to do with it next."""
+    if isinstance(record, TableRecord):
+        return [record.command] if record.command else []
+    folder = str(record.directory)
+    if record.job:
+        return [
+            shlex.join([Path(sys.executable).name, "-m", "ugat_marl.experiments.paper.job", folder])
+        ]
+    if not record.scenario:
+        return []
+    lines = _train(record, folder)
+    if record.finished and (record.directory / "policies").is_dir():
+        policies = sorted(str(path) for path in (record.directory / "policies").glob("*.pt"))
+        domains = record.evaluation.domains if record.evaluation is not None else []
+        judge = ["ugat-marl", "evaluate", record.scenario, "--domains", *domains]
+        lines.append(shlex.join([*judge, "--policies", *policies]))
+    return [*lines, shlex.join(["tensorboard", "--logdir", folder])]
+
+
+def _train(record: RunRecord, folder: str) -> list[str]:
+    settings = dict(record.settings)
+    lines: list[str] = []
+    if not (record.directory / SETTINGS).is_file():  # a run from before it was kept
+        lines.append("# options that only add policies, such as --oracle, are not on record")
+        if settings.get("real_log"):
+            settings["real_log"] = "REAL_LOG"
+        if record.evaluation is not None:
+            seeds = {result.seed for result in record.evaluation.results}
+            settings["evaluation_seeds"] = len(seeds)
+    options = train_options(settings)
+    place = ["--out", f"{folder}-again"] if record.finished else ["--out", folder, "--resume"]
+    return [*lines, shlex.join(["ugat-marl", "train", record.scenario, *options, *place])]
+
+
+def train_options(settings: Mapping[str, Any]) -> list[str]:
+    """The options of ``ugat-marl train`` that lead to these settings; what is usual is left out.
+
+    Args:
+        settings: Of a `TransferConfig`, as JSON has them; unknown ones are passed over.
+    """
+    usual = json.loads(json.dumps(asdict(TransferConfig("-")), default=str))
+    usual.pop("scenario")
+    return _options(settings, usual, "")
+
+
+def _options(settings: Mapping[str, Any], usual: Mapping[str, Any], prefix: str) -> list[str]:
+    found: list[str] = []
+    for key, default in usual.items():
+        if key not in settings or settings[key] == default:
+            continue
+        value, name = settings[key], key.replace("_", "-")
+        if isinstance(default, dict):
+            if isinstance(value, Mapping):
+                found += _options(value, default, prefix if key in _FLAT else f"{prefix}{name}.")
+        elif isinstance(default, bool):
+            found.append(f"--{prefix}{name}" if value else f"--{prefix}no-{name}")
+        elif isinstance(value, list):
+            found += [f"--{prefix}{name}", *map(str, value)]
+        else:
+            found += [f"--{prefix}{name}", str(value)]
+    return found

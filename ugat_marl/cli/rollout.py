@@ -1,0 +1,169 @@
+"""``ugat-marl rollout``: record transitions of any policy in any domain, or film it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.cli.arguments import Ray, Workers, workers_of
+from ugat_marl.cli.evaluate import names_of
+from ugat_marl.effects import describe, load_scenario
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import policy_factory
+from ugat_marl.files import require_writable
+from ugat_marl.grounding import RollOut, roll_outs
+from ugat_marl.progress import Bars
+from ugat_marl.reporting import Film, Frame, film, frames, require_video, write_video
+from ugat_marl.scenarios import Scenario
+from ugat_marl.seeding import derive_seed
+
+
+@dataclass(frozen=True)
+class VideoConfig:
+    """What of an episode is filmed.
+
+    Attributes:
+        from_s: Where it begins, in s from the beginning of the episode.
+        length_s: How long it is, in s of traffic.
+        speed: Seconds of traffic per second of video; one frame is one second of traffic.
+        size: Longer side of the picture of a network, in pixels.
+    """
+
+    from_s: float = 600.0
+    length_s: float = 300.0
+    speed: int = 10
+    size: int = 800
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.speed <= 100:
+            raise OptionError(f"film.speed = {self.speed}: must be from 1 to 100")
+        if not 200 <= self.size <= 4000:
+            raise OptionError(f"film.size = {self.size}: must be from 200 to 4000")
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Records transitions, for `train --real-log` or for study, or films an episode.
+
+    Examples:
+        ugat-marl rollout single-v1 --domain V4 --policy largest-queue:20 --out v4.parquet
+        ugat-marl rollout grid4x4-v1 --domain V4 --policy max-pressure:20 --video out.mp4
+        ugat-marl rollout grid2x2-v1 --domain V4 --policy runs/first/policies/direct-transfer.pt
+        --beside runs/first/policies/ugat.pt --video before-after.gif
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        out: Parquet file to write.
+        policy: A rule or the file of a trained policy.
+        domain: Domain to record in.
+        episodes: Number of episodes.
+        seed: Root of the episodes' seeds.
+        epsilon: Chance of a random phase, so that the log holds actions the policy does not take.
+        observation: What to record: count, queue, pressure, waiting, density, movements.
+        neighbours: How many roads away intersections are recorded too.
+        duration_s: Length of an episode in s; default: the scenario's own.
+        crossings: Also record when vehicles cross the stop lines: timed grounding reads it.
+        workers: Simulations at a time.
+        ray: Record on Ray instead.
+        video: Video to write: .mp4 (needs ffmpeg: pip install 'ugat-marl[video]'), .webp or .gif
+            (need nothing). It is of an episode of its own, without random phases.
+        beside: A second policy, filmed beside the first in the same episode.
+        film: What of the episode is filmed.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    out: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: nothing is recorded)")
+    ] = None
+    policy: str = "largest-queue:20"
+    domain: str = "sim"
+    episodes: int = 3
+    seed: int = 0
+    epsilon: float = 0.3
+    observation: str = "count"
+    neighbours: int = 0
+    duration_s: float | None = None
+    crossings: bool = False
+    workers: Workers = None
+    ray: Ray = None
+    video: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: nothing is filmed)")
+    ] = None
+    beside: Annotated[str | None, arg(metavar="POLICY", help_behavior_hint="(default: none)")] = (
+        None
+    )
+    film: VideoConfig = field(default_factory=VideoConfig)
+
+    def run(self, console: Console) -> int:
+        """Records, films and writes."""
+        if self.episodes < 1 or not 0 <= self.epsilon <= 1:
+            raise OptionError("--episodes must be at least 1 and --epsilon from 0 to 1")
+        if self.workers is not None and self.workers < 1:
+            raise OptionError("--workers must be at least 1")
+        if self.out is None and self.video is None:
+            raise OptionError("nothing to write: give --out FILE.parquet, --video FILE, or both")
+        if self.beside is not None and self.video is None:
+            raise OptionError("--beside needs --video, which shows both policies")
+        for path in (self.out, self.video):
+            if path is not None:
+                require_writable(path)
+        if self.video is not None:
+            require_video(self.video)
+        scenario = load_scenario(self.scenario)
+        if self.out is not None:
+            self._record(scenario, self.out, console)
+        if self.video is not None:
+            self._film(scenario, self.video, console)
+        return 0
+
+    def _record(self, scenario: Scenario, out: Path, console: Console) -> None:
+        options = {"duration_s": self.duration_s, "crossings": self.crossings}
+        make = policy_factory(self.policy)
+        each = RollOut(
+            scenario, self.domain, options, make, self.epsilon, self.observation, self.neighbours
+        )
+        seeds = [derive_seed(self.seed, "rollout", episode) for episode in range(self.episodes)]
+        title = f"{self.policy} in {describe(self.domain)}"
+        with workers_of(self.workers, self.ray) as workers:
+            log, _ = roll_outs(each, seeds, workers=workers, reporter=Bars(console), title=title)
+        log.write(out)
+        console.print(f"{len(log)} transitions: {out}", soft_wrap=True)
+
+    def _film(self, scenario: Scenario, video: Path, console: Console) -> None:
+        specs = [self.policy, *([self.beside] if self.beside is not None else [])]
+        names = names_of(specs) if len(set(specs)) > 1 else specs
+        films: list[Film] = []
+        with Bars(console).task(f"filming in {self.domain}", len(specs)) as advance:
+            for spec, name in zip(specs, names, strict=True):
+                films.append(self._filmed(scenario, spec, name))
+                advance()
+        count = len(films[0].scenes)
+        with Bars(console).task(f"writing {video.name}", count) as advance:
+
+            def counted() -> Iterator[Frame]:
+                for picture in frames(films, self.film.size):
+                    yield picture
+                    advance()
+
+            write_video(counted(), video, self.film.speed)
+        console.print(
+            f"{count} s of traffic in {count / self.film.speed:.0f} s of video: {video}",
+            soft_wrap=True,
+        )
+
+    def _filmed(self, scenario: Scenario, spec: str, name: str) -> Film:
+        probe = parallel_env(scenario, self.domain, duration_s=self.duration_s)
+        policy = policy_factory(spec)(probe)
+        options = {"duration_s": self.duration_s, **policy.env_options}
+        env = parallel_env(scenario, self.domain, **options)
+        seed = derive_seed(self.seed, "rollout", 0)
+        try:
+            return film(env, policy, seed, self.film.from_s, self.film.length_s, name)
+        finally:
+            env.close()

@@ -1,0 +1,257 @@
+"""``ugat-marl scenario check``: what a controller will face, and whether all of it is sound."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional, arg
+
+from ugat_marl.cli.arguments import LengthS, Workers
+from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.envs import TrafficEnv, parallel_env
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import (
+    HOLDS_S,
+    Row,
+    Run,
+    as_json,
+    is_full,
+    left_outside,
+    measured_headroom,
+    problems,
+    try_out,
+)
+from ugat_marl.progress import Bars, Silent
+from ugat_marl.scenarios import SHORT_M, IntersectionFacts, Survey, survey
+from ugat_marl.testing import (
+    Result,
+    check_determinism,
+    check_environment,
+    check_scenario,
+    failures,
+    report,
+)
+
+CONFORMANCE_S = 300.0
+MOST_APPROACHES = 8
+
+
+@dataclass(frozen=True)
+class ScenarioCheck:
+    """Says what a controller will face; leaves with 1 if something has to be mended.
+
+    It plays an episode under the network's own programme and one under a good rule.
+
+    With --conformance it runs the conformance kit instead (docs/conformance.md).
+
+    Examples:
+        ugat-marl scenario check single-v1
+        ugat-marl scenario check my-city --headroom 2
+        ugat-marl scenario check my-city --json > my-city.json
+        ugat-marl scenario check my.sumocfg --conformance --domain V3
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        domain: Domain to look at, or to check in.
+        headroom: Seeds to measure the headroom with: 25 episodes each. 0 leaves it out.
+        simulate: Play the two episodes.
+        seed: Seed of the episodes.
+        json: Print JSON instead of tables.
+        conformance: Run the conformance kit on scenario and environment instead.
+        observation: Observation the kit checks with.
+        duration_s: Length of the episodes, s (of the kit: 300).
+        workers: Simulations at a time.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    domain: str = "sim"
+    headroom: int = 0
+    simulate: bool = True
+    seed: int = 1
+    json: bool = False
+    conformance: bool = False
+    observation: str = "count"
+    duration_s: LengthS = None
+    workers: Workers = None
+
+    def run(self, console: Console) -> int:
+        """Checks and prints."""
+        if self.conformance:
+            return self._kit(console)
+        if self.headroom < 0:
+            raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
+        scenario = in_domain(load_scenario(self.scenario), self.domain)
+        if self.duration_s is not None:
+            scenario = scenario.with_duration(self.duration_s)
+        reporter = Silent() if self.json else Bars(console)
+        facts = survey(scenario, reporter)
+        runs = try_out(scenario, self.seed, self.workers, reporter) if self.simulate else ()
+        rows = None
+        if self.headroom:
+            rows = measured_headroom(scenario, self.headroom, self.workers, reporter)
+        outside = left_outside(scenario, self.seed) if is_full(runs) else {}
+        wrong = problems(facts, runs, outside)
+        if self.json:
+            text = json.dumps(
+                as_json(facts, runs, rows, wrong, outside), indent=2, ensure_ascii=False
+            )
+            print(text)
+        else:
+            show(console, facts, runs, rows, wrong)
+        return 1 if wrong else 0
+
+    def _kit(self, console: Console) -> int:
+        scenario = load_scenario(self.scenario)
+        length_s = CONFORMANCE_S if self.duration_s is None else self.duration_s
+
+        def make() -> TrafficEnv:
+            options: dict[str, Any] = {"observation": self.observation}
+            return parallel_env(scenario, self.domain, duration_s=length_s, **options)
+
+        make()
+        results: list[Result] = []
+        with Bars(console).task(f"checking {scenario.id}", 3) as advance:
+            for check in (
+                lambda: check_scenario(self.scenario),
+                lambda: check_environment(make),
+                lambda: check_determinism(make),
+            ):
+                results += check()
+                advance()
+        console.print(report(results))
+        return 1 if failures(results) else 0
+
+
+def show(
+    console: Console,
+    facts: Survey,
+    runs: Sequence[Run],
+    rows: Sequence[Row] | None,
+    wrong: Sequence[str],
+) -> None:
+    """Prints everything as tables that fit 80 columns."""
+
+    def say(text: str) -> None:
+        console.print(text, markup=False, soft_wrap=True)
+
+    agents = facts.intersections
+    say(
+        f"{facts.scenario}: {len(agents)} agents, {sum(len(item.phases) for item in agents)} green "
+        f"phases, {sum(item.lanes for item in agents)} lanes, "
+        f"{sum(item.movements for item in agents)} movements, "
+        f"{sum(item.conflicts for item in agents)} conflicts"
+    )
+    say(
+        f"episode {facts.duration_s:g} s, {facts.decisions} decisions; shortest useful "
+        f"{facts.shortest_episode_s:g} s (the network fills in {facts.fill_s:g} s)"
+    )
+    flows = f" and {facts.flows} flows" if facts.flows else ""
+    say(f"demand {facts.vehicles} vehicles{flows}, the first after {facts.first_s:g} s")
+    if facts.uncontrolled:
+        say(f"no agents (fewer than two green phases): {', '.join(facts.uncontrolled)}")
+    console.print(_intersections(agents))
+    console.print(_approaches(agents))
+    if short := sum(len(item.short_lanes) for item in agents):
+        say(
+            f"lanes at lights that are shorter than {SHORT_M:g} m: {short}. Agents see nobody "
+            "upstream of them; reach_m = 100 under [control], or the effect reach=100, counts those"
+        )
+    if runs:
+        console.print(_runs(runs))
+    if rows is None:
+        say("headroom: not measured; --headroom 1 measures it with one seed")
+    else:
+        console.print(_headroom(rows))
+    for text in wrong:
+        say(f"to mend: {text}")
+    if not wrong:
+        say("nothing to mend")
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, box=box.SIMPLE_HEAD, pad_edge=False, title_justify="left")
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="right" if number else "left", overflow="fold")
+    return table
+
+
+def _intersections(agents: Sequence[IntersectionFacts]) -> Table:
+    """One row for intersections that are alike."""
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for item in agents:
+        groups.setdefault(_row(item), []).append(item.id)
+    table = _table(
+        "Intersections", "agent", "lanes", "links", "movem.", "conflicts", "phases", "remarks"
+    )
+    table.columns[-1].justify = "left"
+    for row, names in groups.items():
+        listed = ", ".join(names) if len(names) <= 3 else f"{names[0]} ... {names[-1]}"
+        table.add_row(f"{listed} ({len(names)})" if len(names) > 3 else listed, *row)
+    return table
+
+
+def _row(item: IntersectionFacts) -> tuple[str, ...]:
+    permitted = sum(bool(phase.permitted) for phase in item.phases)
+    remarks = {
+        "junctions joined": len(item.junctions) if len(item.junctions) > 1 else 0,
+        "phases with permitted turns": permitted,
+        "links on red after a stop": item.right_on_red,
+        "always green": item.always_green,
+        "U-turns": item.u_turns,
+        "crossings": item.crossings,
+        "crossings never green": item.unserved_crossings,
+        "phases for people on foot alone": item.foot_phases,
+        "links without a light": item.uncontrolled,
+        "links never green": len(item.unserved_links),
+        "lanes served in part": len(item.partly_served),
+        "lanes counted with those behind": len(item.lanes_behind),
+    }
+    counts = (item.lanes, item.links, item.movements, item.conflicts, len(item.phases))
+    return (*map(str, counts), "; ".join(f"{n} {what}" for what, n in remarks.items() if n))
+
+
+def _approaches(agents: Sequence[IntersectionFacts]) -> Table:
+    all_roads = [(item.id, road) for item in agents for road in item.approaches]
+    all_roads.sort(key=lambda pair: -(pair[1].saturation or pair[1].flow_ratio))
+    shown = all_roads[:MOST_APPROACHES]
+    title = f"Saturation by approach, the highest {len(shown)} of {len(all_roads)}"
+    table = _table(title, "agent", "road", "lanes", "veh/h", "flow ratio", "own programme")
+    table.columns[1].justify = "left"
+    for name, road in shown:
+        saturation = "no green" if road.saturation is None else f"{road.saturation:.0%}"
+        cells = (str(road.lanes), f"{road.vph:.0f}", f"{road.flow_ratio:.0%}", saturation)
+        table.add_row(name, road.edge, *cells)
+    return table
+
+
+def _runs(runs: Sequence[Run]) -> Table:
+    table = _table(
+        "An episode in sim", "rule", "ATT [s]", "due", "entered", "arrived", "left outside"
+    )
+    for run in runs:
+        counts = (run.due, run.departed, run.arrived, run.backlog)
+        table.add_row(run.rule, f"{run.att_s:.1f}", *map(str, counts))
+    return table
+
+
+def _headroom(rows: Sequence[Row]) -> Table:
+    """What the rule that is best in sim loses elsewhere is what a transfer can win."""
+    holds = [f"{hold_s} s" for hold_s in HOLDS_S]
+    table = _table(
+        "Headroom: ATT [s] of the largest-queue rule held so long", "domain", *holds,
+        "programme", "lost", "arrived",
+    )  # fmt: skip
+    for row in rows:
+        cells = [
+            f"{att_s:.1f}{'*' if hold_s == row.best_hold_s else ''}"
+            for hold_s, att_s in zip(HOLDS_S, row.att_s, strict=True)
+        ]
+        measures = (f"{row.programme_att_s:.1f}", f"{row.lost:.0%}", f"{row.finished:.1%}")
+        table.add_row(row.domain, *cells, *measures)
+    return table

@@ -1,0 +1,39 @@
+"""``ugat-marl scenario draw``: every intersection with its phases, as pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.effects import load_scenario
+from ugat_marl.files import require_writable
+from ugat_marl.progress import Bars
+from ugat_marl.reporting import draw
+
+
+@dataclass(frozen=True)
+class ScenarioDraw:
+    """Draws the network and every intersection with its phases, as SVG and PNG.
+
+    Examples:
+        ugat-marl scenario draw mixed-v1 --out pictures
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        out: Folder to write to.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    out: Path
+
+    def run(self, console: Console) -> int:
+        """Draws."""
+        scenario = load_scenario(self.scenario)
+        require_writable(self.out / "network.svg")
+        files = draw(scenario, self.out, Bars(console))
+        console.print(f"{len(files)} pictures: {self.out}", markup=False, soft_wrap=True)
+        return 0

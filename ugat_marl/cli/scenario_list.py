@@ -1,0 +1,54 @@
+"""``ugat-marl scenario list``: what networks there are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from ugat_marl.effects import ALIASES, SETTINGS, load_scenario
+from ugat_marl.errors import ScenarioError
+from ugat_marl.scenarios import Network, check_demand, resco_maps, shipped_scenarios
+
+
+@dataclass(frozen=True)
+class ScenarioList:
+    """Lists the scenarios and domains that can be named.
+
+    Examples:
+        ugat-marl scenario list
+    """
+
+    def run(self, console: Console) -> int:
+        """Prints the lists."""
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        table.add_column("scenario")
+        for heading in ("agents", "phases", "vehicles"):
+            table.add_column(heading, justify="right")
+        table.add_column("description")
+        maps = [f"resco:{name}" for name in sorted(resco_maps())]
+        for name in (*(name for name, _ in shipped_scenarios()), *maps):
+            table.add_row(name, *_facts(name))
+        console.print(table)
+        if not maps:
+            console.print("RESCO networks: pip install 'ugat-marl[resco]'", markup=False)
+        aliases = {setting: alias for alias, setting in ALIASES.items()}
+        for setting, effects in SETTINGS.items():
+            values = ", ".join(map(str, effects))
+            console.print(f"domain {setting} ({aliases[setting]}): {values}")
+        return 0
+
+
+def _facts(name: str) -> list[str]:
+    try:
+        scenario = load_scenario(name)
+        network = Network.read(scenario)
+        demand = check_demand(scenario, network)
+    except ScenarioError as error:
+        return ["", "", "", str(error)]
+    phases = [len(item.phases) for item in network.intersections]
+    spread = str(phases[0]) if len(set(phases)) == 1 else f"{min(phases)}-{max(phases)}"
+    vehicles = f"{demand.vehicles}{'+' if demand.flows else ''}"
+    return [str(len(phases)), spread, vehicles, scenario.settings.description]

@@ -1,0 +1,197 @@
+"""``ugat-marl scenario new``: a scenario from any road network and any demand."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.errors import OptionError
+from ugat_marl.progress import Bars
+from ugat_marl.scenarios import (
+    Roads,
+    Vehicles,
+    arterial,
+    from_cityflow,
+    from_counts,
+    from_od,
+    from_osm,
+    from_sumo,
+    given_routes,
+    make_scenario,
+    rectangle,
+    turning,
+)
+
+ROADS = ("grid", "arterial", "osm", "sumo", "cityflow")
+DEMANDS = ("routes", "vph", "counts", "od")
+_OWN = Annotated[float | None, arg(metavar="FLOAT", help_behavior_hint="(default: the source's)")]
+
+
+def _none(metavar: str) -> Any:
+    return arg(metavar=metavar, help_behavior_hint="(default: not used)")
+
+
+@dataclass(frozen=True)
+class ScenarioNew:
+    """Makes a scenario directory: roads with demand, ready for all other commands.
+
+    Name one source of roads and one of vehicles.
+
+    Examples:
+        ugat-marl scenario new my-grid --grid 4x4 --vph 400
+        ugat-marl scenario new my-city --sumo city.net.xml --routes cars.rou.xml
+        ugat-marl scenario new my-city --sumo city.sumocfg
+        ugat-marl scenario new my-city --osm city.osm.pbf --vph 300
+        ugat-marl scenario new my-city --cityflow roadnet.json flow.json
+
+    Attributes:
+        name: Directory to write; its last part is the scenario's name.
+        grid: Rows and columns of a grid, as in 4x4.
+        arterial: Intersections along a main road.
+        osm: OpenStreetMap extract that you have: .osm, .osm.gz or .osm.pbf.
+        guess_signals: Put lights at large junctions of --osm that have none.
+        sumo: SUMO configuration (with its vehicles) or network.
+        cityflow: CityFlow's roadnet.json and flow.json (with its vehicles).
+        exact_drivers: Keep CityFlow's headways, and leave nothing to chance in driving; without
+            it vehicles keep their size, accelerations and speed, and follow each other as SUMO's.
+        routes: Route files for the network.
+        vph: Vehicles an hour at every road into the network.
+        turns: Shares of left turns, straight on and right turns, for --vph.
+        counts: CSV file of what was counted: edge,count or from,to,count; also begin_s,end_s.
+        od: CSV file of origins and destinations: from,to,count; also begin_s,end_s.
+        seed: Decides the vehicles of --vph, --counts and --od.
+        spacing_m: Between intersections of a grid or arterial, m.
+        speed_mps: Speed limit of a grid or arterial, m/s.
+        phases: Green phases: as the source wants it; the programme's own; derived from the
+            conflicts; the same, with left turns that let the traffic opposite pass.
+        begin_s: Start of an episode on the clock of the routes, s.
+        duration_s: Length of an episode, s.
+        link: Leave the files of --sumo and --routes where they are.
+        force: Replace a scenario of this name.
+    """
+
+    name: Annotated[Positional[Path], arg(metavar="NAME")]
+    grid: Annotated[str | None, _none("RxC")] = None
+    arterial: Annotated[int | None, _none("N")] = None
+    osm: Annotated[Path | None, _none("FILE")] = None
+    guess_signals: bool = False
+    sumo: Annotated[Path | None, _none("FILE")] = None
+    cityflow: Annotated[tuple[Path, Path] | None, _none("ROADNET FLOW")] = None
+    exact_drivers: bool = False
+    routes: Annotated[tuple[Path, ...], _none("FILE [FILE ...]")] = ()
+    vph: Annotated[float | None, _none("N")] = None
+    turns: tuple[float, float, float] = (0.2, 0.65, 0.15)
+    counts: Annotated[Path | None, _none("FILE")] = None
+    od: Annotated[Path | None, _none("FILE")] = None
+    seed: int = 0
+    spacing_m: float = 300.0
+    speed_mps: float = 13.9
+    phases: Literal["source", "programme", "conflict-free", "permitted"] = "source"
+    begin_s: _OWN = None
+    duration_s: _OWN = None
+    link: bool = False
+    force: bool = False
+
+    def run(self, console: Console) -> int:
+        """Makes it and says what it is."""
+        roads, vehicles = self._roads(), self._vehicles()
+        made = make_scenario(
+            self.name,
+            roads,
+            vehicles,
+            settings=self._settings(),
+            command=self._command(),
+            force=self.force,
+            reporter=Bars(console),
+        )
+        agents = len(made.network.intersections)
+        phases = sum(len(item.phases) for item in made.network.intersections)
+        console.print(
+            f"{self.name}: {agents} intersections with {phases} green phases, "
+            f"{made.demand.vehicles} vehicles"
+            + (f" and {made.demand.flows} flows" if made.demand.flows else ""),
+            markup=False,
+            soft_wrap=True,
+        )
+        for note in made.notes:
+            console.print(f"note: {note}", markup=False, soft_wrap=True)
+        where = shlex.quote(str(self.name))
+        console.print(f"next: ugat-marl scenario check {where}", markup=False, soft_wrap=True)
+        return 0
+
+    def _roads(self) -> Roads:
+        given = [name for name in ROADS if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise OptionError(
+                f"scenario new needs one source of roads, not {len(given)}: "
+                f"give one of {_listed(ROADS)}"
+            )
+        if self.grid is not None:
+            return rectangle(self.grid, self.spacing_m, self.speed_mps)
+        if self.arterial is not None:
+            return arterial(self.arterial, self.spacing_m, self.speed_mps)
+        if self.osm is not None:
+            return from_osm(self.osm, guess=self.guess_signals)
+        if self.cityflow is not None:
+            return from_cityflow(
+                *self.cityflow,
+                self.duration_s,
+                own_vehicles=not self._demands(),
+                exact=self.exact_drivers,
+            )
+        assert self.sumo is not None
+        return from_sumo(self.sumo, link=self.link, own_vehicles=not self._demands())
+
+    def _demands(self) -> list[str]:
+        return [name for name in DEMANDS if getattr(self, name) not in (None, ())]
+
+    def _vehicles(self) -> Vehicles | None:
+        given = self._demands()
+        comes_along = self.cityflow or (self.sumo is not None and ".sumocfg" in self.sumo.name)
+        if len(given) > 1 or (not given and not comes_along):
+            raise OptionError(
+                f"scenario new needs one source of vehicles, not {len(given)}: "
+                f"give one of {_listed(DEMANDS)}"
+            )
+        if self.routes:
+            return given_routes(self.routes, link=self.link)
+        begin_s, length_s = self.begin_s or 0.0, self.duration_s or 3600.0
+        if self.vph is not None:
+            return turning(self.vph, self.turns, begin_s, length_s, self.seed)
+        if self.counts is not None:
+            return from_counts(self.counts, begin_s, length_s, self.seed)
+        if self.od is not None:
+            return from_od(self.od, begin_s, length_s, self.seed)
+        return None
+
+    def _settings(self) -> Mapping[str, Any]:
+        times = {"begin_s": self.begin_s, "duration_s": self.duration_s}
+        settings: dict[str, Any] = {k: v for k, v in times.items() if v is not None}
+        if self.phases != "source":
+            settings["control"] = {"phases": self.phases}
+        return settings
+
+    def _command(self) -> str:
+        """The call that makes the same scenario again."""
+        words = ["ugat-marl", "scenario", "new", str(self.name)]
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name in ("name", "force") or (
+                item.default is not MISSING and value == item.default
+            ):
+                continue
+            option = f"--{item.name.replace('_', '-')}"
+            values = value if isinstance(value, tuple) else () if value is True else (value,)
+            words += [option, *map(str, values)]
+        return shlex.join(words)
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    options = [f"--{name}" for name in names]
+    return f"{', '.join(options[:-1])} or {options[-1]}"

@@ -1,0 +1,73 @@
+"""``ugat-marl train``: train across the gap and print what was won."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import arg
+
+from ugat_marl.cli.arguments import Ray, workers_of
+from ugat_marl.data import METRICS, Metrics
+from ugat_marl.effects import describe
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import TransferConfig, transfer
+from ugat_marl.progress import Bars
+from ugat_marl.reporting import calibration_picture, transfer_picture, transfer_table
+
+
+@dataclass(frozen=True)
+class Train:
+    """Trains policies by UGAT on a scenario and judges them in sim and in the real domain.
+
+    Examples:
+        ugat-marl train grid2x2-v1 --real V4
+        ugat-marl train resco:cologne3 --real V3 --seed 1 --out runs/cologne3
+        ugat-marl train path/to/my.sumocfg --real startup_delay=0.8+acceleration=1.2
+        ugat-marl train single-v1 --real none --real-log measured.parquet
+        ugat-marl train grid4x4-v1 --real V4 --ray auto
+
+    Attributes:
+        config: What to train, where, and how to judge it.
+        out: Folder of the run; default: runs/SCENARIO-REAL-sSEED.
+        resume: Go on with the run in that folder.
+        ray: Play roll-outs and the search for the best rule on Ray; learning stays here.
+    """
+
+    config: Annotated[TransferConfig, arg(name="")]
+    out: Path | None = None
+    resume: bool = False
+    ray: Ray = None
+
+    def run(self, console: Console) -> int:
+        """Trains, evaluates, prints the table, draws it."""
+        config = self.config
+        if self.out == Path():
+            raise OptionError("--out is empty; give the name of a folder")
+        name = "-".join(re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in _names(config))
+        directory = self.out or Path("runs") / f"{name}-s{config.seed}"
+        with workers_of(None, self.ray) as workers:
+            found = transfer(
+                config, directory, resume=self.resume, reporter=Bars(console), workers=workers
+            )
+        picture = directory / "gap.png"
+        metrics = Metrics.read(directory / METRICS)
+        transfer_picture(found, metrics, picture)
+        calibration_picture(metrics, directory / "calibration.png")
+        console.print(transfer_table(found))
+        console.print(
+            f"run: {directory}\ntable: {directory / 'table.json'}\npicture: {picture}\n"
+            f"policies: {directory / 'policies'}\n"
+            f"curves: tensorboard --logdir {directory}",
+            soft_wrap=True,
+        )
+        return 0
+
+
+def _names(config: TransferConfig) -> tuple[str, str]:
+    """Scenario and real domain; of paths the last part."""
+    scenario, real = config.scenario, describe(config.real)
+    return Path(scenario).name.removesuffix(".sumocfg"), Path(real).name

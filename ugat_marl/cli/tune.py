@@ -1,0 +1,87 @@
+"""``ugat-marl tune``: the best settings of the rules in a domain."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.cli.arguments import LengthS, Ray, Workers, workers_of
+from ugat_marl.effects import describe, load_scenario
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.experiments import BUDGET, LEAST_BUDGET, TUNED_RULES, tune
+from ugat_marl.files import require_writable, write_whole
+from ugat_marl.policies import NAMES, RULES
+from ugat_marl.progress import Bars
+from ugat_marl.reporting import tuning_table
+
+
+@dataclass(frozen=True)
+class Tune:
+    """Finds the settings with which each rule does best in a domain, by racing them.
+
+    Examples:
+        ugat-marl tune single-v1 --domain V4
+        ugat-marl tune grid2x2-v1 --rules actuated max-pressure --budget 40
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        domain: The domain to tune in.
+        rules: Names of rules, without their numbers.
+        budget: Most episodes for each rule.
+        duration_s: Length of an episode in s.
+        workers: Simulations at a time.
+        ray: Play on Ray instead.
+        fresh: Play anew what is remembered from an earlier call.
+        out: JSON file for every setting tried.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    domain: str = "sim"
+    rules: tuple[str, ...] = TUNED_RULES
+    budget: int = BUDGET
+    duration_s: LengthS = None
+    workers: Workers = None
+    ray: Ray = None
+    fresh: bool = False
+    out: Path | None = None
+
+    def run(self, console: Console) -> int:
+        """Tunes and prints."""
+        if not self.rules:
+            raise OptionError("--rules needs at least one value")
+        if len(set(self.rules)) < len(self.rules):
+            raise OptionError(f"--rules holds one twice: {' '.join(self.rules)}")
+        for name in self.rules:
+            if name not in RULES:
+                raise UnknownNameError("rule", name, NAMES)
+        if self.budget < LEAST_BUDGET:
+            raise OptionError(f"--budget {self.budget}: must be at least {LEAST_BUDGET}")
+        if self.workers is not None and self.workers < 1:
+            raise OptionError("--workers must be at least 1")
+        if self.out is not None:
+            require_writable(self.out)
+        scenario, reporter = load_scenario(self.scenario), Bars(console)
+        with workers_of(self.workers, self.ray) as workers:
+            found = [
+                tune(
+                    name,
+                    scenario,
+                    self.domain,
+                    self.budget,
+                    duration_s=self.duration_s,
+                    workers=workers,
+                    reporter=reporter,
+                    fresh=self.fresh,
+                )
+                for name in self.rules
+            ]
+        console.print(tuning_table(f"{scenario.id} in {describe(self.domain)}", found))
+        if self.out is not None:
+            write_whole(self.out, json.dumps([asdict(each) for each in found], indent=1) + "\n")
+            console.print(f"table: {self.out}", soft_wrap=True)
+        return 0

@@ -1,0 +1,372 @@
+"""Imports high-resolution logs of signal controllers (ATSPM) as measured data.
+
+The events are those of the "Indiana Traffic Signal Hi Resolution Data Logger Enumerations" (Purdue
+University, https://docs.lib.purdue.edu/jtrpdata/4/), as UDOT's ATSPM lists them in
+``Atspm/Data/Enums/IndianaEnumerations.cs`` (github.com/utahudot/udot-atspm) and ODOT's package
+`atspm` uses them in ``src/atspm/queries/timeline.sql`` (github.com/ShawnStrasser/atspm).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from ugat_marl.data.measured.atspm_log import (
+    ARROW_EVENTS,
+    BEFORE,
+    CLOCK_UPDATED,
+    DETECTOR_FAULTS,
+    DETECTOR_OFF,
+    DETECTOR_ON,
+    GREEN,
+    OVERLAP_EVENTS,
+    PHASE_EVENTS,
+    RED,
+    YELLOW,
+    read_log,
+)
+from ugat_marl.data.measured.atspm_mapping import AtspmMapping, Device, Span, read_mapping
+from ugat_marl.data.measured.checks import detectors_of, periods_of
+from ugat_marl.data.measured.coverage import coverage
+from ugat_marl.data.measured.data import Finding, Measured
+from ugat_marl.data.measured.detections import passages_of
+from ugat_marl.data.measured.rows import in_order, refuse_set_back, with_period
+from ugat_marl.data.measured.signal_logs import signals_of
+from ugat_marl.data.measured.tables import DETECTORS, PERIODS, ROW, frame_of
+from ugat_marl.errors import MeasuredDataError
+from ugat_marl.scenarios import Network, Period, Scenario, SignalLog, letter, signal_widths
+
+LOOK_BACK_S = 3600.0
+"""Events so long before a period tell what the signals showed at its begin."""
+
+Source = tuple[str, int]
+"""``("phase", 2)``, ``("overlap", 1)`` or ``("arrow", 5)``."""
+
+_CODES = {"phase": PHASE_EVENTS, "overlap": OVERLAP_EVENTS, "arrow": ARROW_EVENTS}
+_KIND = {code: kind for kind, codes in _CODES.items() for code in codes}
+_COLOUR = PHASE_EVENTS | OVERLAP_EVENTS | ARROW_EVENTS
+# Of events at one moment the end of the old comes before the begin of the new.
+_RANK = {RED: 0, GREEN: 1, YELLOW: 2}
+
+
+@dataclass(frozen=True)
+class _Event:
+    """A phase, overlap or arrow changes its colour."""
+
+    time_s: float
+    source: Source
+    code: int
+
+    @property
+    def colour(self) -> str:
+        return _COLOUR[self.code]
+
+
+def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Network) -> Measured:
+    """Reads a controllers' log as measured data.
+
+    Args:
+        events: CSV or Parquet with TimeStamp, DeviceId, EventId and Parameter.
+        mapping: TOML that maps devices to traffic lights, phases and overlaps to links, channels
+            to detectors, and local time to the scenario's clock (``docs/measured-data.md``).
+        scenario: The scenario whose clock is meant.
+        network: Its network.
+
+    Raises:
+        MeasuredDataError: The log or the mapping cannot be read, contradict each other or do not
+            fit the network.
+    """
+    events, mapping = Path(events), Path(mapping)
+    found: list[Finding] = []
+    widths = signal_widths(scenario)
+    driven = {item.id: {link.index for link in item.links} for item in network.intersections}
+    table = read_mapping(mapping, widths, driven)
+    spans = table.spans()
+    periods = _periods(mapping, spans, scenario)
+    detectors = detectors_of(mapping, _zones(table), network)
+    log = read_log(events, table.time_zone, found)
+    known = log.filter(pl.col("device").is_in([device.id for device in table.devices]))
+    if known.is_empty():
+        raise MeasuredDataError(
+            f"{events}: no event of a device in {mapping.name}; the log is of "
+            f"{', '.join(map(repr, log['device'].unique().sort().to_list()[:8]))}"
+        )
+    rows = _in_periods(events, known, spans, periods)
+    _report(events, rows, table, found)
+    signals = _signals(events, rows, table, periods, network, widths, found)
+    stamps = _detections(rows, table)
+    if stamps.is_empty():
+        raise MeasuredDataError(
+            f"{events}: no detector event (81, 82) of a channel in {mapping.name}; check the "
+            "channels"
+        )
+    passages, broken = passages_of(
+        events, with_period(events, stamps, periods, found), periods, detectors, found
+    )
+    measured = Measured(
+        tuple(detector for detector in detectors if detector.id not in broken),
+        tuple(
+            replace(period, signals=shown, passages=seen)
+            for period, shown, seen in zip(periods, signals, passages, strict=True)
+        ),
+    )
+    found += coverage(measured, scenario, network)
+    return replace(measured, findings=tuple(found))
+
+
+def _periods(path: Path, spans: Sequence[Span], scenario: Scenario) -> tuple[Period, ...]:
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    rows = [
+        (
+            span.id,
+            begin if span.begin_s is None else span.begin_s,
+            end if span.end_s is None else span.end_s,
+            span.split,
+        )
+        for span in spans
+    ]
+    periods = periods_of(path, _numbered(frame_of(PERIODS, rows)), scenario)
+    zeros = [(span.zero - spans[0].zero).total_seconds() for span in spans]
+    real = sorted(
+        (zero + p.begin_s, zero + p.end_s, p.id) for zero, p in zip(zeros, periods, strict=True)
+    )
+    for (_, ends, one), (begins, _, other) in zip(real, real[1:], strict=False):
+        if begins < ends:
+            raise MeasuredDataError(
+                f"{path}: the periods {one!r} and {other!r} overlap by {ends - begins:g} s; the "
+                "same vehicles would count twice"
+            )
+    return periods
+
+
+def _zones(table: AtspmMapping) -> pl.DataFrame:
+    rows = [
+        (
+            item.id or f"{device.id}:{item.channel}",
+            item.lane,
+            item.position_m,
+            item.length_m,
+            item.kind,
+        )
+        for device in table.devices
+        for item in device.detectors
+    ]
+    return _numbered(frame_of(DETECTORS, rows))
+
+
+def _numbered(frame: pl.DataFrame) -> pl.DataFrame:
+    return frame.with_columns(pl.int_range(1, pl.len() + 1, dtype=pl.Int64).alias(ROW))
+
+
+def _in_periods(
+    path: Path, log: pl.DataFrame, spans: Sequence[Span], periods: Sequence[Period]
+) -> pl.DataFrame:
+    """The events of each period and of a while before, with ``period_id`` and ``time_s``."""
+    parts: list[pl.DataFrame] = []
+    for span, period in zip(spans, periods, strict=True):
+        time = (pl.col("time") - pl.lit(span.zero)).dt.total_microseconds() / 1e6
+        part = log.with_columns(
+            pl.lit(period.id).alias("period_id"),
+            pl.lit(period.begin_s).alias("begin_s"),
+            time.alias("time_s"),
+        ).filter(pl.col("time_s").is_between(period.begin_s - LOOK_BACK_S, period.end_s))
+        if part.filter(pl.col("time_s") >= period.begin_s).is_empty():
+            raise MeasuredDataError(
+                f"{path}: no event in period {period.id!r}, of which second 0 is {span.zero}; the "
+                f"log goes from {log['time'].min()} to {log['time'].max()}"
+            )
+        parts.append(part)
+    return pl.concat(parts)
+
+
+def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, found: list[Finding]) -> None:
+    """What a log says of itself: clocks that were set, detectors that failed."""
+    updates = rows.filter(pl.col("event") == CLOCK_UPDATED)
+    if updates.height:
+        names = ", ".join(map(repr, updates["device"].unique().sort().to_list()[:6]))
+        found.append(
+            Finding(
+                f"{path.name}: the clock of {names} was set {updates.height} times (event 181); "
+                "times around it may jump by seconds"
+            )
+        )
+    faults = rows.filter(pl.col("event").is_in(DETECTOR_FAULTS))
+    for device in table.devices:
+        own = faults.filter(pl.col("device") == device.id)["parameter"].to_list()
+        broken = sorted({item.channel for item in device.detectors} & set(own))
+        if broken:
+            found.append(
+                Finding(
+                    f"{path.name}: device {device.id!r} reports faults (events 84 to 88) of its "
+                    f"channels {', '.join(map(str, broken))}"
+                )
+            )
+
+
+def _detections(rows: pl.DataFrame, table: AtspmMapping) -> pl.DataFrame:
+    """Detector events as rows of ``detections``."""
+    zones = pl.DataFrame(
+        [
+            (device.id, item.channel, item.id or f"{device.id}:{item.channel}", item.latency_s)
+            for device in table.devices
+            for item in device.detectors
+        ],
+        schema={
+            "device": pl.String,
+            "parameter": pl.Int64,
+            "detector_id": pl.String,
+            "latency_s": pl.Float64,
+        },
+        orient="row",
+    )
+    begun = rows.filter(
+        pl.col("event").is_in([DETECTOR_OFF, DETECTOR_ON]) & (pl.col("time_s") >= pl.col("begin_s"))
+    )
+    return begun.join(zones, on=["device", "parameter"], maintain_order="left").select(
+        ROW,
+        "period_id",
+        pl.col("time_s") - pl.col("latency_s"),
+        "detector_id",
+        pl.when(pl.col("event") == DETECTOR_ON)
+        .then(pl.lit("on"))
+        .otherwise(pl.lit("off"))
+        .alias("event"),
+        pl.lit(None, pl.Float64).alias("speed_mps"),
+        pl.lit(None, pl.Float64).alias("length_m"),
+    )
+
+
+def _signals(
+    path: Path,
+    rows: pl.DataFrame,
+    table: AtspmMapping,
+    periods: Sequence[Period],
+    network: Network,
+    widths: Mapping[str, int],
+    found: list[Finding],
+) -> tuple[dict[str, SignalLog], ...]:
+    shown: list[tuple[str, float, str, str]] = []
+    programmes = {item.id: item.programme for item in network.intersections}
+    for device in table.devices:
+        links = _links(device, widths[device.tls], programmes.get(device.tls, ()))
+        sources = {source for own in links for source, _ in own}
+        silent = set(sources)
+        for period in periods:
+            events = _events(path, rows, device, period, sources, found)
+            silent -= {event.source for event in events}
+            if not any(event.time_s >= period.begin_s for event in events):
+                found.append(
+                    Finding(
+                        f"{path.name}: device {device.id!r} logs no signals in period {period.id!r}"
+                    )
+                )
+                continue
+            states = _states(events, links, device, period)
+            shown += [(period.id, time, device.tls, state) for time, state in states]
+        found += [
+            Finding(f"{path.name}: {kind} {number} of device {device.id!r} is never logged: red")
+            for kind, number in sorted(silent)
+        ]
+    if not shown:
+        raise MeasuredDataError(
+            f"{path}: no phase event (1, 8, 10 ...) of a mapped phase; check the phases"
+        )
+    frame = pl.DataFrame(shown, schema=["period_id", "time_s", "tls_id", "state"], orient="row")
+    frame = with_period(path, _numbered(frame), periods, found, early=True)
+    return signals_of(path, frame, periods, widths, found)
+
+
+def _links(
+    device: Device, width: int, programme: Sequence[tuple[float, str]]
+) -> list[list[tuple[Source, str]]]:
+    """Per link, what it follows and with which letter it is green then."""
+    follows: list[list[tuple[Source, str]]] = [[] for _ in range(width)]
+    for kind, mapped in (("phase", device.phases), ("overlap", device.overlaps)):
+        for number, links in mapped.items():
+            for link in links.green:
+                follows[link].append(((kind, number), _green(link, links.green, programme)))
+            for link in links.permissive:
+                follows[link].append(((kind, number), "g"))
+            for link in links.flashing:
+                follows[link].append((("arrow", number), "g"))
+    return follows
+
+
+def _green(link: int, together: Sequence[int], programme: Sequence[tuple[float, str]]) -> str:
+    """The letter a link has in the network's programme when its phase is green."""
+    states = [state for _, state in programme]
+    alike = [state for state in states if all(state[other] in "Gg" for other in together)]
+    shown = [state[link] for state in alike or states]
+    return "G" if "G" in shown or not shown else "g"
+
+
+def _events(
+    path: Path,
+    rows: pl.DataFrame,
+    device: Device,
+    period: Period,
+    sources: set[Source],
+    found: list[Finding],
+) -> list[_Event]:
+    """The changes of colour of a device up to the end of a period, in order."""
+    own = rows.filter(
+        (pl.col("device") == device.id)
+        & (pl.col("period_id") == period.id)
+        & pl.col("event").is_in(list(_KIND))
+    )
+    if own.is_empty():
+        return []
+    key, time = np.zeros(own.height, np.int64), own["time_s"].to_numpy()
+    refuse_set_back(path, key, time, own[ROW].to_numpy(), lambda _: f"device {device.id!r}")
+    order = in_order(path, key, time, found)
+    own = own[order]
+    events = [
+        _Event(time, (_KIND[code], number), code)
+        for time, code, number in own.select("time_s", "event", "parameter").iter_rows()
+        if (_KIND[code], number) in sources
+    ]
+    return sorted(events, key=lambda event: (event.time_s, _RANK[event.colour]))
+
+
+def _states(
+    events: Sequence[_Event],
+    links: Sequence[Sequence[tuple[Source, str]]],
+    device: Device,
+    period: Period,
+) -> SignalLog:
+    """The state at the begin of the period and at every change in it."""
+    colours = {source: RED for own in links for source, _ in own}
+    later: list[_Event] = []
+    seen: set[Source] = set()
+    for event in events:
+        if event.time_s <= period.begin_s:
+            colours[event.source] = event.colour
+            continue
+        if event.source not in seen:
+            # The log may have a gap before the period: what ends now was shown until now.
+            colours[event.source] = BEFORE.get(event.code, colours[event.source])
+            seen.add(event.source)
+        later.append(event)
+
+    def state() -> str:
+        letters = [
+            device.constant.get(link)
+            or letter([green if colours[s] == GREEN else colours[s] for s, green in own])
+            for link, own in enumerate(links)
+        ]
+        return "".join(letters)
+
+    log = [(period.begin_s, state())]
+    for index, event in enumerate(later):
+        colours[event.source] = event.colour
+        if index + 1 < len(later) and later[index + 1].time_s == event.time_s:
+            continue
+        now = state()
+        if now != log[-1][1]:
+            log.append((event.time_s, now))
+    return tuple(log)

@@ -1,0 +1,199 @@
+"""The table that says what the numbers in a controller's log mean on the network."""
+
+from __future__ import annotations
+
+import tomllib
+import zoneinfo
+from collections.abc import Collection, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import pydantic
+from pydantic import Field
+
+from ugat_marl.errors import MeasuredDataError
+from ugat_marl.scenarios import DetectorKind, Split
+
+_STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+Index = Annotated[int, Field(ge=0)]
+Text = Annotated[str, Field(min_length=1)]
+
+
+def _name(value: Any) -> Any:
+    """Numbers are names too: ``id = 1136``."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Name = Annotated[Text, pydantic.BeforeValidator(_name)]
+
+
+class Links(pydantic.BaseModel):
+    """Links of a phase or overlap, by their index in the signal state.
+
+    Attributes:
+        green: Green with the phase; protected where the network's programme has them so.
+        permissive: Green with the phase, but they yield.
+        flashing: They yield while the phase's arrow flashes yellow (events 32 and 33).
+    """
+
+    model_config = _STRICT
+
+    green: tuple[Index, ...] = ()
+    permissive: tuple[Index, ...] = ()
+    flashing: tuple[Index, ...] = ()
+
+
+def _as_links(value: Any) -> Any:
+    return {"green": value} if isinstance(value, list) else value
+
+
+LinksOf = Annotated[Links, pydantic.BeforeValidator(_as_links)]
+
+
+class Channel(pydantic.BaseModel):
+    """A detector channel of a controller, and where it lies."""
+
+    model_config = _STRICT
+
+    channel: Index
+    lane: Text
+    position_m: float
+    length_m: float = 0.0
+    kind: DetectorKind
+    id: Name = ""
+    latency_s: float = 0.0
+    """Delay of the detector's stamps, which is taken off them."""
+
+
+class Device(pydantic.BaseModel):
+    """A controller and the traffic light it is in the network."""
+
+    model_config = _STRICT
+
+    id: Name
+    tls: Text
+    phases: dict[int, LinksOf] = {}
+    overlaps: dict[int, LinksOf] = {}
+    constant: dict[int, Annotated[str, Field(pattern="^[rugGyYoOs]$")]] = {}
+    detectors: tuple[Channel, ...] = ()
+
+
+class Span(pydantic.BaseModel):
+    """A period of measurement; `zero` is the local time at which the scenario's clock is 0."""
+
+    model_config = _STRICT
+
+    id: Name = ""
+    zero: datetime
+    begin_s: float | None = None
+    end_s: float | None = None
+    split: Split | None = None
+
+
+class AtspmMapping(pydantic.BaseModel):
+    """The content of a mapping file."""
+
+    model_config = _STRICT
+
+    time_zone: str = ""
+    zero: tuple[datetime, ...] = ()
+    begin_s: float | None = None
+    end_s: float | None = None
+    periods: tuple[Span, ...] = ()
+    devices: Annotated[tuple[Device, ...], Field(min_length=1)]
+
+    def spans(self) -> tuple[Span, ...]:
+        """All periods, with names."""
+        given = self.periods or tuple(Span(zero=zero) for zero in self.zero)
+        return tuple(
+            span.model_copy(
+                update={
+                    "id": span.id or span.zero.strftime("%Y-%m-%dT%H%M"),
+                    "begin_s": self.begin_s if span.begin_s is None else span.begin_s,
+                    "end_s": self.end_s if span.end_s is None else span.end_s,
+                }
+            )
+            for span in given
+        )
+
+
+def read_mapping(
+    path: Path, widths: Mapping[str, int], driven: Mapping[str, Collection[int]]
+) -> AtspmMapping:
+    """Reads and checks a mapping file.
+
+    Args:
+        path: TOML.
+        widths: Letters in the state of each traffic light of the network.
+        driven: Its letters that vehicles obey; the others may be left out of the mapping, and are
+            red. All of them for a traffic light that is not listed.
+
+    Raises:
+        MeasuredDataError: Unreadable, keys missing or unknown, no periods, a traffic light the
+            network does not have or has twice, or links that are not mapped or do not exist.
+    """
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        mapping = AtspmMapping.model_validate(raw)
+    except OSError as error:
+        raise MeasuredDataError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        raise MeasuredDataError(f"{path}: not UTF-8 ({error.reason}); save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise MeasuredDataError(f"{path}: not valid TOML: {error}") from None
+    except pydantic.ValidationError as error:
+        said = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:4]]
+        raise MeasuredDataError(
+            f"{path}: {'; '.join(said)}; docs/measured-data.md has the keys"
+        ) from None
+    if bool(mapping.zero) == bool(mapping.periods):
+        raise MeasuredDataError(
+            f"{path}: give zero (the local times at which the scenario's clock is 0), or "
+            "[[periods]] with a zero each, and not both"
+        )
+    if mapping.time_zone and mapping.time_zone not in zoneinfo.available_timezones():
+        raise MeasuredDataError(
+            f"{path}: unknown time_zone {mapping.time_zone!r}; write it as in 'America/Denver'"
+        )
+    if any(span.zero.tzinfo for span in mapping.spans()):
+        raise MeasuredDataError(f"{path}: zero has a time zone; write local time without one")
+    _check_devices(path, mapping.devices, widths, driven)
+    return mapping
+
+
+def _check_devices(
+    path: Path,
+    devices: Sequence[Device],
+    widths: Mapping[str, int],
+    driven: Mapping[str, Collection[int]],
+) -> None:
+    for device in devices:
+        where = f"{path}: device {device.id!r}"
+        if device.tls not in widths:
+            raise MeasuredDataError(
+                f"{where}: {device.tls!r} is no traffic light of the network; it has "
+                f"{', '.join(sorted(widths)[:12])}"
+            )
+        if [other.tls for other in devices].count(device.tls) > 1:
+            raise MeasuredDataError(
+                f"{where}: the traffic light {device.tls!r} is mapped twice; map it once"
+            )
+        mapped = set(device.constant)
+        for links in (*device.phases.values(), *device.overlaps.values()):
+            mapped |= {*links.green, *links.permissive, *links.flashing}
+        width = widths[device.tls]
+        if unknown := sorted(link for link in mapped if not 0 <= link < width):
+            raise MeasuredDataError(
+                f"{where}: link {unknown[0]} does not exist; {device.tls!r} has the links 0 to "
+                f"{width - 1}"
+            )
+        if bare := sorted(set(driven.get(device.tls, range(width))) - mapped):
+            raise MeasuredDataError(
+                f"{where}: nothing says what the links {', '.join(map(str, bare))} of "
+                f"{device.tls!r} show; add them to a phase or an overlap, or write them under "
+                '[devices.constant], as in 3 = "g" for a right turn that always yields'
+            )
+        channels = [item.channel for item in device.detectors]
+        if twice := [channel for channel in channels if channels.count(channel) > 1]:
+            raise MeasuredDataError(f"{where}: channel {twice[0]} is mapped twice; map it once")

@@ -1,0 +1,395 @@
+"""What measured data lack, and which hypotheses nobody can examine without it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.data.measured.data import Finding, Measured
+from ugat_marl.effects import known_effects
+from ugat_marl.scenarios import (
+    GREEN,
+    YELLOW,
+    Detector,
+    DetectorKind,
+    Network,
+    Period,
+    Scenario,
+    edge_of,
+    letter,
+)
+
+SHORT_S = 300.0
+"""A shorter period holds too few signal cycles to judge much."""
+SILENT_S = 1800.0
+"""A detector that says nothing for longer, while others on its road count, is probably off."""
+ALL_SILENT_S = 600.0
+"""So is the whole recording where no detector says anything for this long."""
+HOLE_S = 180.0
+"""And a busy one where they say nothing for longer than a signal cycle."""
+BUSY = 20
+"""Passages of its neighbours in that time that make a silent detector stand out."""
+EXPECTED = 10.0
+"""Vehicles that must be missing for a silence to be worth a word."""
+MOST_ON_RED = 0.6
+"""Share of vehicles that leave the stop line on red only where something is mixed up."""
+MANY_LENGTHS = 3
+"""Different lengths of one green, in whole s, that no fixed programme has."""
+NAMED = 6
+"""Names listed in one finding; the rest is counted."""
+
+COUNTABLE = (
+    "demand_level",
+    "demand_surge",
+    "demand_timing",
+    "turning",
+    "undercount",
+    "stuck",
+    "dropout",
+    "swapped",
+)
+"""Effects that counts alone can show."""
+NEEDS_SIGNALS = (
+    "late_green",
+    "yellow_time",
+    "all_red_time",
+    "startup_delay",
+    "acceleration",
+    "yellow_running",
+    "red_running",
+    "gap_acceptance",
+    "signal_clock",
+    "clock_drift",
+)
+"""Effects that show relative to what the signals do."""
+NEEDS_STOP = (
+    "startup_delay",
+    "acceleration",
+    "imperfection",
+    "late_green",
+    "yellow_running",
+    "red_running",
+    "gap_acceptance",
+    "lane_discipline",
+    "signal_clock",
+    "clock_drift",
+)
+"""Effects that show in how a queue leaves the stop line."""
+NEEDS_ADVANCE = ("deceleration", "emergency_deceleration", "min_gap")
+"""Effects that show in the approach to red and in how far queues reach."""
+NEEDS_YELLOW = ("yellow_running", "yellow_time")
+NEEDS_SPEEDS = ("speed_spread",)
+NEEDS_TWO_KINDS = ("undercount",)
+"""A detector that misses vehicles is one that sees fewer than the next along the road."""
+
+
+def coverage(measured: Measured, scenario: Scenario, network: Network) -> list[Finding]:
+    """Findings on everything that is not there, most important first."""
+    return [
+        *_of_periods(measured),
+        *_of_signals(measured, scenario, network),
+        *_of_kinds(measured, network),
+        *_of_places(measured.detectors, network),
+        *_of_silence(measured),
+        *_of_agreement(measured, network),
+    ]
+
+
+def _of_periods(measured: Measured) -> Iterator[Finding]:
+    periods = measured.periods
+    if not measured.of("heldout"):
+        why = "only one period" if len(periods) == 1 else "every period is to be fitted"
+        yield Finding(
+            f"periods.csv: {why}, so none is held out: a verdict can only be judged on the data "
+            "that were fitted"
+        )
+    short = [period.id for period in periods if period.end_s - period.begin_s < SHORT_S]
+    if short:
+        yield Finding(
+            f"periods.csv: {_list('period', short)} shorter than {SHORT_S:g} s; a few signal "
+            "cycles tell little"
+        )
+
+
+def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Iterator[Finding]:
+    periods = measured.periods
+    if not any(period.signals for period in periods):
+        yield Finding(
+            "no signals: the network's own programme is taken for what the street's signals did",
+            NEEDS_SIGNALS,
+        )
+        return
+    controlled = [item.id for item in network.intersections]
+    never = [tls for tls in controlled if not any(tls in period.signals for period in periods)]
+    if never:
+        yield Finding(
+            f"signals: nothing of {_list('traffic light', never)}, of {len(controlled)}; "
+            "in the simulation they run the network's programme"
+        )
+    for period in periods:
+        gone = [tls for tls in controlled if tls not in period.signals and tls not in never]
+        if gone:
+            yield Finding(
+                f"signals: nothing of {_list('traffic light', gone)} in period {period.id!r}"
+            )
+    if scenario.control.yellow_s > 0:
+        bare = [tls for tls in controlled if tls not in never and not _has_yellow(periods, tls)]
+        if bare:
+            yield Finding(
+                f"signals: {_list('traffic light', bare)} never yellow, though the scenario has "
+                f"{scenario.control.yellow_s:g} s of it; was the yellow left out of the log?",
+                NEEDS_YELLOW if len(bare) == len(controlled) - len(never) else (),
+            )
+
+    adaptive = [tls for tls in controlled if follows_traffic(periods, tls)]
+    if adaptive:
+        yield Finding(
+            f"signals: {_list('traffic light', adaptive)} with greens of many lengths, as if they "
+            "followed the traffic: simulated days get the arrivals they answered, as the advance "
+            "detectors saw them; where an approach has none, doubt the verdict unknown"
+        )
+
+
+def follows_traffic(periods: Sequence[Period], tls: str) -> bool:
+    """Whether some green lasts differently long; twice in one cycle it may in a fixed programme."""
+    lengths: dict[str, set[float]] = {}
+    for period in periods:
+        changes = period.signals.get(tls, ())
+        # The first and the last are cut by the ends of the period.
+        for (begin_s, state), (end_s, _) in itertools.pairwise(changes[1:]):
+            if set(state) & GREEN:
+                lengths.setdefault(state, set()).add(round(end_s - begin_s))
+    return any(len(found) >= MANY_LENGTHS for found in lengths.values())
+
+
+def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
+    """Whether a log has yellow, or has no green that could end in it."""
+    shown = {state for period in periods for _, state in period.signals.get(tls, ())}
+    letters = set("".join(shown))
+    return bool(letters & YELLOW) or not letters & GREEN or len(shown) < 2
+
+
+def _of_kinds(measured: Measured, network: Network) -> Iterator[Finding]:
+    if not measured.has_events:
+        yield Finding(
+            "counts only, no detections of single vehicles: only "
+            f"{', '.join(COUNTABLE)} can be examined",
+            tuple(sorted(set(known_effects()) - set(COUNTABLE))),
+        )
+        return
+    seen = {name for period in measured.periods for name in period.passages}
+    silent = [item.id for item in measured.detectors if item.id not in seen]
+    if silent:
+        many = 2 * len(silent) >= len(measured.detectors)
+        yield Finding(
+            f"detections: nothing of {_list('detector', silent)}, of {len(measured.detectors)}"
+            + ("; they are not used, and what happens there stays unknown" if many else ""),
+            ("dropout", "swapped", "undercount") if many else (),
+        )
+    kinds = {item.kind for item in measured.detectors if item.id in seen}
+    shared = any(
+        len({link.to_edge for link in item.links if link.from_lane == lane}) > 1
+        for item in network.intersections
+        for lane in item.incoming_lanes
+    )
+    needs: dict[DetectorKind, tuple[str, tuple[str, ...]]] = {
+        "stop": ("how queues leave the stop line stays unseen", NEEDS_STOP),
+        "advance": ("the approach to red and the reach of queues stay unseen", NEEDS_ADVANCE),
+        "exit": (
+            "where vehicles turn "
+            + ("on shared lanes stays unseen" if shared else "shows by lane"),
+            ("turning",) if shared else (),
+        ),
+    }
+    for kind, (what, effects) in needs.items():
+        if kind not in kinds:
+            yield Finding(f"no {kind} detector counts: {what}", effects)
+    if len(kinds) < 2:
+        yield Finding(
+            "all detectors are of one kind: one that misses vehicles looks like less demand",
+            NEEDS_TWO_KINDS,
+        )
+    yield from _of_speeds(measured)
+
+
+def _of_speeds(measured: Measured) -> Iterator[Finding]:
+    passages = [item for period in measured.periods for item in period.passages.values()]
+    total = sum(map(len, passages))
+    known = sum(int(np.isfinite(item.speed_mps).sum()) for item in passages)
+    if known == 0:
+        yield Finding(
+            "no speeds: a small change of desired_speed stays unseen, and heavy_share shows only "
+            "in how long detectors are occupied",
+            NEEDS_SPEEDS,
+        )
+    elif known < total:
+        yield Finding(f"detections: no speed for {total - known} of {total} passages")
+    times = np.concatenate([item.on_s for item in passages])
+    times = times[np.isfinite(times)]
+    if len(times) >= BUSY and not (times % 1).any():
+        yield Finding(
+            "detections: all times are whole seconds; effects of less than a second are hard to "
+            "see (controllers log tenths)"
+        )
+
+
+def _of_places(detectors: Sequence[Detector], network: Network) -> Iterator[Finding]:
+    into = {lane for item in network.intersections for lane in item.incoming_lanes}
+    out = {lane for item in network.intersections for lane in item.outgoing_lanes}
+    wrong = [
+        item.id for item in detectors if item.lane not in (out if item.kind == "exit" else into)
+    ]
+    if wrong:
+        yield Finding(
+            f"detectors.csv: {_list('detector', wrong)} not on a lane of that kind (advance and "
+            "stop: leading to an intersection with signals, exit: leading away); not used"
+        )
+    bare = sorted(into - {item.lane for item in detectors if item.kind != "exit"})
+    if bare:
+        yield Finding(
+            f"detectors.csv: no detector on {_list('incoming lane', bare)}, of {len(into)}; "
+            "what differs there stays unknown"
+        )
+
+
+def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
+    """Traffic lights whose vehicles leave the stop line on red: a wrong table, or a wrong clock."""
+    stops: dict[str, list[str]] = {}
+    for item in measured.detectors:
+        if item.kind == "stop":
+            stops.setdefault(item.lane, []).append(item.id)
+    for item in network.intersections:
+        total = red = 0
+        for lane in item.incoming_lanes:
+            links = sorted({link.index for link in item.links if link.from_lane == lane})
+            for period in measured.periods:
+                log = period.signals.get(item.id)
+                if not log:
+                    continue
+                since = np.array([since for since, _ in log])
+                is_red = np.array([letter([s[i] for i in links]) == "r" for _, s in log])
+                for name in stops.get(lane, ()):
+                    if name in period.passages:
+                        off = period.passages[name].off_s
+                        shown = np.searchsorted(since, off[np.isfinite(off)], side="right") - 1
+                        total += len(shown)
+                        red += int(is_red[shown].sum())
+        if total >= BUSY and red > MOST_ON_RED * total:
+            yield Finding(
+                f"{red} of {total} vehicles leave the stop detectors of traffic light {item.id!r} "
+                "while their lane has red; are lanes and links the right ones, and the clocks?"
+            )
+
+
+@dataclass(frozen=True)
+class _Silence:
+    """A detector does not change for a while, in which a neighbour counts vehicles."""
+
+    period: str
+    begin_s: float
+    length_s: float
+    meanwhile: int
+
+
+def _of_silence(measured: Measured) -> Iterator[Finding]:
+    roads: dict[str, list[Detector]] = {}
+    for item in measured.detectors:
+        roads.setdefault(edge_of(item.lane), []).append(item)
+    usual = _usual_rates(measured)
+    silences: dict[tuple[str, str], list[_Silence]] = {}
+    for period in measured.periods:
+        if not period.passages:
+            if measured.has_events:
+                yield Finding(f"detections: nothing in period {period.id!r}")
+            continue
+        times = {name: _times(period, name) for name in period.passages}
+        together = np.concatenate(list(times.values()))
+        begin, length = _longest_gap(together, period)
+        if length > ALL_SILENT_S or _is_hole(together, begin, length):
+            yield Finding(
+                f"detections: no detector says anything for {length / 60:.0f} min from {begin:g} s "
+                f"on in period {period.id!r}; was the recording interrupted, or a clock set ahead?"
+            )
+            continue
+        for group in roads.values():
+            for name, what, silence in _silent(group, times, period, usual):
+                silences.setdefault((name, what), []).append(silence)
+    for (name, what), found in silences.items():
+        minutes = sorted(round(item.length_s / 60) for item in found)
+        span = f"{minutes[0]}" if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"
+        where = f"in {_list('period', [item.period for item in found])}"
+        if len(found) == 1:
+            where = f"from {found[0].begin_s:g} s on in period {found[0].period!r}"
+        yield Finding(
+            f"detections: {name!r} {what} for {span} min {where}, while a "
+            f"neighbour counts {max(item.meanwhile for item in found)} vehicles"
+        )
+
+
+def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> bool:
+    """Whether a silence is longer than a cycle and as long before and after it was busy."""
+    end_s = begin_s + length_s
+    before = int(((times > begin_s - length_s) & (times <= begin_s)).sum()) // 2
+    after = int(((times >= end_s) & (times < end_s + length_s)).sum()) // 2
+    return length_s > HOLE_S and min(before, after) >= BUSY
+
+
+def _usual_rates(measured: Measured) -> dict[str, float]:
+    """Vehicles per second at each detector over all periods."""
+    counts: dict[str, float] = {}
+    seconds = sum(period.end_s - period.begin_s for period in measured.periods)
+    for period in measured.periods:
+        for name in period.passages:
+            counts[name] = counts.get(name, 0.0) + len(_times(period, name)) / 2
+    return {name: count / seconds for name, count in counts.items()}
+
+
+def _silent(
+    group: Sequence[Detector],
+    times: dict[str, NDArray[np.float64]],
+    period: Period,
+    usual: Mapping[str, float],
+) -> Iterator[tuple[str, str, _Silence]]:
+    """Detectors of one road that say nothing while others of it count, and they did elsewhere."""
+    for item in group:
+        begin, length = _longest_gap(times.get(item.id, np.empty(0)), period)
+        if usual.get(item.id, 0.0) * length < EXPECTED:
+            continue  # a lane that hardly anybody uses
+        if length <= min(SILENT_S, period.end_s - period.begin_s - 1e-6):
+            continue
+        others = [times[other.id] for other in group if other.id in times and other is not item]
+        busy = max(
+            (int(((t > begin) & (t < begin + length)).sum()) // 2 for t in others), default=0
+        )
+        if busy >= BUSY:
+            what = "is on" if _is_on(period, item.id, begin) else "says nothing"
+            yield item.id, what, _Silence(period.id, begin, length, busy)
+
+
+def _times(period: Period, detector: str) -> NDArray[np.float64]:
+    passages = period.passages[detector]
+    both = np.concatenate([passages.on_s, passages.off_s])
+    return both[np.isfinite(both)]
+
+
+def _is_on(period: Period, detector: str, time_s: float) -> bool:
+    """Whether a vehicle comes over the detector at this time."""
+    return detector in period.passages and bool((period.passages[detector].on_s == time_s).any())
+
+
+def _longest_gap(times: NDArray[np.float64], period: Period) -> tuple[float, float]:
+    """Begin and length of the longest time without an event."""
+    marks = np.concatenate([[period.begin_s], np.sort(times), [period.end_s]])
+    gaps = np.diff(marks)
+    longest = int(gaps.argmax())
+    return float(marks[longest]), float(gaps[longest])
+
+
+def _list(what: str, names: Sequence[str]) -> str:
+    """``2 detectors ('a', 'b')``."""
+    shown = ", ".join(map(repr, names[:NAMED])) + (" ..." if len(names) > NAMED else "")
+    return f"{len(names)} {what}{'s' if len(names) != 1 else ''} ({shown})"

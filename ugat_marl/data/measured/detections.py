@@ -1,0 +1,293 @@
+"""Detections: rows of on and off become passages of vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ugat_marl.data.measured.data import Finding
+from ugat_marl.data.measured.pairing import IMPUTED_S, untangled
+from ugat_marl.data.measured.rows import PERIOD, in_order, refuse_set_back
+from ugat_marl.data.measured.tables import ROW, refuse
+from ugat_marl.errors import MeasuredDataError, nearest
+from ugat_marl.scenarios import Detector, Passages, Period
+
+MOST_UNPAIRED = 0.5
+"""A detector with a larger share of events that have no partner is not used."""
+FEW = 0.01
+"""Share of impossible values that is left out; a larger share means another unit."""
+FASTEST_MPS = 70.0
+"""Faster vehicles on a street are errors of measurement (250 km/h)."""
+LONGEST_M = 40.0
+"""Longer vehicles do not exist on streets."""
+MOST_SHARED = 0.5
+"""Share of equal detections that two different days do not reach."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Stream:
+    """Events in order of stream and time; all arrays ``(events,)``."""
+
+    key: NDArray[np.int64]
+    time: NDArray[np.float64]
+    is_on: NDArray[np.bool_]
+    speed: NDArray[np.float64]
+    length: NDArray[np.float64]
+
+
+def passages_of(
+    path: Path,
+    frame: pl.DataFrame,
+    periods: Sequence[Period],
+    detectors: Sequence[Detector],
+    found: list[Finding],
+) -> tuple[tuple[dict[str, Passages], ...], frozenset[str]]:
+    """The vehicles over every detector.
+
+    Args:
+        path: The file.
+        frame: Its rows, with `PERIOD`.
+        periods: The periods.
+        detectors: The detectors.
+        found: Findings; what was left out or filled in is added.
+
+    Returns:
+        One mapping per period, and the detectors that cannot be used.
+
+    Raises:
+        MeasuredDataError: Unknown events, no known detector, impossible speeds or lengths, a clock
+            set back, or the same detections in two periods.
+    """
+    refuse(
+        path,
+        frame.filter(~pl.col("event").is_in(["on", "off"])),
+        "event",
+        "is unknown",
+        "write on or off",
+    )
+    names = [detector.id for detector in detectors]
+    frame = _known(path, frame, names, found)
+    frame = frame.with_columns(
+        _plausible(path, frame, "speed_mps", FASTEST_MPS, found),
+        _plausible(path, frame, "length_m", LONGEST_M, found),
+    )
+    once = frame.unique(["key", "time_s", "event"], keep="first", maintain_order=True)
+    if once.height < frame.height:
+        found.append(
+            Finding(
+                f"{path.name}: {frame.height - once.height} of {frame.height} rows are there "
+                "twice; they count once"
+            )
+        )
+    stream = _sorted(path, once, periods, names, found)
+    _refuse_copies(path, stream, periods, len(names))
+    paired, broken = _pair(path, stream, names, found)
+    return _split(paired, periods, names, broken), frozenset(names[i] for i in broken)
+
+
+def _known(
+    path: Path, frame: pl.DataFrame, names: Sequence[str], found: list[Finding]
+) -> pl.DataFrame:
+    """The rows of known detectors, with the number of their stream as ``key``."""
+    index = {name: i for i, name in enumerate(names)}
+    code = pl.col("detector_id").replace_strict(index, default=None, return_dtype=pl.Int64)
+    frame = frame.with_columns((pl.col(PERIOD).cast(pl.Int64) * len(names) + code).alias("key"))
+    unknown = frame.filter(pl.col("key").is_null())
+    if unknown.is_empty():
+        return frame
+    others = unknown["detector_id"].unique(maintain_order=True).to_list()
+    near = nearest(others[0], names)
+    listed = ", ".join(map(repr, others[:5])) + (" ..." if len(others) > 5 else "")
+    if unknown.height == frame.height:
+        raise MeasuredDataError(
+            f"{path}: no row is of a detector in detectors.csv; the rows are of {listed}"
+            + (f" (is {others[0]!r} {near!r}?)" if near else "")
+        )
+    found.append(
+        Finding(
+            f"{path.name}: {unknown.height} rows are of detectors that detectors.csv does not "
+            f"list ({listed}); they are left out"
+        )
+    )
+    return frame.filter(pl.col("key").is_not_null())
+
+
+def _plausible(
+    path: Path, frame: pl.DataFrame, column: str, most: float, found: list[Finding]
+) -> pl.Series:
+    """A column of speeds or lengths, NaN where it is missing or, rarely, impossible."""
+    values = frame[column]
+    refuse(
+        path,
+        frame.filter(pl.col(column) < 0),
+        column,
+        "is negative",
+        "leave the cell empty where it was not measured",
+    )
+    impossible = values > most
+    if column == "length_m":
+        impossible |= values == 0
+    count = int(impossible.sum() or 0)
+    if count > FEW * max(values.len() - values.null_count(), 1) and count > 1:
+        unit = "m/s" if column == "speed_mps" else "m"
+        refuse(
+            path,
+            frame.filter(impossible),
+            column,
+            f"is impossible; allowed: up to {most:g} {unit}",
+            f"convert the column to {unit}, or leave cells empty that were not measured",
+        )
+    if count:
+        found.append(Finding(f"{path.name}: {count} impossible {column} taken as not measured"))
+    return values.set(impossible.fill_null(False), None).fill_null(float("nan")).alias(column)
+
+
+def _sorted(
+    path: Path,
+    frame: pl.DataFrame,
+    periods: Sequence[Period],
+    names: Sequence[str],
+    found: list[Finding],
+) -> _Stream:
+    key = frame["key"].to_numpy()
+    time = frame["time_s"].to_numpy()
+    is_on = (frame["event"] == "on").to_numpy()
+
+    def name(stream: int) -> str:
+        period, detector = divmod(stream // 2, len(names))
+        return f"detector {names[detector]!r} in period {periods[period].id!r}"
+
+    # Ons and offs may have been exported one after the other.
+    refuse_set_back(path, key * 2 + is_on, time, frame[ROW].to_numpy(), name)
+    order = in_order(path, key, time, found)
+    order = order[untangled(key[order], time[order], is_on[order])]
+    return _Stream(
+        key[order],
+        time[order],
+        is_on[order],
+        frame["speed_mps"].to_numpy()[order],
+        frame["length_m"].to_numpy()[order],
+    )
+
+
+def _pair(
+    path: Path, stream: _Stream, names: Sequence[str], found: list[Finding]
+) -> tuple[tuple[NDArray[np.int64], Passages], frozenset[int]]:
+    """Passages with their streams, and the detectors that have too few of them."""
+    key, time, is_on = stream.key, stream.time, stream.is_on
+    follows = np.append(key[1:] == key[:-1], False)  # the next event is of the same stream
+    leads = np.append(False, follows[:-1])
+    next_on = np.append(is_on[1:], False)
+    next_time = np.append(time[1:], np.nan)
+    whole = is_on & follows & ~next_on
+    imputed = is_on & follows & next_on & (next_time - time <= IMPUTED_S)
+    open_end = is_on & ~follows
+    open_begin = ~is_on & ~leads
+    lost_off = is_on & follows & next_on & ~imputed
+    lost_on = ~is_on & leads & np.append(False, ~is_on[:-1])
+    with_on = whole | imputed | open_end
+    first = np.flatnonzero(with_on | open_begin)
+    on = np.where(is_on, time, np.nan)[first]
+    off = np.where(is_on, np.where(open_end, np.nan, next_time), time)[first]
+    partner = np.where(whole, np.arange(len(key)) + 1, np.arange(len(key)))[first]
+
+    def of_pair(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.where(np.isfinite(values[partner]), values[partner], values[first])
+
+    passages = Passages(on, off, of_pair(stream.speed), of_pair(stream.length))
+    _report(path, int(imputed.sum()), int(lost_off.sum()), int(lost_on.sum()), len(first), found)
+    detector = key % len(names)
+    events = np.bincount(detector, minlength=len(names))
+    lost = np.bincount(detector[lost_off | lost_on], minlength=len(names))
+    broken = frozenset(np.flatnonzero(lost > MOST_UNPAIRED * events).tolist())
+    found += [
+        Finding(
+            f"{path.name}: detector {names[i]!r} has no partner for {lost[i]} of {events[i]} "
+            "events; it is not used"
+        )
+        for i in sorted(broken)
+    ]
+    return (key[first], passages), broken
+
+
+def _report(
+    path: Path, imputed: int, lost_off: int, lost_on: int, kept: int, found: list[Finding]
+) -> None:
+    if imputed:
+        found.append(
+            Finding(
+                f"{path.name}: {imputed} times on follows on within {IMPUTED_S:g} s; the off in "
+                "between was filled in"
+            )
+        )
+    if lost_off or lost_on:
+        found.append(
+            Finding(
+                f"{path.name}: {lost_off} ons without off and {lost_on} offs without on were left "
+                f"out; {kept} passages are left"
+            )
+        )
+
+
+def _split(
+    paired: tuple[NDArray[np.int64], Passages],
+    periods: Sequence[Period],
+    names: Sequence[str],
+    broken: frozenset[int],
+) -> tuple[dict[str, Passages], ...]:
+    key, passages = paired
+    result: tuple[dict[str, Passages], ...] = tuple({} for _ in periods)
+    if not len(key):
+        return result
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    for begin, end in zip(starts, np.append(starts[1:], len(key)), strict=True):
+        period, detector = divmod(int(key[begin]), len(names))
+        if detector not in broken:
+            chosen = np.arange(begin, end)
+            result[period][names[detector]] = passages.at(chosen)
+    return result
+
+
+def _refuse_copies(path: Path, stream: _Stream, periods: Sequence[Period], detectors: int) -> None:
+    """Two periods may show the same time of two days, but not the same vehicles."""
+    # One whole number per event: its time in ms, its detector, and whether it is an on.
+    code = np.round(stream.time * 1000).astype(np.int64) * detectors + stream.key % detectors
+    code = code * 2 + stream.is_on
+    period = stream.key // detectors
+    bounds = np.searchsorted(period, np.arange(len(periods) + 1))
+    events = [np.sort(code[a:b]) for a, b in zip(bounds, bounds[1:], strict=False)]
+    for i, one in enumerate(periods):
+        for j in range(i + 1, len(periods)):
+            other = periods[j]
+            begin, end = max(one.begin_s, other.begin_s), min(one.end_s, other.end_s)
+            if begin >= end:
+                continue
+            a, b = (_between(events[k], begin, end, detectors) for k in (i, j))
+            few, many = (a, b) if len(a) <= len(b) else (b, a)
+            sample = few[:: max(len(few) // 200, 1)]
+            if len(few) < 20 or _share(sample, many) < MOST_SHARED:
+                continue
+            if (share := _share(few, many)) >= MOST_SHARED:
+                raise MeasuredDataError(
+                    f"{path}: {share:.0%} of the detections from {begin:g} s to {end:g} s are the "
+                    f"same in the periods {one.id!r} and {other.id!r}: one recording would count "
+                    "twice; let periods of one day not overlap, and give each day its own rows"
+                )
+
+
+def _between(
+    events: NDArray[np.int64], begin_s: float, end_s: float, detectors: int
+) -> NDArray[np.int64]:
+    scale = 2000 * detectors
+    low, high = np.searchsorted(events, [begin_s * scale, (end_s + 0.001) * scale])
+    return events[low:high]
+
+
+def _share(some: NDArray[np.int64], many: NDArray[np.int64]) -> float:
+    at = np.minimum(np.searchsorted(many, some), len(many) - 1)
+    return float(np.mean(many[at] == some))

@@ -1,0 +1,363 @@
+"""The tables of measured data: which files and columns there are, read without trusting them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import polars as pl
+
+from ugat_marl.data.measured.data import Finding
+from ugat_marl.errors import MeasuredDataError, nearest
+
+ROW = "row"
+"""Column added to every table: the line of a CSV file, or the row of a Parquet file, from 1."""
+
+Kind = Literal["text", "number"]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A file of the format.
+
+    Attributes:
+        stem: File name without suffix.
+        columns: Required columns and what they hold.
+        optional: Further columns; empty cells are allowed in them.
+        suffixes: File types it may have, the default first.
+    """
+
+    stem: str
+    columns: Mapping[str, Kind]
+    optional: Mapping[str, Kind]
+    suffixes: tuple[str, ...] = (".parquet", ".csv")
+
+    def path(self, directory: Path) -> Path | None:
+        """The file in a directory, or None.
+
+        Raises:
+            MeasuredDataError: It is there twice.
+        """
+        found = [path for path in self._paths(directory) if path.exists()]
+        if len(found) > 1:
+            raise MeasuredDataError(
+                f"{directory}: both {found[0].name} and {found[1].name} are there; remove one"
+            )
+        return found[0] if found else None
+
+    def names(self) -> tuple[str, ...]:
+        """The names the file may have."""
+        return tuple(self.stem + suffix for suffix in self.suffixes)
+
+    def _paths(self, directory: Path) -> Iterator[Path]:
+        return (directory / name for name in self.names())
+
+
+PERIODS = Table(
+    "periods",
+    {"period_id": "text", "begin_s": "number", "end_s": "number"},
+    {"split": "text"},
+    (".csv",),
+)
+DETECTORS = Table(
+    "detectors",
+    {
+        "detector_id": "text",
+        "lane_id": "text",
+        "position_m": "number",
+        "length_m": "number",
+        "kind": "text",
+    },
+    {},
+    (".csv",),
+)
+SIGNALS = Table(
+    "signals", {"period_id": "text", "time_s": "number", "tls_id": "text", "state": "text"}, {}
+)
+DETECTIONS = Table(
+    "detections",
+    {"period_id": "text", "time_s": "number", "detector_id": "text", "event": "text"},
+    {"speed_mps": "number", "length_m": "number"},
+)
+LANES = Table(
+    "lanes",
+    {
+        "period_id": "text",
+        "time_s": "number",
+        "lane_id": "text",
+        "vehicles": "number",
+        "halting": "number",
+    },
+    {"mean_speed_mps": "number"},
+)
+TRAJECTORIES = Table(
+    "trajectories",
+    {
+        "period_id": "text",
+        "vehicle_id": "text",
+        "time_s": "number",
+        "lane_id": "text",
+        "position_m": "number",
+        "speed_mps": "number",
+    },
+    {},
+)
+COUNTS = Table(
+    "counts",
+    {
+        "period_id": "text",
+        "begin_s": "number",
+        "end_s": "number",
+        "detector_id": "text",
+        "count": "number",
+    },
+    {},
+    (".csv",),
+)
+TABLES = (PERIODS, DETECTORS, SIGNALS, DETECTIONS, LANES, TRAJECTORIES, COUNTS)
+
+
+def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
+    """The columns of `table` in a file, numbers as Float64, and `ROW`.
+
+    Args:
+        path: The file.
+        table: What it should hold.
+        found: Findings; columns that are not read are added.
+
+    Returns:
+        One row per row of the file, in its order. Missing optional columns are null.
+
+    Raises:
+        MeasuredDataError: Unreadable, cut short, columns missing, text where numbers belong, or
+            empty cells in required columns.
+    """
+    raw = read_raw(path, found)
+    wanted = {**table.columns, **table.optional}
+    _check_columns(path, table, raw.columns, found)
+    start = 1 if path.suffix == ".parquet" else 2  # line 1 of a CSV file is its header
+    columns = [pl.int_range(start, raw.height + start, dtype=pl.Int64, eager=True).alias(ROW)]
+    for name, kind in wanted.items():
+        if name not in raw.columns:
+            dtype = pl.Float64 if kind == "number" else pl.String
+            columns.append(pl.Series(name, [None] * raw.height, dtype))
+            continue
+        cells = raw[name]
+        values = to_numbers(path, cells) if kind == "number" else to_texts(path, cells)
+        if name in table.columns and values.null_count():
+            where = place(path, int(values.is_null().arg_true()[0]) + start)
+            raise MeasuredDataError(
+                f"{where}: {name} is empty, in {values.null_count()} of {values.len()} rows; "
+                "fill it in or leave the rows out (an empty last row means a file cut short)"
+            )
+        columns.append(values)
+    return pl.DataFrame(columns)
+
+
+def read_raw(path: Path, found: list[Finding]) -> pl.DataFrame:
+    """All columns of a CSV or Parquet file; those of a CSV file as text.
+
+    Raises:
+        MeasuredDataError: Unreadable, damaged or cut short.
+    """
+    return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, found)
+
+
+def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
+    """Rows with the columns of a table."""
+    kinds = {**table.columns, **table.optional}
+    schema = {
+        name: pl.Float64() if kind == "number" else pl.String() for name, kind in kinds.items()
+    }
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+def place(path: Path, row: int) -> str:
+    """How a row is called in messages."""
+    what = {".csv": "line", ".parquet": "row"}.get(path.suffix, "entry")
+    return f"{path}, {what} {row}"
+
+
+def refuse(path: Path, bad: pl.DataFrame, column: str, complaint: str, way_out: str) -> None:
+    """Raises an error for the first of the bad rows, if there are any.
+
+    Raises:
+        MeasuredDataError: `bad` has rows.
+    """
+    if bad.is_empty():
+        return
+    value = str(bad[column][0])
+    shown = value if len(value) <= 60 else f"{value[:57]}..."
+    rows = "row" if bad.height == 2 else "rows"
+    more = f" (and {bad.height - 1} {rows} more)" if bad.height > 1 else ""
+    raise MeasuredDataError(
+        f"{place(path, int(bad[ROW][0]))}: {column} {shown!r} {complaint}{more}; {way_out}"
+    )
+
+
+def _check_columns(path: Path, table: Table, given: list[str], found: list[Finding]) -> None:
+    wanted = (*table.columns, *table.optional)
+    unknown = [name for name in given if name not in wanted]
+    for name in table.columns:
+        if name not in given:
+            near = nearest(name, unknown)
+            guess = f" (is it {near!r}?)" if near else ""
+            raise MeasuredDataError(
+                f"{path}: no column {name!r}{guess}; it has {_listed(given)}, and needs "
+                f"{', '.join(table.columns)}"
+            )
+    for name in unknown:
+        missing = [column for column in table.optional if column not in given]
+        near = nearest(name, missing)
+        guess = f"; if it means {near!r}, rename it" if near else ""
+        found.append(Finding(f"{path.name}: column {name!r} is not read{guess}"))
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(name.split("\n")[0][:30] for name in names[:12])
+    return shown + (" ..." if len(names) > 12 else "")
+
+
+def _read_parquet(path: Path) -> pl.DataFrame:
+    content = _bytes(path)
+    if content[:4] != b"PAR1":
+        raise MeasuredDataError(f"{path}: not a Parquet file; export it again")
+    if content[-4:] != b"PAR1" or len(content) < 12:
+        raise MeasuredDataError(
+            f"{path}: the Parquet file is cut short ({len(content)} bytes, no footer); "
+            "copy it again"
+        )
+    try:
+        with _quietly():
+            return pl.read_parquet(io.BytesIO(content))
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
+        raise MeasuredDataError(
+            f"{path}: damaged Parquet file ({_first_line(error)}); copy or export it again"
+        ) from None
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Keeps a block that fails from writing to standard error.
+
+    Threads of polars print their own stack traces there before Python learns of the error.
+    """
+    sys.stderr.flush()
+    try:
+        kept = os.dup(2)
+    except OSError:  # no standard error at all
+        yield
+        return
+    with tempfile.TemporaryFile() as said:
+        try:
+            os.dup2(said.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        said.seek(0)
+        os.write(2, said.read())
+
+
+def _read_csv(path: Path, found: list[Finding]) -> pl.DataFrame:
+    content = _bytes(path).removeprefix(b"\xef\xbb\xbf")
+    if b"\0" in content:
+        line = content[: content.index(b"\0")].count(b"\n") + 1
+        raise MeasuredDataError(
+            f"{path}, line {line}: a NUL byte; the file is damaged or not CSV in UTF-8, "
+            "export it again"
+        )
+    try:
+        head = content.decode("utf-8").split("\n", 1)[0]
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise MeasuredDataError(
+            f"{path}, line {line}: not UTF-8 ({error.reason}); save the file as UTF-8"
+        ) from None
+    if not content.strip():
+        raise MeasuredDataError(f"{path}: the file is empty; it needs a header and rows")
+    if ";" in head and "," not in head:
+        raise MeasuredDataError(
+            f"{path}: columns are divided by semicolons; save it with commas, and with points in "
+            "numbers"
+        )
+    if not content.endswith((b"\n", b"\r")):
+        found.append(
+            Finding(f"{path.name}: the last line has no end; the file may have been cut short")
+        )
+    try:
+        frame = pl.read_csv(io.BytesIO(content), infer_schema=False)
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
+        raise MeasuredDataError(
+            f"{path}: not a table ({_first_line(error)}); every line needs the columns of line 1"
+        ) from None
+    return frame.rename({name: name.strip() for name in frame.columns}, strict=False)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MeasuredDataError(
+            f"{path}: cannot be read ({error.strerror}); check its path and its rights"
+        ) from None
+
+
+def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
+    """Numbers as Float64; empty cells and NaN are null.
+
+    Raises:
+        MeasuredDataError: Text, infinity, or a column of another type.
+    """
+    name, start = cells.name, 1 if path.suffix == ".parquet" else 2
+    if cells.dtype == pl.String:
+        cells = cells.str.strip_chars()
+        cells = cells.set(cells == "", None)
+    elif not (cells.dtype.is_numeric() or cells.dtype == pl.Null):
+        what = "seconds of the scenario's clock" if name.endswith("_s") else "numbers"
+        raise MeasuredDataError(
+            f"{path}: column {name!r} has the type {cells.dtype}; it holds {what}"
+        )
+    numbers = cells.cast(pl.Float64, strict=False)
+    wrong = (numbers.is_null() & cells.is_not_null()) | numbers.is_infinite().fill_null(False)
+    if wrong.any():
+        at = int(wrong.arg_true()[0])
+        text = str(cells[at])
+        comma = " with a point, not a comma" if "," in text else ""
+        raise MeasuredDataError(
+            f"{place(path, at + start)}: {name} is {text[:40]!r}; write a number{comma}, or "
+            "leave the row out"
+        )
+    return numbers.fill_nan(None)
+
+
+def to_texts(path: Path, cells: pl.Series) -> pl.Series:
+    """Names as text; empty cells are null.
+
+    Raises:
+        MeasuredDataError: A column that holds no names.
+    """
+    dtype = cells.dtype
+    known = isinstance(dtype, pl.String | pl.Categorical | pl.Enum | pl.Null)
+    if not (known or dtype.is_integer()):
+        raise MeasuredDataError(
+            f"{path}: column {cells.name!r} has the type {dtype}; it holds names (text)"
+        )
+    try:
+        texts = cells.cast(pl.String).str.strip_chars()
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+        raise MeasuredDataError(
+            f"{path}: column {cells.name!r} is damaged ({_first_line(error)}); export it again"
+        ) from None
+    return texts.set(texts == "", None)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]

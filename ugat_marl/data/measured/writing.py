@@ -1,0 +1,205 @@
+"""Writes measured data as the directory that `read_measured` reads."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from ugat_marl.data.measured.data import Measured
+from ugat_marl.data.measured.pairing import as_logged
+from ugat_marl.data.measured.tables import (
+    COUNTS,
+    DETECTIONS,
+    DETECTORS,
+    LANES,
+    PERIODS,
+    SIGNALS,
+    TABLES,
+    TRAJECTORIES,
+    Table,
+    frame_of,
+)
+from ugat_marl.errors import OutputError
+from ugat_marl.scenarios import Passages, Period
+
+
+def write_measured(measured: Measured, directory: Path, *, csv: bool = False) -> Path:
+    """Writes measured data; the directory is there whole or not at all.
+
+    Passages are written as `as_logged` has them: to the millisecond, within their period, and one
+    vehicle at a time.
+
+    Args:
+        measured: What to write; its findings are not written.
+        directory: New, empty, or measured data that are replaced.
+        csv: Whether to write CSV where Parquet is the default.
+
+    Returns:
+        `directory`.
+
+    Raises:
+        OutputError: The directory holds other things, or cannot be written.
+    """
+    require_replaceable(directory)
+    suffix = ".csv" if csv else ".parquet"
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(dir=directory.parent, prefix=f".{directory.name}."))
+    except OSError as error:
+        raise OutputError(
+            f"{directory}: cannot be written ({error.strerror}); give another place"
+        ) from None
+    try:
+        _write(_detectors(measured), temporary / "detectors.csv")
+        _write(_periods(measured.periods), temporary / "periods.csv")
+        _write(_signals(measured.periods), temporary / f"signals{suffix}")
+        if measured.has_events or measured.counts is None:
+            _write(_detections(measured.periods), temporary / f"detections{suffix}")
+        if measured.lanes is not None:
+            _write(_ordered(measured.lanes, LANES), temporary / f"lanes{suffix}")
+        if measured.trajectories is not None:
+            table = _ordered(measured.trajectories, TRAJECTORIES)
+            _write(table, temporary / f"trajectories{suffix}")
+        if measured.counts is not None:
+            _write(_ordered(measured.counts, COUNTS), temporary / "counts.csv")
+        _put(temporary, directory)
+    except OSError as error:
+        raise OutputError(
+            f"{directory}: cannot be written ({error.strerror}); give another place"
+        ) from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return directory
+
+
+def require_replaceable(directory: Path) -> None:
+    """Refuses a directory that `write_measured` would not replace; to be asked before measuring.
+
+    Raises:
+        OutputError: It holds other things, or is a file.
+    """
+    if not directory.exists():
+        return
+    if not directory.is_dir():
+        raise OutputError(f"{directory}: is a file; give the name of a directory")
+    known = {name for table in TABLES for name in table.names()}
+    try:
+        there = {path.name for path in directory.iterdir()}
+    except OSError as error:
+        raise OutputError(
+            f"{directory}: cannot be read ({error.strerror}); give another place"
+        ) from None
+    if foreign := sorted(there - known):
+        raise OutputError(
+            f"{directory}: holds {foreign[0]!r}, which is not measured data; give another "
+            "directory, or empty this one"
+        )
+    if there and "periods.csv" not in there:
+        raise OutputError(
+            f"{directory}: is not empty and has no periods.csv, so it is no measured data to "
+            "replace; give another directory"
+        )
+
+
+def _put(temporary: Path, directory: Path) -> None:
+    """Moves the finished directory to its place, aside of what was there."""
+    umask = os.umask(0)
+    os.umask(umask)
+    temporary.chmod(0o777 & ~umask)
+    if not directory.exists():
+        temporary.rename(directory)
+        return
+    with tempfile.TemporaryDirectory(dir=directory.parent, prefix=f".{directory.name}.") as aside:
+        old = directory.rename(Path(aside) / "old")
+        try:
+            temporary.rename(directory)
+        except OSError:
+            old.rename(directory)
+            raise
+
+
+def _write(frame: pl.DataFrame, path: Path) -> None:
+    if path.suffix == ".csv":
+        frame.write_csv(path)
+    else:
+        frame.write_parquet(path)
+
+
+def _detectors(measured: Measured) -> pl.DataFrame:
+    rows = [(d.id, d.lane, d.position_m, d.length_m, d.kind) for d in measured.detectors]
+    return frame_of(DETECTORS, rows)
+
+
+def _periods(periods: Sequence[Period]) -> pl.DataFrame:
+    return frame_of(PERIODS, [(p.id, p.begin_s, p.end_s, p.split) for p in periods])
+
+
+def _signals(periods: Sequence[Period]) -> pl.DataFrame:
+    rows = [
+        (period.id, round(float(since), 3), tls, state)
+        for period in periods
+        for tls, log in period.signals.items()
+        for since, state in log
+    ]
+    return frame_of(SIGNALS, rows)
+
+
+def _detections(periods: Sequence[Period]) -> pl.DataFrame:
+    parts = [frame_of(DETECTIONS, [])]
+    for period in periods:
+        streams = [
+            _events(period, name, passages)
+            for name, passages in period.passages.items()
+            if len(passages)
+        ]
+        if streams:
+            # A stable sort keeps the off of one vehicle before the on of the next.
+            parts.append(pl.concat(streams).sort("time_s", maintain_order=True))
+    return pl.concat(parts)
+
+
+def _events(period: Period, detector: str, passages: Passages) -> pl.DataFrame:
+    passages = as_logged(passages, period.begin_s, period.end_s)
+    time = np.stack([passages.on_s, passages.off_s], 1).reshape(-1)
+    is_on = np.tile([True, False], len(passages))
+    inside = np.isfinite(time)
+    nothing = np.full(len(passages), np.nan)
+    # Speed and length are known when the rear has left, or else with the front.
+    with_off = inside[1::2]
+    values = [
+        np.stack(
+            [np.where(with_off, nothing, column), np.where(with_off, column, nothing)], 1
+        ).reshape(-1)
+        for column in (passages.speed_mps, passages.length_m)
+    ]
+    frame = pl.DataFrame(
+        {
+            "time_s": time,
+            "event": np.where(is_on, "on", "off"),
+            "speed_mps": values[0],
+            "length_m": values[1],
+        }
+    ).filter(pl.Series(inside))
+    return frame.select(
+        pl.lit(period.id).alias("period_id"),
+        "time_s",
+        pl.lit(detector).alias("detector_id"),
+        "event",
+        pl.col("speed_mps", "length_m").fill_nan(None),
+    )
+
+
+def _ordered(frame: pl.DataFrame, table: Table) -> pl.DataFrame:
+    """The frame as the table has it, NaN as an empty cell."""
+    columns = [name for name in (*table.columns, *table.optional) if name in frame.columns]
+    kinds = {**table.columns, **table.optional}
+    return frame.select(
+        pl.col(name).cast(pl.Float64).fill_nan(None) if kinds[name] == "number" else pl.col(name)
+        for name in columns
+    )

@@ -1,0 +1,249 @@
+"""The folder of a training run: what is measured, what is saved, and how it is taken up again.
+
+A checkpoint is a folder that appears by one rename, so that a killed run has lost at most the stage
+in progress. Metrics are rewritten whole at every checkpoint; a resumed run drops the rows of the
+stage it repeats and ends with the same file as an unbroken one.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import polars as pl
+
+from ugat_marl.data.versions import versions_of
+from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.files import replacing, require_writable, write_whole
+from ugat_marl.progress import Reporter
+
+CHECKPOINT = "checkpoint"
+METRICS = "metrics.parquet"
+SETTINGS = "settings.json"
+_VERSIONS = ("ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch")
+_SCHEMA = {"stage": pl.String, "step": pl.Int64, "name": pl.String, "value": pl.Float64}
+
+
+@dataclass
+class Metrics:
+    """Numbers in long form: stage, step, name, value.
+
+    Attributes:
+        rows: One tuple per number; `step` is the training episode or the iteration.
+    """
+
+    rows: list[tuple[str, int, str, float]] = field(default_factory=list)
+
+    def add(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
+        """Appends a number of values."""
+        self.rows += [(stage, step, name, float(value)) for name, value in numbers.items()]
+
+    def write(self, path: Path) -> None:
+        """Writes all rows as Parquet, whole or not at all."""
+        frame = pl.DataFrame(self.rows, schema=_SCHEMA, orient="row")
+        with replacing(path) as temporary:
+            frame.write_parquet(temporary)
+
+    @classmethod
+    def read(cls, path: Path) -> Metrics:
+        """Reads what `write` wrote.
+
+        Raises:
+            CheckpointError: The file is missing, cut short or of another form.
+        """
+        try:
+            frame = pl.read_parquet(path)
+        except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+            reason = str(error).splitlines()[0]
+            raise CheckpointError(
+                f"{path}: cannot be read ({reason}); it may have been cut short. Remove the run "
+                "folder and start again"
+            ) from None
+        if frame.schema != pl.Schema(_SCHEMA):
+            raise CheckpointError(f"{path}: not the metrics of a run")
+        return cls(frame.rows())
+
+
+class Run:
+    """One folder of one training run.
+
+    Args:
+        directory: Where it lies.
+        identity: What must be the same for the run to be taken up again: settings, scenario, seed.
+        resume: Go on from the checkpoint in the folder, if there is one.
+        reporter: Shows progress.
+
+    Raises:
+        OptionError: The folder holds a run already, and `resume` is not set.
+        CheckpointError: The folder holds a run with another identity.
+    """
+
+    def __init__(
+        self, directory: Path, identity: Mapping[str, Any], resume: bool, reporter: Reporter
+    ) -> None:
+        self.directory = directory
+        self.reporter = reporter
+        self.metrics = Metrics()
+        self._board: Any = None
+        identity = json.loads(json.dumps(identity, sort_keys=True))
+        file = directory / "run.json"
+        require_writable(file)
+        self._lock = locked(directory)
+        _remove_remains(directory)
+        if file.exists() and self.resumable:
+            if not resume:
+                raise OptionError(
+                    f"{directory} holds a run already; use --resume to go on with it, or another "
+                    "--out"
+                )
+            _refuse_other(file, identity)
+        else:
+            write_whole(file, json.dumps(identity, indent=1) + "\n")
+
+    @property
+    def resumable(self) -> bool:
+        """Whether there is a checkpoint."""
+        return (self.directory / CHECKPOINT / "state.json").is_file()
+
+    def save(self, state: Mapping[str, Any], write: Callable[[Path], None]) -> None:
+        """Makes the next checkpoint.
+
+        Args:
+            state: Plain values that say where the run stands.
+            write: Writes everything else into the folder it is given.
+        """
+        fresh = self.directory / f".{CHECKPOINT}.new"
+        fresh.mkdir(parents=True)
+        write(fresh)
+        self.metrics.write(fresh / METRICS)
+        write_whole(fresh / "state.json", json.dumps(dict(state), indent=1) + "\n")
+        current, old = self.directory / CHECKPOINT, self.directory / f".{CHECKPOINT}.old"
+        if current.exists():
+            current.rename(old)
+        fresh.rename(current)
+        shutil.rmtree(old, ignore_errors=True)
+        self.metrics.write(self.directory / METRICS)
+        if self._board is not None:
+            self._board.flush()
+
+    def restore(self, read: Callable[[Path], None]) -> dict[str, Any]:
+        """Takes up the checkpoint.
+
+        Args:
+            read: Reads what `write` wrote.
+
+        Returns:
+            The state.
+
+        Raises:
+            CheckpointError: The checkpoint cannot be used.
+        """
+        folder = self.directory / CHECKPOINT
+        try:
+            state: dict[str, Any] = json.loads((folder / "state.json").read_text())
+        except (OSError, ValueError) as error:
+            raise CheckpointError(
+                f"{folder}: cannot be read ({error}); remove {self.directory} and start again"
+            ) from None
+        read(folder)
+        self.metrics = Metrics.read(folder / METRICS)
+        return state
+
+    def log(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
+        """Keeps numbers in the metrics and shows them on TensorBoard."""
+        self.metrics.add(stage, step, numbers)
+        board = self._tensorboard(step)
+        for name, value in numbers.items():
+            if math.isfinite(value):
+                board.add_scalar(f"{stage}/{name}", value, step)
+
+    def close(self) -> None:
+        """Ends the TensorBoard file and gives the folder free."""
+        self._lock.close()
+        if self._board is not None:
+            self._board.close()
+            self._board = None
+
+    def _tensorboard(self, step: int) -> Any:
+        if self._board is None:
+            from torch.utils.tensorboard import SummaryWriter
+
+            folder = self.directory / "tensorboard"
+            again = step if folder.exists() else None  # hides what a killed run logged from here on
+            self._board = SummaryWriter(str(folder), purge_step=again)
+        return self._board
+
+
+def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
+    """Keeps all options of a run, and the versions it is made with, for readers.
+
+    ``run.json`` holds only what must be the same for `--resume`.
+    """
+    content = {"settings": settings, "versions": versions_of(*_VERSIONS)}
+    write_whole(directory / SETTINGS, json.dumps(content, indent=1, default=str) + "\n")
+
+
+def locked(directory: Path) -> IO[str]:
+    """A file that stays locked as long as it is open, also by a process that is killed.
+
+    Raises:
+        OptionError: Another process has locked the folder.
+    """
+    lock = (directory / ".lock").open("w")
+    if importlib.util.find_spec("fcntl") is not None:  # not on Windows
+        import fcntl
+
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            raise OptionError(
+                f"{directory}: another process is training in this folder; wait for it, or name "
+                "another one"
+            ) from None
+    return lock
+
+
+def _refuse_other(file: Path, identity: Mapping[str, Any]) -> None:
+    try:
+        found: dict[str, Any] = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{file}: cannot be read ({error}); use another --out") from None
+    different = [key for key in {*found, *identity} if found.get(key) != identity.get(key)]
+    if different:
+        key = sorted(different)[0]
+        raise CheckpointError(
+            f"{file.parent} holds another run: its {key} is {_short(found.get(key))}, asked for is "
+            f"{_short(identity.get(key))}; repeat its options, or use another --out"
+        )
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 120 else f"{text[:117]}..."
+
+
+def _remove_remains(directory: Path) -> None:
+    """Clears what a run killed in the middle of a rename left, keeping a whole checkpoint."""
+    current, old = directory / CHECKPOINT, directory / f".{CHECKPOINT}.old"
+    fresh = directory / f".{CHECKPOINT}.new"
+    if old.exists() and not current.exists():
+        old.rename(current)
+    for remains in (old, fresh):
+        shutil.rmtree(remains, ignore_errors=True)
+    remove_temporaries(directory)
+
+
+def remove_temporaries(directory: Path) -> None:
+    """Clears files that were being written (`files.replacing`) when their process was killed.
+
+    For whoever has locked the folder: nobody else may be writing there.
+    """
+    for remains in directory.glob(".*.tmp"):
+        remains.unlink(missing_ok=True)

@@ -1,0 +1,394 @@
+"""Transition logs: what roll-outs write and grounding reads.
+
+A log holds one row per (episode, step, agent): what the intersection observed, which phase its
+policy asked for, which phase really was served and how long its green was held back, the reward,
+and what it observed next. Simulated
+and measured logs are the same thing, told apart by their provenance, which travels in the metadata
+of the Parquet file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ugat_marl.data.transition_table import SCHEMA, checked, read_parquet
+from ugat_marl.errors import LogError
+from ugat_marl.files import replacing
+
+FORMAT = 1
+METADATA_KEY = "ugat_marl.data.transitions"
+SOURCES = ("simulated", "measured")
+
+# Logs that differ in one of these describe different processes; one model cannot be fitted to both.
+SAME_IN_CONCATENATION = (
+    "scenario",
+    "scenario_hash",
+    "domain",
+    "decision_interval_s",
+    "observation",
+    "layouts",
+    "source",
+    "units",
+)
+
+
+@dataclass(frozen=True)
+class AgentLayout:
+    """How the observation vector of an agent is divided: features | phase one-hot | context.
+
+    Attributes:
+        features: Traffic numbers of the intersection itself; what f predicts and h compares.
+        phases: Number of green phases, the size of the action space and of the one-hot part.
+        context: Numbers about the neighbours; may be 0.
+    """
+
+    features: int
+    phases: int
+    context: int = 0
+
+    def __post_init__(self) -> None:
+        if self.features < 1 or self.phases < 1 or self.context < 0:
+            raise LogError(f"{self}: needs features >= 1, phases >= 1 and context >= 0")
+
+    @property
+    def size(self) -> int:
+        """Length of the observation vector."""
+        return self.features + self.phases + self.context
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a log comes from; everything a reader needs to use it without its writer.
+
+    Attributes:
+        scenario: Scenario id.
+        scenario_hash: Hash of the scenario with the domain's effects applied ("" if measured
+            without one).
+        domain: "sim", "V1" ..., or the name of the place that was measured.
+        seeds: Seed of every episode, in order; empty if measured.
+        decision_interval_s: Seconds between two rows of one agent.
+        observation: Name of the observation function.
+        layouts: Agent to the division of its observation vector, in the order of the agents.
+        source: "simulated" or "measured".
+        versions: Package to version, of whatever could change the numbers.
+        units: Column to unit.
+    """
+
+    scenario: str
+    scenario_hash: str
+    domain: str
+    seeds: tuple[int, ...]
+    decision_interval_s: float
+    observation: str
+    layouts: Mapping[str, AgentLayout]
+    source: str = "simulated"
+    versions: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.source not in SOURCES:
+            raise LogError(f"provenance: source is {self.source!r}; allowed: {', '.join(SOURCES)}")
+        if not self.decision_interval_s > 0:
+            raise LogError(
+                f"provenance: decision_interval_s is {self.decision_interval_s}; must be > 0"
+            )
+        if not self.layouts:
+            raise LogError("provenance: layouts is empty; name at least one agent")
+
+    def to_json(self) -> str:
+        """The provenance as a JSON object."""
+        return json.dumps({"format": FORMAT, **dataclasses.asdict(self)})
+
+    @classmethod
+    def from_json(cls, text: str) -> Provenance:
+        """Inverse of `to_json`.
+
+        Raises:
+            LogError: Not JSON, of a newer format, or fields missing, unknown or of the wrong type.
+        """
+        try:
+            content = json.loads(text)
+            if content.pop("format") != FORMAT:
+                raise LogError(f"provenance has another format; this version reads {FORMAT}")
+            layouts = {name: AgentLayout(**part) for name, part in content.pop("layouts").items()}
+            return cls(seeds=tuple(content.pop("seeds")), layouts=layouts, **content)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise LogError(f"provenance cannot be understood ({error!r})") from None
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """All transitions of one agent as arrays; n rows, observation size d.
+
+    Attributes:
+        observation: ``(n, d)`` float32.
+        action: ``(n,)`` int64, the phase the policy asked for.
+        executed: ``(n,)`` int64, the phase that was served.
+        delay_s: ``(n,)`` float32, for how long a beginning green was held back on purpose.
+        reward: ``(n,)`` float32.
+        next_observation: ``(n, d)`` float32.
+        served_features: ``(n, features)`` float32, the features at first without the vehicles that
+            left, averaged over the interval: what was served, and how early. ``(n, 0)`` if some
+            row was not measured.
+        episode: ``(n,)`` int64.
+        step: ``(n,)`` int64.
+    """
+
+    observation: NDArray[np.float32]
+    action: NDArray[np.int64]
+    executed: NDArray[np.int64]
+    delay_s: NDArray[np.float32]
+    reward: NDArray[np.float32]
+    next_observation: NDArray[np.float32]
+    served_features: NDArray[np.float32]
+    episode: NDArray[np.int64]
+    step: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+
+class TransitionLog:
+    """A checked table of transitions with its provenance.
+
+    Args:
+        provenance: Where the rows come from.
+        frame: Columns as in `transition_table.SCHEMA`; wider number types are converted.
+
+    Raises:
+        LogError: A column is missing or of another kind, a vector has the wrong length, a phase
+            does not exist, a number is missing or not finite, an agent is unknown, or a row
+            (episode, step, agent) occurs twice.
+    """
+
+    def __init__(self, provenance: Provenance, frame: pl.DataFrame) -> None:
+        self.provenance = provenance
+        self.frame = checked(
+            frame,
+            sizes={agent: layout.size for agent, layout in provenance.layouts.items()},
+            phases={agent: layout.phases for agent, layout in provenance.layouts.items()},
+            features={agent: layout.features for agent, layout in provenance.layouts.items()},
+        )
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """The agents, in the order of the environment."""
+        return tuple(self.provenance.layouts)
+
+    @property
+    def episodes(self) -> int:
+        """Number of different episodes."""
+        return self.frame["episode"].n_unique()
+
+    def __len__(self) -> int:
+        """Number of rows, over all agents."""
+        return self.frame.height
+
+    def transitions(self, agent: str) -> Transitions:
+        """The rows of one agent, ordered by episode and step.
+
+        Raises:
+            LogError: The log knows no such agent.
+        """
+        if agent not in self.provenance.layouts:
+            raise LogError(f"the log has no agent {agent!r}; it has {', '.join(self.agents)}")
+        rows = self.frame.filter(pl.col("agent") == agent).sort("episode", "step")
+        layout = self.provenance.layouts[agent]
+
+        def vectors(column: str, size: int = layout.size) -> NDArray[np.float32]:
+            if rows.is_empty():  # exploding nothing still gives one null
+                return np.zeros((0, size), np.float32)
+            return rows[column].explode().to_numpy().reshape(-1, size).copy()
+
+        def numbers(column: str) -> NDArray[np.int64]:
+            return rows[column].to_numpy().astype(np.int64)
+
+        return Transitions(
+            observation=vectors("observation"),
+            action=numbers("action"),
+            executed=numbers("executed"),
+            delay_s=rows["delay_s"].to_numpy().astype(np.float32),
+            reward=rows["reward"].to_numpy().astype(np.float32),
+            next_observation=vectors("next_observation"),
+            served_features=vectors("served_features", layout.features)
+            if (rows["served_features"].list.len() == layout.features).all()
+            else np.zeros((len(rows), 0), np.float32),
+            episode=numbers("episode"),
+            step=numbers("step"),
+        )
+
+    @staticmethod
+    def concatenate(logs: Sequence[TransitionLog]) -> TransitionLog:
+        """One log after the other, episodes renumbered from 0 so that none are confused.
+
+        Raises:
+            LogError: No logs, or logs of different scenarios, domains, observations or layouts.
+        """
+        if not logs:
+            raise LogError("no transition logs to concatenate; give at least one")
+        first = logs[0].provenance
+        frames: list[pl.DataFrame] = []
+        versions: dict[str, str] = {}
+        offset = 0
+        for log in logs:
+            _refuse_difference(first, log.provenance)
+            for name, version in log.provenance.versions.items():
+                known = versions.get(name, "").split(", ") + version.split(", ")
+                versions[name] = ", ".join(dict.fromkeys(part for part in known if part))
+            number = (pl.col("episode").rank("dense").cast(pl.Int32) - 1 + offset).alias("episode")
+            frames.append(log.frame.with_columns(number))
+            offset += log.episodes
+        seeds = tuple(seed for log in logs for seed in log.provenance.seeds)
+        provenance = dataclasses.replace(first, seeds=seeds, versions=versions)
+        return TransitionLog(provenance, pl.concat(frames))
+
+    def write(self, path: Path) -> None:
+        """Writes the log as Parquet; an existing file is replaced whole or left as it was."""
+        with replacing(path) as temporary:
+            self.frame.write_parquet(temporary, metadata={METADATA_KEY: self.provenance.to_json()})
+
+    @classmethod
+    def read(cls, path: Path | str) -> TransitionLog:
+        """Reads and checks what `write` wrote, here or elsewhere.
+
+        Raises:
+            LogError: Missing, cut short, not a transition log, or with impossible contents.
+        """
+        frame, metadata = read_parquet(Path(path))
+        if METADATA_KEY not in metadata:
+            raise LogError(
+                f"{path}: a Parquet file, but not a transition log: its metadata lacks "
+                f"{METADATA_KEY!r}; write logs with TransitionLog.write"
+            )
+        try:
+            return cls(Provenance.from_json(metadata[METADATA_KEY]), frame)
+        except LogError as error:
+            raise LogError(f"{path}: {error}") from None
+
+
+_Row = tuple[NDArray[np.float32], int, int, float, float, NDArray[np.float32], NDArray[np.float32]]
+_NONE = np.zeros(0, np.float32)
+
+
+class TransitionRecorder:
+    """Collects transitions while an episode runs; cheap per step, a table only at the end."""
+
+    def __init__(self, provenance: Provenance) -> None:
+        self._provenance = provenance
+        self._clock: list[tuple[int, int]] = []
+        self._rows: list[list[_Row]]
+        self._rows = [[] for _ in provenance.layouts]
+
+    def __len__(self) -> int:
+        """Number of steps recorded."""
+        return len(self._clock)
+
+    def record(
+        self,
+        episode: int,
+        step: int,
+        observations: Mapping[str, NDArray[np.float32]],
+        actions: Mapping[str, Any],
+        executed: Mapping[str, Any],
+        rewards: Mapping[str, float],
+        next_observations: Mapping[str, NDArray[np.float32]],
+        delays_s: Mapping[str, float] | None = None,
+        served: Mapping[str, NDArray[np.float32]] | None = None,
+    ) -> None:
+        """Adds one step of all agents; the arrays are copied.
+
+        Without delays no green was held back, without served features none were measured.
+
+        Raises:
+            LogError: An agent of the provenance is missing in one of the mappings.
+        """
+        try:
+            rows = [
+                (
+                    np.array(observations[agent], np.float32),
+                    int(actions[agent]),
+                    int(executed[agent]),
+                    0.0 if delays_s is None else float(delays_s[agent]),
+                    float(rewards[agent]),
+                    np.array(next_observations[agent], np.float32),
+                    _NONE if served is None else np.array(served[agent], np.float32),
+                )
+                for agent in self._provenance.layouts
+            ]
+        except KeyError as error:
+            raise LogError(
+                f"episode {episode}, step {step}: agent {error} is missing; all agents of the "
+                "environment are recorded together"
+            ) from None
+        self._clock.append((episode, step))
+        for kept, row in zip(self._rows, rows, strict=True):
+            kept.append(row)
+
+    def log(self) -> TransitionLog:
+        """Everything recorded so far as a checked log."""
+        frames = [
+            self._agent_frame(agent, layout, rows)
+            for (agent, layout), rows in zip(
+                self._provenance.layouts.items(), self._rows, strict=True
+            )
+        ]
+        frame = pl.concat(frames).sort("episode", "step", maintain_order=True)
+        return TransitionLog(self._provenance, frame)
+
+    def _agent_frame(
+        self,
+        agent: str,
+        layout: AgentLayout,
+        rows: list[_Row],
+    ) -> pl.DataFrame:
+        if not rows:
+            return pl.DataFrame(schema=SCHEMA)
+        clock = np.asarray(self._clock, np.int32)
+        return pl.DataFrame(
+            {
+                "episode": clock[:, 0],
+                "step": clock[:, 1],
+                "agent": [agent] * len(rows),
+                "observation": _stacked(agent, layout, [row[0] for row in rows]),
+                "action": [row[1] for row in rows],
+                "executed": [row[2] for row in rows],
+                "delay_s": np.array([row[3] for row in rows], np.float32),
+                "reward": np.array([row[4] for row in rows], np.float32),
+                "next_observation": _stacked(agent, layout, [row[5] for row in rows]),
+                "served_features": [row[6].tolist() for row in rows],
+            },
+            schema_overrides={
+                name: SCHEMA[name]
+                for name in ("observation", "next_observation", "served_features")
+            },
+        )
+
+
+def _stacked(agent: str, layout: AgentLayout, vectors: list[NDArray[np.float32]]) -> pl.Series:
+    """Equal vectors as one list column, without a Python object per number."""
+    for vector in vectors:
+        if vector.shape != (layout.size,):
+            raise LogError(
+                f"agent {agent}: an observation of shape {vector.shape}; expected ({layout.size},)"
+            )
+    flat = pl.Series(np.concatenate(vectors))
+    return flat.reshape((len(vectors), layout.size)).arr.to_list()
+
+
+def _refuse_difference(first: Provenance, other: Provenance) -> None:
+    for name in SAME_IN_CONCATENATION:
+        one, two = getattr(first, name), getattr(other, name)
+        if one != two or (name == "layouts" and tuple(one) != tuple(two)):
+            raise LogError(
+                f"transition logs with different {name} ({one!r} and {two!r}) cannot be "
+                "concatenated; fit them apart"
+            )

@@ -1,0 +1,369 @@
+"""Tallies of simulated days: in parallel, remembered on disk, within a budget of time."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import itertools
+import time
+import zipfile
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ugat_marl.data import version_of
+from ugat_marl.diagnosis.arrivals import Due, corrected
+from ugat_marl.diagnosis.features import FEATURES, Tally, tally
+from ugat_marl.diagnosis.replay import WHEN, Day, Replay
+from ugat_marl.diagnosis.site import Greens, Site
+from ugat_marl.diagnosis.standstill import locked_up
+from ugat_marl.diagnosis.unmeasured import Unmeasured
+from ugat_marl.effects import DetectorEffect, Effect
+from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
+from ugat_marl.files import user_cache, write_whole
+from ugat_marl.parallel import Workers, parts_at_a_time
+from ugat_marl.scenarios import Period, Scenario
+from ugat_marl.seeding import derive_seed
+
+VERSION = 4
+"""Of features and replays: a tally remembered under another version is not used."""
+
+_KEPT_DAYS = 40
+
+Job = TypeVar("Job")
+Done = TypeVar("Done")
+
+
+class OutOfTime(UgatMarlError):
+    """The budget is spent; what is known by then is the answer."""
+
+
+@dataclass(frozen=True, eq=False)
+class Replicate:
+    """What is kept of a simulated day.
+
+    Attributes:
+        tally: Its features.
+        travel_time_s: Mean travel time.
+        counted: The features as they were counted, if what was asked for was put in their place.
+        due: What that was.
+    """
+
+    tally: Tally
+    travel_time_s: float
+    counted: Tally | None = None
+    due: Due | None = None
+
+
+class Engine:
+    """Simulates days of models and reduces them.
+
+    Args:
+        scenario: The scenario without effects.
+        site: Lanes and detectors.
+        replay: Runs SUMO.
+        periods: Measured periods; replicate ``r`` is played under the signals of period
+            ``r mod len(periods)``.
+        seed: Root of the days.
+        cache: Folder of remembered tallies, or None.
+        deadline: ``time.monotonic()`` at which new simulations are refused, or None.
+        workers: Simulations at a time, None for one per core; or an executor that simulates days.
+    """
+
+    set_aside: frozenset[int] = frozenset()
+    """Numbers of days that `first` passes over."""
+    day_to_day: float = 0.0
+    """How much the vehicles counted on a day differ at least from day to day."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        site: Site,
+        replay: Replay,
+        periods: Sequence[Period],
+        seed: int,
+        *,
+        cache: Path | None = None,
+        deadline: float | None = None,
+        workers: Workers = None,
+    ) -> None:
+        self.site = site
+        self.periods = tuple(periods)
+        self.simulated = 0
+        self.deadline = deadline
+        self._replay = replay
+        self._seed = seed
+        self._cache = cache
+        self._workers = workers
+        self._greens: list[tuple[Greens, ...]] = [site.greens(period) for period in periods]
+        self._days: OrderedDict[str, Day] = OrderedDict()
+        self._known: dict[str, Replicate] = {}
+        self._unmeasured = Unmeasured.of(periods)
+        versions = version_of("eclipse-sumo"), version_of("numpy")
+        head = (VERSION, FEATURES, scenario.hash, site.detectors, versions, seed)
+        head += (self._unmeasured,) if self._unmeasured else ()
+        self._root = hashlib.sha256(repr(head).encode()).hexdigest()
+        self._edges = sorted({edge for _, edge, _ in site.places})
+        self._signals = [_signals_hash(period, replay.answering) for period in periods]
+        self._known_by: Callable[[], None] | None = None
+
+    @property
+    def known(self) -> int:
+        """Number of simulated days that are known by now, those of earlier runs included."""
+        return len(self._known)
+
+    def measured(self, periods: Sequence[Period]) -> list[Tally]:
+        """Tallies of measured periods."""
+        return [tally(self.site, period, self.site.greens(period)) for period in periods]
+
+    @contextlib.contextmanager
+    def watched(self, advance: Callable[[], None], most: int) -> Iterator[None]:
+        """Tells of days as they become known, for work of which nobody knows how many it takes.
+
+        Args:
+            advance: Called after each of them.
+            most: How often at most.
+        """
+        calls = iter(range(most))
+
+        def known() -> None:
+            if next(calls, None) is not None:
+                advance()
+
+        self._known_by = known
+        try:
+            yield
+        finally:
+            self._known_by = None
+
+    def first(self, count: int) -> list[int]:
+        """The numbers of the first days; those that were set aside are passed over."""
+        numbers = (number for number in itertools.count() if number not in self.set_aside)
+        return list(itertools.islice(numbers, count))
+
+    def ordinary(
+        self,
+        effects: Sequence[Effect],
+        numbers: Sequence[int],
+        advance: Callable[[], None] | None = None,
+    ) -> dict[int, Replicate]:
+        """Simulated days of a model by number, but for a few on which traffic stood still.
+
+        Args:
+            effects: The model.
+            numbers: Of its days.
+            advance: Called after every one.
+        """
+        days = self.replicates(effects, numbers, advance)
+        aside = locked_up([day.tally for day in days], self.day_to_day)
+        known = enumerate(zip(numbers, days, strict=True))
+        return {number: day for place, (number, day) in known if place not in aside}
+
+    def replicates(
+        self,
+        effects: Sequence[Effect],
+        numbers: Sequence[int],
+        advance: Callable[[], None] | None = None,
+    ) -> list[Replicate]:
+        """Simulated days of a model, in the order of `numbers`.
+
+        Args:
+            effects: The model.
+            numbers: Which days.
+            advance: Called after each of them.
+
+        Raises:
+            OutOfTime: The deadline has passed and a day is not remembered.
+            SimulatorError: SUMO refused.
+        """
+
+        def one(number: int) -> Replicate:
+            found = self._one(tuple(effects), number)
+            if advance is not None:
+                advance()
+            return found
+
+        (days,) = self._together(one, [numbers])
+        return days
+
+    def prepare(
+        self,
+        models: Sequence[tuple[Sequence[Effect], Sequence[int]]],
+        advance: Callable[[], None] | None = None,
+    ) -> None:
+        """Simulates days of many models at once, so that no core waits for the end of each model.
+
+        What SUMO refuses is left for `replicates` to report.
+
+        Args:
+            models: Effects and numbers of days.
+            advance: Called after each model.
+
+        Raises:
+            OutOfTime: The deadline has passed.
+        """
+
+        def one(day: tuple[Sequence[Effect], int]) -> None:
+            with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
+                self._one(tuple(day[0]), day[1])
+
+        days = [[(effects, number) for number in numbers] for effects, numbers in models]
+        self._together(one, days, advance)
+
+    def _together(
+        self,
+        work: Callable[[Job], Done],
+        groups: Sequence[Sequence[Job]],
+        advance: Callable[[], None] | None = None,
+    ) -> list[list[Done]]:
+        """Does groups of jobs on all workers; the first failure stops what was not begun.
+
+        Args:
+            work: Does one.
+            groups: Jobs.
+            advance: Called after each group.
+        """
+        with ThreadPoolExecutor(parts_at_a_time(self._workers)) as pool:
+            futures = [[pool.submit(work, job) for job in group] for group in groups]
+            done: list[list[Done]] = []
+            try:
+                for group in futures:
+                    done.append([future.result() for future in group])
+                    if advance is not None:
+                        advance()
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+        return done
+
+    def _one(self, effects: tuple[Effect, ...], number: int) -> Replicate:
+        key = self._key(effects, number)
+        new = key not in self._known
+        found = self._known.get(key) or self._remembered(key)
+        if found is None:
+            others = tuple(effect for effect in effects if not isinstance(effect, WHEN))
+            if self._replay.answering and len(others) < len(effects):
+                found = self._asked_for(self._one(others, number), effects, number)
+            else:
+                found = self._counted(effects, number)
+            self._remember(key, found)
+        self._known[key] = found
+        if (tell := self._known_by) is not None and new:
+            tell()
+        return found
+
+    def _counted(self, effects: tuple[Effect, ...], number: int) -> Replicate:
+        """A simulated day, counted."""
+        day = self._day(effects, number)
+        period = self._unmeasured.kept_from(day.period)
+        counted = tally(self.site, period, self._greens[number % len(self.periods)])
+        # As precise as what is remembered, so that the answer does not depend on the cache.
+        counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
+        return self._with_due(counted, day.travel_time_s, day.due)
+
+    def _asked_for(self, given: Replicate, effects: tuple[Effect, ...], number: int) -> Replicate:
+        """The same simulated day, of a model that asks for other vehicles."""
+        if given.counted is None or given.due is None:
+            return self._counted(effects, number)
+        physics = [effect for effect in effects if not isinstance(effect, DetectorEffect)]
+        period = self.periods[number % len(self.periods)]
+        seed = derive_seed(self._seed, "replicate", number)
+        due = Due(self._replay.asked(physics, period, seed), given.due.given)
+        return self._with_due(given.counted, given.travel_time_s, due)
+
+    def _with_due(self, counted: Tally, travel_time_s: float, due: Due | None) -> Replicate:
+        if due is None:
+            return Replicate(counted, travel_time_s)
+        return Replicate(corrected(counted, self.site, due), travel_time_s, counted, due)
+
+    def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
+        """A day as the detectors saw it; faults of detectors cost no further simulation."""
+        faults = tuple(effect for effect in effects if isinstance(effect, DetectorEffect))
+        physics = tuple(effect for effect in effects if not isinstance(effect, DetectorEffect))
+        key = self._key(physics, number)
+        day = self._days.get(key)
+        if day is None:
+            if self.deadline is not None and time.monotonic() > self.deadline:
+                raise OutOfTime("the budget of time is spent")
+            period = self.periods[number % len(self.periods)]
+            seed = derive_seed(self._seed, "replicate", number)
+            day = self._simulated(physics, period, seed)
+            self.simulated += 1
+            self._days[key] = day
+            while len(self._days) > _KEPT_DAYS:
+                try:
+                    self._days.popitem(last=False)
+                except KeyError:  # another thread was quicker
+                    break
+        if not faults:
+            return day
+        return replace(day, period=self._replay.observed(faults, day.period))
+
+    def _simulated(self, effects: tuple[Effect, ...], period: Period, seed: int) -> Day:
+        if not isinstance(self._workers, Executor):
+            return self._replay.simulate(effects, period, seed)
+        # Here a thread waits for it and does what follows, which is little.
+        return self._workers.submit(self._replay.simulate, effects, period, seed).result()
+
+    def _key(self, effects: Sequence[Effect], number: int) -> str:
+        signals = self._signals[number % len(self.periods)]
+        text = repr((self._root, tuple(map(str, effects)), number, signals))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _remembered(self, key: str) -> Replicate | None:
+        if self._cache is None:
+            return None
+        try:
+            with np.load(self._cache / key[:2] / f"{key}.npz", allow_pickle=False) as stored:
+                counted = Tally(
+                    stored["sums"].astype(np.float64), stored["bins"].astype(np.float64)
+                )
+                due = None
+                if "asked" in stored:
+                    asked, given = (
+                        dict(zip(self._edges, stored[name], strict=True))
+                        for name in ("asked", "given")
+                    )
+                    due = Due(asked, given)
+                return self._with_due(counted, float(stored["travel_time_s"]), due)
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
+            return None  # absent or damaged: simulated again
+
+    def _remember(self, key: str, found: Replicate) -> None:
+        if self._cache is None:
+            return
+        content = io.BytesIO()
+        counted = found.counted or found.tally
+        arrays: dict[str, Any] = {
+            "sums": counted.sums,
+            "bins": counted.bins.astype(np.float32),
+            "travel_time_s": np.float64(found.travel_time_s),
+        }
+        if found.due is not None:
+            for name, of_edge in (("asked", found.due.asked), ("given", found.due.given)):
+                arrays[name] = np.stack([of_edge[edge] for edge in self._edges])
+        np.savez_compressed(content, **arrays)
+        write_whole(self._cache / key[:2] / f"{key}.npz", content.getvalue())
+
+
+def default_cache() -> Path:
+    """Where tallies are remembered between runs: the user's cache folder."""
+    return user_cache("replicates")
+
+
+def _signals_hash(period: Period, answering: bool) -> str:
+    """Of what a simulated day takes from a measured one."""
+    content = (period.begin_s, period.end_s, sorted(period.signals.items()))
+    digest = hashlib.sha256(repr(content).encode())
+    if answering:
+        digest.update(b"arrivals/2")
+    for name, seen in sorted(period.passages.items()) if answering else ():
+        digest.update(repr((name, seen.on_s.tolist(), seen.off_s.tolist())).encode())
+    return digest.hexdigest()

@@ -1,0 +1,386 @@
+"""What detectors tell by regime: sums of features, per lane, of one period.
+
+Every statistic is a mean: a sum and the number of observations behind it. So lanes pool to
+intersections and to the network, and periods pool to data sets, by adding. Queue discharge is
+counted from the start of green; times of crossing are those at which a vehicle's rear leaves the
+stop detector, since a vehicle may wait anywhere on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.diagnosis.site import Greens, Site, SiteLane
+from ugat_marl.scenarios import Passages, Period
+
+Array = NDArray[np.float64]
+
+FEATURES: tuple[tuple[str, str, str], ...] = (
+    ("lost", "discharge", "s"),
+    ("lost_trend", "discharge", "s"),
+    ("gap2", "discharge", "s"),
+    ("gap3", "discharge", "s"),
+    ("gap4-5", "discharge", "s"),
+    ("gap6-8", "discharge", "s"),
+    ("gap9+", "discharge", "s"),
+    ("gap_spread", "discharge", "s"),
+    ("gap_short", "discharge", ""),
+    ("gap_long", "discharge", ""),
+    ("gap_permitted", "discharge", "s"),
+    ("speed1", "discharge", "m/s"),
+    ("speed2", "discharge", "m/s"),
+    ("speed3", "discharge", "m/s"),
+    ("speed4-5", "discharge", "m/s"),
+    ("speed6-8", "discharge", "m/s"),
+    ("over1", "discharge", "s"),
+    ("over2-3", "discharge", "s"),
+    ("over4+", "discharge", "s"),
+    ("queued", "discharge", ""),
+    ("discharged", "discharge", ""),
+    ("platoon_gap", "free flow", "s"),
+    ("platoon_short", "free flow", ""),
+    ("platoon_middle", "free flow", ""),
+    ("platoon_time", "free flow", "s"),
+    ("free_speed", "free flow", "m/s"),
+    ("free_speed_spread", "free flow", "m/s"),
+    ("free_fast", "free flow", ""),
+    ("free_time", "free flow", "s"),
+    ("red_speed", "approach to red", "m/s"),
+    ("red_slow", "approach to red", ""),
+    ("red_time", "approach to red", "s"),
+    ("yellow_crossings", "yellow", ""),
+    ("late_crossings", "yellow", ""),
+    ("red_crossings", "yellow", ""),
+    ("last_crossing", "yellow", "s"),
+    ("vehicle_length", "vehicles", "m"),
+    ("long_vehicles", "vehicles", ""),
+    ("occupied_in_red", "storage", ""),
+    ("occupied_in_green", "storage", ""),
+    ("queue_over", "storage", ""),
+    ("count_advance", "volume", "1/min"),
+    ("count_stop", "volume", "1/min"),
+    ("count_exit", "volume", "1/min"),
+    ("kept_to_stop", "volume", ""),
+    ("kept_to_exit", "volume", ""),
+)
+"""Name, regime and unit of every feature."""
+
+INDEX = {name: index for index, (name, _, _) in enumerate(FEATURES)}
+SPEED_FEATURES = frozenset(
+    {
+        "speed1", "speed2", "speed3", "speed4-5", "speed6-8", "free_speed", "free_speed_spread",
+        "free_fast", "red_speed", "red_slow", "vehicle_length", "long_vehicles",
+    }
+)  # fmt: skip
+EVENT_FEATURES = frozenset(
+    {
+        "gap_short", "gap_long", "platoon_short", "platoon_middle", "free_fast", "red_slow",
+        "yellow_crossings", "late_crossings", "red_crossings", "long_vehicles", "queue_over",
+    }
+)  # fmt: skip
+"""Features that count how often something happens, which may be hardly ever."""
+COUNT_FEATURES = ("count_advance", "count_stop", "count_exit")
+PLATOON_FEATURES = ("platoon_gap", "platoon_short", "platoon_middle", "platoon_time")
+BIN_FEATURES = (*COUNT_FEATURES, "occupied")
+BIN_S = 300.0
+
+_BREAK_S = 5.0
+_FIRST_S = 12.0
+_MOVING_MPS = 6.0
+_AFTER_RED_S = 7.0
+
+
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """The features of one period.
+
+    Attributes:
+        sums: Sums and numbers of observations, ``(features, places, 2)``; a place is an incoming
+            lane, or behind them an outgoing one.
+        bins: Counts and occupied seconds in time, ``(bin features, places, bins)``.
+        days: Number of periods that were added up.
+        known: In how many of these every one of the bins was counted; None for all.
+    """
+
+    sums: Array
+    bins: Array
+    days: int = 1
+    known: Array | None = None
+
+    @property
+    def counted(self) -> Array:
+        """In how many periods every one of the bins was counted."""
+        return np.full_like(self.bins, self.days) if self.known is None else self.known
+
+    def gathered(self, together: int) -> tuple[Array, Array]:
+        """Bins put together, and in how many periods all of each were counted.
+
+        Args:
+            together: How many bins make one; what is left at the end is not used.
+
+        Returns:
+            Both ``(bin features, places, groups of bins)``.
+        """
+        width = min(together, self.bins.shape[-1])
+        groups = self.bins.shape[-1] // width
+        shape = (*self.bins.shape[:2], groups, width)
+        bins, counted = (
+            values[..., : groups * width].reshape(shape) for values in (self.bins, self.counted)
+        )
+        return bins.sum(axis=-1), counted.min(axis=-1)
+
+    def __add__(self, other: Tally) -> Tally:
+        bins = min(self.bins.shape[-1], other.bins.shape[-1])
+        every = self.known is None and other.known is None
+        return Tally(
+            self.sums + other.sums,
+            self.bins[..., :bins] + other.bins[..., :bins],
+            self.days + other.days,
+            None if every else self.counted[..., :bins] + other.counted[..., :bins],
+        )
+
+
+def bins_of(period: Period) -> int:
+    """Number of bins of time in a period."""
+    return max(1, round((period.end_s - period.begin_s) / BIN_S))
+
+
+def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
+    """Reduces a period to its features.
+
+    Args:
+        site: Lanes and detectors.
+        period: What was detected.
+        greens: ``site.greens(period)``; those of the measured period for its replicates.
+    """
+    places = len(site.lanes) + len(site.exits)
+    bins = bins_of(period)
+    counter = _Counter(
+        np.zeros((len(FEATURES), places, 2)), np.zeros((len(BIN_FEATURES), places, bins)), period
+    )
+    stops = np.zeros(len(site.lanes))
+    advances = np.zeros(len(site.lanes))
+    for index, (lane, green) in enumerate(zip(site.lanes, greens, strict=True)):
+        counter.place = index
+        stop, advance = _passages(period, lane, "stop"), _passages(period, lane, "advance")
+        if stop is not None:
+            stops[index] = counter.volume("count_stop", 1, stop)
+            _discharge(counter, stop, green)
+            _clearance(counter, stop, green)
+            _lengths(counter, stop)
+        if advance is not None:
+            advances[index] = counter.volume("count_advance", 0, advance)
+            _approach(counter, advance, green, lane.speed_mps)
+            _storage(counter, advance, green)
+            if stop is None:
+                _lengths(counter, advance)
+    exits = np.zeros(len(site.exits))
+    for index, (_, _, names) in enumerate(site.exits):
+        counter.place = len(site.lanes) + index
+        exits[index] = counter.volume("count_exit", 2, _merged(period, names))
+    _conserved(counter, site, advances, stops, exits)
+    return Tally(counter.sums, counter.bins)
+
+
+@dataclass
+class _Counter:
+    """Where features are added up, for the lane at hand."""
+
+    sums: Array
+    bins: Array
+    period: Period
+    place: int = 0
+
+    def add(self, name: str, values: Array) -> None:
+        values = values[np.isfinite(values)]
+        self.sums[INDEX[name], self.place] += (values.sum(), len(values))
+
+    def ratio(self, name: str, total: float, weight: float) -> None:
+        self.sums[INDEX[name], self.place] += (total, weight)
+
+    def volume(self, name: str, row: int, passages: Passages) -> float:
+        begin, end = self.period.begin_s, self.period.end_s
+        times = np.where(np.isfinite(passages.on_s), passages.on_s, passages.off_s)
+        times = times[np.isfinite(times)]
+        self.ratio(name, len(times), (end - begin) / 60.0)
+        self.bins[row, self.place] += np.histogram(times, self.bins.shape[2], (begin, end))[0]
+        return float(len(times))
+
+
+def _passages(period: Period, lane: SiteLane, kind: str) -> Passages | None:
+    """What the lane's detectors of a kind saw; None if it has none."""
+    names = lane.detectors.get(kind)  # pyright: ignore[reportArgumentType,reportCallIssue]
+    return None if not names else _merged(period, names)
+
+
+def _merged(period: Period, names: Sequence[str]) -> Passages:
+    """The first detector that saw anything: two at one place would count everything twice."""
+    found = [period.passages[name] for name in names if name in period.passages]
+    return found[0] if found else Passages.none()
+
+
+def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
+    """Gaps, speeds and times over the detector of vehicles that stood at the start of green."""
+    order = np.argsort(stop.off_s, kind="stable")
+    stop = stop.at(order[np.isfinite(stop.off_s[order])])
+    cycles = float(len(greens.start_s))
+    counter.ratio("queued", 0.0, cycles)
+    counter.ratio("discharged", 0.0, cycles)
+    if not len(stop) or not cycles:
+        return
+    crossed = stop.off_s
+    cycle = np.searchsorted(greens.start_s, crossed, "right") - 1
+    inside = (cycle >= 0) & (crossed <= greens.red_s[np.maximum(cycle, 0)])
+    stop, crossed, cycle = stop.at(inside), crossed[inside], cycle[inside]
+    if not len(stop):
+        return
+    first = np.searchsorted(cycle, cycle, "left")
+    number = np.arange(len(cycle)) - first
+    start = greens.start_s[cycle]
+    came = np.where(np.isfinite(stop.on_s), stop.on_s, -np.inf)
+    queue = came[first] < start
+    before = np.where(number == 0, start, np.roll(crossed, 1))
+    gap = crossed - before
+    broken = np.cumsum(gap > np.where(number == 0, _FIRST_S, _BREAK_S))
+    alive = queue & (broken - broken[first] + (gap[first] > _FIRST_S) == 0)
+    protected = alive & greens.protected[cycle]
+    counter.add("gap_permitted", gap[alive & ~greens.protected[cycle] & (number >= 1)])
+    lost = gap[protected & (number == 0)]
+    counter.add("lost", lost)
+    middle = 0.5 * (counter.period.begin_s + counter.period.end_s)
+    half = 0.5 * (counter.period.end_s - counter.period.begin_s)
+    counter.add("lost_trend", lost * (start[protected & (number == 0)] - middle) / half)
+    for name, low, high in (
+        ("gap2", 1, 1), ("gap3", 2, 2), ("gap4-5", 3, 4), ("gap6-8", 5, 7), ("gap9+", 8, 14),
+    ):  # fmt: skip
+        counter.add(name, gap[protected & (number >= low) & (number <= high)])
+    steady = gap[protected & (number >= 3)]
+    counter.add("gap_spread", np.abs(steady - 2.0))
+    counter.add("gap_short", (steady < 1.7).astype(np.float64))
+    counter.add("gap_long", (steady > 2.6).astype(np.float64))
+    for name, low, high in (
+        ("speed1", 0, 0), ("speed2", 1, 1), ("speed3", 2, 2), ("speed4-5", 3, 4),
+        ("speed6-8", 5, 7),
+    ):  # fmt: skip
+        counter.add(name, stop.speed_mps[protected & (number >= low) & (number <= high)])
+    over = stop.off_s - np.where(number == 0, start, stop.on_s)
+    for name, low, high in (("over1", 0, 0), ("over2-3", 1, 2), ("over4+", 3, 9)):
+        counter.add(name, over[protected & (number >= low) & (number <= high)])
+    counter.ratio("queued", float((alive & (number == 0)).sum()), 0.0)
+    counter.ratio("discharged", float(alive.sum()), 0.0)
+
+
+def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
+    """Crossings in yellow and at the beginning of red, per change of signal."""
+    cycles = float(len(greens.start_s))
+    crossed = stop.off_s[np.isfinite(stop.off_s)]
+    if not cycles:
+        return
+    cycle = np.searchsorted(greens.end_s, crossed, "right") - 1
+    crossed, cycle = crossed[cycle >= 0], cycle[cycle >= 0]
+    after = crossed - greens.end_s[cycle]
+    red = crossed - greens.red_s[cycle]
+    counted = crossed < greens.next_s[cycle]
+    counter.ratio("yellow_crossings", float((counted & (red <= 0)).sum()), cycles)
+    counter.ratio("late_crossings", float((counted & (red > 0) & (red <= 2.0)).sum()), cycles)
+    counter.ratio(
+        "red_crossings", float((counted & (red > 2.0) & (red <= _AFTER_RED_S)).sum()), cycles
+    )
+    counter.add("last_crossing", after[counted & (red <= 3.0)])
+
+
+def _lengths(counter: _Counter, passages: Passages) -> None:
+    """Lengths as measured, or else from speed and time over the detector."""
+    quick = (passages.speed_mps > 5.0) & np.isfinite(passages.on_s)
+    length = np.where(quick, passages.speed_mps * (passages.off_s - passages.on_s), np.nan)
+    length = np.where(np.isfinite(passages.length_m), passages.length_m, length)
+    counter.add("vehicle_length", length)
+    counter.add("long_vehicles", (length[np.isfinite(length)] > 8.0).astype(np.float64))
+
+
+def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: float) -> None:
+    """Moving platoons, free vehicles, and those that see red."""
+    known = np.isfinite(advance.on_s)
+    advance = advance.at(known)
+    if len(advance) < 2:
+        return
+    on, speed = advance.on_s, advance.speed_mps
+    over = advance.off_s - on
+    gap = np.append(np.inf, np.diff(on))
+    moving = np.where(np.isfinite(speed), speed > _MOVING_MPS, over < 1.2)
+    platoon = moving & np.append(False, moving[:-1]) & (gap < 6.0)
+    counter.add("platoon_gap", gap[platoon])
+    counter.add("platoon_short", (gap[platoon] < 1.6).astype(np.float64))
+    counter.add("platoon_middle", (gap[platoon] < 2.2).astype(np.float64))
+    counter.add("platoon_time", over[platoon])
+    if not len(greens.start_s):
+        return
+    cycle = np.searchsorted(greens.start_s, on, "right") - 1
+    inside = np.maximum(cycle, 0)
+    green = (cycle >= 0) & (on < greens.end_s[inside])
+    red = (cycle >= 0) & (on > greens.red_s[inside]) & (on < greens.next_s[inside] - 3.0)
+    free = green & (gap > 5.0) & (on - greens.start_s[inside] > 5.0)
+    counter.add("free_speed", speed[free])
+    counter.add("free_speed_spread", np.abs(speed[free] - limit_mps))
+    counter.add("free_fast", _share(speed[free], 1.05 * limit_mps))
+    counter.add("free_time", over[free & (over < 3.0)])
+    alone = red & (gap > 4.0)
+    counter.add("red_speed", speed[alone])
+    counter.add("red_slow", 1.0 - _share(speed[alone], 5.0))
+    counter.add("red_time", over[alone & (over < 4.0)])
+
+
+def _share(values: Array, limit: float) -> Array:
+    values = values[np.isfinite(values)]
+    return (values > limit).astype(np.float64)
+
+
+def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
+    """Occupancy of the advance detector by signal, and how often the queue stands on it."""
+    period = counter.period
+    on = np.where(np.isfinite(advance.on_s), advance.on_s, period.begin_s)
+    off = np.where(np.isfinite(advance.off_s), advance.off_s, period.end_s)
+    lone = np.isfinite(advance.on_s) | (off - period.begin_s < 30.0)
+    on, off = on[lone], np.maximum(off[lone], on[lone])
+    times = np.concatenate(([period.begin_s], np.sort(on), np.sort(off), [period.end_s]))
+    steps = np.concatenate(([0.0], np.ones(len(on)), -np.ones(len(off)), [0.0]))
+    order = np.argsort(
+        np.concatenate(([period.begin_s], np.sort(on), np.sort(off), [period.end_s])), kind="stable"
+    )
+    times, present = times[order], np.minimum(np.cumsum(steps[order]), 1.0)
+    filled = np.append(0.0, np.cumsum(np.diff(times) * present[:-1]))
+
+    def occupied(when: Array) -> Array:
+        return np.interp(when, times, filled)
+
+    edges = np.linspace(period.begin_s, period.end_s, counter.bins.shape[2] + 1)
+    counter.bins[3, counter.place] += np.diff(occupied(edges))
+    if not len(greens.start_s):
+        return
+    green = occupied(greens.end_s) - occupied(greens.start_s)
+    red = occupied(greens.next_s) - occupied(greens.red_s)
+    counter.ratio("occupied_in_green", green.sum(), (greens.end_s - greens.start_s).sum())
+    counter.ratio("occupied_in_red", red.sum(), (greens.next_s - greens.red_s).sum())
+    standing = occupied(greens.start_s + 1.0) - occupied(greens.start_s - 1.0) > 1.9
+    counter.add("queue_over", standing.astype(np.float64))
+
+
+def _conserved(counter: _Counter, site: Site, advances: Array, stops: Array, exits: Array) -> None:
+    """Vehicles that came and were seen again, by approach and by intersection."""
+    approaches: dict[str, list[int]] = {}
+    for index, lane in enumerate(site.lanes):
+        if "stop" in lane.detectors and "advance" in lane.detectors:
+            approaches.setdefault(lane.edge, []).append(index)
+    for members in approaches.values():
+        counter.place = members[0]
+        counter.ratio("kept_to_stop", stops[members].sum(), advances[members].sum())
+    for number in range(len(site.intersections)):
+        incoming = [i for i, lane in enumerate(site.lanes) if lane.intersection == number]
+        outgoing = [i for i, (owner, _, _) in enumerate(site.exits) if owner == number]
+        if incoming and outgoing:
+            counter.place = incoming[0]
+            counter.ratio("kept_to_exit", exits[outgoing].sum(), stops[incoming].sum())

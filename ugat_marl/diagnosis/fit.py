@@ -1,0 +1,337 @@
+"""Fits the free numbers of a set of effects by simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.diagnosis.engine import Engine
+from ugat_marl.diagnosis.features import Tally
+from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, ordered
+from ugat_marl.diagnosis.statistics import Distance, Pools, Reference, shift, shrunk
+from ugat_marl.diagnosis.whitening import Whitener
+from ugat_marl.effects import EVERYWHERE, Effect
+
+Array = NDArray[np.float64]
+
+Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
+"""A set of effects: hypotheses and the values of their free fields."""
+
+Change = tuple[dict[str, Array], float]
+"""What moving a free value does to the statistics, and how far it was moved."""
+
+WIDE = ("network", "intersection")
+"""Blocks that effects on the whole network are fitted to: single lanes add more noise than they
+tell of them."""
+WINDOW_STEPS_S = (120.0, 60.0, 30.0)
+WINDOW_DAYS = 4
+SHORTEST_S = 60.0
+SETTLING_DAYS = 16
+NEARBY, FAR = 0.2, 0.9
+"""Shares of its distance from nominal by which a value is moved for a derivative."""
+PLAIN = 10.0
+"""Standard deviations that such a move is meant to make."""
+NEAR = 0.2
+"""Standard errors by which a value may be off."""
+INTERPOLATION = 0.02
+"""Share of a measured difference that a model is forgiven while it is fitted: simulation steps
+round what the street does not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model that was simulated.
+
+    Attributes:
+        members: Its effects.
+        days: Its simulated days by their numbers.
+        reference: Its statistics.
+        distance: From the data that were fitted.
+        cost: Distance, penalty for noise, and price of the effects: less is better.
+    """
+
+    members: Members
+    days: Mapping[int, Tally]
+    reference: Reference
+    distance: Distance
+    cost: float
+
+    @property
+    def tallies(self) -> tuple[Tally, ...]:
+        """Its simulated days."""
+        return tuple(self.days.values())
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects in the order in which they are applied."""
+        return effects_of(self.members)
+
+    @property
+    def values(self) -> Array:
+        """All free values, one after the other."""
+        return np.array([value for _, values in self.members for value in values])
+
+
+def cost_of(model: Fitted) -> float:
+    """What models are ranked by."""
+    return model.cost
+
+
+def effects_of(members: Members) -> tuple[Effect, ...]:
+    """Effects of a set, in order."""
+    return ordered([hypothesis.effect(values) for hypothesis, values in members])
+
+
+class Fitter:
+    """Simulates and fits models against one data set.
+
+    Args:
+        engine: Simulates.
+        pools: How places pool.
+        base: Statistics of the scenario as it is.
+        base_days: Its simulated days by their numbers.
+        data: Tallies of the periods to fit.
+        days: Simulated days behind each evaluation.
+        price: What every effect must gain.
+        speeds: Whether speeds were measured.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        pools: Pools,
+        base: Reference,
+        base_days: Mapping[int, Tally],
+        data: Sequence[Tally],
+        *,
+        days: int,
+        price: float,
+        speeds: bool,
+    ) -> None:
+        self.engine = engine
+        self.pools = pools
+        self.base = base
+        self.base_days = base_days
+        self.data = tuple(data)
+        self.days = days
+        self.price = price
+        self.speeds = speeds
+
+    def simulate(self, members: Members, days: int | None = None) -> Fitted:
+        """Simulates a set of effects and measures its distance from the data."""
+        numbers = list(self.base_days)[: days or self.days]
+        found = self.engine.ordinary(effects_of(members), numbers)
+        reference = Reference(
+            self.pools,
+            [day.tally for day in found.values()],
+            speeds=self.speeds,
+            prior=self.base,
+            paired=[self.base_days[number] for number in found],
+        )
+        distance = reference.distance(self.data, relative_to=self.base)
+        cost = distance.total + distance.penalty + self.price * len(members)
+        known = {number: day.tally for number, day in found.items()}
+        return Fitted(members, known, reference, distance, cost)
+
+    def refine(self, start: Fitted, rounds: int = 3) -> Fitted:
+        """Gauss-Newton steps from a simulated model, with derivatives by finite differences."""
+        best = start
+        jacobian: Array | None = None
+        for number in range(rounds):
+            if not len(best.values):
+                break
+            whitener = self.whitener(best)
+            if jacobian is None or number == 2:
+                jacobian = self.jacobian(best, whitener)
+            step = _solve(jacobian, whitener.measured)
+            moved = self._moved(best, step)
+            if moved == best.members:
+                break
+            found = self.simulate(moved)
+            if found.cost >= best.cost:
+                moved = self._moved(best, 0.4 * step)
+                if moved == best.members:
+                    break
+                found = self.simulate(moved)
+                if found.cost >= best.cost:
+                    if number:
+                        break
+                    jacobian = None
+                    continue
+            gain, best = best.cost - found.cost, found
+            if gain < 1.0 and number:
+                break
+        return best
+
+    def settled(self, model: Fitted, errors: Array) -> Fitted:
+        """A last step with more days: the search stops as soon as it hardly gains any more.
+
+        Args:
+            model: The model.
+            errors: Standard errors of its free values.
+        """
+        if not len(model.values):
+            return model
+        precise = self.simulate(model.members, SETTLING_DAYS)
+        whitener = self.whitener(precise)
+        step = _solve(self.jacobian(model, whitener), whitener.measured)
+        if (np.abs(step) <= NEAR * errors).all():
+            return precise
+        moved = self.simulate(self._moved(precise, step), SETTLING_DAYS)
+        return moved if moved.cost < precise.cost else precise
+
+    def fitted(self, start: Fitted) -> Fitted:
+        """The best values, and the best window where there is one."""
+        best = self.refine(start)
+        if any(set(WINDOW) <= dict(h.fixed).keys() for h, _ in best.members):
+            moved = self._windows(best)
+            best = self.refine(moved, 1) if moved is not best else best
+        return best
+
+    def _windows(self, best: Fitted) -> Fitted:
+        """Moves begin and end in ever smaller steps, and on as long as that helps.
+
+        The same few days before and after a move tell whether it helps.
+        """
+        members = best.members
+        cost = self.simulate(members, WINDOW_DAYS).cost
+        for step in WINDOW_STEPS_S:
+            for direction in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                while True:
+                    move = (step * direction[0], step * direction[1])
+                    moved = tuple((_shifted(h, move), values) for h, values in members)
+                    if moved == members:
+                        break
+                    found = self.simulate(moved, WINDOW_DAYS).cost
+                    if found >= cost - 1.0:
+                        break
+                    members, cost = moved, found
+        if members == best.members:
+            return best
+        found = self.simulate(members)
+        return found if found.cost < best.cost else best
+
+    def whitener(self, model: Fitted) -> Whitener:
+        """Residuals of a model: on all lanes and minutes only if an effect has a place."""
+        places = [
+            value
+            for hypothesis, _ in model.members
+            for _, value in hypothesis.fixed
+            if value != EVERYWHERE
+        ]
+        blocks = None if places else WIDE
+        return Whitener(model.reference, self.data, INTERPOLATION, self.base, blocks)
+
+    def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
+        """Derivatives of the whitened statistics, ``(free values, statistics)``."""
+        return derivatives(self.changes(model), whitener)
+
+    def changes(self, model: Fitted) -> list[Change]:
+        """For every free value: what moving it does to the statistics, and how far it was moved.
+
+        It is moved so far that what this does is more than chance.
+        """
+        whitener = self.whitener(model)
+        found: list[Change] = []
+        for place, (hypothesis, values) in enumerate(model.members):
+            for index in range(len(values)):
+                change, delta = self._change(model, place, index, NEARBY)
+                errors = float(np.linalg.norm(whitener(change)))
+                if errors < PLAIN and not hypothesis.step:
+                    share = min(NEARBY * PLAIN / max(errors, 1e-9), FAR)
+                    change, delta = self._change(model, place, index, share)
+                found.append((change, delta))
+        return found
+
+    def _change(self, model: Fitted, place: int, index: int, share: float) -> Change:
+        """What moving one value by a share of its distance from nominal does; how far it went."""
+        hypothesis, values = model.members[place]
+        moved = _moved_a_little(hypothesis, values, index, share)
+        members = replaced(model.members, place, moved)
+        return shrunk(*self.difference(model, members)), (moved[index] - values[index]) or 1.0
+
+    def window_changes(self, model: Fitted) -> list[Change]:
+        """What it does to begin and to end a minute nearer to the middle, in models with numbers.
+
+        How strong an effect was is only known together with how long it lasted.
+        """
+        found: list[Change] = []
+        for place, (hypothesis, values) in enumerate(model.members):
+            for move in ((SHORTEST_S, 0.0), (0.0, -SHORTEST_S)):
+                moved = _shifted(hypothesis, move) if values else hypothesis
+                if moved is not hypothesis:
+                    members = (*model.members[:place], (moved, values), *model.members[place + 1 :])
+                    found.append((shrunk(*self.difference(model, members)), SHORTEST_S))
+        return found
+
+    def difference(
+        self, model: Fitted, members: Members, days: int | None = None
+    ) -> tuple[dict[str, Array], dict[str, Array]]:
+        """What other members change in the statistics on the same days; its variances."""
+        numbers = list(model.days)[: days or self.days]
+        found = self.engine.ordinary(effects_of(members), numbers)
+        before = [model.days[number] for number in found]
+        return shift(self.pools, [day.tally for day in found.values()], before)
+
+    def _moved(self, model: Fitted, step: Array) -> Members:
+        """The model's values after a step, in range and not too far at once."""
+        moved: list[tuple[Hypothesis, tuple[float, ...]]] = []
+        place = 0
+        for hypothesis, values in model.members:
+            changed: list[float] = []
+            for index, value in enumerate(values):
+                nominal = hypothesis.nominal[index] if hypothesis.nominal else value
+                most = max(abs(value - nominal), 4 * hypothesis.least, 1e-6)
+                changed.append(value + float(np.clip(step[place], -most, most)))
+                place += 1
+            moved.append((hypothesis, hypothesis.clipped(changed)))
+        return tuple(moved)
+
+
+def _moved_a_little(
+    hypothesis: Hypothesis, values: tuple[float, ...], index: int, share: float
+) -> tuple[float, ...]:
+    """The values with one of them moved for a derivative, to the side that is in range."""
+    nominal = hypothesis.nominal[index] if hypothesis.nominal else 0.0
+    delta = max(share * abs(values[index] - nominal), hypothesis.least, 1e-3)
+    changed = list(values)
+    changed[index] += hypothesis.step or delta
+    moved = hypothesis.clipped(changed)
+    if moved == values:
+        changed[index] -= 2 * (hypothesis.step or delta)
+        moved = hypothesis.clipped(changed)
+    return moved
+
+
+def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
+    """The hypothesis with another window, if it has one and something is left of it."""
+    known = dict(hypothesis.fixed)
+    if not set(WINDOW) <= known.keys():
+        return hypothesis
+    begin, end = (known[name] + shift for name, shift in zip(WINDOW, move, strict=True))
+    if begin < 0 or end - begin < SHORTEST_S:
+        return hypothesis
+    changed = {**known, WINDOW[0]: begin, WINDOW[1]: end}
+    return replace(hypothesis, fixed=tuple((name, changed[name]) for name, _ in hypothesis.fixed))
+
+
+def replaced(members: Members, place: int, values: tuple[float, ...]) -> Members:
+    """The members with other values of one of them."""
+    hypothesis = members[place][0]
+    return (*members[:place], (hypothesis, values), *members[place + 1 :])
+
+
+def _solve(jacobian: Array, residual: Array) -> Array:
+    """Least squares with a touch of ridge, each value on its own scale."""
+    scale = np.sqrt((jacobian**2).sum(axis=1)) + 1e-12
+    scaled = jacobian / scale[:, None]
+    normal = scaled @ scaled.T + 1e-3 * np.eye(len(scaled))
+    return np.linalg.solve(normal, scaled @ residual) / scale
+
+
+def derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
+    """Changes as derivatives of the whitened statistics, ``(changes, statistics)``."""
+    return np.stack([whitener(change) / delta for change, delta in changes])

@@ -1,0 +1,289 @@
+"""The library: which effects may be missing, at which strengths they are first tried."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from ugat_marl.effects import SETTINGS, DetectorEffect, Effect, known_effects
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.scenarios import Scenario
+
+WINDOW = ("begin_s", "end_s")
+ORDER = (
+    "local_speed", "demand_level", "demand_surge", "demand_timing", "turning", "lane_closure",
+    "parking",
+)  # fmt: skip
+"""Effects on roads and demand come first, then drivers, trucks, signals, and detectors last."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect with what is not known of it left open.
+
+    Attributes:
+        name: Of the effect.
+        fixed: Fields that are known: places, windows, models.
+        free: Fields to be fitted.
+        levels: Values of the free fields at which it is first simulated.
+        nominal: Values of the free fields that change nothing, or None if unknown.
+        least: Distance from nominal below which it does not matter in practice.
+        step: Values are multiples of it, if not 0.
+        both: Whether the other side of nominal is the opposite of this one.
+        extreme: Those of `levels` that are looked at, but are no world to be reckoned with.
+    """
+
+    name: str
+    fixed: tuple[tuple[str, Any], ...]
+    free: tuple[str, ...]
+    levels: tuple[tuple[float, ...], ...]
+    nominal: tuple[float, ...] | None
+    least: float = 0.0
+    step: float = 0.0
+    both: bool = False
+    extreme: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What may stand in a model only once."""
+        return (self.name, tuple(item for item in self.fixed if isinstance(item[1], str)))
+
+    @property
+    def faults_only(self) -> bool:
+        """Whether it concerns detectors and not traffic."""
+        return issubclass(known_effects()[self.name], DetectorEffect)
+
+    def effect(self, values: Sequence[float]) -> Effect:
+        """The effect with these values of the free fields, brought into range."""
+        given = dict(self.fixed)
+        given |= dict(zip(self.free, self.clipped(values), strict=True))
+        return known_effects()[self.name](**given)
+
+    def clipped(self, values: Sequence[float]) -> tuple[float, ...]:
+        """The values inside the effect's plausible ranges, and on its grid."""
+        ranges = known_effects()[self.name].ranges
+        found: list[float] = []
+        for name, value in zip(self.free, values, strict=True):
+            low, high = ranges[name].low, ranges[name].high
+            if self.step:
+                value = self.step * round(value / self.step)
+            found.append(round(min(max(float(value), low), high), 4))
+        return tuple(found)
+
+    def matters(self, values: Sequence[float]) -> bool:
+        """Whether the effect is strong enough to be named."""
+        if not self.free or self.nominal is None:
+            return True
+        return abs(values[0] - self.nominal[0]) >= self.least
+
+
+LATE_STEP_S = 0.1
+"""Lost time is fitted in tenths: fractions of a simulation step are spread over many greens."""
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A global effect of the library: one number for the whole network."""
+
+    field: str
+    levels: tuple[float, ...]
+    nominal: float
+    least: float
+    place: str = ""
+    attribute: str = ""
+    both: bool = False
+    step: float = 0.0
+    extreme: tuple[float, ...] = ()
+
+
+CLOCK_S = (0.7, 1.4, 2.2, 3.1, 4.3)
+DRIFT = (1.5, 3.1, 5.2, 7.5)
+"""Strengths at which clocks are looked at, s and s/h."""
+
+
+def _both_sides(*levels: float) -> tuple[float, ...]:
+    return (*(-level for level in reversed(levels)), *levels)
+
+
+_GLOBAL: dict[str, _Entry] = {
+    "acceleration": _Entry("mps2", (0.8, 1.6), 2.6, 0.1, attribute="accel", both=True),
+    "deceleration": _Entry("mps2", (2.0, 3.2), 4.5, 0.2, attribute="decel", both=True),
+    "emergency_deceleration": _Entry("mps2", (3.0, 6.0), 9.0, 0.5, attribute="emergencyDecel"),
+    "startup_delay": _Entry(
+        "seconds", (0.3, 0.6, 0.8, 1.2), 0.0, 0.05, attribute="startupDelay", extreme=(2.4,)
+    ),
+    "headway": _Entry("seconds", (1.3, 1.7), 1.0, 0.05, attribute="tau"),
+    "min_gap": _Entry("metres", (1.2, 1.8, 3.1, 3.8, 4.7), 2.5, 0.2, attribute="minGap"),
+    "imperfection": _Entry("sigma", (0.15, 0.85), 0.5, 0.05, attribute="sigma"),
+    "desired_speed": _Entry("factor", (0.87,), 1.0, 0.01, both=True),
+    "speed_spread": _Entry("deviation", (0.03, 0.2), 0.1, 0.01, attribute="speedDev"),
+    "reaction_step": _Entry("seconds", (2.0,), 1.0, 0.5, attribute="actionStepLength"),
+    "yellow_running": _Entry("seconds", (3.0,), 0.0, 0.3, attribute="jmDriveAfterYellowTime"),
+    "red_running": _Entry("seconds", (2.0,), 0.0, 0.3, attribute="jmDriveAfterRedTime"),
+    "gap_acceptance": _Entry("seconds", (0.4, 2.5), 1.0, 0.2, attribute="jmTimegapMinor"),
+    "lane_discipline": _Entry("strategic", (0.1, 5.0), 1.0, 0.2, attribute="lcStrategic"),
+    "heavy_share": _Entry("share", (0.12,), 0.0, 0.01),
+    "late_green": _Entry("seconds", (2.0,), 0.0, 0.3, place="place", step=LATE_STEP_S),
+    # What a clock moves across the start of green is not in proportion; faults cost no simulation.
+    "signal_clock": _Entry("seconds", _both_sides(*CLOCK_S), 0.0, 0.2, place="place"),
+    "clock_drift": _Entry("seconds_per_hour", _both_sides(*DRIFT), 0.0, 0.5, place="place"),
+    "undercount": _Entry("share", (0.15,), 0.0, 0.02, place="place"),
+    "demand_level": _Entry("factor", (1.15,), 1.0, 0.03, place="edge", both=True),
+    "demand_timing": _Entry("seconds", (300.0,), 0.0, 45.0, place="edge", both=True),
+}
+
+LOCAL = frozenset(
+    {
+        "demand_surge", "turning", "lane_closure", "parking", "local_speed", "stuck", "dropout",
+        "swapped",
+    }
+)  # fmt: skip
+"""Effects that only a place, and often a window, makes complete: see `local`."""
+
+MODELS = ("IDM", "EIDM", "W99")
+"""Driver models that are examined."""
+
+
+def library(without: Collection[str] = ()) -> frozenset[str]:
+    """Names of all effects that are examined.
+
+    Raises:
+        UnknownNameError: A name in `without` is not in the library.
+    """
+    names = frozenset(_GLOBAL) | LOCAL | {"driver_model"}
+    for name in without:
+        if name not in known_effects():
+            raise UnknownNameError("effect of the library", name, known_effects())
+    return names - frozenset(without)
+
+
+def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypothesis]:
+    """Hypotheses about the whole network.
+
+    Args:
+        scenario: Its vehicle types say where each number is now.
+        allowed: Names of effects to examine.
+    """
+    found: list[Hypothesis] = []
+    step = scenario.settings.step_length_s
+    for name, entry in _GLOBAL.items():
+        if name not in allowed:
+            continue
+        nominal = _nominal(scenario, entry)
+        extreme = tuple((level,) for level in entry.extreme)
+        levels = tuple((level,) for level in entry.levels if abs(level - nominal) > entry.least)
+        if name == "reaction_step":
+            nominal, levels = max(nominal, step), ((2 * max(nominal, step),),)
+        fixed = ((entry.place, "*"),) if entry.place else ()
+        grid = step if name == "reaction_step" else entry.step
+        found.append(
+            Hypothesis(
+                name,
+                fixed,
+                (entry.field,),
+                levels + extreme,
+                (nominal,),
+                entry.least,
+                grid,
+                entry.both,
+                extreme,
+            )
+        )
+    if "driver_model" in allowed:
+        now = _attribute(scenario, "carFollowModel")
+        found += [
+            Hypothesis("driver_model", (("model", model),), (), ((),), None)
+            for model in MODELS
+            if now != {model}
+        ]
+    return found
+
+
+def settings_as_members(
+    hypotheses: Sequence[Hypothesis],
+) -> list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]]:
+    """The settings of the paper (loads, rain, snow) as starting points of a fit.
+
+    Where drivers are sluggish in several ways at once, no single effect leads there.
+    """
+    known = {item.name: item for item in hypotheses}
+    found: list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]] = []
+    for effects in SETTINGS.values():
+        members = [
+            (known[effect.name], free_values(effect, known[effect.name]))
+            for effect in effects
+            if effect.name in known
+        ]
+        if len(members) > 1:
+            found.append(tuple(members))
+    return found
+
+
+def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The order in which effects are applied: a truck keeps its own acceleration, say."""
+
+    def rank(effect: Effect) -> tuple[int, str]:
+        if isinstance(effect, DetectorEffect):
+            return (4, str(effect))
+        if effect.name in ORDER:
+            return (0, str(effect))
+        if effect.name == "driver_model":
+            return (1, str(effect))
+        return (3 if effect.name == "heavy_share" else 2, str(effect))
+
+    return tuple(sorted(effects, key=rank))
+
+
+def _nominal(scenario: Scenario, entry: _Entry) -> float:
+    """The number in the scenario's vehicle types if they agree, their mean, or SUMO's default."""
+    values: list[float] = []
+    for text in _attribute(scenario, entry.attribute) if entry.attribute else ():
+        try:
+            values.append(float(text))
+        except ValueError:
+            return entry.nominal
+    return float(np.mean(values)) if values else entry.nominal
+
+
+def _attribute(scenario: Scenario, name: str) -> set[str]:
+    """What the vehicle types of a scenario say."""
+    found: set[str] = set()
+    for document in (*scenario.additional, *scenario.routes):
+        if b"<vType" in document.read():
+            found |= {
+                item.get(name, "") for item in document.parse().iter("vType") if item.get(name)
+            }
+    return found
+
+
+def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:
+    """The values of the free fields in an effect."""
+    known = {item.name for item in fields(effect)}
+    if missing := [name for name in hypothesis.free if name not in known]:
+        raise OptionError(f"effect {effect.name!r} has no {missing[0]!r}")
+    return tuple(float(getattr(effect, name)) for name in hypothesis.free)
+
+
+def both_ways(
+    hypothesis: Hypothesis, values: tuple[float, ...]
+) -> list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...]]]:
+    """Both ways in which an effect of the model may change: less, to nothing, and more."""
+    if not values or hypothesis.nominal is None:
+        return []
+    away = tuple(1.4 * v - 0.4 * n for v, n in zip(values, hypothesis.nominal, strict=True))
+    less = hypothesis.clipped(hypothesis.nominal)
+    found = [(hypothesis, level, values) for level in (less, hypothesis.clipped(away))]
+    return [item for item in found if item[1] != values]
+
+
+def a_few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
+    """One strength on each side of nominal: enough to see what is still missing."""
+    levels, nominal = hypothesis.levels, hypothesis.nominal
+    if nominal is None or len(levels) < 2:
+        return levels
+    low = [level for level in levels if level < nominal]
+    high = [level for level in levels if level > nominal]
+    return tuple(side[len(side) // 2] for side in (low, high) if side)

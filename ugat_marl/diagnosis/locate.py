@@ -1,0 +1,179 @@
+"""Where data and model disagree: place, regime, size and window, with few false discoveries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
+from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.statistics import Array, Distance, Reference
+
+SHOWN = 40
+_REGIME_OF_BINS = ("volume", "volume", "volume", "storage")
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """One place and regime in which data and model differ.
+
+    Attributes:
+        tls: Traffic light, or None for all of the network.
+        approach: Edge, or None for all.
+        lane: Lane, or None for all.
+        regime: discharge, free flow, approach to red, yellow, storage, volume or vehicles.
+        statistic: The one that differs most.
+        window: Begin and end on the scenario's clock, s; None for all of the time.
+        size: Measured minus simulated, in `unit`.
+        unit: Of the statistic.
+        z: The same in standard deviations.
+        p: Chance of this under the model.
+    """
+
+    tls: str | None
+    approach: str | None
+    lane: str | None
+    regime: str
+    statistic: str
+    window: tuple[float, float] | None
+    size: float
+    unit: str
+    z: float
+    p: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """The fields for JSON."""
+        found = asdict(self)
+        found["window"] = None if self.window is None else list(self.window)
+        return found
+
+
+def locate(
+    site: Site,
+    reference: Reference,
+    distance: Distance,
+    alpha: float,
+    span: tuple[float, float] | None,
+) -> list[Disagreement]:
+    """All disagreements that survive the control of false discoveries, strongest first.
+
+    The control is that of Benjamini and Hochberg (1995) over all statistics of all pools and all
+    stretches of time. The statistics of a place are then gathered by regime.
+
+    Args:
+        site: Lanes.
+        reference: The model.
+        distance: Of the data from it.
+        alpha: Share of false discoveries.
+        span: Begin and end of the periods if they agree, which places bins in time.
+    """
+    found: list[Disagreement] = []
+    for name, z in distance.z.items():
+        if name != "time":
+            found += _statistics(site, name, z, distance.difference[name])
+    if span is not None:
+        found += _stretches(site, reference, distance, span)
+    tested = sum(int(block.used.sum()) for block in reference.blocks.values())
+    found.sort(key=lambda item: item.p)
+    kept = 0
+    for rank, item in enumerate(found, start=1):
+        if item.p <= alpha * rank / max(tested, 1):
+            kept = rank
+    return _gathered(found[:kept])[:SHOWN]
+
+
+def _chance(z: float) -> float:
+    """Two-sided tail; beyond a few deviations heavier than normal, as the null draws are."""
+    soft = 6.0 * math.asinh(abs(z) / 6.0)
+    return max(math.erfc(soft / math.sqrt(2)), 1e-300)
+
+
+def _statistics(site: Site, pool: str, z: Array, difference: Array) -> list[Disagreement]:
+    found: list[Disagreement] = []
+    for member, feature in zip(*np.nonzero(z), strict=True):
+        tls, approach, lane = _place(site, pool, int(member))
+        name, regime, unit = FEATURES[int(feature)]
+        value = float(z[member, feature])
+        size = float(difference[member, feature])
+        found.append(
+            Disagreement(tls, approach, lane, regime, name, None, size, unit, value, _chance(value))
+        )
+    return found
+
+
+def _place(site: Site, pool: str, member: int) -> tuple[str | None, str | None, str | None]:
+    if pool == "network":
+        return (site.intersections[0] if len(site.intersections) == 1 else None, None, None)
+    if pool == "intersection":
+        return (site.intersections[member], None, None)
+    owner, edge, name = site.places[member]
+    return (site.intersections[owner], edge, name)
+
+
+def _stretches(
+    site: Site, reference: Reference, distance: Distance, span: tuple[float, float]
+) -> list[Disagreement]:
+    """The most unusual stretch of every kind of count at every place."""
+    z, difference = distance.z["time"], distance.difference["time"]
+    used = reference.blocks["time"].used
+    places = len(site.places)
+    bins = z.shape[1]
+    width = (span[1] - span[0]) / bins
+    found: list[Disagreement] = []
+    for row in range(z.shape[0]):
+        if used[row].sum() < 3:
+            continue
+        middle = float(np.median(z[row][used[row]]))
+        best = _stretch(z[row] - middle)
+        if best is None:
+            continue
+        value, first, last = best
+        kind, place = divmod(row, places)
+        tls, approach, lane = _place(site, "lane", place)
+        size = float(difference[row, first:last].sum())
+        stretches = bins * (bins + 1) / 2
+        found.append(
+            Disagreement(
+                tls,
+                approach,
+                lane,
+                _REGIME_OF_BINS[kind],
+                f"{BIN_FEATURES[kind]} in time",
+                (span[0] + width * first, span[0] + width * last),
+                size,
+                "s" if kind == 3 else "vehicles",
+                value,
+                min(1.0, stretches * _chance(value)),
+            )
+        )
+    return found
+
+
+def _stretch(z: Array) -> tuple[float, int, int] | None:
+    """The contiguous bins with the largest standardised sum."""
+    sums = np.concatenate(([0.0], np.cumsum(np.clip(z, -15, 15))))
+    best: tuple[float, int, int] | None = None
+    for length in range(1, max(int(0.7 * len(z)), 1) + 1):
+        values = (sums[length:] - sums[:-length]) / math.sqrt(length)
+        place = int(np.argmax(np.abs(values)))
+        if best is None or abs(values[place]) > abs(best[0]):
+            best = (float(values[place]), place, place + length)
+    return best
+
+
+def _gathered(found: Sequence[Disagreement]) -> list[Disagreement]:
+    """The strongest statistic of each place, regime and kind of window."""
+    best: dict[tuple[Any, ...], Disagreement] = {}
+    for item in found:
+        key = (item.tls, item.approach, item.lane, item.regime, item.window is None)
+        if key not in best or abs(item.z) > abs(best[key].z):
+            best[key] = item
+    wide = [item for item in best.values() if item.lane is None]
+    narrow = [item for item in best.values() if item.lane is not None]
+    wide.sort(key=lambda item: -abs(item.z))
+    narrow.sort(key=lambda item: -abs(item.z))
+    return [*wide, *narrow]

@@ -1,0 +1,169 @@
+"""Is what a model leaves no more than chance? The distribution of chance is simulated.
+
+The days of the model are cut in halves: one gives the statistics and their noise, sets of days from
+the other are treated as data. Nothing is looked up in a table, since the parts of the distance
+depend on each other and have heavy tails.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.diagnosis.features import Tally
+from ugat_marl.diagnosis.fit import Fitted
+from ugat_marl.diagnosis.statistics import Distance, Pools, Reference
+
+Array = NDArray[np.float64]
+
+Directed = Callable[[Distance], Mapping[str, float]]
+"""Statistics of a distance."""
+
+_DRAWS = 40
+ONE_DAY = 0.25
+"""Chance above which data without some day are nothing unusual."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """The test of one model on one data set.
+
+    Attributes:
+        distance: Of the data from the model, in total.
+        floor: What 99 of 100 data sets of the model itself would stay below, in total.
+        expected: Mean distance of data sets of the model itself.
+        p: Chance of a distance like this under the model: smallest over the blocks, corrected for
+            their number.
+        blocks: The same for every statistic that is tested.
+    """
+
+    distance: float
+    floor: float
+    expected: float
+    p: float
+    blocks: dict[str, float]
+
+
+class Null:
+    """The distribution of the distance under a model.
+
+    Args:
+        pools: How places pool.
+        tallies: Simulated days of the model.
+        periods: Periods in a data set.
+        speeds: Whether speeds were measured.
+        directed: Makes further statistics of a distance, which small effects move most, for the
+            model whose distance it is. It is made anew for each half: what was adapted to the days
+            it judges would find them more usual than others.
+        doubt: What the model's means may be off by, see `Reference`; its own days are not.
+    """
+
+    def __init__(
+        self,
+        pools: Pools,
+        tallies: Sequence[Tally],
+        periods: int,
+        *,
+        speeds: bool,
+        directed: Callable[[Reference], Directed] | None = None,
+        doubt: Mapping[str, Array] | None = None,
+    ) -> None:
+        generator = np.random.default_rng(7)
+        self.reference = Reference(pools, tallies, speeds=speeds, doubt=doubt)
+        self._directed = directed(self.reference) if directed else None
+        draws: dict[str, list[float]] = {}
+        for half in (0, 1):
+            model = Reference(pools, tallies[half::2], speeds=speeds)
+            own = directed(model) if directed else None
+            others = tallies[1 - half :: 2]
+            size = min(periods, max(len(others) - 1, 1))
+            for _ in range(_DRAWS):
+                chosen = generator.choice(len(others), size, replace=False)
+                found = model.distance([others[int(i)] for i in chosen])
+                for name, value in _statistics(found, own).items():
+                    draws.setdefault(name, []).append(value)
+                draws.setdefault("total", []).append(found.total)
+        self._moments = {name: _log_moments(values) for name, values in draws.items()}
+        self.expected = float(np.mean(draws["total"]))
+
+    def test(
+        self,
+        data: Sequence[Tally],
+        extra: Mapping[str, Array] | None = None,
+    ) -> Residual:
+        """Tests a data set.
+
+        A network may lock up on one day in a hundred. So a difference must not hang on one day: if
+        it is nothing unusual once some period is left out, that is the chance reported.
+
+        Args:
+            data: Its periods.
+            extra: Variance of the expected statistics for the parameters' errors.
+        """
+        found = self._judge(self.reference.distance(data, extra=extra))
+        if len(data) < 2 or found.p > ONE_DAY:
+            return found
+        others = [[*data[:i], *data[i + 1 :]] for i in range(len(data))]
+        without = [self._judge(self.reference.distance(part, extra=extra)).p for part in others]
+        return replace(found, p=max(without)) if max(without) > ONE_DAY else found
+
+    def _judge(self, found: Distance) -> Residual:
+        values = _statistics(found, self._directed)
+        chances = {name: self._chance(name, value) for name, value in values.items()}
+        smallest = min(chances.values())
+        return Residual(
+            found.total,
+            self.quantile(0.99),
+            self.expected,
+            min(1.0, smallest * len(chances)),
+            chances,
+        )
+
+    def quantile(self, share: float) -> float:
+        """What this share of data sets of the model stay below, in total."""
+        mean, deviation = self._moments["total"]
+        normal = {0.95: 1.645, 0.99: 2.326}[share]
+        return math.exp(mean + normal * deviation)
+
+    def _chance(self, name: str, value: float) -> float:
+        """Upper tail of a log-normal distribution, heavier than that of a chi-square."""
+        mean, deviation = self._moments[name]
+        return 0.5 * math.erfc((math.log(max(value, 1e-9)) - mean) / (deviation * math.sqrt(2)))
+
+
+def _statistics(found: Distance, directed: Directed | None) -> dict[str, float]:
+    """What is tested: the distance of every block, its largest part, and what is directed."""
+    values = dict(found.parts)
+    for name in ("lane", "time"):
+        values[f"{name}, largest"] = float(np.abs(found.z[name]).max(initial=0.0)) ** 2
+    if directed is not None:
+        values |= directed(found)
+    return {name: value + 1.0 for name, value in values.items()}
+
+
+def _log_moments(values: Sequence[float]) -> tuple[float, float]:
+    logs = np.log(np.maximum(values, 1e-9))
+    return float(logs.mean()), max(float(logs.std(ddof=1)), 0.02)
+
+
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """A fitted model with the test of what it leaves.
+
+    Attributes:
+        model: The model.
+        null: Its own distribution of distances.
+        residual: The test on the fitted periods.
+        errors: Standard errors of its free values.
+        extra: What they make uncertain in the statistics, and the tolerance.
+    """
+
+    model: Fitted
+    null: Null
+    residual: Residual
+    errors: Array
+    extra: dict[str, Array]

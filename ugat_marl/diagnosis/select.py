@@ -1,0 +1,351 @@
+"""Selects the effects: propose, simulate, fit, and stop when what is left is chance."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from ugat_marl.diagnosis.engine import OutOfTime
+from ugat_marl.diagnosis.features import Tally
+from ugat_marl.diagnosis.fit import (
+    SETTLING_DAYS,
+    WIDE,
+    Fitted,
+    Fitter,
+    Members,
+    cost_of,
+    effects_of,
+)
+from ugat_marl.diagnosis.hypotheses import Hypothesis, a_few, both_ways, settings_as_members
+from ugat_marl.diagnosis.intervals import uncertainty
+from ugat_marl.diagnosis.local import Proposer
+from ugat_marl.diagnosis.matched import Directions
+from ugat_marl.diagnosis.members import merged, names_of
+from ugat_marl.diagnosis.pruning import pruned
+from ugat_marl.diagnosis.residual import Null, Tested
+from ugat_marl.diagnosis.search import Ray, between, promising, propose, squared_gap
+from ugat_marl.diagnosis.whitening import Whitener
+from ugat_marl.effects import Effect
+from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios import Period
+
+ROUNDS = 4
+NEAREST, NEARER = 3, 0.8
+CANDIDATES_FITTED = 3
+KINDS_OF_PLACES = 5
+"""Kinds of effects at places of which the best is simulated."""
+TOLERANCE = 0.02
+"""Share of the first difference in a statistic that a model may leave: parameters are known, and
+simulation steps resolved, no better."""
+MOVES_OF_A_VALUE = 8
+"""How often a value is moved, about, until its model is tested; a bar shows how far that is."""
+_MOST = 0.25
+"""Places and windows are looked at if effects on the whole network would leave more than this."""
+_LITTLE = 2.0
+"""Distance per statistic of the network below which nothing is to be seen in the pool."""
+_HOPEFUL = 0.9
+"""Candidates that take off less than this share of what the best one does are not fitted."""
+_HUGE = 20.0
+"""Distances per statistic beyond which several effects at once are likely from the start."""
+_PLAIN = 100.0
+"""How much rarer than the level of the tests a difference must be that its size does not show."""
+_FORESIGHT = 0.05
+"""Rays are straight and effects are not: so much of a difference is not expected to be met."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How many days are simulated for what.
+
+    Attributes:
+        base: For the scenario as it is.
+        bank: For each strength of each hypothesis.
+        fit: For each model that is fitted.
+        test: For the test of what is left.
+    """
+
+    base: int = 60
+    bank: int = 3
+    fit: int = 6
+    test: int = 36
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What the search came to.
+
+    Attributes:
+        best: The model selected; without effects if none was worth its price.
+        rivals: Other sets of effects that were fitted, best first.
+        complete: Whether the search ended by itself, and not by the budget.
+    """
+
+    best: Tested
+    rivals: tuple[Fitted, ...]
+    complete: bool
+
+
+class Selector:
+    """Searches for the effects that make the difference.
+
+    Args:
+        fitter: Simulates and fits.
+        proposer: Finds places and windows.
+        library: Hypotheses about the whole network.
+        periods: The fitted periods.
+        effort: Numbers of days.
+        alpha: Level of the tests.
+        null: Makes the test of a model of its days.
+        reporter: Shows progress.
+
+    Attributes:
+        examined: Effects that were simulated, or for which no place came into question.
+    """
+
+    def __init__(
+        self,
+        fitter: Fitter,
+        proposer: Proposer,
+        library: Sequence[Hypothesis],
+        periods: Sequence[Period],
+        effort: Effort,
+        alpha: float,
+        null: Callable[[Sequence[Tally], int, Directions, tuple[Effect, ...]], Null],
+        reporter: Reporter,
+    ) -> None:
+        self._fitter = fitter
+        self._proposer = proposer
+        self._library = tuple(library)
+        self._periods = tuple(periods)
+        self._effort = effort
+        self._alpha = alpha
+        self._null = null
+        self._reporter = reporter
+        self._first = fitter.base.distance(fitter.data)
+        self._seen: dict[str, Fitted] = {}
+        self._rays: tuple[Ray, ...] = ()
+        self._places: tuple[Ray, ...] = ()
+        self.examined: set[str] = set()
+
+    def looked_closer(self, base: Tested) -> Tested:
+        """The test of the scenario as it is once it is known where single effects would show.
+
+        Raises:
+            OutOfTime: The budget does not suffice for that.
+        """
+        data = self._fitter.data
+        self._places = tuple(self._bank(base.model, self._proposer.everywhere(), 0, "places"))
+        directions = Directions((*self._library_rays(base.model, 0), *self._places))
+        null = self._null(base.model.tallies, len(data), directions, ())
+        return replace(base, null=null, residual=null.test(data))
+
+    def select(self, base: Tested) -> Selection:
+        """The search, from the scenario as it is."""
+        best = base
+        complete = True
+        try:
+            for number in range(ROUNDS):
+                found = self._round(best, number)
+                if found is None:
+                    break
+                best = found
+                if best.residual.p > self._alpha:
+                    break
+            best = pruned(
+                best, base, self._fitter, self._kept, self.test, self._alpha, self._reporter
+            )
+        except OutOfTime:
+            complete = False
+            cheapest = min(self._seen.values(), key=cost_of, default=best.model)
+            if cheapest.cost < best.model.cost:
+                best = self._untested(cheapest, base)
+        return Selection(best, tuple(sorted(self._seen.values(), key=cost_of)), complete)
+
+    def test(self, model: Fitted) -> Tested:
+        """Simulates more days of a model and tests what it leaves."""
+        fitter = self._fitter
+        moves = len(model.values) * MOVES_OF_A_VALUE * fitter.days
+        days = SETTLING_DAYS + self._effort.test + moves
+        with (
+            self._reporter.task("is what is left chance", days) as advance,
+            fitter.engine.watched(advance, days),
+        ):
+            return self._tested(model)
+
+    def _tested(self, model: Fitted) -> Tested:
+        fitter = self._fitter
+        model = self._kept(fitter.settled(model, uncertainty(fitter, model)[0]))
+        days = self._days(model)
+        errors, extra = uncertainty(fitter, model, days, steps=True)
+        for name, difference in self._first.difference.items():
+            extra[name] = extra[name] + (TOLERANCE * difference) ** 2
+        fitted = tuple(change for change, _ in fitter.changes(model))
+        directions = Directions((*self._rays, *self._places), extra, fitted)
+        null = self._null(days, len(fitter.data), directions, model.effects)
+        return Tested(model, null, null.test(fitter.data, extra), errors, extra)
+
+    def _days(self, model: Fitted) -> list[Tally]:
+        engine = self._fitter.engine
+        found = engine.ordinary(model.effects, engine.first(self._effort.test))
+        return [item.tally for item in found.values()]
+
+    def _untested(self, model: Fitted, base: Tested) -> Tested:
+        """A model for whose test there was no time: its errors are unknown."""
+        residual = base.null.test(self._fitter.data)
+        return Tested(model, base.null, residual, 0.0 * model.values, {})
+
+    def _round(self, start: Tested, number: int) -> Tested | None:
+        """Adds, changes or removes effects; None if nothing is worth it."""
+        rays = between(self._library_rays(start.model, number))
+        whitener = self._whitener(start.model, WIDE)
+        gap = float(whitener.measured @ whitener.measured)
+        chance = float(len(whitener.measured))
+        enough = chance + _MOST * max(gap - chance, 0.0)
+        proposals = propose(rays, whitener, self._fitter.price)
+        chosen = [item.members for item in promising(proposals)]
+        little = gap < _LITTLE * chance  # what differs does so in single places
+        near = little or not proposals or proposals[0].expected > enough
+        if near:
+            chosen = [*chosen[:2], *self._elsewhere(start.model, rays, number)]
+        if number == 0:
+            chosen += self._nearest()
+            chosen += settings_as_members(self._library) if gap > _HUGE * chance else []
+        best = self._fitted(start, chosen, f"round {number + 1}: candidates")
+        if best is None and not near:  # the library promised more than it kept
+            chosen = self._elsewhere(start.model, rays, number)
+            best = self._fitted(start, chosen, f"round {number + 1}: places")
+        return best
+
+    def _fitted(self, start: Tested, chosen: Sequence[Members], title: str) -> Tested | None:
+        """The best of some sets of effects on top of a model; None if none is worth its price."""
+        tried = self._tried(start.model, list(dict.fromkeys(chosen)), title)
+        best = self._refined(tried, CANDIDATES_FITTED, start.model.cost)
+        if best is None:
+            return None
+        gain = start.model.cost - best.cost
+        if gain > self._fitter.price:
+            return self.test(best)
+        # All statistics together may hardly notice what is plain along an effect's own direction.
+        if start.residual.p < self._alpha / _PLAIN and gain > -self._fitter.price:
+            tested = self.test(best)
+            return tested if tested.residual.p > self._alpha else None
+        return None
+
+    def _nearest(self) -> list[Members]:
+        """The single strengths of the library that come nearest, simulated, not along rays.
+
+        What effects do may come in steps, as whole vehicles cross the start of green or a detector.
+        """
+        strengths = [((item, level),) for item in self._library for level in item.levels]
+        found: list[tuple[float, int]] = []
+        base, periods = self._fitter.base, len(self._fitter.data)
+        gap = squared_gap(self._first, base, periods)
+        for place, members in enumerate(strengths):
+            with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
+                model = self._fitter.simulate(members, self._effort.bank)
+                if squared_gap(model.distance, base, periods) < NEARER * gap:
+                    found.append((model.cost, place))
+        return [strengths[place] for _, place in sorted(found)[:NEAREST]]
+
+    def _elsewhere(self, model: Fitted, rays: Sequence[Ray], number: int) -> list[Members]:
+        """Proposals with effects at places and in windows, judged by lanes and minutes too."""
+        present = {item.key for item in self._library}
+        found = self._proposer.hypotheses(model.reference, model.distance, self._periods)
+        local = [item for item in found if item.key not in present]
+        known = [] if number else list(self._places)  # worked out upon the scenario as it is
+        places = {ray.hypothesis.key for ray in known}
+        added = self._bank(model, [h for h in local if h.key not in places], number, "places")
+        added += known
+        proposals = propose([*rays, *added], self._whitener(model, None), self._fitter.price)
+        places |= {item.key for item in local}
+        self.examined |= self._proposer.allowed
+        alone = [item for item in proposals if len(item.members) == 1]
+        best: dict[str, Members] = {}
+        for item in alone:
+            hypothesis = item.members[0][0]
+            if hypothesis.key in places:
+                best.setdefault(hypothesis.name, item.members)
+        here = list(best.values())[:KINDS_OF_PLACES]
+        # What the counts say may be nearer than what a straight ray makes of it.
+        here += [((h, h.levels[0]),) for ((h, _),) in here if h.levels[0]]
+        return [*(item.members for item in promising(proposals)), *here]
+
+    def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
+        data, base = self._fitter.data, self._fitter.base
+        return Whitener(model.reference, data, _FORESIGHT, base, blocks)
+
+    def _library_rays(self, model: Fitted, number: int) -> tuple[Ray, ...]:
+        """The whole library on top of a model; upon the scenario as it is it is worked out once."""
+        if number:
+            return tuple(self._bank(model, self._library, number))
+        self._rays = self._rays or tuple(self._bank(model, self._library, 0))
+        return self._rays
+
+    def _bank(
+        self, model: Fitted, hypotheses: Sequence[Hypothesis], number: int, what: str = "library"
+    ) -> list[Ray]:
+        """Simulates hypotheses on top of a model."""
+        present = {hypothesis.key: values for hypothesis, values in model.members}
+        jobs: list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...] | None]] = []
+        for hypothesis in dict.fromkeys(hypotheses):
+            if hypothesis.key not in present:
+                levels = hypothesis.levels if number == 0 else a_few(hypothesis)
+                jobs += [(hypothesis, level, hypothesis.nominal) for level in levels]
+        if what == "library":
+            for hypothesis, values in model.members:
+                jobs += both_ways(hypothesis, values)
+        days = self._effort.bank
+        rays: list[Ray] = []
+        numbers = list(model.days)[:days]
+        models = [merged(model.members, ((h, level),)) for h, level, _ in jobs]
+        with self._reporter.task(f"round {number + 1}: {what}", len(jobs)) as advance:
+            prepared = [(effects_of(members), numbers) for members in models]
+            self._fitter.engine.prepare(prepared, advance)
+        self.examined |= {hypothesis.name for hypothesis, _, _ in jobs}
+        for (hypothesis, level, origin), members in zip(jobs, models, strict=True):
+            try:
+                difference, variance = self._fitter.difference(model, members, days)
+            except (SimulatorError, OptionError, ScenarioError) as error:
+                # it cannot be there: the lane is too short to park on, say
+                if what == "library":
+                    self._reporter.say(f"note: {hypothesis.name} left out: {error}")
+                continue
+            rays.append(Ray(hypothesis, level, difference, variance, origin))
+        return rays
+
+    def _tried(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
+        """Simulates sets of effects on top of a model."""
+        found: list[Fitted] = []
+        with self._reporter.task(title, len(chosen)) as advance:
+            for new in chosen:
+                members = merged(model.members, new)
+                if members:
+                    try:
+                        found.append(self._kept(self._fitter.simulate(members)))
+                    except (SimulatorError, OptionError, ScenarioError) as error:
+                        self._reporter.say(f"note: {names_of(members)} left out: {error}")
+                advance(note=names_of(members))
+        return found
+
+    def _refined(self, models: Sequence[Fitted], count: int, gap: float) -> Fitted | None:
+        """The best of several models once the most promising and the best simple are fitted."""
+        ranked = sorted(models, key=cost_of)
+        simple = [model for model in ranked[count:] if len(model.members) == 1]
+        ranked = ranked[:count] + simple[:1]
+        best: Fitted | None = None
+        with self._reporter.task("fitting", len(ranked)) as advance:
+            for model in ranked:
+                if best is None or gap - model.cost > _HOPEFUL * (gap - best.cost):
+                    found = self._kept(self._fitter.fitted(model))
+                    best = found if best is None or found.cost < best.cost else best
+                advance(note=names_of(model.members))
+        return best
+
+    def _kept(self, model: Fitted) -> Fitted:
+        """Remembers the best of every set of effects."""
+        key = str(sorted(str(hypothesis.key) for hypothesis, _ in model.members))
+        if key not in self._seen or model.cost < self._seen[key].cost:
+            self._seen[key] = model
+        return model

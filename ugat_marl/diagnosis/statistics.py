@@ -1,0 +1,390 @@
+"""Statistics of data sets, their noise, and the distance between data and a model.
+
+A data set is D periods. Its statistics are features pooled three ways: over the network, over each
+intersection, over each lane. Each pool is a block with one correlation between features, estimated
+from simulated days over all members of the block at once and shrunk (Ledoit and Wolf 2004). The
+distance is the sum of the blocks' Mahalanobis distances: a composite of dependent parts, so that
+its distribution is never looked up but always simulated.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.diagnosis.features import EVENT_FEATURES, FEATURES, SPEED_FEATURES, Tally
+from ugat_marl.diagnosis.site import Site
+
+Array = NDArray[np.float64]
+
+MIN_OBSERVATIONS = 3.0
+"""Observations per period below which a mean is not used."""
+_GRAIN = 0.3
+"""A mean is not known better than to this much of a unit in one observation."""
+_EVENT = 1.0
+"""What hardly ever happens is not known better than to one event in a period."""
+SINGLE = ("lane", "time")
+"""Blocks with so many statistics of single lanes and minutes that most of an effect's differences
+there are chance: those are left as they were."""
+CERTAIN = 6.0
+"""Squared standardised difference beyond which one is not chance."""
+SOFT = {"network": np.inf, "intersection": np.inf, "lane": 5.0, "time": 4.0}
+"""Standardised differences beyond this count less: queues reach a place or they do not, and single
+lanes and minutes have heavy tails."""
+
+
+@dataclass(frozen=True)
+class Pools:
+    """How places pool.
+
+    Attributes:
+        blocks: Block name to a matrix ``(members, places)`` of zeros and ones.
+        together: How many bins of time make one; what is left at the end is not used.
+    """
+
+    blocks: dict[str, Array]
+    together: int = 1
+
+    @classmethod
+    def of(cls, site: Site, together: int = 1) -> Pools:
+        """The network, every intersection if there are several, every lane."""
+        places = len(site.places)
+        owners = [owner for owner, _, _ in site.places]
+        blocks = {"network": np.ones((1, places))}
+        if len(site.intersections) > 1:
+            blocks["intersection"] = np.array(
+                [
+                    [float(owner == index) for owner in owners]
+                    for index in range(len(site.intersections))
+                ]
+            )
+        blocks["lane"] = np.eye(places)
+        return cls(blocks, together)
+
+    def pool(self, item: Tally) -> dict[str, Array]:
+        """Sums and weights ``(members, features, 2)`` of every block.
+
+        The block "time" has a member for every kind of count at every place, and bins of time for
+        features.
+        """
+        pooled = {
+            name: np.einsum("mp,fpc->mfc", matrix, item.sums)
+            for name, matrix in self.blocks.items()
+        }
+        bins, counted = item.gathered(self.together)
+        time = np.stack([bins, counted], axis=-1)
+        pooled["time"] = time.reshape(-1, *time.shape[2:])
+        return pooled
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """What one block looks like under a model; all arrays ``(members, features)``.
+
+    Attributes:
+        mean: Expected statistics.
+        variance: Variance of one period.
+        weight: Observations per period.
+        error: Variance of `mean` itself.
+        used: Which statistics are used.
+        correlation: Between features, ``(features, features)``.
+        doubt: Variance of `mean` that no number of days takes away.
+    """
+
+    mean: Array
+    variance: Array
+    weight: Array
+    error: Array
+    used: NDArray[np.bool_]
+    correlation: Array
+    doubt: Array | float = 0.0
+
+    def noise(self, weight: Array, periods: int) -> Array:
+        """Variance of measured minus expected; fewer observations than usual say less.
+
+        Args:
+            weight: Observations per measured period.
+            periods: Measured periods.
+        """
+        thin = np.clip(self.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
+        return self.variance * thin / periods + self.error + self.doubt
+
+
+@dataclass(frozen=True, eq=False)
+class Distance:
+    """How far data are from a model.
+
+    Attributes:
+        total: Sum over the blocks.
+        parts: The distance of every block.
+        penalty: Logarithm of the variances relative to a reference, for comparing models.
+        z: Standardised differences of every block, 0 where unused, ``(members, features)``.
+        difference: Data minus model, in units of the features.
+    """
+
+    total: float
+    parts: dict[str, float]
+    penalty: float
+    z: dict[str, Array]
+    difference: dict[str, Array]
+
+
+class Reference:
+    """Statistics and noise of a model, from simulated days.
+
+    Args:
+        pools: How places pool.
+        tallies: Simulated days.
+        speeds: Whether speeds were measured.
+        prior: A model whose correlations are taken over, and towards whose variances those of few
+            days are shrunk.
+        paired: Days of `prior` with the same numbers as `tallies`: their difference is what is
+            known of the mean (common random numbers).
+        doubt: Variance of the means that no number of days takes away, by block; None for that of
+            `prior`.
+    """
+
+    def __init__(
+        self,
+        pools: Pools,
+        tallies: Sequence[Tally],
+        *,
+        speeds: bool = True,
+        prior: Reference | None = None,
+        paired: Sequence[Tally] = (),
+        doubt: Mapping[str, Array] | None = None,
+    ) -> None:
+        self.pools = pools
+        self.days = len(tallies)
+        self._speeds = speeds
+        stacked = _stack(pools, tallies)
+        partners = _stack(pools, paired) if paired else {}
+        self.blocks: dict[str, Block] = {}
+        for name, sums in stacked.items():
+            before = prior.blocks[name] if prior else None
+            block = self._block(sums, before, partners.get(name), name)
+            known = before.doubt if before else 0.0
+            self.blocks[name] = replace(block, doubt=doubt[name] if doubt else known)
+
+    def _block(self, sums: Array, prior: Block | None, partner: Array | None, name: str) -> Block:
+        """From sums ``(days, members, features, 2)``."""
+        timed = name == "time"
+        mean, variance, weight, residual = _moments(sums)
+        if timed:
+            variance = _smoothed(mean, variance)
+        error = variance / len(sums)
+        if prior is not None:
+            few = 6.0
+            scale = len(sums) / (len(sums) + few)
+            variance = scale * variance + (1 - scale) * prior.variance
+            error = variance / len(sums)
+            if partner is not None:
+                moved = _moved(mean, residual, partner) if name in SINGLE else True
+                mean, error = _controlled(mean, variance, residual, partner, prior)
+                mean = np.where(moved, mean, prior.mean)
+                variance = np.where(moved, variance, prior.variance)
+                error = np.where(moved, error, prior.error)
+        if timed:
+            used = mean > 0.5
+        else:
+            used = (weight >= MIN_OBSERVATIONS) & np.isfinite(mean)
+            used &= ~_constant(self._speeds)[None, :]
+        if timed:
+            correlation = np.eye(sums.shape[2])
+        elif prior is None:
+            correlation = _correlation(np.where(used, residual / np.sqrt(variance), 0.0))
+        else:
+            correlation = prior.correlation
+            used &= prior.used
+        return Block(mean, variance, weight, error, used, correlation)
+
+    def distance(
+        self,
+        data: Sequence[Tally],
+        *,
+        relative_to: Reference | None = None,
+        extra: Mapping[str, Array] | None = None,
+    ) -> Distance:
+        """The distance of a data set.
+
+        Args:
+            data: Its periods.
+            relative_to: Whose variances the penalty is relative to; its choice of statistics is
+                used too.
+            extra: Further variance of the expected statistics.
+        """
+        sums = self.pools.pool(added(data))
+        total = penalty = 0.0
+        parts: dict[str, float] = {}
+        z: dict[str, Array] = {}
+        difference: dict[str, Array] = {}
+        for name, block in self.blocks.items():
+            other = relative_to.blocks[name] if relative_to else block
+            weight = sums[name][..., 1] / len(data)
+            used = other.used & (weight >= 1.0)
+            value = sums[name][..., 0] / np.maximum(sums[name][..., 1], 1e-9)
+            variance = block.noise(weight, len(data))
+            if extra is not None:
+                variance = variance + extra[name]
+            mean = np.where(np.isfinite(block.mean), block.mean, other.mean)
+            difference[name] = np.where(used, value - mean, 0.0)
+            z[name] = difference[name] / np.sqrt(variance)
+            parts[name] = _mahalanobis(softened(name, z[name]), used, other.correlation)
+            total += parts[name]
+            if relative_to:
+                ratio = np.log(
+                    np.maximum(variance, 1e-12) / (other.variance / len(data) + other.doubt)
+                )
+                penalty += float(ratio[used].sum())
+        return Distance(total, parts, penalty, z, difference)
+
+
+def softened(block: str, z: Array) -> Array:
+    """Standardised differences as they count: those of single places less, the larger they are."""
+    soft = SOFT[block]
+    return soft * np.arcsinh(z / soft) if soft < np.inf else z
+
+
+def _stack(pools: Pools, tallies: Sequence[Tally]) -> dict[str, Array]:
+    """Pooled sums of several days, ``(days, members, features, 2)``."""
+    pooled = [pools.pool(item) for item in tallies]
+    return {name: np.stack([item[name] for item in pooled]) for name in pooled[0]}
+
+
+def added(tallies: Sequence[Tally]) -> Tally:
+    """The tally of several periods together."""
+    total = tallies[0]
+    for item in tallies[1:]:
+        total = total + item
+    return total
+
+
+def _smoothed(mean: Array, variance: Array) -> Array:
+    """Variances of counts in short bins: half their own, half in proportion to the mean."""
+    scale = variance.sum(axis=1, keepdims=True) / np.maximum(mean.sum(axis=1, keepdims=True), 1e-9)
+    return np.maximum(0.5 * variance + 0.5 * scale * mean, 0.05)
+
+
+def _moments(sums: Array) -> tuple[Array, Array, Array, Array]:
+    """Ratio estimates: mean, variance of one day, observations per day, residuals of the days."""
+    total = sums.sum(axis=0)
+    weight = total[..., 1] / len(sums)
+    mean = total[..., 0] / np.maximum(total[..., 1], 1e-9)
+    residual = (sums[..., 0] - mean * sums[..., 1]) / np.maximum(weight, 1e-9)
+    variance = (residual**2).sum(axis=0) / max(len(sums) - 1, 1)
+    grain = (_grain(sums.shape[2]) / np.maximum(weight, 1.0)) ** 2
+    mean = np.where(weight > 0, mean, np.nan)
+    return mean, np.maximum(variance, grain), weight, residual
+
+
+def _moved(mean: Array, residual: Array, partner: Array) -> NDArray[np.bool_]:
+    """Which statistics differ from those of the same days under the prior model beyond chance."""
+    before, _, _, other = _moments(partner)
+    days = len(partner)
+    noise = ((residual - other) ** 2).sum(axis=0) / max(days - 1, 1) / days
+    return np.nan_to_num((mean - before) ** 2, nan=np.inf) > CERTAIN * noise
+
+
+def _controlled(
+    mean: Array, variance: Array, residual: Array, partner: Array, prior: Block
+) -> tuple[Array, Array]:
+    """The mean corrected by what the same days do under the prior model (a control variate)."""
+    before, _, _, other = _moments(partner)
+    spread = (other**2).sum(axis=0)
+    slope = np.clip((residual * other).sum(axis=0) / np.maximum(spread, 1e-12), 0.0, 1.5)
+    slope = np.where(np.isfinite(prior.mean) & np.isfinite(before), slope, 0.0)
+    days = len(partner)
+    left = ((residual - slope * other) ** 2).sum(axis=0) / max(days - 2, 1)
+    shift = np.where(slope > 0, slope * (before - prior.mean), 0.0)
+    error = np.maximum(left, 0.1 * variance) / days + slope**2 * prior.error
+    return mean - shift, error
+
+
+@functools.cache
+def _grain(width: int) -> Array:
+    """The smallest sum that is known to be one, for every feature, or bin of time."""
+    if width != len(FEATURES):
+        return np.full(width, _GRAIN)
+    return np.array([_EVENT if name in EVENT_FEATURES else _GRAIN for name, _, _ in FEATURES])
+
+
+@functools.cache
+def _constant(speeds: bool) -> NDArray[np.bool_]:
+    """Features that are never used."""
+    return np.array([not speeds and name in SPEED_FEATURES for name, _, _ in FEATURES])
+
+
+def _correlation(residual: Array) -> Array:
+    """Shrunk correlation of ``(days, members, features)``, all members of the block together."""
+    rows = residual.reshape(-1, residual.shape[-1])
+    spread = np.sqrt((rows**2).mean(axis=0))
+    rows = rows / np.where(spread > 0, spread, 1.0)
+    count, width = rows.shape
+    sample = rows.T @ rows / count
+    np.fill_diagonal(sample, 1.0)
+    # Ledoit and Wolf (2004), with the identity as target.
+    distance = ((sample - np.eye(width)) ** 2).sum()
+    noise = float((((rows**2).T @ (rows**2)) / count - sample**2).sum()) / count
+    shrinkage = min(max(noise / max(distance, 1e-12), 0.02), 1.0)
+    return (1 - shrinkage) * sample + shrinkage * np.eye(width)
+
+
+def _mahalanobis(z: Array, used: NDArray[np.bool_], correlation: Array) -> float:
+    """Sum over the members of ``z' C^-1 z``, each with the features it uses."""
+    total = 0.0
+    patterns, kind = np.unique(used, axis=0, return_inverse=True)
+    for index, pattern in enumerate(patterns):
+        if pattern.any():
+            rows = z[kind.ravel() == index][:, pattern]
+            solved = np.linalg.solve(correlation[np.ix_(pattern, pattern)], rows.T)
+            total += float((rows.T * solved).sum())
+    return total
+
+
+def shift(
+    pools: Pools, after: Sequence[Tally], before: Sequence[Tally]
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """What a change of the model does to the statistics, from the same days before and after.
+
+    Returns:
+        The differences, and the variances of these differences.
+    """
+    new, old = _stack(pools, after), _stack(pools, before)
+    difference: dict[str, Array] = {}
+    variance: dict[str, Array] = {}
+    for name in new:
+        mean, _, _, left = _moments(new[name])
+        base, _, _, right = _moments(old[name])
+        difference[name] = np.nan_to_num(mean - base)
+        days = len(after)
+        spread = ((left - right) ** 2).sum(axis=0) / max(days - 1, 1)
+        variance[name] = np.nan_to_num(spread / days, nan=np.inf)
+    return difference, variance
+
+
+def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> dict[str, Array]:
+    """Differences drawn towards 0 by what may be chance in them.
+
+    A derivative that holds chance points everywhere a little, which makes a fit timid and its
+    errors too small.
+    """
+    found: dict[str, Array] = {}
+    for name, values in difference.items():
+        squared = np.maximum(values**2, 1e-300)
+        found[name] = values * np.maximum(1.0 - CERTAIN * variance[name] / squared, 0.0)
+    return found
+
+
+def without_noise(
+    difference: Mapping[str, Array], variance: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Differences with those of single lanes and minutes set to 0 that may be chance."""
+    found: dict[str, Array] = {}
+    for name, values in difference.items():
+        certain = values**2 > CERTAIN * variance[name]
+        found[name] = np.where(certain, values, 0.0) if name in SINGLE else values
+    return found

@@ -1,1 +1,0 @@
-"""Where simulation and measurement disagree, which effect is missing, and the gap without it."""

@@ -1,0 +1,210 @@
+"""Parallel environments as a `VecEnv` of Stable-Baselines3: one network for all agents.
+
+    from stable_baselines3 import PPO
+    from ugat_marl.adapters.sb3 import AgentsVecEnv
+    from ugat_marl.wrappers import agent_indicator, pad
+
+    env = AgentsVecEnv([agent_indicator(pad(ugat_marl.parallel_env("grid4x4-v1")))])
+    PPO("MlpPolicy", env, seed=1).learn(100_000)
+
+In contrast to SuperSuit's it seeds, carries masks, closes, and says which ends are truncations.
+"""
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from ugat_marl.envs.types import AnyParallelEnv
+from ugat_marl.errors import ActionError, EpisodeError, OptionError
+
+Step = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]
+
+
+class AgentsVecEnv(VecEnv):
+    """Each agent of each environment is an environment of its own, in the order of both.
+
+    An episode that ends begins anew, as Stable-Baselines3 expects. What was seen at its end is in
+    the infos, as ``terminal_observation``, and with it ``TimeLimit.truncated``: there the library
+    goes on with the value of that observation. `action_masks` is what sb3-contrib's `MaskablePPO`
+    asks for.
+
+    Args:
+        envs: Environments whose agents all have the same spaces, and stay to the end of the
+            episode; `ugat_marl.envs.wrappers.pad` makes spaces the same.
+        masks_in_observation: Append its action mask to each observation, for policies that know no
+            other way to see it (`ugat_marl.envs.wrappers.appended_mask` does the same for one
+            environment).
+
+    Raises:
+        OptionError: No agents, or unequal spaces.
+    """
+
+    def __init__(
+        self, envs: Sequence[AnyParallelEnv], *, masks_in_observation: bool = False
+    ) -> None:
+        self.envs = list(envs)
+        self.rows = [(env, agent) for env in self.envs for agent in env.possible_agents]
+        if not self.rows:
+            raise OptionError("no environment with agents; nothing can be learned in none")
+        box, actions = _common_spaces(self.rows)
+        self.masks_in_observation = masks_in_observation
+        if masks_in_observation:
+            ones = np.ones(int(actions.n), np.float32)
+            low, high = np.append(box.low, 0 * ones), np.append(box.high, ones)
+            box = spaces.Box(low, high, dtype=np.float32)
+        self._masks = np.ones((len(self.rows), int(actions.n)), np.bool_)
+        self._starts = np.cumsum([0, *(len(env.possible_agents) for env in self.envs)])
+        self._chosen = np.zeros(len(self.rows), np.int64)
+        super().__init__(len(self.rows), box, actions)
+
+    def reset(self) -> NDArray[np.float32]:
+        """Begins an episode in every environment, with the seeds that `seed` has left."""
+        seen = [
+            self._begin(k, self._seeds[int(self._starts[k])])  # its first agent's
+            for k in range(len(self.envs))
+        ]
+        self._reset_seeds()
+        self._reset_options()
+        return np.concatenate(seen)
+
+    def seed(self, seed: int | None = None) -> list[int | None]:
+        """Seeds the next reset: ``seed + k`` for environment `k`, whatever its number of agents."""
+        if seed is None:
+            return super().seed(None)
+        for k in range(len(self.envs)):
+            for row in self._agents_of(k):
+                self._seeds[row] = seed + k
+        return self._seeds
+
+    def step_async(self, actions: NDArray[np.int64]) -> None:
+        """Keeps the actions; environments in worker processes may begin with them."""
+        self._chosen = np.asarray(actions).reshape(-1)
+
+    def step_wait(self) -> Step:
+        """Steps every environment once, and begins anew where an episode is over."""
+        seen, infos = list[NDArray[np.float32]](), list[dict[str, Any]]()
+        rewards = np.zeros(len(self.rows), np.float32)
+        over = np.zeros(len(self.rows), np.bool_)
+        for k, env in enumerate(self.envs):
+            rows = self._agents_of(k)
+            agents = env.possible_agents
+            chosen = dict(zip(agents, self._chosen[rows.start : rows.stop].tolist(), strict=True))
+            observations, paid, terminated, truncated, told = env.step(chosen)
+            now = self._stacked(k, observations, told)
+            rewards[rows.start : rows.stop] = [paid[agent] for agent in agents]
+            own = [dict(told[agent]) for agent in agents]
+            if not env.agents:
+                over[rows.start : rows.stop] = True
+                for agent, row, info in zip(agents, now, own, strict=True):
+                    info["terminal_observation"] = row
+                    info["TimeLimit.truncated"] = truncated[agent] and not terminated[agent]
+                now = self._begin(k, None)
+            elif len(env.agents) < len(agents):
+                gone = sorted(set(agents) - set(env.agents))
+                raise EpisodeError(f"{', '.join(gone)} left before the others; all have to stay")
+            seen.append(now)
+            infos += own
+        return np.concatenate(seen), rewards, over, infos
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """What each agent may do now, ``(agents, actions)``; all of it where no info says so."""
+        return self._masks.copy()
+
+    def close(self) -> None:
+        """Closes every environment; may be called again."""
+        for env in self.envs:
+            env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute, for each agent that of its environment."""
+        if attr_name == "action_masks":
+            return [lambda row=row: self._masks[row] for row in self._picked(indices)]
+        return [getattr(self.rows[row][0], attr_name) for row in self._picked(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Sets an attribute of the environments of these agents."""
+        for env in self._environments(indices):
+            setattr(env, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls a method, once for each environment that these agents are in.
+
+        ``action_masks`` is one mask for each agent instead.
+        """
+        if method_name == "action_masks":
+            return [self._masks[row].copy() for row in self._picked(indices)]
+        environments = self._environments(indices)
+        return [getattr(env, method_name)(*method_args, **method_kwargs) for env in environments]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Whether agents are inside one of Gymnasium's wrappers, which none is."""
+        return [False for _ in self._picked(indices)]
+
+    def get_images(self) -> Sequence[Any]:
+        """A picture of each environment."""
+        return [env.render() for env in self.envs]
+
+    def _begin(self, k: int, seed: int | None) -> NDArray[np.float32]:
+        options = self._options[int(self._starts[k])] or None
+        observations, infos = self.envs[k].reset(seed=seed, options=options)
+        for row in self._agents_of(k):
+            self.reset_infos[row] = dict(infos[self.rows[row][1]])
+        return self._stacked(k, observations, infos)
+
+    def _stacked(self, k: int, observations: Any, infos: Any) -> NDArray[np.float32]:
+        """What the agents of environment `k` see, ``(agents, size)``; their masks are kept."""
+        rows = self._agents_of(k)
+        agents = self.envs[k].possible_agents
+        for row, agent in zip(rows, agents, strict=True):
+            given = infos[agent].get("action_mask")
+            self._masks[row] = True if given is None else given
+            if not self._masks[row].any():
+                raise ActionError(f"action_mask of agent {agent!r} allows no action")
+        seen = np.array([observations[agent] for agent in agents], dtype=np.float32)
+        if not self.masks_in_observation:
+            return seen
+        masks = self._masks[rows.start : rows.stop].astype(np.float32)
+        return np.concatenate((seen, masks), axis=1)
+
+    def _agents_of(self, k: int) -> range:
+        return range(int(self._starts[k]), int(self._starts[k + 1]))
+
+    def _picked(self, indices: Any) -> Iterable[int]:
+        return self._get_indices(indices)
+
+    def _environments(self, indices: Any) -> list[AnyParallelEnv]:
+        return list(
+            {id(self.rows[row][0]): self.rows[row][0] for row in self._picked(indices)}.values()
+        )
+
+
+def _common_spaces(
+    rows: Sequence[tuple[AnyParallelEnv, str]],
+) -> tuple[spaces.Box, spaces.Discrete]:
+    (env, first), *others = rows
+    box, actions = env.observation_space(first), env.action_space(first)
+    if not isinstance(box, spaces.Box) or len(box.shape) != 1:
+        raise OptionError(f"agent {first!r} observes {box}; needed: a Box of one dimension")
+    if not isinstance(actions, spaces.Discrete) or actions.start != 0:
+        raise OptionError(f"agent {first!r} acts in {actions}; needed: Discrete(n)")
+    for other, agent in others:
+        for own, common in (
+            (other.observation_space(agent), box),
+            (other.action_space(agent), actions),
+        ):
+            if own != common:
+                raise OptionError(
+                    f"agent {agent!r} has {own}, agent {first!r} {common}; Stable-Baselines3 "
+                    "needs equal spaces: wrap each environment in ugat_marl.envs.wrappers.pad, "
+                    "and for environments of several networks give all the sizes of the largest"
+                )
+    return box, spaces.Discrete(int(actions.n))

@@ -1,0 +1,126 @@
+"""Simulations in worker processes as a `VecEnv` of Stable-Baselines3.
+
+from ugat_marl.adapters.sb3_vector import SimulationsVecEnv
+
+wraps = ["ugat_marl.envs.wrappers:pad", "ugat_marl.envs.wrappers:agent_indicator"]
+env = SimulationsVecEnv(ugat_marl.vector_env("grid4x4-v1", 4, wrap=wraps))
+MaskablePPO("MlpPolicy", env, seed=1).learn(100_000)
+"""
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.envs.adapters.sb3 import AgentsVecEnv, Step
+from ugat_marl.envs.vector.environment import Batch, VectorEnv
+from ugat_marl.errors import OptionError
+
+_ELSEWHERE = (
+    "simulations are in processes of their own; give options to ugat_marl.vector_env, or use "
+    "ugat_marl.envs.adapters.sb3.AgentsVecEnv"
+)
+
+
+class SimulationsVecEnv(AgentsVecEnv):
+    """Each agent of each simulation is an environment of its own; the simulations step together.
+
+    Args:
+        simulations: The environments; their agents have the same spaces
+            (``wrap="ugat_marl.envs.wrappers:pad"``), their episodes begin anew in the step that
+            ends them, which is the only convention Stable-Baselines3 knows.
+        masks_in_observation: As for `AgentsVecEnv`.
+
+    Raises:
+        OptionError: Unequal spaces, or another convention.
+    """
+
+    def __init__(self, simulations: VectorEnv, *, masks_in_observation: bool = False) -> None:
+        if simulations.autoreset != "same-step":
+            raise OptionError(
+                f"autoreset = {simulations.autoreset!r}: Stable-Baselines3 needs 'same-step'"
+            )
+        self.simulations = simulations
+        super().__init__(
+            [simulations.plain] * simulations.n, masks_in_observation=masks_in_observation
+        )
+
+    def reset(self) -> NDArray[np.float32]:
+        """Begins an episode in every simulation, with the seeds that `seed` has left."""
+        seeds = [self._seeds[int(start)] for start in self._starts[:-1]]
+        given = [seed for seed in seeds if seed is not None]
+        batch = self.simulations.reset(given if len(given) == len(seeds) else None)
+        self.reset_infos = self._infos(batch)
+        self._reset_seeds()
+        self._reset_options()
+        return self._seen(batch)
+
+    def step_async(self, actions: NDArray[np.int64]) -> None:
+        """Begins a step of every simulation."""
+        self.simulations.step_async(np.asarray(actions).reshape(self.simulations.n, -1))
+
+    def step_wait(self) -> Step:
+        """Waits for it."""
+        batch = self.simulations.step_wait()
+        infos, agents = self._infos(batch), len(self.simulations.agents)
+        for ended in batch.ended:
+            last = self._with_masks(ended.observations, ended.masks)
+            for row, seen in enumerate(last, ended.environment * agents):
+                infos[row] |= {"terminal_observation": seen, "TimeLimit.truncated": True}
+        rewards = batch.rewards.reshape(-1).astype(np.float32)
+        return self._seen(batch), rewards, np.repeat(batch.truncated, agents), infos
+
+    def close(self) -> None:
+        """Ends the simulations; may be called again."""
+        self.simulations.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """``action_masks``, ``render_mode`` or ``metadata`` of each agent's environment.
+
+        Raises:
+            AttributeError: Another one; the environments are in processes of their own.
+        """
+        if attr_name not in ("action_masks", "render_mode", "metadata"):
+            raise AttributeError(f"{attr_name}: {_ELSEWHERE}")
+        return super().get_attr(attr_name, indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuses; the environments are in processes of their own."""
+        raise OptionError(f"set_attr({attr_name!r}): {_ELSEWHERE}")
+
+    def set_options(self, options: Any = None) -> None:
+        """Refuses; a reset of simulations takes seeds only."""
+        if options:
+            raise OptionError(f"set_options({options!r}): a reset of simulations takes seeds only")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """``action_masks``: one mask for each agent; others are refused."""
+        if method_name != "action_masks":
+            raise OptionError(f"env_method({method_name!r}): {_ELSEWHERE}")
+        return super().env_method(method_name, indices=indices)
+
+    def _seen(self, batch: Batch) -> NDArray[np.float32]:
+        """What all agents see, ``(rows, size)``; their masks are kept."""
+        masks = batch.masks.reshape(len(self.rows), -1)
+        self._masks = masks.astype(np.bool_)
+        return self._with_masks(batch.observations.reshape(len(self.rows), -1), masks)
+
+    def _with_masks(
+        self, seen: NDArray[np.float32], masks: NDArray[np.int8]
+    ) -> NDArray[np.float32]:
+        if not self.masks_in_observation:
+            return seen
+        return np.concatenate((seen, masks.astype(np.float32)), axis=1)
+
+    def _infos(self, batch: Batch) -> list[dict[str, Any]]:
+        masks = batch.masks.reshape(len(self.rows), -1)
+        shown = batch.executed.reshape(-1).tolist()
+        return [
+            {"action_mask": mask, "executed_action": executed}
+            for mask, executed in zip(masks, shown, strict=True)
+        ]

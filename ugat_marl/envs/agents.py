@@ -1,0 +1,138 @@
+"""Between dictionaries by agent and padded arrays over all agents."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from ugat_marl.envs.types import AnyParallelEnv, Infos, Observations
+from ugat_marl.errors import ActionError, OptionError
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class AgentSet:
+    """The agents of an environment, in a fixed order, with the sizes of their spaces.
+
+    Attributes:
+        names: The agents.
+        observation_sizes: Length of each agent's observation vector.
+        action_counts: Number of actions of each agent.
+    """
+
+    names: tuple[str, ...]
+    observation_sizes: tuple[int, ...]
+    action_counts: tuple[int, ...]
+
+    @classmethod
+    def of(cls, env: AnyParallelEnv) -> AgentSet:
+        """The agents of any parallel environment with Box vectors and Discrete actions.
+
+        Raises:
+            OptionError: No agents, or a space of another kind.
+        """
+        names = tuple(env.possible_agents)
+        if not names:
+            raise OptionError("the environment has no agents; nothing can be learned in it")
+        observed = tuple(_vector_length(a, env.observation_space(a)) for a in names)
+        return cls(names, observed, tuple(_action_count(a, env.action_space(a)) for a in names))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def widest_observation(self) -> int:
+        """Length to which observations are padded."""
+        return max(self.observation_sizes)
+
+    @property
+    def most_actions(self) -> int:
+        """Number to which actions are padded."""
+        return max(self.action_counts)
+
+    def stack(self, observations: Observations) -> NDArray[np.float32]:
+        """Observations as one array ``(agents, widest_observation)``, padded with zeros.
+
+        Raises:
+            OptionError: An agent is missing, unknown, or its vector has another length or holds
+                what is not a number.
+        """
+        if len(observations) != len(self.names):
+            raise OptionError(
+                f"observations of {len(observations)} agents ({', '.join(observations)}), but this "
+                f"policy acts for {len(self.names)} ({', '.join(self.names)}); use the environment "
+                "it was trained in, or train a new one"
+            )
+        stacked = np.zeros((len(self.names), self.widest_observation), dtype=np.float32)
+        for row, (name, size) in enumerate(zip(self.names, self.observation_sizes, strict=True)):
+            vector = observations.get(name)
+            if vector is None or vector.shape != (size,):
+                found = "is missing" if vector is None else f"has shape {vector.shape}"
+                raise OptionError(
+                    f"the observation of agent {name!r} {found}, expected ({size},); use the "
+                    "scenario and the observation this policy was trained with"
+                )
+            stacked[row, :size] = vector
+        if not np.isfinite(stacked).all():
+            name = self.names[int(np.isfinite(stacked).all(axis=1).argmin())]
+            raise OptionError(f"the observation of agent {name!r} holds NaN or infinity")
+        return stacked
+
+    def masks(self, infos: Infos) -> Mask:
+        """Allowed actions ``(agents, most_actions)``; an info without a mask allows all.
+
+        Raises:
+            ActionError: An agent's mask allows nothing, or has the wrong length.
+        """
+        allowed = np.zeros((len(self.names), self.most_actions), dtype=np.bool_)
+        for row, (name, count) in enumerate(zip(self.names, self.action_counts, strict=True)):
+            mask = infos.get(name, {}).get("action_mask")
+            if mask is None:
+                allowed[row, :count] = True
+            elif len(mask) == count:
+                allowed[row, :count] = mask
+            else:
+                raise ActionError(f"action_mask of {name!r} has {len(mask)} entries, not {count}")
+        if not allowed.any(axis=1).all():
+            name = self.names[int(allowed.any(axis=1).argmin())]
+            raise ActionError(f"action_mask of agent {name!r} allows no action; it must allow one")
+        return allowed
+
+    def actions(self, chosen: NDArray[np.int64]) -> dict[str, int]:
+        """The row of action indices as a dictionary."""
+        return dict(zip(self.names, chosen.tolist(), strict=True))
+
+    def values(self, by_agent: Mapping[str, Any]) -> NDArray[np.float32]:
+        """One number per agent as a vector ``(agents,)``."""
+        return np.array([by_agent[name] for name in self.names], dtype=np.float32)
+
+
+def groups_of(agents: AgentSet) -> dict[str, str]:
+    """Agent to its group: all agents ``<group>_<n>`` if they are alike, or the agent itself."""
+    sizes = zip(agents.observation_sizes, agents.action_counts, strict=True)
+    kinds: dict[str, set[tuple[int, int]]] = {}
+    for agent, kind in zip(agents.names, sizes, strict=True):
+        kinds.setdefault(agent.rpartition("_")[0], set()).add(kind)
+    prefixes = {agent: agent.rpartition("_")[0] for agent in agents.names}
+    return {a: p if p and len(kinds[p]) == 1 else a for a, p in prefixes.items()}
+
+
+def _vector_length(agent: str, space: spaces.Space[Any]) -> int:
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise OptionError(
+            f"agent {agent!r} observes {space}; this learner needs a Box of one dimension "
+            "(supersuit.flatten_v0 makes one)"
+        )
+    return int(space.shape[0])
+
+
+def _action_count(agent: str, space: spaces.Space[Any]) -> int:
+    if not isinstance(space, spaces.Discrete) or space.start != 0:
+        raise OptionError(f"agent {agent!r} acts in {space}; this learner needs Discrete(n)")
+    return int(space.n)

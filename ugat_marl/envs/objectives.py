@@ -1,0 +1,128 @@
+"""What controllers are judged by and never trained on: emissions, fairness, safety, persons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.data import Scores
+from ugat_marl.effects import OBJECTIVES, Effect, Objective
+from ugat_marl.scenarios import Scenario
+from ugat_marl.simulation import Trips
+
+HIDDEN: dict[str, str] = {
+    "cost": "cost",
+    "co2_g": "CO2 [g/veh]",
+    "delay_gini": "Gini of delay",
+    "delay_p95_s": "95 % delay [s]",
+    "person_delay_s": "person delay [s]",
+    "hard_brakings": "hard brakings [1/1000 veh]",
+    "collisions": "collisions [1/1000 veh]",
+}
+"""What a domain with an objective measures beside `ugat_marl.data.metrics.MEASURES`, with
+headings."""
+
+NORMS: dict[str, float] = {
+    "queue": 10.0,
+    "delay": 1.0,
+    "co2_g": 300.0,
+    "delay_gini": 0.5,
+    "person_delay_s": 60.0,
+    "hard_brakings": 10.0,
+    "collisions": 1.0,
+}
+"""What makes each measure 1 in a cost: round numbers of the size they have in shipped scenarios."""
+
+PERSONS: dict[str, float] = {
+    "bus": 25.0,
+    "coach": 30.0,
+    "tram": 60.0,
+    "truck": 1.0,
+    "trailer": 1.0,
+    "delivery": 1.0,
+    "motorcycle": 1.0,
+    "moped": 1.0,
+    "bicycle": 1.0,
+}
+"""Persons assumed in a vehicle of a class."""
+
+PERSONS_IN_A_CAR = 1.5
+"""Persons assumed in any other vehicle."""
+
+
+class Judge:
+    """Knows what the owner of the street wants.
+
+    Args:
+        wanted: Name of the objective.
+        scenario: Whose vehicle types say how many persons travel.
+    """
+
+    def __init__(self, wanted: str, scenario: Scenario) -> None:
+        self._weights = OBJECTIVES[wanted]
+        self.persons: dict[str, float] = {"": PERSONS_IN_A_CAR}
+        for document in (*scenario.additional, *scenario.routes):
+            for item in document.scan():
+                if item.name == "vType":
+                    carried = PERSONS.get(item.attributes.get("vClass", ""), PERSONS_IN_A_CAR)
+                    self.persons[item.attributes.get("id", "")] = carried
+
+    @classmethod
+    def of(cls, effects: Sequence[Effect], scenario: Scenario) -> Judge | None:
+        """The judge of a scenario with these effects; None if nothing hidden is wanted."""
+        for effect in effects:
+            if isinstance(effect, Objective):
+                return cls(effect.wanted, scenario)
+        return None
+
+    def judged(self, scores: Scores, trips: Trips) -> Scores:
+        """The scores with what is hidden, and its cost.
+
+        Args:
+            scores: Of an episode.
+            trips: What became of its vehicles, emissions and persons included.
+        """
+        hidden = hidden_measures(trips)
+        known = {"queue": scores.queue, "delay": scores.delay, **hidden}
+        parts = (weight * known[name] / NORMS[name] for name, weight in self._weights.items())
+        return replace(scores, hidden={"cost": sum(parts), **hidden})
+
+
+def hidden_measures(trips: Trips) -> dict[str, float]:
+    """The measures of `HIDDEN`, but for the cost.
+
+    CO2 is the mean over vehicles that entered, of what each emitted until it arrived or the episode
+    ended (SUMO's emission model HBEFA, by the emission class of the vehicle's type). The Gini
+    coefficient and the 95 % quantile are over the delays of all vehicles due. Person delay is the
+    mean delay weighted with the persons in each vehicle. Hard brakings and collisions are counted
+    by SUMO and given per 1000 vehicles that entered.
+    """
+    entered = max(int(trips.entered.sum()), 1)
+    persons, delays = trips.persons, trips.delay_s
+    collisions, brakings = (1000.0 * count / entered for count in trips.dangers.tolist())
+    return {
+        "co2_g": _sum(trips.co2_g) / entered,
+        "delay_gini": gini(delays),
+        "delay_p95_s": float(np.quantile(delays, 0.95)) if delays.size else math.nan,
+        "person_delay_s": _sum(persons * delays) / _sum(persons) if delays.size else math.nan,
+        "hard_brakings": brakings,
+        "collisions": collisions,
+    }
+
+
+def gini(values: NDArray[np.float64]) -> float:
+    """Gini coefficient of values of at least 0: 0 if all are equal, towards 1 if one has it all."""
+    total = _sum(values)
+    if total <= 0:
+        return 0.0
+    ranks = np.arange(1, values.size + 1)
+    return _sum((2 * ranks - values.size - 1) * np.sort(values)) / (values.size * total)
+
+
+def _sum(values: NDArray[np.float64]) -> float:
+    """The exact sum; numpy's own depends on where in memory the values lie."""
+    return math.fsum(values.tolist())

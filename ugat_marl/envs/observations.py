@@ -1,0 +1,215 @@
+"""Snapshot -> one vector per intersection, with its space.
+
+Every vector is ``features | own phase one-hot | context``: what the intersection measures, what it
+shows, and, if asked for, the same of its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from ugat_marl.data import AgentLayout
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.scenarios import Network, group_names, member_names, within
+from ugat_marl.simulation import Snapshot
+
+ObservationName = Literal["count", "queue", "pressure", "waiting", "density", "movements"]
+
+COUNT_SCALE = 40.0
+"""Vehicles that make a count 1: what fits on a lane of 300 m."""
+
+WAITING_SCALE_S = 100.0
+"""Mean waiting time per storage place that makes `waiting` 1."""
+
+UNITS: dict[str, str] = {
+    "count": "vehicles per incoming lane / 40",
+    "queue": "halting vehicles per incoming lane / 40",
+    "pressure": "vehicles / lane capacity, incoming lane minus mean of the lanes its links lead to",
+    "waiting": "waiting time summed over the lane's vehicles / (lane capacity * 100 s)",
+    "density": "vehicles per incoming lane / lane capacity (lane length / 7.5 m)",
+    "movements": "halting per incoming, vehicles per incoming, vehicles per outgoing lane; "
+    "each / lane capacity",
+}  # fmt: skip
+"""What one feature of each observation is. All are clipped to [0, 1] (pressure: [-1, 1])."""
+
+
+class Observer:
+    """Computes the observations of all intersections at once.
+
+    Args:
+        network: The network.
+        name: One of `ObservationName`; ``"count"`` is the observation of the UGAT paper.
+        neighbours: How many roads away intersections are whose features and phase are included.
+
+    Attributes:
+        layouts: Sizes of the parts of each intersection's vector, in the network's order.
+        spaces: A float32 `Box` for each intersection; one object for equal ones.
+        groups: Group to the positions of its intersections. One group has the same lanes and
+            phases, and so the same spaces under every observation: the names of agents do not
+            depend on what is observed.
+        agents: ``<group>_<n>`` for each intersection.
+    """
+
+    def __init__(self, network: Network, name: str = "count", neighbours: int = 0) -> None:
+        if name not in get_args(ObservationName):
+            raise UnknownNameError("observation", str(name), get_args(ObservationName))
+        if neighbours < 0:
+            raise OptionError(f"neighbours = {neighbours}: must be 0 or a number of roads")
+        self.name = name
+        self._lanes = network.lane_table()
+        items = network.intersections
+        self._incoming = np.concatenate(
+            [self._lanes.indices(item.incoming_lanes) for item in items]
+        )
+        self._downstream = _downstream_matrix(network) if name == "pressure" else None
+        self._gather, sizes = _gather(network, name)
+        self._sizes = sizes
+        self._phases = [len(item.phases) for item in items]
+        self._near = _within(network, neighbours)
+        self.layouts = [
+            AgentLayout(
+                features=size,
+                phases=phases,
+                context=sum(sizes[j] + self._phases[j] for j in near),
+            )
+            for size, phases, near in zip(sizes, self._phases, self._near, strict=True)
+        ]
+        sizes_of = [(len(i.incoming_lanes), len(i.outgoing_lanes), len(i.phases)) for i in items]
+        kinds = [
+            (sizes_of[index], *(sizes_of[j] for j in near)) for index, near in enumerate(self._near)
+        ]
+        self.groups = group_names(kinds)
+        self.agents = member_names(self.groups)
+        low = -1.0 if name == "pressure" else 0.0
+        spaces = {own[0]: self._space(own[0], low) for own in self.groups.values()}
+        first = {place: own[0] for own in self.groups.values() for place in own}
+        self.spaces = [spaces[first[index]] for index in range(len(items))]
+        self._place()
+
+    @property
+    def needs_waiting(self) -> bool:
+        """Whether snapshots must hold waiting times."""
+        return self.name == "waiting"
+
+    def observe(self, snapshot: Snapshot, phases: Sequence[int]) -> list[NDArray[np.float32]]:
+        """The vectors of all intersections.
+
+        Args:
+            snapshot: What was measured.
+            phases: Green phase each intersection shows or clears towards.
+
+        Returns:
+            For each intersection float32 ``(layout.size,)``, parts of one fresh array.
+        """
+        own = np.zeros(self._length, dtype=np.float32)
+        own[self._feature_places] = self._flat(snapshot)
+        own[self._first_phases + np.array(phases)] = 1.0
+        seen = own if self._context is None else own[self._context]
+        return [seen[part] for part in self._parts]
+
+    def _place(self) -> None:
+        """Lays out ``features | phases`` of all intersections in one row, and who sees what of it.
+
+        Every number of a decision is then written by three assignments, however many intersections
+        there are.
+        """
+        features = [layout.features for layout in self.layouts]
+        widths = [f + phases for f, phases in zip(features, self._phases, strict=True)]
+        own = _slices(widths)
+        starts = np.array([part.start for part in own])
+        self._length = sum(widths)
+        self._first_phases = starts + np.array(features)
+        self._feature_places = np.concatenate(
+            [np.arange(part.start, part.start + f) for part, f in zip(own, features, strict=True)]
+        )
+        self._context: NDArray[np.int64] | None = None
+        self._parts = own
+        if any(self._near):
+            places = np.arange(self._length)
+            seen = [
+                np.concatenate([places[own[j]] for j in (index, *near)])
+                for index, near in enumerate(self._near)
+            ]
+            self._context = np.concatenate(seen)
+            self._parts = _slices([len(part) for part in seen])
+
+    def _flat(self, snapshot: Snapshot) -> NDArray[np.float64]:
+        capacity = self._lanes.capacity
+        if self.name == "count":
+            values = snapshot.vehicles[self._incoming] / COUNT_SCALE
+        elif self.name == "queue":
+            values = snapshot.halting[self._incoming] / COUNT_SCALE
+        elif self.name == "density":
+            values = (snapshot.vehicles / capacity)[self._incoming]
+        elif self.name == "waiting":
+            values = (snapshot.waiting_s / capacity)[self._incoming] / WAITING_SCALE_S
+        elif self.name == "pressure":
+            assert self._downstream is not None
+            filled = snapshot.vehicles / capacity
+            return np.clip(filled[self._incoming] - self._downstream @ filled, -1.0, 1.0)
+        else:
+            both = np.concatenate((snapshot.halting / capacity, snapshot.vehicles / capacity))
+            values = both[self._gather]
+        return np.minimum(values, 1.0)
+
+    def _space(self, index: int, low: float) -> Box:
+        parts: list[NDArray[np.float32]] = []
+        for j in (index, *self._near[index]):
+            parts.append(np.full(self._sizes[j], low, dtype=np.float32))
+            parts.append(np.zeros(self._phases[j], dtype=np.float32))
+        lows = np.concatenate(parts)
+        return Box(lows, np.ones_like(lows), dtype=np.float32)
+
+
+def joint_space(spaces: Sequence[Box]) -> Box:
+    """The space of vectors one after the other."""
+    low = np.concatenate([space.low for space in spaces])
+    high = np.concatenate([space.high for space in spaces])
+    return Box(low, high, dtype=np.float32)
+
+
+def _gather(network: Network, name: str) -> tuple[NDArray[np.int64], list[int]]:
+    """Positions in (halting | vehicles) for `movements`, and the number of features of each."""
+    lanes = network.lane_table()
+    count = len(lanes.ids)
+    parts: list[NDArray[np.int64]] = []
+    sizes: list[int] = []
+    for item in network.intersections:
+        incoming, outgoing = lanes.indices(item.incoming_lanes), lanes.indices(item.outgoing_lanes)
+        if name == "movements":
+            own = np.concatenate((incoming, incoming + count, outgoing + count))
+        else:
+            own = incoming
+        parts.append(own)
+        sizes.append(len(own))
+    return np.concatenate(parts), sizes
+
+
+def _downstream_matrix(network: Network) -> NDArray[np.float64]:
+    """Rows average, for each incoming lane, the lanes its links lead to."""
+    lanes = network.lane_table()
+    rows: list[NDArray[np.float64]] = []
+    for item in network.intersections:
+        for lane in item.incoming_lanes:
+            row = np.zeros(len(lanes.ids))
+            for to_lane in {link.to_lane for link in item.links if link.from_lane == lane}:
+                row[lanes.indices([to_lane])] = 1.0
+            rows.append(row / row.sum())
+    return np.stack(rows)
+
+
+def _within(network: Network, hops: int) -> list[list[int]]:
+    """For each intersection the others at most `hops` roads away, nearest first."""
+    position = {item.id: index for index, item in enumerate(network.intersections)}
+    near = within({item.id: item.neighbours for item in network.intersections}, hops)
+    return [[position[name] for name in others] for others in near.values()]
+
+
+def _slices(sizes: Sequence[int]) -> list[slice]:
+    ends = np.cumsum(sizes)
+    return [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]

@@ -1,0 +1,107 @@
+"""(before, after) -> one number per intersection."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.errors import UnknownNameError
+from ugat_marl.scenarios import Network
+from ugat_marl.simulation import Snapshot
+
+RewardName = Literal["queue", "pressure", "waiting"]
+
+
+@dataclass(frozen=True)
+class IntersectionView:
+    """What one intersection sees of a snapshot; lanes in the intersection's own order.
+
+    Attributes:
+        time_s: Time on the scenario's clock.
+        vehicles: Vehicles per incoming lane.
+        halting: Halting vehicles per incoming lane.
+        mean_speed_mps: Mean speed per incoming lane.
+        waiting_s: Waiting time per incoming lane.
+        outgoing_vehicles: Vehicles per outgoing lane.
+    """
+
+    time_s: float
+    vehicles: NDArray[np.float64]
+    halting: NDArray[np.float64]
+    mean_speed_mps: NDArray[np.float64]
+    waiting_s: NDArray[np.float64]
+    outgoing_vehicles: NDArray[np.float64]
+
+
+RewardFunction = Callable[[IntersectionView, IntersectionView], float]
+"""Maps the view before and after a decision interval to a reward."""
+
+
+class Rewarder:
+    """Computes the rewards of all intersections at once.
+
+    Args:
+        network: The network.
+        reward: ``"queue"`` (minus the halting vehicles on incoming lanes; the UGAT paper's),
+            ``"pressure"`` (minus the absolute difference of vehicles on incoming and outgoing
+            lanes; Wei et al. 2019, PressLight), ``"waiting"`` (decrease of the summed waiting time,
+            in s), or a function of two `IntersectionView`.
+    """
+
+    def __init__(self, network: Network, reward: str | RewardFunction = "queue") -> None:
+        if not callable(reward) and reward not in get_args(RewardName):
+            raise UnknownNameError(
+                "reward", str(reward), get_args(RewardName), "A function works as well."
+            )
+        self._reward = reward
+        lanes = network.lane_table()
+        self._incoming = [lanes.indices(item.incoming_lanes) for item in network.intersections]
+        self._outgoing = [lanes.indices(item.outgoing_lanes) for item in network.intersections]
+        self._sum_in = _Sums(self._incoming)
+        self._sum_out = _Sums(self._outgoing)
+
+    @property
+    def needs_waiting(self) -> bool:
+        """Whether snapshots must hold waiting times."""
+        return self._reward == "waiting" or callable(self._reward)
+
+    def rewards(self, before: Snapshot, after: Snapshot) -> list[float]:
+        """The rewards of all intersections, in the network's order."""
+        if self._reward == "queue":
+            return (-self._sum_in(after.halting)).tolist()
+        if self._reward == "pressure":
+            difference = self._sum_in(after.vehicles) - self._sum_out(after.vehicles)
+            return (-np.abs(difference)).tolist()
+        if self._reward == "waiting":
+            return (self._sum_in(before.waiting_s) - self._sum_in(after.waiting_s)).tolist()
+        assert callable(self._reward)
+        return [
+            float(self._reward(self._view(before, index), self._view(after, index)))
+            for index in range(len(self._incoming))
+        ]
+
+    def _view(self, snapshot: Snapshot, index: int) -> IntersectionView:
+        own = self._incoming[index]
+        return IntersectionView(
+            snapshot.time_s,
+            snapshot.vehicles[own],
+            snapshot.halting[own],
+            snapshot.mean_speed_mps[own],
+            snapshot.waiting_s[own],
+            snapshot.vehicles[self._outgoing[index]],
+        )
+
+
+class _Sums:
+    """From one value per lane to the sum over each group of lanes; no group is empty."""
+
+    def __init__(self, groups: Sequence[NDArray[np.int64]]) -> None:
+        self._members = np.concatenate(groups)
+        self._starts = np.cumsum([0, *map(len, groups[:-1])])
+
+    def __call__(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.add.reduceat(values[self._members], self._starts)

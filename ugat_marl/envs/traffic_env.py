@@ -1,0 +1,398 @@
+"""The PettingZoo environment: one agent per signalised intersection."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from ugat_marl.data import AgentLayout, EpisodeRecorder, Scores
+from ugat_marl.effects import (
+    Domain,
+    controller_effects,
+    describe,
+    in_domain,
+    late_greens,
+    load_scenario,
+    with_late_programmes,
+)
+from ugat_marl.envs.actions import checked_delays, checked_phases
+from ugat_marl.envs.actuators import Cabinet
+from ugat_marl.envs.objectives import Judge
+from ugat_marl.envs.observations import Observer, joint_space
+from ugat_marl.envs.options import EnvOptions
+from ugat_marl.envs.rendering import Picture
+from ugat_marl.envs.rewards import Rewarder
+from ugat_marl.envs.sensors import Sensing
+from ugat_marl.errors import EpisodeError, OptionError
+from ugat_marl.files import OwnDirectory
+from ugat_marl.scenarios import Network, Scenario, check_demand, signals
+from ugat_marl.simulation import Simulator, Snapshot, launch_of, simulator_of
+
+
+class TrafficEnv(ParallelEnv[str, Any, Any]):
+    """Traffic signals of a road network, one agent per intersection.
+
+    An action is the green phase of the next decision interval; yellow, all-red and minimum green
+    are kept whatever is asked for. Episodes end by truncation, for all agents at once. SUMO is not
+    started before `reset`.
+
+    Args:
+        scenario: The simulation.
+        domain: The world the environment is in: ``"sim"``, ``"V1"``..``"V4"``, effects, ....
+        options: See `EnvOptions`.
+
+    Attributes:
+        scenario: The scenario in its domain.
+        domain: Name of the domain.
+        network: Static facts.
+        layouts: Agent to the parts of its observation.
+        intersection_of: Agent to SUMO's id of its traffic light.
+        agent_groups: Group to its agents; agents of one group have the same spaces.
+        np_random: Draws the seeds of episodes; SuperSuit's frame_skip draws from it too.
+    """
+
+    observation_spaces: dict[str, Box]
+    action_spaces: dict[str, Discrete]
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own convention
+        "name": "ugat_marl_v1",
+        "render_modes": ["human", "rgb_array"],
+        "is_parallelizable": True,
+        "render_fps": 1,
+    }
+
+    def __init__(self, scenario: Scenario, domain: Domain, options: EnvOptions) -> None:
+        self.scenario = in_domain(scenario, domain)
+        if options.duration_s is not None:
+            self.scenario = self.scenario.with_duration(options.duration_s)
+        self.domain = describe(domain)
+        self.options = options
+        self.render_mode = options.render_mode
+        self.network = Network.read(self.scenario)
+        self.demand = check_demand(self.scenario, self.network, whole=False)
+        self.decision_interval_s = self.scenario.control.decision_interval_s
+        self._timing = self.scenario.timing
+        self._lanes = self.network.lane_table()
+        self._observer = Observer(self.network, options.observation, options.neighbours)
+        self._rewarder = Rewarder(self.network, options.reward)
+        effects = controller_effects(self.scenario)
+        self._sensing = Sensing.of(effects, self.network, self.decision_interval_s)
+        self._cabinet = Cabinet.of(effects, self.network, self._timing, self.decision_interval_s)
+        self._judge = Judge.of(effects, self.scenario)
+        self._name_agents()
+        self._state_space = joint_space(list(self.observation_spaces.values()))
+        self._simulator: Simulator | None = None
+        self._directory = OwnDirectory()
+        self.np_random = np.random.default_rng()
+        self.agents: list[str] = []
+        self._scores: Scores | None = None
+        self._picture: Picture | None = None
+
+    # --- spaces -------------------------------------------------------------------------------
+
+    def observation_space(self, agent: str) -> Box:
+        """The space of an agent's observations, the same object at each call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Discrete:
+        """The space of an agent's actions, the same object at each call."""
+        return self.action_spaces[agent]
+
+    @property
+    def state_space(self) -> Box:
+        """The space of `state`: all observations, one after the other."""
+        return self._state_space
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """What a policy must know to be given the same observations elsewhere."""
+        return {"observation": self.options.observation, "neighbours": self.options.neighbours}
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """What was measured after the last decision (or the reset)."""
+        return self._snapshot
+
+    @property
+    def seen(self) -> Snapshot:
+        """What controllers see of `snapshot`: all of it, but for effects on observations."""
+        return self._seen
+
+    @property
+    def phases(self) -> list[int]:
+        """Green phase each intersection shows or clears towards, in the order of the agents."""
+        return [state.phase for state in self._states]
+
+    # --- episode ------------------------------------------------------------------------------
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
+        """Starts an episode in a fresh simulation.
+
+        Args:
+            seed: Fixes the simulation to the bit; without it the seed is drawn from the one before.
+            options: Not used.
+        """
+        if seed is not None and seed < 0:
+            raise OptionError(f"seed = {seed}: must not be negative")
+        if seed is not None:
+            self.np_random = np.random.default_rng(seed)
+        self._start(int(self.np_random.integers(2**31)))
+        self.agents = self.possible_agents[:]
+        self._scores = None
+        self._decision = 0
+        self._states = [signals.initial_state(self._timing) for _ in self.agents]
+        lights = self.network.intersections
+        self._delays = signals.GreenDelays(
+            {item.id: item.phases[0] for item in lights},
+            late_greens(self.scenario),
+            self.scenario.settings.step_length_s,
+        )
+        self._recorder = EpisodeRecorder(
+            self._lanes,
+            [self._lanes.indices(item.incoming_lanes) for item in lights],
+        )
+        return self._observe(), self._infos()
+
+    def step(
+        self, actions: Mapping[str, int]
+    ) -> tuple[
+        dict[str, NDArray[np.float32]],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Shows the chosen phases for one decision interval.
+
+        Args:
+            actions: A green phase for every agent; forbidden by its mask, it is not shown.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos of all agents.
+
+        Raises:
+            ActionError: An action is missing, unknown or out of range; nothing has happened.
+            EpisodeError: The episode has not begun or is over.
+            SimulatorError: SUMO failed.
+        """
+        if not actions and self._scores is not None:  # after the end; SuperSuit's black_death asks
+            return {}, {}, {}, {}, {}
+        if not self.agents:
+            raise EpisodeError("step() needs a running episode; call reset() first")
+        requested = checked_phases(actions, self.agents, self.action_spaces)
+        if self._cabinet is not None:
+            requested = self._cabinet.obey(requested, self._states)
+        before = self._snapshot
+        self._advance(requested)
+        rewards = self._rewarder.rewards(before, self._snapshot)
+        self._recorder.add(self._snapshot, sum(rewards) / len(rewards))
+        self._decision += 1
+        self._warn_if_empty()
+        over = self._decision == self.scenario.decisions
+        agents = self.agents
+        result = (
+            self._observe(),
+            dict(zip(agents, rewards, strict=True)),
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, over),
+            self._infos(),
+        )
+        if over:
+            self._finish()
+        return result
+
+    def delay_greens(self, seconds: Mapping[str, float]) -> None:
+        """Holds back the greens that begin in the next step; what ends is not touched.
+
+        Observations and infos are blind to it, as they are to a late green of the scenario.
+
+        Args:
+            seconds: Agent to how long its links stay red beyond the usual, in s. Greens begin at
+                whole simulation steps; what is left over is added to the link's next green.
+
+        Raises:
+            ActionError: Of an unknown agent, negative or not finite.
+            EpisodeError: The episode has not begun or is over.
+        """
+        if not self.agents:
+            raise EpisodeError("delay_greens() needs a running episode; call reset() first")
+        delays = checked_delays(seconds, self.agents)
+        lights = {self.intersection_of[agent]: delay for agent, delay in delays.items()}
+        self._delays.ask(lights)
+
+    def state(self) -> NDArray[np.float32]:
+        """All observations, one after the other; also after the last step."""
+        if not hasattr(self, "_states"):
+            raise EpisodeError("state() has no meaning before the first reset()")
+        return np.concatenate(self._observer.observe(self._seen, self.phases))
+
+    def scores(self) -> Scores:
+        """The measures of the episode that has ended.
+
+        Raises:
+            EpisodeError: No episode has ended since the last reset.
+        """
+        if self._scores is None:
+            raise EpisodeError(
+                f"scores() needs a whole episode of {self.scenario.decisions} steps; "
+                "set duration_s for shorter ones"
+            )
+        return self._scores
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The network with its vehicles and signals, uint8 ``(height, width, 3)``.
+
+        None with render mode "human": there SUMO draws its own window.
+        """
+        if self.render_mode != "rgb_array":
+            return None
+        if self._picture is None:
+            self._picture = Picture(self.network, self.intersection_of)
+        if self._simulator is not None and self.agents:
+            self._picture.draw(self._simulator.vehicles(), self._simulator.signals())
+        return self._picture.pixels()
+
+    def close(self) -> None:
+        """Ends the simulation and its process and removes its files; may be called again."""
+        simulator, self._simulator = self._simulator, None
+        self.agents = []
+        if simulator is not None:
+            simulator.close()
+        self._directory.remove()
+
+    def __del__(self) -> None:
+        if getattr(self, "_simulator", None) is not None:
+            self.close()
+
+    # --- parts --------------------------------------------------------------------------------
+
+    def _name_agents(self) -> None:
+        """Agents are named by their observer; the same group means the same spaces."""
+        observer, items = self._observer, self.network.intersections
+        agents = self.possible_agents = list(observer.agents)
+        self.agent_groups = {
+            group: [agents[place] for place in own] for group, own in observer.groups.items()
+        }
+        self.intersection_of = {a: item.id for a, item in zip(agents, items, strict=True)}
+        self.layouts: dict[str, AgentLayout] = dict(zip(agents, observer.layouts, strict=True))
+        self.observation_spaces = dict(zip(agents, observer.spaces, strict=True))
+        phases = [len(item.phases) for item in items]
+        actions = {count: Discrete(count) for count in phases}
+        self.action_spaces = {a: actions[count] for a, count in zip(agents, phases, strict=True)}
+        self._all_free = [np.ones(count, dtype=np.int8) for count in phases]
+
+    def _start(self, seed: int) -> None:
+        if self._simulator is None:
+            self._simulator = simulator_of(self.options.simulator)
+        launch = launch_of(
+            with_late_programmes(self.scenario),
+            seed,
+            self._directory.fresh(),
+            self._lanes.ids,
+            waiting=self._observer.needs_waiting or self._rewarder.needs_waiting,
+            crossings=self.options.crossings,
+            gui=self.render_mode == "human",
+            zone_m=self._sensing.zone_m if self._sensing else 0.0,
+            persons=self._judge.persons if self._judge else None,
+            behind=self._lanes.behind,
+        )
+        self.agents = []
+        for part in (self._sensing, self._cabinet):
+            if part is not None:
+                part.reset(seed)
+        self._look(self._simulator.start(launch))
+
+    def _advance(self, requested: list[int]) -> None:
+        assert self._simulator is not None
+        plans: dict[str, list[signals.Segment]] = {}
+        states: list[signals.SignalState] = []
+        for item, state, phase in zip(
+            self.network.intersections, self._states, requested, strict=True
+        ):
+            after, plans[item.id] = signals.advance(
+                item.phases, state, phase, self.decision_interval_s, self._timing
+            )
+            states.append(after)
+        if self.options.signals == "programme":
+            plans, states = {}, self._states
+        plans = self._delays.hold(plans)
+        agents, self.agents = self.agents, []  # the episode is over if SUMO fails
+        self._look(self._simulator.advance(self.decision_interval_s, plans))
+        self.agents, self._states = agents, states
+
+    def _look(self, snapshot: Snapshot) -> None:
+        self._snapshot = snapshot
+        self._seen = snapshot if self._sensing is None else self._sensing.see(snapshot)
+
+    def _observe(self) -> dict[str, NDArray[np.float32]]:
+        seen = self._observer.observe(self._seen, self.phases)
+        return dict(zip(self.agents, seen, strict=True))
+
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        infos: dict[str, dict[str, Any]] = {}
+        if self._cabinet is not None:
+            masks = self._cabinet.masks(self._states)
+            return {
+                agent: {"action_mask": mask, "executed_action": state.phase}
+                for agent, mask, state in zip(self.agents, masks, self._states, strict=True)
+            }
+        for agent, state, free in zip(self.agents, self._states, self._all_free, strict=True):
+            mask = free.copy()
+            if not signals.free_to_change(state, self._timing, self.decision_interval_s):
+                mask[:] = 0
+                mask[state.phase] = 1
+            infos[agent] = {"action_mask": mask, "executed_action": state.phase}
+        return infos
+
+    def _warn_if_empty(self) -> None:
+        if self._decision == max(1, self.scenario.decisions // 10) and not self._snapshot.departed:
+            warnings.warn(
+                f"scenario {self.scenario.id!r}: no vehicle has entered the network in the first "
+                f"{self._decision * self.decision_interval_s:g} s "
+                f"({self._snapshot.backlog} are waiting to); check departures and routes",
+                stacklevel=3,
+            )
+
+    def _finish(self) -> None:
+        assert self._simulator is not None
+        if self.render_mode == "rgb_array":
+            self.render()
+        self.agents = []
+        trips = self._simulator.finish()
+        scores = self._recorder.scores(trips)
+        self._scores = self._judge.judged(scores, trips) if self._judge else scores
+
+
+def parallel_env(
+    scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any
+) -> TrafficEnv:
+    """The environment as a PettingZoo `ParallelEnv`.
+
+    Args:
+        scenario: Id of a shipped scenario, a scenario directory, a ``.sumocfg``, ``resco:<map>``,
+            or a loaded scenario.
+        domain: ``"sim"``, ``"V1"``..``"V4"`` or an alias, ``"effect=value+..."``, the path of
+            another scenario on the same network, or a list of effects.
+        **options: See `EnvOptions`.
+
+    Raises:
+        UnknownNameError: No such scenario, domain or option.
+        ScenarioError: The scenario's files are missing or contradict each other.
+    """
+    return TrafficEnv(load_scenario(scenario), domain, EnvOptions.of(options))
+
+
+def env(scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any) -> Any:
+    """The environment as a PettingZoo `AECEnv`; arguments as for `parallel_env`."""
+    from pettingzoo.utils import parallel_to_aec
+
+    return parallel_to_aec(parallel_env(scenario, domain, **options))

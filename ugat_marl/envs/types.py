@@ -1,0 +1,31 @@
+"""Types of what environments take and return, by agent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+Observations = Mapping[str, NDArray[np.float32]]
+
+
+Infos = Mapping[str, Mapping[str, Any]]
+
+
+Actions = dict[str, int]
+
+
+AnyParallelEnv = ParallelEnv[str, Any, Any]
+
+
+Begun = tuple[dict[str, Any], dict[str, dict[str, Any]]]
+"""What an environment's `reset` returns: observations and infos, by agent."""
+
+
+Stepped = tuple[
+    dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
+]
+"""What its `step` returns: observations, rewards, terminations, truncations and infos."""

@@ -1,0 +1,17 @@
+"""Many simulations in worker processes, stepped together: `vector_env`."""
+
+from ugat_marl.envs.vector.arrays import Arrays
+from ugat_marl.envs.vector.environment import Autoreset, Batch, Ended, VectorEnv, vector_env
+from ugat_marl.envs.vector.lane import Episode
+from ugat_marl.envs.vector.spec import in_turn
+
+__all__ = [
+    "Arrays",
+    "Autoreset",
+    "Batch",
+    "Ended",
+    "Episode",
+    "VectorEnv",
+    "in_turn",
+    "vector_env",
+]

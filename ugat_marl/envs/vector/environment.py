@@ -1,0 +1,400 @@
+"""Many simulations, stepped together."""
+
+from __future__ import annotations
+
+import contextlib
+import operator
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ugat_marl.data import Scores
+from ugat_marl.effects import Domain, load_scenario
+from ugat_marl.envs.agents import AgentSet
+from ugat_marl.envs.traffic_env import parallel_env
+from ugat_marl.envs.types import AnyParallelEnv
+from ugat_marl.envs.vector.arrays import Arrays
+from ugat_marl.envs.vector.lane import Answer, Episode, Lane
+from ugat_marl.envs.vector.nursery import Home
+from ugat_marl.envs.vector.spec import (
+    DomainOf,
+    Wraps,
+    checked_options,
+    domain_chooser,
+    imported,
+    listed,
+    spelling,
+)
+from ugat_marl.errors import ActionError, EpisodeError, OptionError, UgatMarlError, UnknownNameError
+from ugat_marl.scenarios import Scenario
+
+Autoreset = Literal["same-step", "next-step", "disabled"]
+"""Gymnasium's modes. In ``"same-step"`` the step that ends an episode returns the first observation
+of the next one, and the last one in `Batch.ended`; in ``"next-step"`` the next episode begins with
+the step after, whose actions are ignored; in ``"disabled"`` the user calls `VectorEnv.reset`."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """An episode that has ended in a step.
+
+    Attributes:
+        environment: Which environment's, counted within the object that was stepped.
+        episode: Its seed and domain.
+        observations: float32 ``(agents, width)``: the last ones.
+        masks: int8 ``(agents, actions)``: the last ones.
+        scores: Its measures; None if a wrapper hides them.
+    """
+
+    environment: int
+    episode: Episode
+    observations: NDArray[np.float32]
+    masks: NDArray[np.int8]
+    scores: Scores | None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What a reset or step of all environments returns; the arrays are the caller's own.
+
+    Agents are in the order of `VectorEnv.agents`, unequal ones padded at the end: observations with
+    zeros, and phases an agent does not have are 0 in its mask.
+
+    Attributes:
+        observations: float32 ``(environments, agents, width)``.
+        masks: int8 ``(environments, agents, actions)``; 1 where a phase may be chosen.
+        rewards: float64 ``(environments, agents)``; 0 after a reset.
+        executed: int64 ``(environments, agents)``; the phases that were shown.
+        truncated: bool ``(environments,)``; episodes end in no other way.
+        ended: One for each that is.
+    """
+
+    observations: NDArray[np.float32]
+    masks: NDArray[np.int8]
+    rewards: NDArray[np.float64]
+    executed: NDArray[np.int64]
+    truncated: NDArray[np.bool_]
+    ended: tuple[Ended, ...]
+
+
+class VectorEnv:
+    """Environments in processes of their own, stepped together; see `vector_env`.
+
+    Args:
+        lanes: The environments.
+        arrays: Their memory.
+        plain: An environment with the same spaces, which is never started.
+        domains: The domain of an episode.
+        autoreset: What happens when one ends.
+        home: What is closed with them; or what they are a half of, which is kept alive.
+
+    Attributes:
+        n: Number of environments.
+        agents: The agents of each.
+        agent_set: Their names and sizes.
+        observation_spaces: Agent to its space, without padding.
+        action_spaces: The same for actions.
+        autoreset: What happens when an episode ends.
+        plain: An environment with the same spaces, which is never started.
+    """
+
+    def __init__(
+        self,
+        lanes: Sequence[Lane],
+        arrays: Arrays,
+        plain: AnyParallelEnv,
+        domains: DomainOf,
+        autoreset: Autoreset,
+        home: Home | VectorEnv,
+    ) -> None:
+        self.n = len(lanes)
+        self.agent_set = AgentSet.of(plain)
+        self.agents = self.agent_set.names
+        self.observation_spaces = {a: plain.observation_space(a) for a in self.agents}
+        self.action_spaces = {a: plain.action_space(a) for a in self.agents}
+        self.autoreset: Autoreset = autoreset
+        self.plain = plain
+        self._lanes = list(lanes)
+        self._arrays: Arrays | None = arrays
+        self._domains = domains
+        self._whole = home if isinstance(home, VectorEnv) else None
+        self._home = None if isinstance(home, VectorEnv) else home
+        self._counts = np.array(self.agent_set.action_counts)
+        self._begun: list[int] = []
+        self._stepped: list[int] = []
+
+    @property
+    def episodes(self) -> tuple[Episode | None, ...]:
+        """The episode each environment is in; None before the first reset."""
+        return tuple(lane.episode for lane in self._lanes)
+
+    def halves(self) -> tuple[VectorEnv, VectorEnv]:
+        """Two vectors of these environments: one is stepped while the other one's answer is used.
+
+        Closing the whole closes both, closing a half ends its simulations only.
+
+        Raises:
+            OptionError: There is one environment only.
+        """
+        if self.n < 2:
+            raise OptionError("halves() needs at least two environments")
+        middle, arrays = self.n // 2, self._memory
+        parts = slice(0, middle), slice(middle, self.n)
+        first, second = (
+            VectorEnv(
+                self._lanes[part],
+                arrays.part(part),
+                self.plain,
+                self._domains,
+                self.autoreset,
+                self,
+            )
+            for part in parts
+        )
+        return first, second
+
+    def reset(
+        self, seed: int | Sequence[int] | None = None, where: ArrayLike | None = None
+    ) -> Batch:
+        """Begins episodes; those under way are given up.
+
+        Args:
+            seed: One for each environment; a single number stands for itself, the next one, .... A
+                later reset without a seed begins the next episodes, whose seeds follow from it.
+            where: Numbers of the environments to reset, or a mask of them; all if None.
+
+        Raises:
+            SimulatorError: SUMO refuses; its own words are in the message.
+        """
+        chosen = self._chosen(where)
+        seeds = self._seeds(seed, chosen)
+        for index in chosen:
+            self._lanes[index].close()
+        self._stepped = []
+        self._begin(chosen, seeds)
+        self._memory.rewards[chosen] = 0.0
+        return self._batch(np.zeros(self.n, dtype=np.bool_), ())
+
+    def step(self, actions: ArrayLike) -> Batch:
+        """Shows the chosen phases for one decision interval, in all environments.
+
+        Args:
+            actions: Integers ``(environments, agents)``.
+
+        Raises:
+            ActionError: Of another shape, or a phase the agent does not have; nothing has happened.
+            EpisodeError: There is no episode under way.
+            SimulatorError: SUMO failed. The other environments have made their step.
+        """
+        self.step_async(actions)
+        return self.step_wait()
+
+    def step_async(self, actions: ArrayLike) -> None:
+        """Begins a step; `step_wait` ends it, and there is time for something else between."""
+        asked = self._checked(actions)
+        idle = [lane.over and not lane.asked for lane in self._lanes]
+        anew = self.autoreset == "next-step" and self._lanes[0].episode is not None
+        for lane, over in zip(self._lanes, idle, strict=True):
+            if not (anew and over):
+                lane.require_running()
+        self._begun = [index for index, over in enumerate(idle) if over]
+        self._stepped = [index for index, over in enumerate(idle) if not over]
+        for index in self._stepped:
+            self._lanes[index].act(asked[index].copy())
+        for index in self._begun:
+            self._lanes[index].begin(None, self._domains)
+
+    def step_wait(self) -> Batch:
+        """Waits for the step that `step_async` began.
+
+        Raises:
+            EpisodeError: It has begun none.
+        """
+        if not self._stepped and not self._begun:
+            raise EpisodeError("step_wait() without step_async()")
+        stepped, begun = self._stepped, self._begun
+        self._stepped, self._begun = [], []
+        answers = self._answers([*stepped, *begun])
+        memory = self._memory
+        memory.rewards[begun] = 0.0
+        over = [index for index in stepped if answers[index].over]
+        truncated = np.zeros(self.n, dtype=np.bool_)
+        truncated[over] = True
+        ended = tuple(self._ended(index, answers[index]) for index in over)
+        if over and self.autoreset == "same-step":
+            rewards, executed = memory.rewards[over], memory.executed[over]
+            self._begin(over, dict.fromkeys(over))
+            memory.rewards[over], memory.executed[over] = rewards, executed
+        return self._batch(truncated, ended)
+
+    def close(self) -> None:
+        """Ends all simulations and their processes, removes their files; may be called again."""
+        for lane in self._lanes:
+            lane.close()
+        home, self._home = self._home, None
+        if home is not None:
+            self._arrays = None
+            home.close()
+
+    def __enter__(self) -> VectorEnv:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        if getattr(self, "_home", None) is not None:
+            with contextlib.suppress(OSError):
+                self.close()
+
+    # --- parts --------------------------------------------------------------------------------
+
+    @property
+    def _memory(self) -> Arrays:
+        if self._arrays is None:
+            raise EpisodeError("this vector_env is closed; make another one")
+        return self._arrays
+
+    def _chosen(self, where: ArrayLike | None) -> list[int]:
+        numbers = np.arange(self.n)
+        if where is None:
+            return numbers.tolist()
+        try:
+            chosen = numbers[np.asarray(where)]
+        except IndexError:
+            chosen = numbers[:0]
+        if chosen.ndim != 1 or not chosen.size or len(set(chosen.tolist())) < chosen.size:
+            raise OptionError(
+                f"where = {where!r}: must be different numbers below {self.n}, or a mask of "
+                f"{self.n} truth values, at least one of them true"
+            )
+        return chosen.tolist()
+
+    def _seeds(self, seed: int | Sequence[int] | None, chosen: list[int]) -> dict[int, int | None]:
+        if seed is None:
+            return dict.fromkeys(chosen)
+        try:
+            if isinstance(seed, int | np.integer):
+                listed = [int(seed) + i for i in range(self.n)]
+            else:
+                listed = [operator.index(one) for one in seed]
+        except TypeError:  # no sequence, or not of whole numbers
+            listed = []
+        if len(listed) != self.n or min(listed) < 0:
+            raise OptionError(
+                f"seed = {seed!r}: must be a number from 0 on, or {self.n} of them, one for each "
+                "environment"
+            )
+        return {index: listed[index] for index in chosen}
+
+    def _checked(self, actions: ArrayLike) -> NDArray[np.int64]:
+        asked = np.asarray(actions)
+        wanted = (self.n, len(self.agents))
+        if asked.shape != wanted or not np.issubdtype(asked.dtype, np.integer):
+            raise ActionError(
+                f"actions are {asked.dtype} of shape {asked.shape}; allowed: integers of shape "
+                f"{wanted}, one for each environment and agent"
+            )
+        wrong = (asked < 0) | (asked >= self._counts)
+        if wrong.any():
+            row, column = (int(places[0]) for places in np.nonzero(wrong))
+            raise ActionError(
+                f"action of agent {self.agents[column]!r} in environment {row} is "
+                f"{asked[row, column]}; allowed: the integers 0 to {self._counts[column] - 1}, its "
+                "green phases; the others are padding, and 0 in the mask"
+            )
+        return asked.astype(np.int64)
+
+    def _begin(self, chosen: list[int], seeds: dict[int, int | None]) -> None:
+        for index in chosen:
+            self._lanes[index].begin(seeds[index], self._domains)
+        self._answers(chosen)
+
+    def _answers(self, chosen: list[int]) -> dict[int, Answer]:
+        """All answers; an error is raised when everyone has been heard."""
+        answers: dict[int, Answer] = {}
+        failed: list[UgatMarlError] = []
+        for index in chosen:
+            try:
+                answers[index] = self._lanes[index].answer()
+            except UgatMarlError as error:
+                failed.append(error)
+        for text in dict.fromkeys(_said(answers.values())):
+            warnings.warn(text, stacklevel=4)
+        if failed:
+            raise failed[0]
+        return answers
+
+    def _ended(self, index: int, answer: Answer) -> Ended:
+        memory, episode = self._memory, self._lanes[index].episode
+        assert episode is not None
+        seen, masks = memory.observations[index].copy(), memory.masks[index].copy()
+        return Ended(index, episode, seen, masks, answer.scores)
+
+    def _batch(self, truncated: NDArray[np.bool_], ended: tuple[Ended, ...]) -> Batch:
+        memory = self._memory
+        return Batch(
+            memory.observations.copy(),
+            memory.masks.copy(),
+            memory.rewards.copy(),
+            memory.executed.copy(),
+            truncated,
+            ended,
+        )
+
+
+def _said(answers: Iterable[Answer]) -> Iterator[str]:
+    for answer in answers:
+        yield from answer.warnings
+
+
+def vector_env(
+    scenario: str | Path | Scenario,
+    n: int,
+    domains: Domain | Sequence[Domain] | DomainOf = "sim",
+    *,
+    autoreset: Autoreset = "same-step",
+    wrap: Wraps = None,
+    **options: Any,
+) -> VectorEnv:
+    """Simulations in worker processes, stepped together, with their arrays in shared memory.
+
+    What an environment does depends on its seed, its domain and its actions alone: not on `n`, and
+    not on whether its process was killed meanwhile, which is replaced and taken to where it was.
+
+    Args:
+        scenario: As for `ugat_marl.parallel_env`.
+        n: Number of environments; one simulation and one process each.
+        domains: One domain for all; a list of `n`; or a function ``(environment, episode) ->
+            domain`` that is asked at each reset, such as `ugat_marl.envs.vector.spec.in_turn`
+            makes.
+        autoreset: What happens when an episode ends, see `Autoreset`.
+        wrap: A function that is put around each environment, one that can be imported, or
+            its ``"module:name"``, such as ``"ugat_marl.envs.wrappers:agent_indicator"``; or a list
+            of them.
+        **options: See `EnvOptions`; all but ``simulator`` and ``render_mode``.
+
+    Raises:
+        UnknownNameError: No such scenario, domain, option or mode.
+        OptionError: An impossible number, or a function that a worker cannot import.
+        ScenarioError: The scenario's files are missing or contradict each other.
+    """
+    count: Any = n
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise OptionError(f"n = {n!r}: must be a number of environments, at least 1")
+    if autoreset not in get_args(Autoreset):
+        raise UnknownNameError("value of option 'autoreset':", str(autoreset), get_args(Autoreset))
+    checked_options(options)
+    loaded = load_scenario(scenario)
+    domain_of = domain_chooser(loaded, domains, n)
+    plain: AnyParallelEnv = parallel_env(loaded, domain_of(0, 0), **options)
+    for each in listed(wrap):
+        plain = imported(spelling("wrap", each))(plain)
+    home = Home(loaded, options, wrap, AgentSet.of(plain), n)
+    lanes = [Lane(home, index, home.arrays.part(index)) for index in range(n)]
+    return VectorEnv(lanes, home.arrays, plain, domain_of, autoreset, home)

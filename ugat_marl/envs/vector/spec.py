@@ -1,0 +1,218 @@
+"""What an environment of a vector is made of, in plain values that can be sent to a process."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from ugat_marl.effects import (
+    Domain,
+    effect_from,
+    in_domain,
+    load_scenario,
+    parse_domain,
+    scenario_of,
+)
+from ugat_marl.envs.agents import AgentSet
+from ugat_marl.envs.options import EnvOptions
+from ugat_marl.envs.traffic_env import parallel_env
+from ugat_marl.envs.types import AnyParallelEnv
+from ugat_marl.errors import OptionError
+from ugat_marl.scenarios import Scenario
+
+DomainOf = Callable[[int, int], Domain]
+"""The domain of an episode: ``(number of the environment, number of its episode) -> domain``."""
+
+Wrap = Callable[[Any], AnyParallelEnv] | str
+"""A function from environment to environment that can be imported, or its ``"module:name"``."""
+
+Wraps = Wrap | Sequence[Wrap] | None
+"""One, some in the order in which they are put around the environment, or none."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """How to make the environment.
+
+    Attributes:
+        scenario: Folder of the scenario.
+        applied: The effects in it, some of which are in no file.
+        options: Options, see `EnvOptions`.
+        reward: ``"module:name"`` of the reward, if that is a function.
+        wraps: ``"module:name"`` of each wrapper.
+    """
+
+    scenario: str
+    applied: Sequence[str]
+    options: Mapping[str, Any]
+    reward: str | None
+    wraps: Sequence[str]
+
+    @classmethod
+    def of(cls, scenario: Scenario, options: Mapping[str, Any], wraps: Wraps) -> Spec:
+        """The specification of an environment; its scenario is to be written somewhere."""
+        plain = dict(options)
+        reward = plain.pop("reward") if callable(plain.get("reward")) else None
+        return cls(
+            "",
+            scenario.applied,
+            plain,
+            None if reward is None else spelling("reward", reward),
+            [spelling("wrap", each) for each in listed(wraps)],
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def environment(self, domain: Any) -> AnyParallelEnv:
+        """The environment in a domain as `sent` gives it, its simulator in this process."""
+        options = dict(self.options)
+        if self.reward is not None:
+            options["reward"] = imported(self.reward)
+        options["simulator"] = "inprocess"
+        scenario = replace(load_scenario(self.scenario), applied=tuple(self.applied))
+        env: AnyParallelEnv = parallel_env(scenario, received(domain), **options)
+        for wrap in self.wraps:
+            env = imported(wrap)(env)
+        return env
+
+
+def checked_options(options: Mapping[str, Any]) -> None:
+    """Refuses options that mean nothing here.
+
+    Raises:
+        UnknownNameError: No such option.
+        OptionError: One that says where to simulate, or asks for pictures.
+    """
+    EnvOptions.of(options)
+    for name in ("simulator", "render_mode"):
+        if options.get(name) is not None:
+            raise OptionError(
+                f"{name} = {options[name]!r}: the simulations of a vector_env run in processes of "
+                "their own and draw nothing; use parallel_env for that"
+            )
+
+
+def listed(wraps: Wraps) -> list[Wrap]:
+    """Wrappers as a list, the innermost first."""
+    if wraps is None:
+        return []
+    return [wraps] if isinstance(wraps, str) or callable(wraps) else list(wraps)
+
+
+def spelling(what: str, function: Callable[..., Any] | str) -> str:
+    """The ``"module:name"`` by which a worker imports a function.
+
+    Raises:
+        OptionError: A worker would not find it.
+    """
+    if isinstance(function, str):
+        imported(function)
+        return function
+    module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", "<")
+    if module in (None, "__main__") or "<" in name:
+        raise OptionError(
+            f"{what} = {function!r}: the workers of a vector_env import it by its name, which a "
+            "lambda, an inner function and one of the program itself do not have; move it to a "
+            "module, at its top level"
+        )
+    return f"{module}:{name}"
+
+
+def imported(text: str) -> Any:
+    """The function ``"module:name"``.
+
+    Raises:
+        OptionError: There is none.
+    """
+    module, _, name = text.partition(":")
+    try:
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise OptionError(
+            f"{text!r} cannot be imported ({error}); write module:name, such as "
+            "ugat_marl.envs.wrappers:pad"
+        ) from None
+    return found
+
+
+def sent(domain: Domain) -> Any:
+    """A domain as JSON holds it, to the last digit."""
+    if not isinstance(domain, str):
+        return [effect.record() for effect in parse_domain(domain)]
+    path = scenario_of(domain)
+    return domain if path is None else str(path.resolve())
+
+
+def received(domain: Any) -> Domain:
+    """What `sent` was given."""
+    return domain if isinstance(domain, str) else [effect_from(record) for record in domain]
+
+
+def domain_chooser(
+    scenario: Scenario, domains: Domain | Sequence[Domain] | DomainOf, n: int
+) -> DomainOf:
+    """The domain of each episode.
+
+    Args:
+        scenario: Where.
+        domains: One domain, a list of `n`, or a function.
+        n: Number of environments.
+
+    Raises:
+        OptionError: A list of another length.
+        UnknownNameError: No such domain.
+    """
+    if callable(domains):
+        return domains
+    given: Any = domains
+    if isinstance(given, str) or not any(map(_is_domain, given)):
+        in_domain(scenario, given)
+        return lambda environment, episode: given
+    listed: list[Any] = list(given)
+    if effects := [item for item in listed if not _is_domain(item)]:
+        raise OptionError(
+            f"domains mixes domains and single effects ({effects[0]}); put the effects of one "
+            "domain into a list of their own"
+        )
+    if len(listed) != n:
+        raise OptionError(
+            f"domains has {len(listed)} entries for {n} environments: give one for each, or "
+            "ugat_marl.envs.vector.spec.in_turn(domains), which goes through a list of any length"
+        )
+    for domain in {str(sent(domain)): domain for domain in listed}.values():
+        in_domain(scenario, domain)
+    return lambda environment, episode: listed[environment]
+
+
+def in_turn(domains: Sequence[Domain]) -> DomainOf:
+    """Domain randomisation over a list: each environment goes through it, from another start.
+
+    Episode ``k`` of environment ``i`` is in domain ``(i + k) mod len(domains)``, however many
+    environments there are.
+
+    Args:
+        domains: At least one.
+
+    Raises:
+        OptionError: None are given.
+    """
+    listed = list(domains)
+    if not listed:
+        raise OptionError("in_turn() needs at least one domain")
+    return lambda environment, episode: listed[(environment + episode) % len(listed)]
+
+
+def _is_domain(item: Any) -> bool:
+    """Whether something in a list is a domain of its own, and not an effect of one domain."""
+    return isinstance(item, str | list | tuple)
+
+
+def agents_of(env: AnyParallelEnv) -> dict[str, list[Any]]:
+    """The agents of an environment with their sizes, for JSON."""
+    return {name: list(values) for name, values in asdict(AgentSet.of(env)).items()}

@@ -1,0 +1,377 @@
+"""Wrappers for learners that need equal spaces, or more in an observation than one agent sees.
+
+They take any `ParallelEnv` whose agents observe one-dimensional boxes, act in `Discrete(n)` and
+live to the end of the episode, and stack in any order; `masked_observation` comes last. Rewards,
+ends, infos (but for `pad`, which lengthens ``action_mask``) and `state()` are those of the
+environment within.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo.utils import BaseParallelWrapper
+
+from ugat_marl.envs.actions import checked_phases
+from ugat_marl.envs.types import AnyParallelEnv, Begun, Stepped
+from ugat_marl.errors import ActionError, EpisodeError, OptionError
+
+Vectors = Mapping[str, NDArray[np.float32]]
+Infos = dict[str, dict[str, Any]]
+
+
+def pad(env: AnyParallelEnv) -> Wrapper:
+    """Gives all agents equal spaces: zeros behind short observations, further actions.
+
+    All observe one and the same `Box`, of the length of the longest observation, and act in
+    `Discrete` of the size of the largest. ``infos[agent]["action_mask"]`` is 0 for the actions an
+    agent does not have; where the environment gives no mask, there is one now. An action space's
+    `sample()` draws among the agent's own actions.
+
+    Raises:
+        ActionError: From `step`, for an action the agent does not have; nothing has happened, and
+            nothing is chosen in its place.
+    """
+    return _Pad(env)
+
+
+def agent_indicator(env: AnyParallelEnv) -> Wrapper:
+    """Appends to each observation a one-hot of its agent, in the order of `possible_agents`.
+
+    It is 0 or 1 and its bounds are 0 and 1, whatever the bounds of the observation.
+    """
+    return _AgentIndicator(env)
+
+
+def shared_observation(env: AnyParallelEnv) -> Wrapper:
+    """Appends to each observation those of all agents, its own again included.
+
+    The appended part is the same for all agents, in the order of `possible_agents`. It is made of
+    the observations of the environment within, padded or stacked if that is; `state()` stays
+    as it was.
+    """
+    return _SharedObservation(env)
+
+
+def frame_stack(env: AnyParallelEnv, k: int) -> Wrapper:
+    """Joins the last `k` observations of each agent, the newest last; zeros before the first.
+
+    Raises:
+        OptionError: `k` is not at least 1.
+    """
+    return _FrameStack(env, k)
+
+
+def masked_observation(env: AnyParallelEnv) -> Wrapper:
+    """Observations as ``{"observations": vector, "action_mask": int8 (actions,)}``, as RLlib wants.
+
+    The mask is that of the infos, which keep theirs; all ones where they have none.
+    """
+    return _MaskedObservation(env)
+
+
+def appended_mask(env: AnyParallelEnv) -> Wrapper:
+    """Appends to each observation the agent's action mask, for learners that know no other way.
+
+    Whoever reads it gives the actions with a 0 no probability, or a value below all others. It is
+    all ones where the infos have no mask.
+    """
+    return _AppendedMask(env)
+
+
+class Wrapper(BaseParallelWrapper[str, Any, Any]):
+    """What the wrappers have in common: spaces of their own, all else of the environment within.
+
+    Attributes:
+        observation_spaces: Agent to its space, the same object as `observation_space` returns.
+        action_spaces: The same for actions.
+    """
+
+    observation_spaces: dict[str, Any]
+    action_spaces: dict[str, Any]
+
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        agents = env.possible_agents
+        self.observation_spaces = {agent: _box(env, agent) for agent in agents}
+        self.action_spaces = {agent: env.action_space(agent) for agent in agents}
+
+    @property
+    def unwrapped(self) -> Wrapper:
+        """The wrapper itself: skrl and EPyMARL read the spaces there and would find those within.
+
+        It has every public attribute of the environments within; `base` is the innermost.
+        """
+        return self
+
+    @property
+    def base(self) -> Any:
+        """The environment inside all wrappers."""
+        found: Any = self
+        while isinstance(found, Wrapper):
+            found = found.env.unwrapped
+        return found
+
+    def observation_space(self, agent: str) -> Any:
+        """The space of an agent's observations, the same object at each call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        """The space of an agent's actions, the same object at each call."""
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
+        """Starts an episode of the environment within."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._begin()
+        told = self._told(infos)
+        return self._seen(observations, told), told
+
+    def step(self, actions: dict[str, Any]) -> Stepped:
+        """Passes actions on, and observations back.
+
+        Raises:
+            ActionError: As the environment within, and `pad`.
+        """
+        self._check(actions)
+        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        told = self._told(infos)
+        return self._seen(observations, told), rewards, terminations, truncations, told
+
+    def _begin(self) -> None:
+        """Forgets the episode before."""
+
+    def _check(self, actions: Mapping[str, Any]) -> None:
+        """Refuses actions before anything happens."""
+
+    def _told(self, infos: Infos) -> Infos:
+        """The infos as the learner gets them."""
+        return infos
+
+    def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
+        """The observations as the learner gets them, in fresh arrays."""
+        raise NotImplementedError
+
+
+class PaddedDiscrete(spaces.Discrete):
+    """`Discrete(n)` of whose actions only the first `own` exist; `sample()` draws among these.
+
+    Equal to any other `Discrete(n)`, and contains all of it, so that agents can share a network.
+
+    Args:
+        n: Actions, with the padding.
+        own: Actions that exist.
+    """
+
+    def __init__(self, n: int, own: int) -> None:
+        super().__init__(n)
+        self.own = own
+
+    def sample(self, mask: Any = None, probability: Any = None) -> np.int64:
+        """A random action; among those that exist unless `mask` or `probability` say otherwise."""
+        if probability is not None:
+            return super().sample(mask, probability=probability)
+        if mask is None:
+            mask = (np.arange(int(self.n)) < self.own).astype(np.int8)
+        return super().sample(mask)
+
+
+class _Pad(Wrapper):
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        self._own = {agent: _discrete(env, agent) for agent in self.action_spaces}
+        self._most = max(int(space.n) for space in self._own.values())
+        padded = {own: PaddedDiscrete(self._most, own) for own in map(_size, self._own.values())}
+        self.action_spaces = {agent: padded[_size(own)] for agent, own in self._own.items()}
+        common = _common_box(list(self.observation_spaces.values()))
+        self._width = common.shape[0]
+        self.observation_spaces = dict.fromkeys(self.observation_spaces, common)
+
+    def _check(self, actions: Mapping[str, Any]) -> None:
+        if self.env.agents:  # after the end it is for the environment to say something
+            try:
+                checked_phases(actions, self.env.agents, self._own)
+            except ActionError as error:
+                raise ActionError(
+                    f"{error}; actions up to {self._most - 1} are padding, and 0 in the "
+                    "action_mask of its info"
+                ) from None
+
+    def _told(self, infos: Infos) -> Infos:
+        told = dict(infos)
+        for agent, own in self._own.items():
+            if agent in infos:
+                mask = np.zeros(self._most, dtype=np.int8)
+                given = infos[agent].get("action_mask")
+                mask[: own.n] = 1 if given is None else given
+                told[agent] = {**infos[agent], "action_mask": mask}
+        return told
+
+    def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
+        return {agent: _longer(vector, self._width) for agent, vector in observations.items()}
+
+
+class _AgentIndicator(Wrapper):
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        agents = list(self.observation_spaces)
+        one_hot = spaces.Box(0.0, 1.0, (len(agents),), np.float32)
+        extended = _each(self.observation_spaces, lambda box: _joined([box, one_hot]))
+        self.observation_spaces = extended
+        self._row = {agent: row for row, agent in enumerate(agents)}
+
+    def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
+        seen: dict[str, Any] = {}
+        for agent, vector in observations.items():
+            seen[agent] = _longer(vector, vector.size + len(self._row))
+            seen[agent][vector.size + self._row[agent]] = 1
+        return seen
+
+
+class _SharedObservation(Wrapper):
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        every = list(self.observation_spaces.values())
+        extended = _each(self.observation_spaces, lambda box: _joined([box, *every]))
+        self.observation_spaces = extended
+
+    def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
+        if not observations:  # after the end
+            return {}
+        if missing := [agent for agent in self.observation_spaces if agent not in observations]:
+            raise EpisodeError(
+                f"the environment gave no observation of {missing}; shared_observation needs those "
+                "of all agents to the end"
+            )
+        every = np.concatenate([observations[agent] for agent in self.observation_spaces])
+        return {agent: np.concatenate((own, every)) for agent, own in observations.items()}
+
+
+class _FrameStack(Wrapper):
+    def __init__(self, env: AnyParallelEnv, k: int) -> None:
+        super().__init__(env)
+        if k < 1:
+            raise OptionError(f"frame_stack of {k} observations: must be at least 1")
+        self._k = k
+        self._frames: dict[str, deque[NDArray[np.float32]]] = {}
+        self.observation_spaces = _each(self.observation_spaces, self._stacked_box)
+
+    def _stacked_box(self, box: spaces.Box) -> spaces.Box:
+        """The newest frame is in the box; those before may be zeros as well."""
+        zeros = spaces.Box(np.minimum(box.low, 0), np.maximum(box.high, 0), dtype=_dtype(box))
+        return _joined([*[zeros] * (self._k - 1), box])
+
+    def _begin(self) -> None:
+        self._frames.clear()
+
+    def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
+        for agent, vector in observations.items():
+            if agent not in self._frames:
+                self._frames[agent] = deque([np.zeros_like(vector)] * self._k, self._k)
+            self._frames[agent].append(vector)
+        return {agent: np.concatenate(self._frames[agent]) for agent in observations}
+
+
+class _Masking(Wrapper):
+    """What shows masks in observations."""
+
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        self._sizes = {agent: _size(_discrete(env, agent)) for agent in self.action_spaces}
+
+    def _mask(self, agent: str, infos: Infos) -> NDArray[np.int8]:
+        given = infos.get(agent, {}).get("action_mask")
+        return np.ones(self._sizes[agent], np.int8) if given is None else np.array(given, np.int8)
+
+
+class _AppendedMask(_Masking):
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        masks = {size: spaces.Box(0.0, 1.0, (size,)) for size in self._sizes.values()}
+        made: dict[tuple[int, int], spaces.Box] = {}  # agents that shared a box still do
+        for agent, box in self.observation_spaces.items():
+            key = id(box), self._sizes[agent]
+            made[key] = made.get(key) or _joined([box, masks[key[1]]])
+            self.observation_spaces[agent] = made[key]
+
+    def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
+        return {
+            agent: np.concatenate((vector, self._mask(agent, infos)), dtype=vector.dtype)
+            for agent, vector in observations.items()
+        }
+
+
+class _MaskedObservation(_Masking):
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        sizes = self._sizes
+        masks = {size: spaces.Box(0, 1, (size,), np.int8) for size in sizes.values()}
+        self.observation_spaces = {
+            agent: spaces.Dict({"observations": box, "action_mask": masks[sizes[agent]]})
+            for agent, box in self.observation_spaces.items()
+        }
+
+    def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
+        return {
+            agent: {"observations": vector, "action_mask": self._mask(agent, infos)}
+            for agent, vector in observations.items()
+        }
+
+
+def _box(env: AnyParallelEnv, agent: str) -> spaces.Box:
+    space = env.observation_space(agent)
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise OptionError(
+            f"agent {agent!r} observes {space}; wrappers need a Box of one dimension "
+            "(put masked_observation last; supersuit.flatten_v0 makes vectors of other boxes)"
+        )
+    return space
+
+
+def _discrete(env: AnyParallelEnv, agent: str) -> spaces.Discrete:
+    space = env.action_space(agent)
+    if not isinstance(space, spaces.Discrete) or space.start != 0:
+        raise OptionError(f"agent {agent!r} acts in {space}; this wrapper needs Discrete(n)")
+    return space
+
+
+def _longer(vector: NDArray[Any], width: int) -> NDArray[Any]:
+    """A copy with zeros behind it; `numpy.pad` takes several times as long."""
+    longer = np.zeros(width, dtype=vector.dtype)
+    longer[: vector.size] = vector
+    return longer
+
+
+def _size(space: spaces.Discrete) -> int:
+    return int(space.n)
+
+
+def _dtype(box: spaces.Box) -> Any:
+    assert box.dtype is not None
+    return box.dtype.type
+
+
+def _joined(boxes: list[spaces.Box]) -> spaces.Box:
+    """The box of vectors written one behind the other, in the first one's type."""
+    low, high = ([getattr(box, side) for box in boxes] for side in ("low", "high"))
+    return spaces.Box(np.concatenate(low), np.concatenate(high), dtype=_dtype(boxes[0]))
+
+
+def _each(boxes: Mapping[str, spaces.Box], change: Any) -> dict[str, spaces.Box]:
+    """Each agent's box changed; agents that shared one still do."""
+    changed = {id(box): change(box) for box in boxes.values()}
+    return {agent: changed[id(box)] for agent, box in boxes.items()}
+
+
+def _common_box(boxes: list[spaces.Box]) -> spaces.Box:
+    """A box for all, of the longest one's length, that holds zeros where some are shorter."""
+    width = max(box.shape[0] for box in boxes)
+    low, high = (
+        np.array([_longer(getattr(box, side), width) for box in boxes]) for side in ("low", "high")
+    )
+    return spaces.Box(low.min(axis=0), high.max(axis=0), dtype=_dtype(boxes[0]))

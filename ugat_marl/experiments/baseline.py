@@ -1,0 +1,114 @@
+"""The command of a baseline: train a learner on one scenario, judge it on seeds kept for that."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tyro
+
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import AnyParallelEnv, parallel_env
+from ugat_marl.errors import UgatMarlError
+from ugat_marl.experiments.evaluation import evaluate, fixed_policy
+from ugat_marl.files import require_writable, write_whole
+from ugat_marl.policies import DQNPolicy, EpisodeCallback
+
+FIRST_SEED = 1000
+"""Of the evaluations; the same episodes as in the tables of ``ugat-marl train``."""
+
+
+@dataclass(frozen=True)
+class BaselineArgs:
+    """What every baseline is asked.
+
+    Attributes:
+        scenario: Id or path of the scenario.
+        domain: The world to train and to be judged in.
+        duration_s: Length of an episode in s; none: the scenario's own.
+        episodes: Episodes to train.
+        seed: Seed of all that is drawn.
+        evaluate_every: Episodes from one evaluation to the next; 0: only at the end.
+        evaluation_seeds: Episodes of an evaluation, always the same; 0: none.
+        out: Folder for policy.pt, learner.pt and result.json.
+    """
+
+    scenario: str = "grid2x2-v1"
+    domain: str = "sim"
+    duration_s: float | None = None
+    episodes: int = 100
+    seed: int = 0
+    evaluate_every: int = 0
+    evaluation_seeds: int = 5
+    out: Path | None = None
+
+
+class Result(NamedTuple):
+    """The policy, the return of each episode, and by episodes trained the ATT of each seed, s."""
+
+    policy: DQNPolicy
+    returns: list[float]
+    att_s: dict[int, list[float]]
+
+
+def train_baseline(
+    args: BaselineArgs,
+    make: Callable[[AnyParallelEnv], Any],
+    on_episode: EpisodeCallback | None = None,
+) -> Result:
+    """Trains and evaluates; writes the results if `args.out` is given.
+
+    Args:
+        args: What to do.
+        make: Makes the learner for an environment.
+        on_episode: Called after every episode of training.
+    """
+    scenario, length = load_scenario(args.scenario), args.duration_s
+    if args.out is not None:
+        require_writable(args.out / "policy.pt")
+    env = parallel_env(scenario, domain=args.domain, duration_s=length)
+    returns: list[float] = []
+    att_s: dict[int, list[float]] = {}
+
+    def note(episode: int, numbers: Mapping[str, float]) -> None:
+        returns.append(numbers["return"])
+        if on_episode is not None:
+            on_episode(episode, numbers)
+
+    seeds = range(FIRST_SEED, FIRST_SEED + args.evaluation_seeds)
+    every = args.evaluate_every or max(1, args.episodes)
+    with contextlib.closing(env):
+        learner = make(env)
+        for until in (*range(every, args.episodes, every), args.episodes):
+            policy = fixed_policy(learner.learn(env, until - learner.episodes, args.seed, note))
+            if seeds:
+                found = evaluate(scenario, {"it": policy}, [args.domain], seeds, duration_s=length)
+                att_s[learner.episodes] = [item.scores.att_s for item in found.results]
+        result = Result(learner.policy(), returns, att_s)
+    if args.out is not None:
+        result.policy.save(args.out / "policy.pt")
+        learner.save(args.out / "learner.pt")
+        told = {"args": asdict(args), "returns": returns, "att_s": att_s}
+        write_whole(args.out / "result.json", json.dumps(told, default=str) + "\n")
+    return result
+
+
+def baseline_command(
+    kind: type[BaselineArgs], train: Callable[[Any, EpisodeCallback | None], Result]
+) -> None:
+    """Reads the command line into `kind`, trains, prints; errors are one line."""
+    name = Path(sys.argv[0]).name
+    try:
+        result = train(
+            tyro.cli(kind), lambda n, told: print(n, f"return {told['return']:.1f}", flush=True)
+        )
+    except UgatMarlError as error:
+        sys.exit(f"{name}: error: {error}")
+    for episodes, att_s in result.att_s.items():
+        print(f"{episodes} episodes: mean travel time {np.mean(att_s):.1f} s, by seed {att_s}")

@@ -1,0 +1,197 @@
+"""Settings x training seeds x domains: what a method is worth, with intervals over training seeds.
+
+One training is one sample. Episodes of its evaluation are averaged first; intervals are Student's
+over training seeds, and two settings are compared seed by seed: the same seed means the same
+initial weights, the same episodes of plain training and the same traffic in the evaluation.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ugat_marl.data import MEASURES, MORE_IS_BETTER, Scores
+from ugat_marl.experiments.statistics import Floats, Interval, PairedTest
+
+SERVED = 0.9
+"""Share of the vehicles due that arrive in an episode that did not break down."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One episode of one trained policy.
+
+    Attributes:
+        setting: How the policy was made.
+        target: The real domain it was made for; results of a policy that knows none stand there
+            once per domain.
+        domain: Where the episode was played: the simulation or the target.
+        training_seed: Seed of the training; None for a rule, which has none.
+        seed: Seed of the episode.
+        scores: How it went.
+    """
+
+    setting: str
+    target: str
+    domain: str
+    training_seed: int | None
+    seed: int
+    scores: Scores
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All trials of a table.
+
+    Attributes:
+        scenario: Id of the scenario.
+        scenario_hash: Its hash.
+        sim: The simulation, as the trials spell it.
+        trials: One per setting, target, domain, training seed and episode.
+        notes: What else a reader must know.
+    """
+
+    scenario: str
+    scenario_hash: str
+    sim: str
+    trials: tuple[Trial, ...]
+    notes: Mapping[str, str]
+
+    @property
+    def settings(self) -> list[str]:
+        """Names of the settings, in their order."""
+        return list(dict.fromkeys(trial.setting for trial in self.trials))
+
+    @property
+    def targets(self) -> list[str]:
+        """The real domains, in their order."""
+        return list(dict.fromkeys(trial.target for trial in self.trials))
+
+    @property
+    def training_seeds(self) -> list[int]:
+        """Seeds of the trainings, ascending."""
+        return sorted({t.training_seed for t in self.trials if t.training_seed is not None})
+
+    def has(self, setting: str, target: str) -> bool:
+        """Whether there are trials of the setting for that domain."""
+        return any(played[:2] == (setting, target) for played in self._scores)
+
+    @functools.cached_property
+    def _scores(self) -> Mapping[tuple[str, str, str], Mapping[int | None, Sequence[Scores]]]:
+        """The episodes by setting, target and domain, and then by training seed."""
+        found: dict[tuple[str, str, str], dict[int | None, list[Scores]]] = {}
+        for t in self.trials:
+            seeds = found.setdefault((t.setting, t.target, t.domain), {})
+            seeds.setdefault(t.training_seed, []).append(t.scores)
+        return found
+
+    def values(self, setting: str, target: str, measure: str, domain: str | None = None) -> Floats:
+        """Means over the episodes, one per training seed, ``(n,)``.
+
+        A rule stands beside every training with the same value.
+
+        Args:
+            setting: Name of the setting.
+            target: The real domain it was made for.
+            measure: A field of `Scores`.
+            domain: Where it was played; default: the target.
+        """
+        played = self._scores.get((setting, target, target if domain is None else domain), {})
+        means = {
+            seed: float(np.mean([getattr(own, measure) for own in played[seed]])) for seed in played
+        }
+        if None in means:
+            return np.full(max(len(self.training_seeds), 1), means[None])
+        return np.array([means[seed] for seed in sorted(means, key=lambda s: s or 0)])
+
+    def episodes(self, setting: str, target: str) -> list[Scores]:
+        """Every episode in the target, of all training seeds."""
+        wanted = setting, target, target
+        return [t.scores for t in self.trials if (t.setting, t.target, t.domain) == wanted]
+
+    def median_s(self, setting: str, target: str) -> float:
+        """The ATT that half of the episodes in the target stay below."""
+        return float(np.median([own.att_s for own in self.episodes(setting, target)]))
+
+    def unserved(self, setting: str, target: str) -> float:
+        """Share of the episodes in the target in which less than `SERVED` of those due arrived."""
+        found = self.episodes(setting, target)
+        return sum(own.throughput < SERVED * own.due for own in found) / len(found)
+
+    def estimate(
+        self, setting: str, target: str, measure: str, domain: str | None = None
+    ) -> Interval:
+        """Mean and interval over training seeds."""
+        return Interval.of(self.values(setting, target, measure, domain))
+
+    def gaps(self, setting: str, target: str, measure: str) -> Floats:
+        """The measure in the target minus that in the simulation, one per training seed."""
+        there = self.values(setting, target, measure)
+        return there - self.values(setting, target, measure, self.sim)
+
+    def test(self, one: str, other: str, target: str, measure: str = "att_s") -> PairedTest:
+        """Two settings in a domain, by the same training seeds."""
+        return PairedTest.of(self.values(one, target, measure), self.values(other, target, measure))
+
+    def best(self, target: str, among: Sequence[str] | None = None) -> str:
+        """The setting with the lowest mean ATT in a domain."""
+        names = [name for name in among or self.settings if self.has(name, target)]
+        return min(names, key=lambda name: float(self.values(name, target, "att_s").mean()))
+
+    def regret_s(self, setting: str, target: str) -> Floats:
+        """ATT above that of the best setting in the domain, in s, one per training seed."""
+        best = self.values(self.best(target), target, "att_s")
+        return self.values(setting, target, "att_s") - best
+
+    def won_back(self, setting: str, target: str, direct: str) -> float:
+        """Share of the regret of `direct` that is gone: 1 is as good as the best setting there.
+
+        A ratio of means over training seeds; nan where direct transfer leaves nothing to win.
+        """
+        start = float(self.regret_s(direct, target).mean())
+        mine = float(self.regret_s(setting, target).mean())
+        return 1.0 - mine / start if start > 0 else math.nan
+
+    def reduction(self, setting: str, target: str, direct: str, measure: str = "att_s") -> float:
+        """By how much smaller the gap is than that of `direct`, as a share (paper, Table 2).
+
+        nan where direct transfer loses nothing on the way: there is no gap to make smaller.
+        """
+        sign = -1.0 if measure in MORE_IS_BETTER else 1.0
+        start = sign * float(self.gaps(direct, target, measure).mean())
+        mine = sign * float(self.gaps(setting, target, measure).mean())
+        return 1.0 - mine / start if start > 0 else math.nan
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One flat row per setting and target: means and gaps of all measures, and regret."""
+        found: list[dict[str, Any]] = []
+        for setting in self.settings:
+            for target in self.targets:
+                if not self.has(setting, target):
+                    continue
+                row: dict[str, Any] = {
+                    "scenario": self.scenario,
+                    "setting": setting,
+                    "domain": target,
+                    "training_seeds": self.values(setting, target, "att_s").size,
+                }
+                columns: dict[str, Floats] = {}
+                for measure in MEASURES:
+                    columns[measure] = self.values(setting, target, measure)
+                    columns[f"{measure}_sim"] = self.values(setting, target, measure, self.sim)
+                    columns[f"{measure}_gap"] = self.gaps(setting, target, measure)
+                columns["regret_s"] = self.regret_s(setting, target)
+                for name, values in columns.items():
+                    interval = Interval.of(values)
+                    row |= {
+                        name: interval.mean,
+                        f"{name}_low": interval.low,
+                        f"{name}_high": interval.high,
+                    }
+                found.append(row)
+        return found

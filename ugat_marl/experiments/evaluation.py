@@ -1,0 +1,290 @@
+"""Policies x domains x seeds -> scores with intervals, gaps and regret; races between rules."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ugat_marl.effects import Domain, describe
+from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
+from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.experiments.scores import Evaluation, Result, Trial
+from ugat_marl.parallel import (
+    Stop,
+    Workers,
+    as_done,
+    in_this_process,
+    parts_at_a_time,
+    persistently,
+)
+from ugat_marl.policies import (
+    STANDARD_RULES,
+    DQNPolicy,
+    Policy,
+    PolicyFactory,
+    StepCallback,
+    controller_for,
+    parse_spec,
+    roll_out,
+    until,
+)
+from ugat_marl.progress import Reporter, Silent
+from ugat_marl.scenarios import Scenario
+
+Watch = Callable[[str, str, TrafficEnv], StepCallback]
+"""Called with the names of policy and domain and the environment; what it returns is called after
+each decision, in several threads at a time."""
+
+TUNING_SEED = 9001
+"""First of the seeds the best rule is searched on; never those a result is reported on."""
+
+
+@dataclass(frozen=True)
+class _Task:
+    name: str
+    make: PolicyFactory
+    world: TrafficEnv
+    seeds: tuple[int, ...]
+    watch: Watch | None
+
+
+def evaluate(
+    scenario: Scenario,
+    policies: Mapping[str, PolicyFactory],
+    domains: Sequence[Domain],
+    seeds: Sequence[int],
+    *,
+    duration_s: float | None = None,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+    title: str = "evaluating",
+    notes: Mapping[str, str] | None = None,
+    watch: Watch | None = None,
+) -> Evaluation:
+    """Plays every policy in every domain with every seed, spread over the cores.
+
+    Args:
+        scenario: Where.
+        policies: Name to factory.
+        domains: Domains; gaps are taken against the first, usually ``"sim"``.
+        seeds: Seeds of the episodes, the same for all.
+        duration_s: Length of an episode; None for the scenario's own.
+        workers: Simulations at a time; None for the number of cores; or an executor.
+        reporter: Shows progress.
+        title: What to call the work there.
+        notes: Kept with the result.
+        watch: Looks at the environments while they are played.
+    """
+    names = [describe(domain) for domain in domains]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
+    # Made once, and a wrong name is an error now, not in an hour.
+    worlds = [parallel_env(scenario, domain, duration_s=duration_s) for domain in domains]
+    for make in policies.values():
+        make(worlds[0])  # so is a wrong policy
+    if watch is not None and not in_this_process(workers):
+        raise OptionError("what is watched must be played here; give a number of workers")
+    episodes = len(seeds) * len(policies) * len(domains)
+    per_task = max(1, episodes // (4 * parts_at_a_time(workers)))
+    tasks = [
+        _Task(name, make, world, tuple(seeds[start : start + per_task]), watch)
+        for world in worlds
+        for name, make in policies.items()
+        for start in range(0, len(seeds), per_task)
+    ]
+    stop, results = Stop(), list[Result]()
+    with (reporter or Silent()).task(title, episodes) as advance:
+        for _, played in as_done(workers, _play, [(task, stop) for task in tasks], stop):
+            results += played
+            for _ in played:
+                advance()
+    order = {
+        (name, describe(domain)): i for i, (name, domain) in enumerate(_pairs(policies, domains))
+    }
+    results.sort(key=lambda r: (order[r.policy, r.domain], r.seed))
+    return Evaluation(scenario.id, scenario.hash, tuple(results), dict(notes or {}))
+
+
+def best_rules(
+    scenario: Scenario,
+    domains: Sequence[Domain],
+    *,
+    rules: Sequence[str] = STANDARD_RULES,
+    seeds: Sequence[int] = (TUNING_SEED, TUNING_SEED + 1),
+    duration_s: float | None = None,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+) -> dict[str, str]:
+    """For each domain the rule with the smallest mean ATT on the tuning seeds.
+
+    The rules are raced: after each seed the worse half is left behind.
+
+    Returns:
+        Name of the domain to the spelling of the rule.
+    """
+    found: dict[str, str] = {}
+    for domain in domains:
+        trials = race(
+            scenario,
+            domain,
+            rules,
+            [[seed] for seed in seeds],
+            duration_s=duration_s,
+            workers=workers,
+            reporter=reporter,
+            title=f"best rule in {describe(domain)}",
+        )
+        found[describe(domain)] = trials[0].spec
+    return found
+
+
+def race(
+    scenario: Scenario,
+    domain: Domain,
+    specs: Sequence[str],
+    seeds: Sequence[Sequence[int]],
+    *,
+    duration_s: float | None = None,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+    title: str = "racing",
+) -> tuple[Trial, ...]:
+    """Plays all rules with the first seeds, the better half with the next ones too, and so on.
+
+    Args:
+        scenario: Where.
+        domain: In which domain.
+        specs: Spellings of the rules.
+        seeds: The seeds of each rung.
+        duration_s: Length of an episode; None for the scenario's own.
+        workers: Simulations at a time; None for the number of cores; or an executor.
+        reporter: Shows progress.
+        title: What to call the work there.
+
+    Returns:
+        All rules: those of the last rung by their ATT, then those left behind before it, ....
+    """
+    played: dict[str, list[float]] = {spec: [] for spec in specs}
+    running, left = list(played), list[str]()
+    for rung, own in enumerate(seeds):
+        found = evaluate(
+            scenario,
+            {spec: RuleFactory(spec) for spec in running},
+            [domain],
+            own,
+            duration_s=duration_s,
+            workers=workers,
+            reporter=reporter,
+            title=title,
+        )
+        for spec in running:
+            played[spec] += found.values(spec, found.domains[0], "att_s").tolist()
+        running.sort(key=lambda spec: float(np.mean(played[spec])))  # stable: the first of equals
+        if rung + 1 < len(seeds):
+            kept = max(2, math.ceil(len(running) / 2))
+            running, left = running[:kept], running[kept:] + left
+    return tuple(
+        Trial(spec, float(np.mean(played[spec])), len(played[spec])) for spec in running + left
+    )
+
+
+@dataclass(frozen=True)
+class RuleFactory:
+    """Makes a controller by its spelling, such as ``"largest-queue:30"``."""
+
+    spec: str
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        """The controller for an environment."""
+        return controller_for(self.spec, env)
+
+
+@dataclass(frozen=True)
+class FixedPolicy:
+    """Always gives the same, stateless, policy."""
+
+    policy: Policy
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        """The policy."""
+        return self.policy
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """Gives a policy that was trained for the agents of an environment.
+
+    Attributes:
+        policy: It.
+        path: Where it was read, for the error.
+    """
+
+    policy: DQNPolicy
+    path: str
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        """The policy, if it fits."""
+        fitting = parallel_env(env.scenario, **self.policy.env_options)
+        if AgentSet.of(fitting) != self.policy.agents:
+            raise CheckpointError(
+                f"{self.path} was trained for other intersections than those of scenario "
+                f"{env.scenario.id!r}: its agents are {self.policy.agents}, here "
+                f"{AgentSet.of(fitting)}"
+            )
+        return self.policy
+
+
+def rule_factory(spec: str) -> PolicyFactory:
+    """A factory for a controller such as ``"largest-queue:30"``; the spelling is checked now."""
+    parse_spec(spec)
+    return RuleFactory(spec)
+
+
+def fixed_policy(policy: Policy) -> PolicyFactory:
+    """A factory that always gives the same, stateless, policy."""
+    return FixedPolicy(policy)
+
+
+def policy_factory(spec: str) -> PolicyFactory:
+    """A factory for what a user names: a rule, or the file of a trained policy.
+
+    Raises:
+        UnknownNameError: Neither a file nor a rule.
+        CheckpointError: The file is not a policy, or (when used) one of another scenario.
+    """
+    path = Path(spec)
+    if path.is_dir():
+        raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
+    if path.suffix != ".pt" and not path.is_file():
+        return rule_factory(spec)
+    return TrainedPolicy(DQNPolicy.load(path), str(path))
+
+
+def _pairs(
+    policies: Mapping[str, PolicyFactory], domains: Sequence[Domain]
+) -> list[tuple[str, Domain]]:
+    return [(name, domain) for name in policies for domain in domains]
+
+
+def _play(task: _Task, stop: Stop) -> list[Result]:
+    policy = task.make(task.world)
+    env = parallel_env(task.world.scenario, **policy.env_options)  # its domain is in its files
+    results: list[Result] = []
+    check = until(stop)
+    look = task.watch(task.name, task.world.domain, env) if task.watch is not None else check
+
+    def on_step(step: int) -> None:
+        check(step)
+        look(step)
+
+    try:
+        for seed in task.seeds:
+            persistently(lambda seed=seed: roll_out(env, policy, seed, on_step=on_step))
+            results.append(Result(task.name, task.world.domain, seed, env.scores()))
+    finally:
+        env.close()
+    return results

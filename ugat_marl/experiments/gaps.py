@@ -1,0 +1,75 @@
+"""Controllers x gaps: what each gap costs each controller, over all its domains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.effects import GAPS, NAMED
+from ugat_marl.experiments.scores import Estimate, Evaluation
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What a gap costs a controller.
+
+    Attributes:
+        cost: Mean over the gap's domains and the seeds, with an interval over seeds. For the
+            reward gap the cost of the domain's objective above that of the best controller there,
+            in %, for the others the travel time above that of the same controller in the first
+            domain, in s.
+        worst: The domain in which it is highest.
+        worst_cost: The mean there.
+    """
+
+    cost: Estimate
+    worst: str
+    worst_cost: float
+
+
+def gaps_of(found: Evaluation) -> dict[str, list[str]]:
+    """The gaps of an evaluation with those of its domains that open them; none is left empty."""
+    others = found.domains[1:]
+    listed = {
+        gap: [name for name in others if name in NAMED and NAMED[name].gap == gap] for gap in GAPS
+    }
+    return {gap: names for gap, names in listed.items() if names}
+
+
+def gap_matrix(found: Evaluation) -> dict[str, Mapping[str, Cell]]:
+    """For each controller what each gap costs it."""
+    gaps = gaps_of(found)
+    return {
+        policy: {gap: _cell(found, policy, gap, names) for gap, names in gaps.items()}
+        for policy in found.policies
+    }
+
+
+def _cell(found: Evaluation, policy: str, gap: str, domains: Sequence[str]) -> Cell:
+    costs = np.array(
+        [
+            _above_best(found, policy, name)
+            if gap == "reward"
+            else _above_first(found, policy, name)
+            for name in domains
+        ]
+    )
+    means = costs.mean(axis=1)
+    worst = int(means.argmax())
+    return Cell(Estimate.of(costs.mean(axis=0)), domains[worst], float(means[worst]))
+
+
+def _above_first(found: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
+    """Travel time above that in the first domain, seed by seed, in s."""
+    first = found.values(policy, found.domains[0], "att_s")
+    return found.values(policy, domain, "att_s") - first
+
+
+def _above_best(found: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
+    """Hidden cost above that of the best controller there, seed by seed, in %."""
+    best = min(found.policies, key=lambda name: float(found.values(name, domain, "cost").mean()))
+    least = found.values(best, domain, "cost")
+    return 100.0 * (found.values(policy, domain, "cost") / np.maximum(least, 1e-9) - 1.0)

@@ -1,0 +1,120 @@
+"""How much a scenario can tell controllers apart: the largest-queue rule, held long and short.
+
+Vehicles that start slowly are served better by longer greens. Where the rule that is best in
+simulation loses nothing in another domain, no transfer can win anything there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ugat_marl.effects import Domain
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments.evaluation import evaluate, rule_factory
+from ugat_marl.parallel import Workers
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios import Scenario
+
+DOMAINS = ("sim", "V1", "V2", "V3", "V4")
+HOLDS_S = (10, 20, 30, 40)
+SEEDS = (0, 1, 2, 3, 4)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One domain.
+
+    Attributes:
+        domain: Name of the domain.
+        att_s: Mean ATT over the seeds for each hold, in the order of the holds.
+        programme_att_s: Mean ATT of the network's own signal programme.
+        best_hold_s: The hold with the smallest ATT.
+        lost: ATT of the rule best in the first domain above that of the rule best here, as a
+            fraction of the latter.
+        finished: Share of the vehicles due that arrive under the rule best here.
+        backlog: Vehicles that never got in under the rule best here, mean over the seeds.
+    """
+
+    domain: str
+    att_s: tuple[float, ...]
+    programme_att_s: float
+    best_hold_s: int
+    lost: float
+    finished: float
+    backlog: float
+
+
+def headroom(
+    scenario: Scenario,
+    domains: Sequence[Domain] = DOMAINS,
+    holds_s: Sequence[int] = HOLDS_S,
+    seeds: Sequence[int] = SEEDS,
+    *,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+) -> list[Row]:
+    """ATT of the largest-queue rule in every domain for every hold.
+
+    Args:
+        scenario: Where.
+        domains: The first one is the domain the others are compared with.
+        holds_s: Shortest times a phase is kept, in s.
+        seeds: Seeds of the episodes.
+        workers: Simulations at a time; None for the number of cores; or an executor.
+        reporter: Shows progress.
+
+    Returns:
+        One row per domain.
+
+    Raises:
+        OptionError: No domain, hold or seed.
+    """
+    if not (domains and holds_s and seeds):
+        raise OptionError("headroom needs at least one domain, one hold and one seed")
+    rules = {hold_s: f"largest-queue:{hold_s}" for hold_s in holds_s}
+    names = [*rules.values(), "programme"]
+    found = evaluate(
+        scenario,
+        {name: rule_factory(name) for name in names},
+        domains,
+        seeds,
+        workers=workers,
+        reporter=reporter,
+    )
+
+    def mean(name: str, domain: str, measure: str) -> float:
+        return float(found.values(name, domain, measure).mean())
+
+    rows: list[Row] = []
+    for domain in found.domains:
+        att_s = {hold_s: mean(rule, domain, "att_s") for hold_s, rule in rules.items()}
+        best = min(att_s, key=lambda hold_s: att_s[hold_s])
+        reference = rows[0].best_hold_s if rows else best
+        rows.append(
+            Row(
+                domain,
+                tuple(att_s.values()),
+                mean("programme", domain, "att_s"),
+                best,
+                att_s[reference] / att_s[best] - 1,
+                mean(rules[best], domain, "throughput") / mean(rules[best], domain, "due"),
+                mean(rules[best], domain, "backlog"),
+            )
+        )
+    return rows
+
+
+def markdown(rows: Sequence[Row], holds_s: Sequence[int] = HOLDS_S) -> str:
+    """The rows as a table; the best hold of each domain is bold."""
+    head = ["ATT [s]", *(f"held {hold_s} s" for hold_s in holds_s), "own programme"]
+    head += [f"lost by the rule best in {rows[0].domain}", "arrived", "never got in"]
+    lines = [head, ["---", *["---:"] * (len(head) - 1)]]
+    for row in rows:
+        cells = [
+            f"**{att_s:.1f}**" if hold_s == row.best_hold_s else f"{att_s:.1f}"
+            for hold_s, att_s in zip(holds_s, row.att_s, strict=True)
+        ]
+        measures = [f"{row.lost:.0%}", f"{row.finished:.1%}", f"{row.backlog:.0f}"]
+        lines.append([row.domain, *cells, f"{row.programme_att_s:.1f}", *measures])
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + "\n"

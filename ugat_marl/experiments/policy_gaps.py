@@ -1,0 +1,171 @@
+"""What a correction is worth to those who train controllers: policies before and after it.
+
+A policy's travel time in the simulation is a promise. The gap is how far the promise is from what
+the policy does in the real world; a corrected scenario is good if its promise is closer, for
+policies it has never seen. That can only be said where the "real" world can be played in, that is,
+where it is a simulation itself.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.effects import Domain, describe, in_domain, load_scenario
+from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.experiments.evaluation import evaluate
+from ugat_marl.experiments.scores import Estimate, Evaluation
+from ugat_marl.files import write_whole
+from ugat_marl.parallel import Workers
+from ugat_marl.policies import PolicyFactory
+from ugat_marl.progress import Reporter, Silent
+from ugat_marl.scenarios import Scenario
+
+_FILE, _CORRECTED, _SCHEMA = "diagnosis.json", "corrected", "ugat-marl/diagnosis/"
+
+
+def policy_gap(
+    scenario: Scenario,
+    corrected: Domain | Scenario,
+    real: Domain,
+    policies: Mapping[str, PolicyFactory],
+    seeds: Sequence[int],
+    reporter: Reporter | None = None,
+    *,
+    duration_s: float | None = None,
+    workers: Workers = None,
+) -> dict[str, dict[str, Any]]:
+    """Plays policies in the simulation, the corrected one and the real world.
+
+    The demand and the seeds are the same in all three, but for what the correction changed about
+    the demand. Detector faults change no traffic and have no part in this.
+
+    Args:
+        scenario: The simulation as it was.
+        corrected: The same with the effects that were found.
+        real: The world the data came from.
+        policies: Name to factory.
+        seeds: Seeds of the episodes.
+        reporter: Shows progress.
+        duration_s: Length of an episode in s; None for the scenario's own.
+        workers: Simulations at a time, or who plays them (`executors`).
+
+    Returns:
+        For each policy ``sim``, ``corrected`` and ``real``: ATT in s as mean with Student's 95 %
+        interval ``low``, ``high`` (None for one seed); ``before`` and ``after``: |ATT(real) -
+        ATT(sim)| and |ATT(real) - ATT(corrected)| of the means, s; ``shrink``: 1 - after / before,
+        None where no gap is to be seen before (the interval of ATT(real) - ATT(sim), paired by
+        seed, holds 0).
+
+    Raises:
+        OptionError: The real world is the simulation, or there are no policies or seeds.
+        UnknownNameError: No such domain.
+        ScenarioError: A scenario named as a domain cannot be read or has other roads.
+    """
+    if not policies or not seeds:
+        raise OptionError("a policy gap needs at least one policy and one seed")
+    world = in_domain(scenario, real)
+    if world.hash == scenario.hash:
+        raise OptionError(f"real = {describe(real)!r} is the simulation itself; there is no gap")
+    repaired = corrected if isinstance(corrected, Scenario) else in_domain(scenario, corrected)
+    found: dict[str, Evaluation] = {}
+    for name, place in (("sim", scenario), ("corrected", repaired), ("real", world)):
+        found[name] = evaluate(
+            place,
+            policies,
+            ["sim"],
+            seeds,
+            duration_s=duration_s,
+            workers=workers,
+            reporter=reporter or Silent(),
+            title=f"policies in {'the real world' if name == 'real' else name}",
+        )
+    return {policy: _row(found, policy) for policy in policies}
+
+
+def _row(found: Mapping[str, Evaluation], policy: str) -> dict[str, Any]:
+    values = {name: item.values(policy, "sim", "att_s") for name, item in found.items()}
+    att = {name: Estimate.of(item) for name, item in values.items()}
+    before = abs(att["real"].mean - att["sim"].mean)
+    after = abs(att["real"].mean - att["corrected"].mean)
+    paired = Estimate.of(values["real"] - values["sim"])
+    unseen = before == 0 or paired.low <= 0 <= paired.high  # False for the nan of a single seed
+    return {
+        **{name: _as_dict(item) for name, item in att.items()},
+        "before": before,
+        "after": after,
+        "shrink": None if unseen else 1 - after / before,
+    }
+
+
+def _as_dict(estimate: Estimate) -> dict[str, float | None]:
+    values = asdict(estimate)
+    return {name: _or_none(values[name]) for name in ("mean", "low", "high")}
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[dict[str, Any], Scenario]:
+    """A diagnosis and the corrected scenario beside it.
+
+    Args:
+        directory: What `ugat_marl.diagnosis.workflow.diagnose` wrote to.
+        scenario: The scenario that was diagnosed.
+
+    Raises:
+        OptionError: The directory holds no diagnosis, one of another scenario, or one that
+            corrected nothing.
+        ScenarioError: The corrected scenario cannot be read.
+    """
+    file = directory / _FILE
+    try:
+        record: Any = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise OptionError(
+            f"{file}: cannot be read ({error}); name the directory of a diagnosis, "
+            "`ugat-marl diagnose SCENARIO MEASURED --out DIR`"
+        ) from None
+    if not isinstance(record, dict) or not str(record.get("schema")).startswith(_SCHEMA):
+        raise OptionError(f"{file}: not a diagnosis; its schema is not {_SCHEMA}...")
+    hashes = record.get("hashes")
+    if not isinstance(hashes, dict) or hashes.get("scenario") != scenario.hash:
+        raise OptionError(
+            f"{file}: the diagnosis of another scenario or another version of it "
+            f"({record.get('scenario')!r}), not of {scenario.id!r} as it is now"
+        )
+    if record.get("corrected") is None:
+        raise OptionError(
+            f"{file}: verdict {record.get('verdict')!r}: nothing was corrected, so there is "
+            "nothing to compare"
+        )
+    place = directory / _CORRECTED
+    if not (place / "scenario.toml").is_file():
+        raise ScenarioError(f"{place}: the corrected scenario is gone; diagnose again")
+    return record, load_scenario(place)
+
+
+def write_policy_gap(
+    directory: Path, record: Mapping[str, Any], gap: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Writes a diagnosis with its policy gap, whole or not at all, numbers to nine digits.
+
+    Returns:
+        What was written.
+    """
+    content = {**record, "policy_gap": _rounded(gap)}
+    text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
+    write_whole(directory / _FILE, text + "\n")
+    return content
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        items: Mapping[Any, Any] = value
+        return {key: _rounded(item) for key, item in items.items()}
+    return float(f"{value:.9g}") if isinstance(value, float) else value

@@ -1,0 +1,123 @@
+"""Where and when vehicles stand: halting vehicles per intersection and minute of an evaluation."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ugat_marl.envs import AnyParallelEnv
+from ugat_marl.errors import CheckpointError
+from ugat_marl.files import replacing
+from ugat_marl.policies import StepCallback
+
+QUEUES = "queues.parquet"
+_SCHEMA = {
+    "policy": pl.String,
+    "domain": pl.String,
+    "minute": pl.Int64,
+    "intersection": pl.String,
+    "queue": pl.Float64,
+    "looks": pl.Int64,
+}
+_PLACE = ["policy", "domain", "minute", "intersection"]
+
+
+@dataclass
+class _Sums:
+    intersections: tuple[str, ...]
+    queues: NDArray[np.float64]  # (minutes, intersections)
+    looks: NDArray[np.float64]  # (minutes,)
+
+
+class QueueRecord:
+    """Adds up halting vehicles on incoming lanes, minute by minute, over all episodes it sees."""
+
+    def __init__(self) -> None:
+        self._sums: dict[tuple[str, str], _Sums] = {}
+        self._lock = threading.Lock()
+
+    def watch(self, policy: str, domain: str, env: AnyParallelEnv) -> StepCallback:
+        """What `evaluation.evaluate` calls for each environment.
+
+        Args:
+            policy: Who plays in it.
+            domain: Which world it is in.
+            env: An environment of the suite, wrapped or not.
+
+        Returns:
+            What is to be called after every decision.
+        """
+        base: Any = env.unwrapped
+        lights = base.network.intersections
+        lanes = base.network.lane_table()
+        incoming = [lanes.indices(item.incoming_lanes) for item in lights]
+        places = np.concatenate(incoming)
+        starts = np.cumsum([0, *map(len, incoming)])[:-1]
+        interval_s = base.decision_interval_s
+        minutes = math.ceil(base.scenario.decisions * interval_s / 60)
+        names = tuple(item.id for item in lights)
+        with self._lock:
+            sums = self._sums.setdefault(
+                (policy, domain),
+                _Sums(names, np.zeros((minutes, len(names))), np.zeros(minutes)),
+            )
+
+        def look(step: int) -> None:
+            minute = math.ceil(step * interval_s / 60) - 1
+            queues = np.add.reduceat(base.snapshot.halting[places], starts)
+            with self._lock:
+                sums.queues[minute] += queues
+                sums.looks[minute] += 1
+
+        return look
+
+    def frame(self) -> pl.DataFrame:
+        """Columns policy, domain, minute (from 0), intersection, queue (mean, vehicles), looks."""
+        rows: list[tuple[str, str, int, str, float, int]] = []
+        with self._lock:
+            for (policy, domain), sums in self._sums.items():
+                for minute in np.flatnonzero(sums.looks).tolist():
+                    looks = int(sums.looks[minute])
+                    named = zip(sums.intersections, sums.queues[minute].tolist(), strict=True)
+                    rows += [(policy, domain, minute, t, q / looks, looks) for t, q in named]
+        return pl.DataFrame(rows, schema=_SCHEMA, orient="row")
+
+    def write(self, path: Path, *, keep: bool = False) -> None:
+        """Writes `frame` as Parquet, whole or not at all.
+
+        Args:
+            path: The file.
+            keep: Whether what is there already counts as well; a file that cannot be read does not.
+        """
+        frame = self.frame()
+        if keep and path.exists():
+            with contextlib.suppress(CheckpointError):
+                both = pl.concat([read_queues(path), frame]).group_by(_PLACE, maintain_order=True)
+                mean = (pl.col("queue") * pl.col("looks")).sum() / pl.col("looks").sum()
+                frame = both.agg(mean, pl.col("looks").sum())
+        with replacing(path) as temporary:
+            frame.write_parquet(temporary)
+
+
+def read_queues(path: Path) -> pl.DataFrame:
+    """Reads what `QueueRecord.write` wrote.
+
+    Raises:
+        CheckpointError: The file is missing, cut short or of another form.
+    """
+    try:
+        frame = pl.read_parquet(path)
+    except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(f"{path}: cannot be read ({reason})") from None
+    if frame.schema != pl.Schema(_SCHEMA):
+        raise CheckpointError(f"{path}: not the queues of a run")
+    return frame

@@ -1,0 +1,140 @@
+"""Domain randomisation: every episode in another world, drawn from the ranges of the effects.
+
+What a policy has met in training, the street may do as well: the rival of every method that looks
+at the street. The effects are those in which the paper's worlds V1 to V4 differ; the ranges are the
+hull of those worlds, of the simulation, and of what the diagnosis tries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pettingzoo.utils import BaseParallelWrapper
+
+from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
+from ugat_marl.effects import SETTINGS, Domain, Effect, in_domain
+from ugat_marl.envs import AgentSet, Begun, TrafficEnv, parallel_env
+from ugat_marl.errors import ScenarioError
+from ugat_marl.scenarios import Scenario
+from ugat_marl.seeding import numpy_generator
+
+NO_SOFTER = {"emergency_deceleration": "deceleration"}
+"""Who brakes in an emergency brakes at least as hard as usual."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """The values an effect is drawn from.
+
+    Attributes:
+        hypothesis: The effect, with its value left open.
+        low: Smallest value, in the effect's unit.
+        high: Largest value.
+    """
+
+    hypothesis: Hypothesis
+    low: float
+    high: float
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.hypothesis.name
+
+
+def effect_ranges(scenario: Scenario) -> tuple[Range, ...]:
+    """The ranges of the effects of V1 to V4 around a simulation.
+
+    Each holds the simulation's own value, those of V1 to V4, and those at which the diagnosis first
+    tries the effect (`discrepancy.hypotheses`).
+
+    Args:
+        scenario: The simulation; its vehicle types say where each number is now.
+    """
+    settings = [effect for effects in SETTINGS.values() for effect in effects]
+    found: list[Range] = []
+    for item in global_hypotheses(scenario, {effect.name for effect in settings}):
+        values = [level[0] for level in item.levels if level not in item.extreme]
+        values += [free_values(e, item)[0] for e in settings if e.name == item.name]
+        values += item.nominal or ()
+        found.append(Range(item, min(values), max(values)))
+    return tuple(found)
+
+
+def drawn(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
+    """The world of an episode: each value uniform in its range, independent of the others.
+
+    Args:
+        ranges: What to draw.
+        seed: Of the episode.
+    """
+    generator = numpy_generator(seed, "randomised")
+    values = {item.name: float(generator.uniform(item.low, item.high)) for item in ranges}
+    for name, least in NO_SOFTER.items():
+        if name in values and least in values:
+            values[name] = max(values[name], values[least])
+    return ordered([item.hypothesis.effect((values[item.name],)) for item in ranges])
+
+
+class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
+    """An environment whose every episode is in another world; `reset(seed)` decides which.
+
+    The simulation of one episode is ended before that of the next begins.
+
+    Args:
+        make_env: Makes an environment with these effects upon the simulation.
+        ranges: What the worlds are drawn from.
+    """
+
+    def __init__(
+        self, make_env: Callable[[tuple[Effect, ...]], TrafficEnv], ranges: Sequence[Range]
+    ) -> None:
+        super().__init__(make_env(()))
+        self._make_env = make_env
+        self._ranges = tuple(ranges)
+        self._agents = AgentSet.of(self.env)
+        self._generator = numpy_generator(0, "worlds")
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
+        """Starts an episode in a world of its own.
+
+        Args:
+            seed: Decides world and traffic; without it both follow from the seed before.
+            options: Not used.
+
+        Raises:
+            ScenarioError: The world has other agents than the simulation.
+        """
+        if seed is not None:
+            self._generator = numpy_generator(seed, "worlds")
+        else:
+            seed = int(self._generator.integers(2**31))
+        self.env.close()
+        effects = drawn(self._ranges, seed)
+        self.env = self._make_env(effects)
+        if AgentSet.of(self.env) != self._agents:
+            raise ScenarioError(
+                f"the world {self.env.domain} has other agents, observations or phases than the "
+                f"simulation: {AgentSet.of(self.env)}, not {self._agents}; draw effects on vehicles"
+            )
+        return self.env.reset(seed=seed, options=options)
+
+
+def randomised_env(
+    scenario: Scenario, options: Mapping[str, Any], sim: Domain = "sim"
+) -> RandomisedEnv:
+    """Worlds drawn around a simulation.
+
+    Args:
+        scenario: The network and its traffic.
+        options: Of the environments, see `EnvOptions`.
+        sim: The simulation, as a domain of the scenario.
+    """
+    simulation = in_domain(scenario, sim)
+
+    def make(effects: tuple[Effect, ...]) -> TrafficEnv:
+        return parallel_env(simulation, effects, **options)
+
+    return RandomisedEnv(make, effect_ranges(simulation))

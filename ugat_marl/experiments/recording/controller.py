@@ -1,0 +1,122 @@
+"""What a controller commands, which is what its cabinet logs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+import threading
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from xml.sax.saxutils import unescape
+
+from ugat_marl.envs import EnvOptions, TrafficEnv, parallel_env
+from ugat_marl.errors import SimulatorError
+from ugat_marl.files import parse_xml, xml_bytes
+from ugat_marl.policies import PolicyFactory, roll_out, until
+from ugat_marl.scenarios import Document, Network, Scenario, SignalLog, signals, sumo_program
+from ugat_marl.simulation import launch_of
+
+_STATE = re.compile(r'<tlsState time="([\d.]+)" id="([^"]*)" [^>]*?state="([^"]*)"')
+
+
+class _LoggingEnv(TrafficEnv):
+    """Keeps what its controller commands.
+
+    The plan is made by the same machine as the environment's own, and before anything on the
+    street may delay a green.
+    """
+
+    commanded: dict[str, list[tuple[float, str]]]
+
+    def _advance(self, requested: list[int]) -> None:
+        if self.options.signals == "actions":
+            for item, state, phase in zip(
+                self.network.intersections, self._states, requested, strict=True
+            ):
+                _, segments = signals.advance(
+                    item.phases, state, phase, self.decision_interval_s, self._timing
+                )
+                log = self.commanded[item.id]
+                since = self._snapshot.time_s
+                for duration, shown in segments:
+                    if not log or log[-1][1] != shown:
+                        log.append((round(since, 3), shown))
+                    since += duration
+        super()._advance(requested)
+
+
+def play(
+    scenario: Scenario, make: PolicyFactory, seed: int, stop: threading.Event
+) -> dict[str, SignalLog]:
+    """One episode; returns what was commanded."""
+    policy = make(parallel_env(scenario))
+    env = _LoggingEnv(scenario, "sim", EnvOptions.of(policy.env_options))
+    env.commanded = defaultdict(list)
+    try:
+        roll_out(env, policy, seed, on_step=until(stop))
+    finally:
+        env.close()
+    return {tls: tuple(log) for tls, log in env.commanded.items()}
+
+
+def own_programmes(
+    scenario: Scenario, network: Network, make: PolicyFactory
+) -> tuple[dict[str, SignalLog], tuple[str, ...]]:
+    """What the lights nobody commands show where that is fixed, and those where it is not.
+
+    SUMO itself says what a programme shows, without vehicles and without the effects of a domain.
+    """
+    policy = make(parallel_env(scenario))
+    own = set(network.uncontrolled)
+    if policy.env_options.get("signals") == "programme":
+        own |= {item.id for item in network.intersections}
+    if not own:
+        return {}, ()
+    kinds: dict[str, str] = {}
+    for document in (scenario.network, *scenario.additional):
+        for logic in parse_xml(document.read(), document.source).iter("tlLogic"):
+            kinds[logic.get("id", "")] = logic.get("type", "static")
+    fixed = sorted(tls for tls in own if kinds.get(tls, "static") == "static")
+    watched = tuple(sorted(own - set(fixed)))
+    if not fixed:
+        return {}, watched
+    begin, end = scenario.settings.begin_s, scenario.settings.duration_s
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+        directory = Path(name)
+        watching = switch_document(fixed, directory / "signals.xml")
+        empty = replace(scenario, routes=(), additional=(*scenario.additional, watching))
+        launch = launch_of(empty, 0, directory / "sumo", ())
+        launch.write()
+        command = [str(sumo_program("sumo")), *launch.arguments, "--end", repr(begin + end)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            said = " ".join(done.stderr.split())
+            raise SimulatorError(f"SUMO cannot run the signals of {scenario.id!r}: {said}")
+        return switches(directory / "signals.xml", begin + end), watched
+
+
+def switch_document(lights: Sequence[str], file: Path) -> Document:
+    """An additional file by which SUMO writes every change of some traffic lights."""
+    root = ET.Element("additional")
+    for tls in lights:
+        options = {"type": "SaveTLSSwitchStates", "source": tls, "dest": str(file)}
+        ET.SubElement(root, "timedEvent", options)
+    return Document("switches.add.xml", None, xml_bytes(root))
+
+
+def switches(file: Path, end_s: float) -> dict[str, SignalLog]:
+    """What lights showed, in SUMO's own words."""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SimulatorError(f"SUMO's signal states cannot be read ({error.strerror})") from None
+    logs: dict[str, list[tuple[float, str]]] = defaultdict(list)
+    for time, tls, state in _STATE.findall(text):
+        log = logs[unescape(tls)]
+        if float(time) < end_s and (not log or log[-1][1] != state):
+            log.append((float(time), state))
+    return {tls: tuple(log) for tls, log in logs.items()}

@@ -1,0 +1,302 @@
+"""Plays a policy in a domain, day after day, and keeps what the detectors of a street would see.
+
+Every period is another day: the vehicles are drawn again, the effects of the domain are added to
+that day, and the effects on detectors to what was seen of it. The signals that are logged are the
+ones the controller commands, as its cabinet logs them; what the lights on the street make of it
+shows only in the vehicles.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import math
+import os
+import tempfile
+import threading
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from ugat_marl.data import Measured, as_logged, split_periods
+from ugat_marl.effects import (
+    Domain,
+    Effect,
+    apply_effects,
+    detector_effects,
+    in_domain,
+    observed,
+    owners,
+    parked_at_other_times,
+    parse_domain,
+    scenario_of,
+)
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments.recording.controller import (
+    own_programmes,
+    play,
+    switch_document,
+    switches,
+)
+from ugat_marl.experiments.recording.tracks import per_lane, tracks
+from ugat_marl.policies import PolicyFactory
+from ugat_marl.progress import Advance, Reporter, Silent
+from ugat_marl.scenarios import (
+    Detector,
+    Document,
+    Network,
+    Passages,
+    Period,
+    Scenario,
+    SignalLog,
+    Split,
+    explicit,
+    redrawn,
+)
+from ugat_marl.seeding import derive_seed
+from ugat_marl.simulation import loops_document, read_loops, standard_detectors
+
+
+@dataclass(frozen=True)
+class _Street:
+    """What is the same on every day.
+
+    Attributes:
+        base: The scenario without the effects.
+        effects: What makes the domain out of it.
+        detectors: Detection zones.
+        programmes: Traffic lights that follow a fixed programme of their own, and what they show.
+        watched: Traffic lights whose own programme depends on the traffic.
+    """
+
+    base: Scenario
+    effects: tuple[Effect, ...]
+    detectors: tuple[Detector, ...]
+    programmes: Mapping[str, SignalLog]
+    watched: tuple[str, ...]
+    policy: PolicyFactory
+    seed: int
+    same_demand: bool
+    speeds: bool
+    lanes: bool
+    trajectories: bool
+
+
+@dataclass(frozen=True)
+class _Day:
+    """One period and, where asked for, its vehicles second by second."""
+
+    period: Period
+    lanes: pl.DataFrame | None
+    trajectories: pl.DataFrame | None
+
+
+def record(
+    scenario: Scenario,
+    domain: Domain,
+    policy: PolicyFactory,
+    *,
+    periods: int = 5,
+    seed: int = 0,
+    duration_s: float | None = None,
+    same_demand: bool = False,
+    detector_length_m: float = 0.0,
+    speeds: bool = True,
+    lanes: bool = False,
+    trajectories: bool = False,
+    workers: int | None = None,
+    reporter: Reporter | None = None,
+) -> Measured:
+    """Measures a domain as a street is measured. The same arguments give the same data.
+
+    Args:
+        scenario: The simulation.
+        domain: The world to measure.
+        policy: Who controls the signals there.
+        periods: Number of days; the last 40 % are held out.
+        seed: Root of the seeds of all days.
+        duration_s: Length of a day in s; None for the scenario's own.
+        same_demand: Whether every day has the scenario's own vehicles, not vehicles drawn again.
+        detector_length_m: Length of the detection zones; 0 for points.
+        speeds: Whether the detectors measure speeds and lengths.
+        lanes: Whether to keep vehicles, halting and mean speed per lane and second.
+        trajectories: Whether to keep the position of every vehicle at every second.
+        workers: Simulations at a time; None for the number of cores.
+        reporter: Shows progress.
+
+    Raises:
+        OptionError: Not a number of periods or workers, or an impossible length.
+        UnknownNameError: No such domain, effect or detector.
+        ScenarioError: The scenario cannot be simulated.
+        SimulatorError: SUMO failed.
+    """
+    if periods < 1 or (workers is not None and workers < 1):
+        raise OptionError(f"periods = {periods} and workers = {workers} must be at least 1")
+    if seed < 0 or not 0 <= detector_length_m < math.inf:
+        raise OptionError(
+            f"detector_length_m = {detector_length_m:g} and seed = {seed} must be 0 or more"
+        )
+    if duration_s is not None:
+        scenario = scenario.with_duration(duration_s)
+    base, effects = _world(explicit(scenario), domain)
+    if duration_s is not None:  # the domain may be another scenario
+        base = base.with_duration(duration_s)
+    network = Network.read(base)
+    detectors = tuple(_zone(item, detector_length_m) for item in standard_detectors(network))
+    empty = Period("", 0.0, 1.0, "fit", {}, {})
+    observed(empty, effects, detectors, owners(base, detectors))  # a wrong detector is an error now
+    fixed, watched = own_programmes(base, network, policy)
+    street = _Street(
+        explicit(base),
+        effects,
+        detectors,
+        fixed,
+        watched,
+        policy,
+        seed,
+        same_demand,
+        speeds,
+        lanes,
+        trajectories,
+    )
+    with (reporter or Silent()).task("measuring", periods) as advance:
+        days = _all_days(street, periods, workers or os.cpu_count() or 1, advance)
+    return Measured(
+        street.detectors,
+        tuple(day.period for day in days),
+        lanes=_together(day.lanes for day in days) if lanes else None,
+        trajectories=_together(day.trajectories for day in days) if trajectories else None,
+    )
+
+
+def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, ...]]:
+    """What days are drawn from, and what is added to each of them.
+
+    The effects of a scenario's own file are in its documents already, but for those on detectors.
+    """
+    changed = in_domain(scenario, domain)  # a wrong name is an error now
+    if scenario_of(domain) is not None:
+        return changed, detector_effects(changed)
+    return scenario, (*detector_effects(scenario), *parse_domain(domain))
+
+
+def _zone(detector: Detector, length_m: float) -> Detector:
+    """A zone that ends where the point was, and begins on the lane."""
+    begin = max(detector.position_m - length_m, 0.0)
+    return replace(
+        detector, position_m=round(begin, 2), length_m=round(detector.position_m - begin, 2)
+    )
+
+
+def _all_days(street: _Street, periods: int, workers: int, advance: Advance) -> list[_Day]:
+    """Threads suffice: the simulations run in processes of their own."""
+    stop = threading.Event()
+    pool = concurrent.futures.ThreadPoolExecutor(workers)
+    splits = split_periods(periods)
+    try:
+        days = [pool.submit(_day, street, i, split, stop) for i, split in enumerate(splits)]
+        left = set(days)
+        while left:  # wakes up now and then, so that Ctrl-C is heard
+            done, left = concurrent.futures.wait(
+                left, timeout=0.2, return_when=concurrent.futures.FIRST_COMPLETED
+            )
+            for day in done:
+                day.result()
+                advance()
+    finally:
+        stop.set()
+        pool.shutdown(cancel_futures=True)
+    return [day.result() for day in days]
+
+
+def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _Day:
+    """One day, from its vehicles to what was seen of them."""
+    scenario = street.base
+    if not street.same_demand:
+        scenario = redrawn(scenario, derive_seed(street.seed, "record", index, "demand"))
+        scenario = _renamed(scenario, derive_seed(street.seed, "record", index, "names"))
+    scenario = apply_effects(scenario, street.effects)
+    if not street.same_demand:
+        scenario = parked_at_other_times(
+            scenario, derive_seed(street.seed, "record", index, "parking")
+        )
+    begin = scenario.settings.begin_s
+    end = begin + scenario.decisions * scenario.control.decision_interval_s
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+        directory = Path(name)
+        watched = _with_outputs(scenario, street, directory)
+        commanded = play(
+            watched, street.policy, derive_seed(street.seed, "record", index, "simulation"), stop
+        )
+        passages = read_loops(directory / "loops.xml", street.detectors, begin, end)
+        shown = switches(directory / "signals.xml", end) if street.watched else {}
+        vehicles = None
+        if street.lanes or street.trajectories:
+            vehicles = tracks(directory / "vehicles.xml", f"day{index + 1}", begin, end)
+    period = Period(
+        f"day{index + 1}",
+        begin,
+        end,
+        split,
+        {**street.programmes, **shown, **commanded},
+        passages if street.speeds else {k: _without_speed(v) for k, v in passages.items()},
+    )
+    owner = owners(street.base, street.detectors)
+    period = _logged(observed(period, street.effects, street.detectors, owner))
+    lanes = None
+    if vehicles is not None and street.lanes:
+        lanes = per_lane(vehicles, street.detectors, period)
+    return _Day(period, lanes, vehicles if street.trajectories else None)
+
+
+def _renamed(scenario: Scenario, seed: int) -> Scenario:
+    """Other names for the vehicles of a day that was drawn again.
+
+    Effects choose vehicles by their names; on a street the trucks of two days are not the same
+    ones, and no model knows which they are.
+    """
+
+    def renamed(document: Document) -> Document:
+        content = document.read()
+        for quote in (b'"', b"'"):
+            start = b"<vehicle id=" + quote
+            content = content.replace(start, start + b"%08x." % seed)
+        return document.edited(content)
+
+    return replace(scenario, routes=tuple(map(renamed, scenario.routes)))
+
+
+def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scenario:
+    """The scenario with detectors, and with whatever else has to be watched."""
+    extra = [loops_document(street.detectors, None, directory / "loops.xml")]
+    if street.watched:
+        extra.append(switch_document(street.watched, directory / "signals.xml"))
+    settings = scenario.settings
+    if street.lanes or street.trajectories:
+        # A scenario file must not name outputs of SUMO; here one is wanted, in our own folder.
+        output = {
+            "fcd-output": str(directory / "vehicles.xml"),
+            "fcd-output.attributes": "id,lane,pos,speed",
+        }
+        settings = settings.model_copy(update={"sumo": {**settings.sumo, **output}})
+    return replace(scenario, additional=(*scenario.additional, *extra), settings=settings)
+
+
+def _logged(period: Period) -> Period:
+    """What the electronics of a street would have kept; empty detectors are left out."""
+    found = {
+        name: as_logged(passages, period.begin_s, period.end_s)
+        for name, passages in period.passages.items()
+    }
+    return replace(period, passages={name: x for name, x in found.items() if len(x)})
+
+
+def _without_speed(passages: Passages) -> Passages:
+    unknown = np.full(len(passages), np.nan)
+    return Passages(passages.on_s, passages.off_s, unknown, unknown)
+
+
+def _together(frames: Iterable[pl.DataFrame | None]) -> pl.DataFrame:
+    return pl.concat([frame for frame in frames if frame is not None])

@@ -1,0 +1,229 @@
+"""Scores of policies in domains, seed by seed, and what follows from them.
+
+The gap of a policy is its score in a domain minus its score in the first one, usually ``sim``, seed
+by seed. It mixes physics with policy: slow vehicles are slow under any policy. The regret is how
+far the policy is, in that domain, from the best policy known there; that part transfer can win
+back.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.data import MEASURES, Scores
+from ugat_marl.errors import CheckpointError
+from ugat_marl.experiments.statistics import Interval
+from ugat_marl.files import write_whole
+
+
+@dataclass(frozen=True)
+class Result:
+    """One episode.
+
+    Attributes:
+        policy: Name of the policy.
+        domain: Name of the domain.
+        seed: Seed of the episode.
+        scores: How it went.
+    """
+
+    policy: str
+    domain: str
+    seed: int
+    scores: Scores
+
+
+@dataclass(frozen=True)
+class Estimate(Interval):
+    """A mean over seeds with its interval, and the median."""
+
+    median: float
+
+    @classmethod
+    def of(cls, values: NDArray[np.float64]) -> Estimate:
+        """The estimate from one value per seed."""
+        found = Interval.of(values)
+        return cls(found.mean, found.low, found.high, float(np.median(values)))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All episodes of an evaluation.
+
+    Attributes:
+        scenario: Id of the scenario.
+        scenario_hash: Its hash.
+        results: One per policy, domain and seed.
+        notes: What else a reader must know, such as which rule was the best one.
+    """
+
+    scenario: str
+    scenario_hash: str
+    results: tuple[Result, ...]
+    notes: Mapping[str, str]
+
+    @property
+    def policies(self) -> list[str]:
+        """Names of the policies, in the order they were evaluated."""
+        return list(dict.fromkeys(result.policy for result in self.results))
+
+    @property
+    def domains(self) -> list[str]:
+        """Names of the domains, in the order they were evaluated."""
+        return list(dict.fromkeys(result.domain for result in self.results))
+
+    def values(self, policy: str, domain: str, measure: str) -> NDArray[np.float64]:
+        """One value per seed, in the order of the seeds."""
+        found = [r for r in self.results if r.policy == policy and r.domain == domain]
+        found.sort(key=lambda result: result.seed)
+        return np.array([_measured(result.scores, measure) for result in found])
+
+    def estimate(self, policy: str, domain: str, measure: str) -> Estimate:
+        """Mean and interval of a measure."""
+        return Estimate.of(self.values(policy, domain, measure))
+
+    def gap(self, policy: str, domain: str, measure: str) -> Estimate:
+        """The measure in `domain` minus that in the first domain, paired by seed."""
+        real = self.values(policy, domain, measure)
+        return Estimate.of(real - self.values(policy, self.domains[0], measure))
+
+    def regret(self, policy: str, domain: str) -> Estimate:
+        """ATT above that of the best policy evaluated in the domain, in s, paired by seed."""
+        best = min(self.policies, key=lambda name: self.estimate(name, domain, "att_s").mean)
+        mine = self.values(policy, domain, "att_s")
+        return Estimate.of(mine - self.values(best, domain, "att_s"))
+
+    def _hidden(self, domain: str) -> list[str]:
+        """What only a domain with an objective measures."""
+        played = (result.scores for result in self.results if result.domain == domain)
+        return list(dict.fromkeys(name for scores in played for name in scores.hidden))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, for JSON: the summary and every episode."""
+        summary: list[dict[str, Any]] = []
+        for policy in self.policies:
+            for domain in self.domains:
+                row: dict[str, Any] = {"policy": policy, "domain": domain}
+                for measure in MEASURES:
+                    row[measure] = asdict(self.estimate(policy, domain, measure))
+                    if domain != self.domains[0]:
+                        row[f"{measure}_gap"] = asdict(self.gap(policy, domain, measure))
+                for measure in self._hidden(domain):
+                    row[measure] = asdict(self.estimate(policy, domain, measure))
+                row["regret_s"] = asdict(self.regret(policy, domain))
+                summary.append(row)
+        return {
+            "scenario": self.scenario,
+            "scenario_hash": self.scenario_hash,
+            "notes": dict(self.notes),
+            "summary": summary,
+            "episodes": [
+                {"policy": r.policy, "domain": r.domain, "seed": r.seed, **asdict(r.scores)}
+                for r in self.results
+            ],
+        }
+
+    def write(self, path: Path) -> None:
+        """Writes `as_dict` as JSON, whole or not at all; what has no value is null."""
+        content = json.dumps(_without_nan(self.as_dict()), indent=1, allow_nan=False)
+        write_whole(path, content + "\n")
+
+    @classmethod
+    def read(cls, path: Path) -> Evaluation:
+        """Reads what `write` wrote; what is null there, or left out, has no value (nan).
+
+        Raises:
+            CheckpointError: The file is missing, cut short or of another form.
+        """
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            results = tuple(result_of(row) for row in content["episodes"])
+            notes = {str(key): str(text) for key, text in content["notes"].items()}
+            return cls(str(content["scenario"]), str(content["scenario_hash"]), results, notes)
+        except OSError as error:
+            raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from None
+        except json.JSONDecodeError as error:
+            raise CheckpointError(
+                f"{path}: no JSON at line {error.lineno} ({error.msg}); it may have been cut short"
+            ) from None
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            raise CheckpointError(
+                f"{path}: not the table of a run ({error!r}); it may have been cut short"
+            ) from None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One setting of a rule.
+
+    Attributes:
+        spec: Its spelling.
+        att_s: Mean ATT over its episodes.
+        episodes: How many it was given; those that fell behind have fewer.
+    """
+
+    spec: str
+    att_s: float
+    episodes: int
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """A rule with the best of its settings.
+
+    Attributes:
+        rule: Name of the rule.
+        domain: Name of the domain.
+        trials: Everything tried, the best one first.
+    """
+
+    rule: str
+    domain: str
+    trials: tuple[Trial, ...]
+
+    @property
+    def best(self) -> Trial:
+        """The setting that won."""
+        return self.trials[0]
+
+    @property
+    def episodes(self) -> int:
+        """Episodes played for it."""
+        return sum(trial.episodes for trial in self.trials)
+
+
+def result_of(row: Mapping[str, Any]) -> Result:
+    """An episode from its row in a record; what is null or left out has no value (nan)."""
+    numbers = {
+        item.name: _number(row.get(item.name)) for item in fields(Scores) if item.name != "hidden"
+    }
+    hidden = {str(name): _number(value) for name, value in (row.get("hidden") or {}).items()}
+    scores = Scores(**numbers, hidden=hidden)
+    return Result(str(row["policy"]), str(row["domain"]), int(row["seed"]), scores)
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _measured(scores: Scores, measure: str) -> float:
+    """A measure, also a hidden one; nan where that was not measured."""
+    if hasattr(scores, measure):
+        return getattr(scores, measure)
+    return scores.hidden.get(measure, math.nan)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value

@@ -1,0 +1,418 @@
+"""One experiment: train across the gap, judge in both worlds, say what was won."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from ugat_marl.data import Run, TransitionLog, write_settings
+from ugat_marl.effects import describe, in_domain, load_scenario
+from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
+from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
+from ugat_marl.experiments.evaluation import (
+    TUNING_SEED,
+    Watch,
+    best_rules,
+    evaluate,
+    fixed_policy,
+    rule_factory,
+)
+from ugat_marl.experiments.queues import QUEUES, QueueRecord
+from ugat_marl.experiments.randomised import randomised_env
+from ugat_marl.experiments.recipes import (
+    Control,
+    file_names,
+    further,
+    simulated_worlds,
+    train_control,
+)
+from ugat_marl.experiments.scores import Evaluation
+from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES, tuned_rules
+from ugat_marl.grounding import (
+    DIRECT_LEARNER,
+    PLACEBOS,
+    Placebo,
+    RandomDelays,
+    RecordedWorld,
+    ShuffledWorld,
+    State,
+    UgatConfig,
+    World,
+    answer_with_noise,
+    neighbours_of,
+    restore,
+    train_ugat,
+)
+from ugat_marl.parallel import Workers
+from ugat_marl.policies import (
+    DQN_NAME,
+    STANDARD_RULES,
+    DQNConfig,
+    DQNPolicy,
+    Policy,
+    PolicyFactory,
+    learner_factory,
+    require_device_name,
+    require_known,
+)
+from ugat_marl.progress import Reporter, Silent
+from ugat_marl.scenarios import Scenario
+
+EVALUATION_SEED = 1000
+"""First seed of the reported episodes; apart from those of training and of the search for rules."""
+
+DIRECT, UGAT, TIMED = "direct transfer", "UGAT", "UGAT, timed"
+CONTROL = "more plain sim"
+CORRECTED = "corrected sim"
+RANDOMISED = "domain randomisation"
+RANDOM_DELAY = "random delay"
+FINE_TUNED = "fine-tuned on the same data"
+ORACLE = "trained in real"
+
+ADDED = ("control", "further", "randomised", "random_delay_s", "fine_tuned", "oracle")
+"""Options that add policies to the table and change none of the others."""
+
+
+@dataclass(frozen=True)
+class TransferConfig:
+    """What to train, where, and how to judge it.
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        real: The real domain: V1..V4 or an alias, effect=value+..., or a scenario directory. "none"
+            with `real_log`: nothing but the log is known of the real world.
+        sim: The simulation to train in; "sim", or a domain like `real`.
+        real_log: Recorded transitions that take the place of roll-outs in the real domain.
+        seed: Root of every random choice in training.
+        observation: What agents see: count, queue, pressure, waiting, density, movements.
+        reward: What agents want: queue, pressure, waiting.
+        neighbours: How many roads away intersections are seen too.
+        duration_s: Length of an episode in s; default: the scenario's own.
+        evaluation_seeds: Episodes behind every number of the table.
+        tuning_seeds: Episodes behind the choice of the best rule.
+        rule_budget: Tune every rule in every domain with up to so many episodes before the best is
+            chosen; without it the rules are taken with their usual settings.
+        control: Also train as many further episodes in plain sim, for comparison.
+        further: Domains in which direct transfer is trained on as long as the control is, for one
+            policy each: "late_green=*,3" is a constant delay of all greens, "V4" is fine-tuning in
+            the real domain itself.
+        corrected: A corrected simulation, as `ugat-marl diagnose` writes it, or any other domain: a
+            further policy is trained there from scratch, for as many episodes as UGAT in all.
+        randomised: Also train from scratch, for as many episodes as UGAT in all, each of them in a
+            world drawn from the ranges of the effects.
+        random_delay_s: Also train direct transfer on, as long as the control, while greens begin
+            late by random whole seconds up to this.
+        fine_tuned: Also train direct transfer on in the real domain, for as many episodes as UGAT
+            sees of it.
+        oracle: Also train from scratch in the real domain, for as many episodes as UGAT in all.
+        placebo: A negative control, with which grounding must do nothing: "same-world" takes D_real
+            from the simulation, "shuffled" deals out anew what followed in D_real, "noise" puts
+            noise in the place of f.
+        learner: What learns: dqn, the suite's own; or a baseline (docs/learner.md).
+        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; the
+            parts of a tuple are divided by commas.
+        device: Where dqn's updates and the fits of f and h are computed: cpu, cuda, or cuda:N.
+        ugat: Settings of the algorithm.
+        dqn: Settings of dqn.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    real: str = "V4"
+    sim: str = "sim"
+    real_log: Path | None = None
+    seed: int = 0
+    observation: str = "count"
+    reward: str = "queue"
+    neighbours: int = 0
+    duration_s: float | None = None
+    evaluation_seeds: int = 5
+    tuning_seeds: int = 2
+    rule_budget: int | None = None
+    control: bool = True
+    further: tuple[str, ...] = ()
+    corrected: str | None = None
+    randomised: bool = False
+    random_delay_s: int | None = None
+    fine_tuned: bool = False
+    oracle: bool = False
+    placebo: Placebo = "none"
+    learner: str = DQN_NAME
+    learner_settings: tuple[str, ...] = ()
+    device: str = "cpu"
+    ugat: Annotated[UgatConfig, arg(name="")] = field(default_factory=UgatConfig)
+    dqn: DQNConfig = field(default_factory=DQNConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("evaluation_seeds", "tuning_seeds"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if self.rule_budget is not None and self.rule_budget < LEAST_BUDGET:
+            raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
+        if describe(self.real) == describe(self.sim) and self.placebo != "same-world":
+            raise OptionError(
+                f"real = {self.real!r} is the simulation itself; name another domain, such as V4, "
+                'or ask for the placebo "same-world"'
+            )
+        if len({describe(domain) for domain in self.further}) < len(self.further):
+            raise OptionError(f"further holds one twice: {' '.join(self.further)}")
+        if self.corrected is not None and describe(self.corrected) == describe(self.sim):
+            raise OptionError(
+                f"corrected = {self.corrected!r} is the simulation itself; name the scenario that "
+                "`ugat-marl diagnose` wrote, or another domain"
+            )
+        if self.real == "none" and self.real_log is None:
+            raise OptionError('real = "none" needs a real_log: something must be known of the real')
+        self._refuse_impossible_controls()
+
+    def _refuse_impossible_controls(self) -> None:
+        require_known(self.learner)
+        require_device_name(self.device)
+        if self.placebo not in PLACEBOS:
+            raise UnknownNameError("placebo", self.placebo, PLACEBOS)
+        if self.placebo == "same-world" and self.real_log is not None:
+            raise OptionError('the placebo "same-world" takes the place of a real_log; give one')
+        if self.random_delay_s is not None and self.random_delay_s < 1:
+            raise OptionError(f"random_delay_s = {self.random_delay_s}: must be at least 1")
+        for name in ("fine_tuned", "oracle"):
+            if getattr(self, name) and len(self.domains) < 2:
+                raise OptionError(f"{name} needs a real domain to train in, not {self.real!r}")
+        for who, acts in (("fine_tuned", self.fine_tuned), ("timed match", self.ugat.matches)):
+            if acts and self.real_log is not None:
+                raise OptionError(f"{who} acts in the real domain, which a real_log does not allow")
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Options of every environment of the experiment."""
+        return {
+            "observation": self.observation,
+            "reward": self.reward,
+            "neighbours": self.neighbours,
+            "duration_s": self.duration_s,
+        }
+
+    @property
+    def domains(self) -> list[str]:
+        """The domains the policies are judged in."""
+        only = self.real == "none" or describe(self.real) == describe(self.sim)
+        return [self.sim] if only else [self.sim, self.real]
+
+    @property
+    def episodes(self) -> int:
+        """Episodes that UGAT trains for in all, and so do the control and corrected sim."""
+        return self.ugat.pretrain_episodes + self.ugat.iterations * self.ugat.grounded_episodes
+
+
+def transfer(
+    config: TransferConfig,
+    directory: Path,
+    *,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+    workers: Workers = None,
+) -> Evaluation:
+    """Trains by UGAT, evaluates, and leaves everything in `directory`.
+
+    Args:
+        config: What to do.
+        directory: Folder of the run; ``table.json``, ``metrics.parquet``, ``policies``,
+            TensorBoard files, checkpoints and what `ugat-marl report` shows go there.
+        resume: Go on with the run in the folder.
+        reporter: Shows progress.
+        workers: An executor for roll-outs and the search for rules; the rest is played here.
+    """
+    reporter = reporter or Silent()
+    make = learner_factory(config.learner, config.learner_settings, config.dqn, config.device)
+    scenario = load_scenario(config.scenario)
+    env = parallel_env(scenario, config.sim, **config.env_options)
+    recorded: RecordedWorld | None = None
+    if config.real_log is not None:
+        log = TransitionLog.read(config.real_log)
+        every = config.ugat.fit.held_out_every
+        recorded = RecordedWorld(log, env, every)  # refuses a misfit before anything is written
+        _say_if_from_elsewhere(log, config, reporter)
+    controls = _controls(config, scenario, env)
+    learner = make(env, config.seed)
+    transform = config.ugat.transform(env.layouts, config.seed, neighbours_of(env))
+    if config.placebo == "noise":
+        answer_with_noise(transform.forward, config.seed)
+    run = Run(directory, _identity(config, scenario, env, controls), resume, reporter)
+    write_settings(directory, asdict(config))
+    try:
+        state = State(learner, transform)
+        restore(state, run, DQNPolicy.load)
+        policy = _train(config, scenario, env, recorded, state, run, workers)
+        assert state.direct is not None  # plain training comes first
+        policies: dict[str, Policy] = {DIRECT: state.direct}
+        if config.ugat.iterations:
+            policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
+        direct = directory / DIRECT_LEARNER
+        for control in controls:
+            policies[control.name] = train_control(control, make, config.seed, run, direct)
+    finally:
+        for made in (env, *(control.env for control in controls)):
+            made.close()
+        run.close()
+    for file, trained in zip(file_names(policies), policies.values(), strict=True):
+        if isinstance(trained, DQNPolicy):
+            trained.save(directory / "policies" / f"{file}.pt")
+    queues = QueueRecord()
+    table = judge(config, scenario, policies, reporter, queues.watch, workers)
+    queues.write(directory / QUEUES)
+    table.write(directory / "table.json")
+    return table
+
+
+def _say_if_from_elsewhere(log: TransitionLog, config: TransferConfig, reporter: Reporter) -> None:
+    recorded = log.provenance.domain
+    if config.real != "none" and recorded != describe(config.real):
+        reporter.say(
+            f"note: the real log was recorded in {recorded!r}, the policies are judged in "
+            f"{describe(config.real)!r}"
+        )
+
+
+def judge(
+    config: TransferConfig,
+    scenario: Scenario,
+    policies: Mapping[str, Policy],
+    reporter: Reporter,
+    watch: Watch | None = None,
+    workers: Workers = None,
+) -> Evaluation:
+    """Evaluates policies beside the rules that are best in each domain, which `workers` find."""
+    seeds = [TUNING_SEED + k for k in range(config.tuning_seeds)]
+    options: Any = {"duration_s": config.duration_s, "reporter": reporter, "workers": workers}
+    if config.rule_budget is None:
+        rules = best_rules(scenario, config.domains, seeds=seeds, **options)
+        searched = ", ".join(STANDARD_RULES)
+    else:
+        rules = tuned_rules(scenario, config.domains, config.rule_budget, seeds=seeds, **options)
+        searched = f"{', '.join(TUNED_RULES)}; each tuned with up to {config.rule_budget} episodes"
+    factories: dict[str, PolicyFactory] = {
+        name: fixed_policy(policy) for name, policy in policies.items()
+    }
+    for rule in rules.values():
+        factories.setdefault(f"rule {rule}", rule_factory(rule))
+    return evaluate(
+        scenario,
+        factories,
+        config.domains,
+        [EVALUATION_SEED + k for k in range(config.evaluation_seeds)],
+        duration_s=config.duration_s,
+        reporter=reporter,
+        notes={
+            **{f"best rule in {domain}": rule for domain, rule in rules.items()},
+            "rules searched": searched,
+            "training seed": str(config.seed),
+            **({} if config.learner == DQN_NAME else {"learner": config.learner}),
+            **({} if config.corrected is None else {CORRECTED: describe(config.corrected)}),
+        },
+        watch=watch,
+    )
+
+
+def _train(
+    config: TransferConfig,
+    scenario: Scenario,
+    env: TrafficEnv,
+    recorded: RecordedWorld | None,
+    state: State,
+    run: Run,
+    workers: Workers,
+) -> Policy:
+    def probe(policy: Policy) -> dict[str, float]:
+        """ATT after each iteration, on a seed that is not reported."""
+        found = evaluate(
+            scenario,
+            {"policy": fixed_policy(policy)},
+            config.domains,
+            [TUNING_SEED],
+            duration_s=config.duration_s,
+        )
+        return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
+
+    street = config.sim if recorded or config.placebo == "same-world" else config.real
+    sim, street_world = simulated_worlds(
+        scenario, config.sim, street, config.ugat, config.env_options, workers
+    )
+    real: World = recorded or street_world
+    if config.placebo == "shuffled":
+        real = ShuffledWorld(real)
+    try:
+        how = config.ugat, config.seed, run, probe, config.device
+        return train_ugat(state, env, sim, real, *how)
+    finally:
+        sim.close()
+        real.close()
+
+
+def _controls(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> list[Control]:
+    """The policies asked for beside UGAT's; their environments are not started."""
+
+    def world(option: str, domain: str) -> TrafficEnv:
+        return _other_env(config, scenario, env, option, domain)
+
+    plain, whole = config.ugat.pretrain_episodes, config.episodes
+    found: list[Control] = []
+    if config.control:
+        title = "control: more plain sim"
+        found.append(Control(CONTROL, env, whole, file="control-learner.pt", title=title))
+    found += [further(describe(d), world("further", d), whole) for d in config.further]
+    if config.random_delay_s is not None:
+        late = RandomDelays(world("sim", config.sim), config.random_delay_s)
+        found.append(Control(f"{RANDOM_DELAY} 0-{config.random_delay_s} s", late, whole))
+    if config.fine_tuned:
+        seen = config.ugat.iterations * config.ugat.real_rollouts
+        found.append(Control(FINE_TUNED, world("real", config.real), plain + seen))
+    if config.randomised:
+        worlds = randomised_env(scenario, config.env_options, config.sim)
+        found.append(Control(RANDOMISED, worlds, whole, from_direct=False))
+    if config.corrected is not None:
+        made = world("corrected", config.corrected)
+        file = "corrected-learner.pt"
+        found.append(Control(CORRECTED, made, whole, from_direct=False, file=file))
+    if config.oracle:
+        made = world("real", config.real)
+        found.append(Control(ORACLE, made, whole, from_direct=False, file="oracle-learner.pt"))
+    return found
+
+
+def _other_env(
+    config: TransferConfig, scenario: Scenario, sim: TrafficEnv, option: str, domain: str
+) -> TrafficEnv:
+    """Another domain to train in; its policies must fit the others' worlds."""
+    env = parallel_env(scenario, domain, **config.env_options)
+    if AgentSet.of(env) != AgentSet.of(sim):
+        raise ScenarioError(
+            f"{option} = {domain!r} has other agents, observations or phases than "
+            f"scenario {scenario.id!r}: {AgentSet.of(env)}, not {AgentSet.of(sim)}; take a "
+            "corrected scenario of this one"
+        )
+    return env
+
+
+def _identity(
+    config: TransferConfig, scenario: Scenario, env: TrafficEnv, controls: Sequence[Control]
+) -> dict[str, Any]:
+    settings = {**asdict(config), "dqn": config.dqn.identity, "ugat": config.ugat.identity}
+    for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", "device", "corrected", *ADDED):
+        settings.pop(other)
+    if config.placebo == "none":  # runs from before there were any can be resumed
+        settings.pop("placebo")
+    if config.learner == DQN_NAME:  # the same
+        del settings["learner"], settings["learner_settings"]
+    log = config.real_log  # the same if its content is, wherever it lies
+    settings["real_log"] = hashlib.sha256(log.read_bytes()).hexdigest() if log else None
+    hashes = {"sim": env.scenario.hash}
+    if config.real != "none":
+        hashes["real"] = in_domain(scenario, config.real).hash
+    for control in controls:
+        if control.name == CORRECTED:
+            corrected: Any = control.env
+            hashes["corrected"] = corrected.scenario.hash  # the same, wherever it lies
+    return {**settings, "scenario_hash": hashes, "domains": [describe(d) for d in config.domains]}

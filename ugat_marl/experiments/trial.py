@@ -1,0 +1,184 @@
+"""A scenario tried out: does its traffic get in and through, and can controllers be told apart?"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from ugat_marl.experiments.evaluation import evaluate, rule_factory
+from ugat_marl.experiments.headroom import DOMAINS, HOLDS_S, Row, headroom
+from ugat_marl.files import chunks_of, scan_xml
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios import Scenario, Survey, drives, run, sumo_program
+from ugat_marl.simulation import launch_of
+
+TRIPS = "trips.xml"
+"""What the simulator calls SUMO's report on its vehicles."""
+
+RULES = ("programme", "largest-queue:20")
+MUCH_WORSE = 1.5
+"""A rule that takes so many times as long as the programme has phases it cannot work with."""
+_NAMED = 5
+MOST_BACKLOG = 0.01
+"""Share of the vehicles due that may be left outside under the better rule."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """How an episode went under a rule, in sim.
+
+    Attributes:
+        rule: The rule.
+        att_s: Average travel time of all vehicles due, s.
+        due: Vehicles due.
+        departed: Vehicles that got in.
+        arrived: Vehicles that reached their goal.
+        backlog: Vehicles left outside at the end.
+    """
+
+    rule: str
+    att_s: float
+    due: int
+    departed: int
+    arrived: int
+    backlog: int
+
+
+def try_out(
+    scenario: Scenario, seed: int, workers: int | None, reporter: Reporter
+) -> tuple[Run, ...]:
+    """One episode under each of `RULES`."""
+    found = evaluate(
+        scenario,
+        {name: rule_factory(name) for name in RULES},
+        ("sim",),
+        (seed,),
+        workers=workers,
+        reporter=reporter,
+        title="an episode for each rule",
+    )
+
+    def value(rule: str, measure: str) -> float:
+        return float(found.values(rule, "sim", measure)[0])
+
+    measures = ("due", "departed", "throughput", "backlog")
+    return tuple(
+        Run(rule, round(value(rule, "att_s"), 1), *(int(value(rule, name)) for name in measures))
+        for rule in RULES
+    )
+
+
+def measured_headroom(
+    scenario: Scenario, seeds: int, workers: int | None, reporter: Reporter
+) -> list[Row]:
+    """ATT of the largest-queue rule, held long and short, in every domain."""
+    return headroom(
+        scenario, DOMAINS, HOLDS_S, tuple(range(seeds)), workers=workers, reporter=reporter
+    )
+
+
+def is_full(runs: Sequence[Run]) -> bool:
+    """Whether too many vehicles stay outside under every rule."""
+    return bool(runs) and all(run.backlog > MOST_BACKLOG * run.due for run in runs)
+
+
+def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
+    """At which roads vehicles wait at the end under the network's own programme.
+
+    Raises:
+        ScenarioError: SUMO refused; holds its words.
+    """
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+        directory = Path(name) / "run"
+        launch = launch_of(scenario, seed, directory, ())
+        launch.write()
+        end_s = scenario.settings.begin_s + scenario.settings.duration_s
+        run("sumo", [str(sumo_program("sumo")), *launch.arguments, "--end", repr(end_s)])
+        waiting = {
+            item.attributes.get("id", "")
+            for item in scan_xml(chunks_of(directory / TRIPS), "SUMO's report")
+            if item.name == "tripinfo" and float(item.attributes.get("depart", "-1")) < 0
+        }
+    all_drives = drives(scenario, routed=False)
+    return Counter(edges[0] for who, _, edges in all_drives if who in waiting and edges)
+
+
+def problems(
+    facts: Survey, runs: Sequence[Run], outside: Mapping[str, int] | None = None
+) -> list[str]:
+    """What has to be mended before training makes sense, each with the way out.
+
+    Args:
+        facts: What was looked at.
+        runs: What was tried.
+        outside: From `left_outside`, if it was asked.
+    """
+    found: list[str] = []
+    for item in facts.intersections:
+        if item.unserved_lanes:
+            found.append(
+                f"traffic light {item.id!r}: no phase gives green to the lanes "
+                f'{", ".join(item.unserved_lanes)}; use phases = "conflict-free" or list them'
+            )
+        elif item.unserved_links:
+            found.append(
+                f"traffic light {item.id!r}: never green: {', '.join(item.unserved_links)}; "
+                "vehicles that turn there block their lane"
+            )
+        if item.clashes:
+            found.append(
+                f"traffic light {item.id!r}: people on foot have green while vehicles that cross "
+                f"their way need not wait ({'; '.join(item.clashes)}); write g for these vehicles"
+            )
+    if facts.duration_s < facts.shortest_episode_s:
+        found.append(
+            f"an episode of {facts.duration_s:g} s is shorter than the shortest useful one "
+            f"({facts.shortest_episode_s:g} s); set duration_s"
+        )
+    if text := _unsuited(facts, runs):
+        found.append(text)
+    if runs:
+        best = min(runs, key=lambda run: run.backlog)
+        if is_full(runs):
+            roads = Counter(outside or {}).most_common(_NAMED)
+            where = "; they wait at " + ", ".join(f"{road} ({n})" for road, n in roads)
+            found.append(
+                f"{best.backlog} of {best.due} vehicles cannot enter even under {best.rule}"
+                f"{where if roads else ''}; lower the demand, or look at what blocks these roads"
+            )
+    return found
+
+
+def _unsuited(facts: Survey, runs: Sequence[Run]) -> str:
+    """A rule far behind the programme, where phases serve lanes in part."""
+    lanes = sum(len(item.partly_served) for item in facts.intersections)
+    att_s = {run.rule: run.att_s for run in runs}
+    if not lanes or any(rule not in att_s for rule in RULES):
+        return ""
+    programme_s, rule_s = (att_s[rule] for rule in RULES)
+    if rule_s <= MUCH_WORSE * programme_s:
+        return ""
+    return (
+        f"{RULES[1]} takes {rule_s:g} s where the programme takes {programme_s:g} s, and {lanes} "
+        "lanes are served in part by some phase: whoever waits there for another phase blocks the "
+        'lane; phases = "permitted" serves whole lanes'
+    )
+
+
+def as_json(
+    facts: Survey,
+    runs: Sequence[Run],
+    rows: Sequence[Row] | None,
+    wrong: Sequence[str],
+    outside: Mapping[str, int] | None = None,
+) -> dict[str, object]:
+    """Everything as plain values."""
+    found: dict[str, object] = asdict(facts)
+    found["runs"] = [asdict(run) for run in runs]
+    found["headroom"] = None if rows is None else [asdict(row) for row in rows]
+    found["left_outside"] = dict(outside or {})
+    found["problems"] = list(wrong)
+    return found

@@ -1,0 +1,214 @@
+"""The best settings of the rules in a domain, found by racing them, and remembered.
+
+A rule has one or two parameters that act in whole decisions, so that a handful of values each is
+all there is to try; what costs is that one episode says little. So the settings are raced:
+successive halving (Jamieson and Talwalkar 2016) plays all of them a little and the better half
+on, with the same seeds for all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.data import version_of
+from ugat_marl.effects import Domain, describe, in_domain
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race
+from ugat_marl.experiments.scores import Trial, Tuned
+from ugat_marl.files import user_cache, write_whole
+from ugat_marl.parallel import Workers
+from ugat_marl.policies import NAMES, RULES, spell
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios import Scenario
+
+VERSION = 1
+"""Rises whenever the rules or the race change, so that what was remembered no longer holds."""
+
+BUDGET = 24
+"""Episodes in which one rule is tuned."""
+
+LEAST_BUDGET = 2
+"""One episode each of two settings."""
+
+TUNED_RULES = tuple(name for name in NAMES if name != "random")
+"""The rules a search for the best one tunes."""
+
+UNTUNED_EPISODES = 3
+"""At most so many episodes of a rule that has nothing to tune."""
+
+
+def tune(
+    name: str,
+    scenario: Scenario,
+    domain: Domain = "sim",
+    budget: int = BUDGET,
+    *,
+    duration_s: float | None = None,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+    fresh: bool = False,
+) -> Tuned:
+    """The settings of a rule with the smallest mean ATT in a domain.
+
+    All combinations of the values in the rule's `RULES` entry are raced on seeds from
+    `TUNING_SEED` on, which no result is reported on. If the budget does not pay for all, they are
+    thinned out evenly.
+
+    Args:
+        name: Name of the rule, without parameters.
+        scenario: Where.
+        domain: The domain to tune it in.
+        budget: Most episodes to play.
+        duration_s: Length of an episode; None for the scenario's own.
+        workers: Simulations at a time; None for the number of cores; or an executor.
+        reporter: Shows progress.
+        fresh: Play again though the result is remembered. It is kept in the user's cache folder
+            for the same scenario, domain, rule, values, budget and versions.
+
+    Raises:
+        UnknownNameError: No rule of this name.
+        OptionError: A budget below 2.
+    """
+    if name not in RULES:
+        raise UnknownNameError("controller", name, NAMES)
+    if budget < LEAST_BUDGET:
+        raise OptionError(f"budget = {budget}: must be at least {LEAST_BUDGET} episodes")
+    specs = settings_of(name, budget)
+    place = _place(name, scenario, domain, budget, duration_s, specs)
+    if not fresh and (trials := _recall(place, specs)):
+        return Tuned(name, describe(domain), trials)
+    trials = race(
+        scenario,
+        domain,
+        specs,
+        rungs(len(specs), budget),
+        duration_s=duration_s,
+        workers=workers,
+        reporter=reporter,
+        title=f"tuning {name}",
+    )
+    write_whole(place, json.dumps([asdict(trial) for trial in trials], indent=1) + "\n")
+    return Tuned(name, describe(domain), trials)
+
+
+def tuned_rules(
+    scenario: Scenario,
+    domains: Sequence[Domain],
+    budget: int = BUDGET,
+    *,
+    names: Sequence[str] = TUNED_RULES,
+    seeds: Sequence[int] = (TUNING_SEED, TUNING_SEED + 1),
+    duration_s: float | None = None,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+) -> dict[str, str]:
+    """For each domain the best rule, each rule with the settings that are best there.
+
+    As `ugat_marl.experiments.evaluation.best_rules`, but the rules are tuned before they are raced.
+
+    Returns:
+        Name of the domain to the spelling of the rule.
+    """
+    found: dict[str, str] = {}
+    for domain in domains:
+        tuned = [
+            tune(
+                name,
+                scenario,
+                domain,
+                budget,
+                duration_s=duration_s,
+                workers=workers,
+                reporter=reporter,
+            )
+            for name in names
+        ]
+        found |= best_rules(
+            scenario,
+            [domain],
+            rules=[each.best.spec for each in tuned],
+            seeds=seeds,
+            duration_s=duration_s,
+            workers=workers,
+            reporter=reporter,
+        )
+    return found
+
+
+def rungs(settings: int, budget: int) -> list[list[int]]:
+    """The seeds of each rung of a race: new ones, with about the same number of episodes in each.
+
+    Args:
+        settings: How many take part.
+        budget: Most episodes in all, and enough for one each in every rung.
+    """
+    if settings < 2:
+        return [[TUNING_SEED + k for k in range(min(budget, UNTUNED_EPISODES))]]
+    fields = _fields(settings)
+    found: list[list[int]] = []
+    following, left = TUNING_SEED, budget
+    for rung, field in enumerate(fields):
+        share = left / (len(fields) - rung)
+        payable = left - sum(fields[rung + 1 :])
+        episodes = max(1, int(min(share, payable) // field))
+        found.append([following + k for k in range(episodes)])
+        following += episodes
+        left -= episodes * field
+    return found
+
+
+def settings_of(name: str, budget: int) -> list[str]:
+    """The spellings of a rule that a budget pays to race: the usual one, others spread evenly."""
+    rule = RULES[name]
+    values = itertools.product(*(parameter.choices for parameter in rule.parameters))
+    specs = [spell(name, list(each)) for each in values]
+    many = len(specs)
+    while many > 1 and sum(_fields(many)) > budget:
+        many -= 1
+    kept = [(2 * k + 1) * len(specs) // (2 * many) for k in range(many)]
+    usual = specs.index(spell(name, [parameter.default for parameter in rule.parameters]))
+    kept[min(range(many), key=lambda k: abs(kept[k] - usual))] = usual
+    return [specs[k] for k in kept]
+
+
+def _fields(settings: int) -> list[int]:
+    """How many take part in each rung: half of those before, down to two."""
+    fields = [settings]
+    while fields[-1] > 2:
+        fields.append(math.ceil(fields[-1] / 2))
+    return fields
+
+
+def _place(
+    name: str,
+    scenario: Scenario,
+    domain: Domain,
+    budget: int,
+    duration_s: float | None,
+    specs: Sequence[str],
+) -> Path:
+    """The file that remembers a result; whatever could change the result changes its name."""
+    world = in_domain(scenario, domain)
+    if duration_s is not None:
+        world = world.with_duration(duration_s)
+    sumo = version_of("eclipse-sumo")
+    content = (VERSION, sumo, scenario.hash, world.hash, name, budget, TUNING_SEED, *specs)
+    return user_cache("tuned") / f"{hashlib.sha256(repr(content).encode()).hexdigest()}.json"
+
+
+def _recall(place: Path, specs: Sequence[str]) -> tuple[Trial, ...] | None:
+    """What was remembered; None if nothing was, or what lies there is not such a result."""
+    try:
+        rows: Any = json.loads(place.read_text(encoding="utf-8"))
+        trials = tuple(Trial(str(r["spec"]), float(r["att_s"]), int(r["episodes"])) for r in rows)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    whole = sorted(trial.spec for trial in trials) == sorted(specs)
+    return trials if whole and all(math.isfinite(trial.att_s) for trial in trials) else None

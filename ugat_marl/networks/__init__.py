@@ -1,1 +1,0 @@
-"""Road networks from anywhere: made, imported, looked at and drawn."""

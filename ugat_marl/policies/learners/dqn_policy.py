@@ -1,0 +1,179 @@
+"""The greedy policy a DQN learner hands out: networks frozen at one moment."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ugat_marl.data import read_checkpoint, write_checkpoint
+from ugat_marl.envs import Actions, AgentSet, Infos, Observations
+from ugat_marl.errors import CheckpointError
+from ugat_marl.policies.devices import CPU
+from ugat_marl.policies.learners.q_network import Held, greedy_actions, q_network
+from ugat_marl.policies.learners.structure import Structure, structure_in
+
+_KIND = "ugat_marl.dqn_policy"
+
+
+class DQNPolicy:
+    """Takes every agent's allowed action of highest Q.
+
+    Args:
+        agents: The agents it acts for.
+        hidden: Sizes of the hidden layers of each network.
+        parameters: All parameters as one vector, as `flatten_parameters` orders them; copied, to
+            the CPU.
+        env_options: Options of the environment the policy relies on.
+        shared: Whether all agents share one network.
+        structure: What a network other than "mlp" knows of the intersections.
+        ceiling: What the numbers of an observation are held below, ``(agents,
+            widest_observation)``; None takes them as they are. See `DQNConfig.ceiling`.
+
+    Raises:
+        ValueError: `parameters` or `ceiling` are those of other networks.
+    """
+
+    def __init__(
+        self,
+        agents: AgentSet,
+        hidden: tuple[int, ...],
+        parameters: Tensor | NDArray[np.float32],
+        env_options: Mapping[str, Any],
+        shared: bool = False,
+        structure: Structure | None = None,
+        ceiling: Tensor | NDArray[np.float32] | None = None,
+    ) -> None:
+        self.agents = agents
+        self.hidden = hidden
+        self.shared = shared
+        self.structure = structure
+        self.env_options: Mapping[str, Any] = dict(env_options)
+        self._network = q_network(agents, hidden, shared, torch.Generator(), structure)
+        vector = torch.as_tensor(parameters).detach().to(CPU, copy=True)
+        needed = sum(parameter.numel() for parameter in self._network.parameters())
+        if vector.shape != (needed,):
+            raise ValueError(f"parameters of shape {tuple(vector.shape)}, needed: ({needed},)")
+        nn.utils.vector_to_parameters(vector, self._network.parameters())
+        self._network.requires_grad_(False)
+        self._ceiling = None
+        if ceiling is not None:
+            self._ceiling = torch.as_tensor(ceiling, dtype=torch.float32).to(CPU, copy=True)
+            wanted = (len(agents), agents.widest_observation)
+            if self._ceiling.shape != wanted:
+                raise ValueError(f"a ceiling of shape {tuple(self._ceiling.shape)}, not {wanted}")
+            self._network = Held(self._network, self._ceiling)
+
+    @property
+    def parameters(self) -> NDArray[np.float32]:
+        """All parameters as one vector (a copy)."""
+        return nn.utils.parameters_to_vector(self._network.parameters()).numpy().copy()
+
+    @property
+    def ceiling(self) -> NDArray[np.float32] | None:
+        """What observations are held below, ``(agents, widest_observation)`` (a copy)."""
+        return None if self._ceiling is None else self._ceiling.numpy().copy()
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget: the policy is deterministic and has no memory."""
+
+    def q_values(self, observations: Observations) -> dict[str, NDArray[np.float32]]:
+        """Every agent's Q of every one of its actions, ``(actions,)`` (in scaled reward)."""
+        values = self._network(torch.from_numpy(self.agents.stack(observations)).unsqueeze(1))
+        rows = zip(self.agents.names, self.agents.action_counts, values.squeeze(1), strict=True)
+        return {name: row[:count].numpy() for name, count, row in rows}
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """The greedy action of every agent.
+
+        Raises:
+            OptionError: The observations are not of the agents this policy was trained for, or not
+                finite.
+        """
+        stacked = torch.from_numpy(self.agents.stack(observations))
+        allowed = torch.from_numpy(self.agents.masks(infos))
+        return self.agents.actions(greedy_actions(self._network, stacked, allowed))
+
+    def save(self, path: Path) -> None:
+        """Writes the policy to one file; `load` reads it."""
+        content = header(self.agents, self.hidden, self.env_options, self.shared, self.structure)
+        content["parameters"] = torch.from_numpy(self.parameters)
+        if self._ceiling is not None:
+            content["ceiling"] = self._ceiling
+        write_checkpoint(path, _KIND, content)
+
+    @classmethod
+    def load(cls, path: Path) -> DQNPolicy:
+        """Reads a saved policy.
+
+        Raises:
+            CheckpointError: Missing, cut short, not finite, or not a policy.
+        """
+        content = read_checkpoint(path, _KIND)
+        try:
+            agents, hidden, env_options, shared = parse_header(content)
+            structure = structure_in(content, agents)
+            own = (agents, hidden, content["parameters"], env_options, shared, structure)
+            return cls(*own, content.get("ceiling"))
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise CheckpointError(f"{path}: not a whole policy ({error}); save it again") from None
+
+    def __reduce__(self) -> tuple[type[DQNPolicy], tuple[Any, ...]]:
+        # numpy, since torch would send tensors between processes through shared memory
+        own = (self.agents, self.hidden, self.parameters, self.env_options, self.shared)
+        return DQNPolicy, (*own, self.structure, self.ceiling)
+
+
+def header(
+    agents: AgentSet,
+    hidden: tuple[int, ...],
+    env_options: Mapping[str, Any],
+    shared: bool,
+    structure: Structure | None = None,
+) -> dict[str, Any]:
+    """What a checkpoint says about itself.
+
+    Raises:
+        CheckpointError: An option of the environment is not plain data (a callable, say).
+    """
+    try:
+        options = json.dumps(dict(env_options), sort_keys=True)
+    except TypeError as error:
+        raise CheckpointError(
+            f"env_options {dict(env_options)!r} cannot be saved ({error}); keep to plain data"
+        ) from None
+    return {
+        "agents": list(agents.names),
+        "observation_sizes": list(agents.observation_sizes),
+        "action_counts": list(agents.action_counts),
+        "hidden": list(hidden),
+        "env_options": options,
+        "shared": shared,
+        **({} if structure is None else {"structure": structure.written()}),
+    }
+
+
+def parse_header(
+    content: Mapping[str, Any],
+) -> tuple[AgentSet, tuple[int, ...], dict[str, Any], bool]:
+    """Agents, hidden sizes, environment options and `shared` out of what `header` made."""
+    agents = AgentSet(
+        tuple(content["agents"]),
+        tuple(content["observation_sizes"]),
+        tuple(content["action_counts"]),
+    )
+    sizes = agents.observation_sizes, agents.action_counts
+    hidden = tuple(int(width) for width in content["hidden"])
+    if {len(agents)} != {len(each) for each in sizes} or min(*sizes[0], *sizes[1], *hidden) < 1:
+        raise ValueError("its agents or the sizes of its layers are no network's")
+    options = cast(dict[str, Any], json.loads(content["env_options"]))
+    shared = content.get("shared", False)  # older files do not have it
+    if not isinstance(shared, bool):
+        raise TypeError(f"shared = {shared!r} is not a bool")
+    return agents, hidden, options, shared

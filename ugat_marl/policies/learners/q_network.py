@@ -1,0 +1,124 @@
+"""The networks behind Q: one for every agent, or one that all agents share."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ugat_marl.envs import AgentSet
+from ugat_marl.policies.batched import BatchedMLP
+from ugat_marl.policies.devices import CPU
+from ugat_marl.policies.learners.colight import CoLight
+from ugat_marl.policies.learners.frap import FRAP
+from ugat_marl.policies.learners.shared_mlp import SharedMLP
+from ugat_marl.policies.learners.structure import Structure
+
+
+def q_network(
+    agents: AgentSet,
+    hidden: Sequence[int],
+    shared: bool,
+    generator: torch.Generator,
+    structure: Structure | None = None,
+) -> nn.Module:
+    """Observations ``(agents, batch, widest_observation)`` to the values of actions, padded."""
+    if structure is not None and structure.network == "colight":
+        return CoLight(agents, structure.neighbours, hidden, generator)
+    if structure is not None:
+        return FRAP(agents, structure.junctions, hidden, generator)
+    if shared:
+        n_in, n_out = agents.widest_observation, agents.most_actions
+        return SharedMLP(len(agents), n_in, hidden, n_out, generator)
+    return BatchedMLP(agents.observation_sizes, hidden, agents.most_actions, generator)
+
+
+class Held(nn.Module):
+    """Networks that are told of no number more than its ceiling, ``(agents, width)``."""
+
+    ceiling: Tensor
+
+    def __init__(self, network: nn.Module, ceiling: Tensor) -> None:
+        super().__init__()
+        self.network = network
+        self.register_buffer("ceiling", ceiling.unsqueeze(1))
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Values of observations ``(agents, batch, width)``, as of the networks themselves."""
+        return self.network(torch.minimum(observations, self.ceiling))
+
+
+def greedy_actions(network: nn.Module, stacked: Tensor, allowed: Tensor) -> NDArray[np.int64]:
+    """Allowed action of highest value for one observation of every agent, ``(agents,)``."""
+    with torch.no_grad():
+        values = network(stacked.unsqueeze(1)).squeeze(1)
+        return values.masked_fill(~allowed, -torch.inf).argmax(dim=1).numpy()
+
+
+def flatten_parameters(module: nn.Module) -> nn.Parameter:
+    """Moves all parameters of `module`, and their gradients, into one vector each.
+
+    The module computes on views of the vector, so that the optimiser and the target network's
+    update are single operations over all agents and layers.
+    """
+    parameters = list(module.parameters())
+    flat = nn.Parameter(nn.utils.parameters_to_vector(parameters).detach().clone())
+    flat.grad = torch.zeros_like(flat)
+    start = 0
+    for parameter in parameters:
+        end = start + parameter.numel()
+        parameter.data = flat.data[start:end].view_as(parameter)
+        parameter.grad = flat.grad[start:end].view_as(parameter)
+        start = end
+    return flat
+
+
+def reading_unscaled(network: nn.Module, factors: Tensor) -> Tensor:
+    """Parameters with which `network` computes from x what its own make of ``x * factors``.
+
+    Args:
+        network: Its first weights, ``(..., n_in, n_out)``, are those that observations meet.
+        factors: ``(widest_observation,)`` or ``(agents, widest_observation)``; one for all agents
+            where they share a network.
+
+    Returns:
+        All of them as one vector, as `flatten_parameters` orders them.
+    """
+    named = list(network.named_parameters())
+    first = next(name for name, _ in named if name.endswith("weight"))  # (..., n_in, n_out)
+    factor = factors.unsqueeze(-1)
+    return nn.utils.parameters_to_vector(p * factor if name == first else p for name, p in named)
+
+
+class Acting:
+    """The networks that choose actions in training, on the CPU wherever others learn.
+
+    On the CPU they are the learning ones themselves; elsewhere copies, brought up to date when
+    weights have changed since they were last asked for.
+
+    Args:
+        online: The networks that learn.
+        weights: Their parameters, as `flatten_parameters` left them.
+    """
+
+    def __init__(self, online: nn.Module, weights: nn.Parameter) -> None:
+        self._network, self._weights, self._learnt = online, weights, weights
+        self._updates = -1
+        if weights.device != CPU:
+            self._network = copy.deepcopy(online).to(CPU)
+            self._weights = flatten_parameters(self._network)
+
+    def network(self, updates: int) -> nn.Module:
+        """The networks after so many updates."""
+        if self._weights is not self._learnt and self._updates != updates:
+            self._weights.data.copy_(self._learnt.data)
+            self._updates = updates
+        return self._network
+
+    def forget(self) -> None:
+        """Weights were put in place otherwise than by an update."""
+        self._updates = -1

@@ -1,0 +1,227 @@
+"""Learners by name: the suite's own DQN, and the files of baselines/, loaded when they are used.
+
+A baseline is a file that offers a learner, called as ``Learner(env, config, seed)``, and a
+dataclass of its settings. Its policies are `DQNPolicy`, so that all of ``ugat-marl`` reads them.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from types import ModuleType
+from typing import Any, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from ugat_marl.data import version_of
+from ugat_marl.envs import AnyParallelEnv
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.policies.learners.dqn_config import DQNConfig
+from ugat_marl.policies.protocols import Learner
+
+LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
+"""Makes a fresh learner for the agents of an environment, its initial weights drawn from a seed."""
+
+DQN_NAME = "dqn"
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Where a learner is kept.
+
+    Attributes:
+        file: File of baselines/, without its suffix.
+        learner: Class in it.
+        config: Dataclass of its settings.
+        extra: Extra of the package that brings what it imports; "" for none.
+        library: Distribution that does the work; "" for none.
+        settings: What its name says, in place of the defaults.
+    """
+
+    file: str
+    learner: str
+    config: str
+    extra: str = ""
+    library: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+BASELINES: Mapping[str, Baseline] = {
+    "ippo": Baseline("ippo", "IPPO", "IPPOConfig"),
+    "mappo": Baseline("ippo", "IPPO", "IPPOConfig", settings={"centralised": True}),
+    "sb3-ppo": Baseline(
+        "sb3", "SB3", "SB3Config", "sb3", "stable-baselines3", {"algorithm": "ppo"}
+    ),
+    "sb3-dqn": Baseline(
+        "sb3", "SB3", "SB3Config", "sb3", "stable-baselines3", {"algorithm": "dqn"}
+    ),
+    "maskable-ppo": Baseline(
+        "sb3", "SB3", "SB3Config", "sb3", "sb3-contrib", {"algorithm": "maskable-ppo"}
+    ),
+    "supersuit-ppo": Baseline(
+        "supersuit_ppo", "SuperSuitPPO", "SuperSuitConfig", "sb3", "supersuit"
+    ),
+    "torchrl-mappo": Baseline(
+        "torchrl_mappo", "TorchRLMAPPO", "TorchRLConfig", "torchrl", "torchrl"
+    ),
+    "skrl-ippo": Baseline("skrl_ippo", "Skrl", "SkrlConfig", "skrl", "skrl"),
+    "skrl-mappo": Baseline(
+        "skrl_ippo", "Skrl", "SkrlConfig", "skrl", "skrl", {"centralised": True}
+    ),
+    "qmix": Baseline(
+        "benchmarl_task",
+        "BenchMARL",
+        "BenchMARLConfig",
+        "benchmarl",
+        "benchmarl",
+        {"algorithm": "qmix"},
+    ),
+    "vdn": Baseline(
+        "benchmarl_task",
+        "BenchMARL",
+        "BenchMARLConfig",
+        "benchmarl",
+        "benchmarl",
+        {"algorithm": "vdn"},
+    ),
+    "rllib-ppo": Baseline("rllib_ppo", "RLlib", "RLlibConfig", "rllib", "ray"),
+}
+
+
+def learner_factory(
+    name: str,
+    settings: Sequence[str] = (),
+    dqn: DQNConfig | None = None,
+    device: str = "cpu",
+) -> LearnerFactory:
+    """What makes the learners a user names; its library is imported here.
+
+    Args:
+        name: "dqn", or one of `BASELINES`.
+        settings: Of a baseline, as ``NAME=VALUE``; the parts of a tuple are divided by commas.
+        dqn: Settings of "dqn".
+        device: Where "dqn" computes its updates (`devices.device_of`); baselines stay on the CPU.
+
+    Raises:
+        UnknownNameError: No such learner, or no such setting.
+        OptionError: A value is impossible, or the library is not installed, or there is no such
+            device.
+    """
+    from ugat_marl.policies.devices import device_of
+
+    require_known(name)
+    place = device_of(device)
+    if name == DQN_NAME:
+        if settings:
+            raise OptionError(f"learner settings {' '.join(settings)}: those of dqn are --dqn.*")
+        from ugat_marl.policies.learners.dqn import DQN
+
+        return lambda env, seed: DQN.of(env, dqn, seed, device=place)
+    config = _baseline_config(name, settings)
+    make = getattr(load_baseline(name), BASELINES[name].learner)
+    return lambda env, seed: make(env, config, seed)
+
+
+def settings_of(name: str) -> dict[str, Any]:
+    """The settings a learner has unless others are given.
+
+    Raises:
+        OptionError: Its library is not installed.
+    """
+    if name == DQN_NAME:
+        return DQNConfig().identity
+    return asdict(_baseline_config(name, ()))
+
+
+def _baseline_config(name: str, settings: Sequence[str]) -> Any:
+    baseline = BASELINES[name]
+    kind = getattr(load_baseline(name), baseline.config)
+    return _configured(kind, baseline.settings, settings, name)
+
+
+def require_known(name: str) -> None:
+    """Refuses the name of a learner that does not exist.
+
+    Raises:
+        UnknownNameError: It is neither "dqn" nor one of `BASELINES`.
+    """
+    if name != DQN_NAME and name not in BASELINES:
+        raise UnknownNameError("learner", name, (DQN_NAME, *BASELINES))
+
+
+def library_of(name: str) -> str:
+    """The library that does a learner's work, with its version; "" for the suite's own learners."""
+    library = _library(name)
+    return library and f"{library} {version_of(library) or '-'}"
+
+
+def is_installed(name: str) -> bool:
+    """Whether a learner's library is; the suite's own learners need none."""
+    return not _library(name) or bool(version_of(_library(name)))
+
+
+def _library(name: str) -> str:
+    return BASELINES[name].library if name in BASELINES else ""
+
+
+def load_baseline(name: str) -> ModuleType:
+    """The module of a baseline; the same object at each call.
+
+    Raises:
+        OptionError: Its library is not installed.
+    """
+    baseline = BASELINES[name]
+    path = baselines_folder() / f"{baseline.file}.py"
+    module_name = f"ugat_marl_baseline_{baseline.file}"
+    if module_name in sys.modules:
+        return sys.modules[module_name]
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise OptionError(f"learner {name!r}: {path} is missing; install the package again")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[module_name]
+        missing = str(getattr(error, "name", "")).partition(".")[0]
+        if not isinstance(error, ModuleNotFoundError) or missing == "ugat_marl":
+            raise
+        raise OptionError(
+            f"learner {name!r} needs {missing}, which is not installed; run "
+            f"pip install 'ugat-marl[{baseline.extra}]', or in a checkout "
+            f"pip install -c constraints-baselines.txt -e '.[{baseline.extra}]'"
+        ) from None
+    return module
+
+
+def baselines_folder() -> Path:
+    """The baselines: beside the package in a checkout, inside it in a wheel."""
+    package = Path(__file__).resolve().parents[2]
+    inside = package / "_baselines"
+    return inside if inside.is_dir() else package.parent / "baselines"
+
+
+def _configured(kind: Any, preset: Mapping[str, Any], given: Sequence[str], name: str) -> Any:
+    """The dataclass of settings with those of the name, then those of the user."""
+    hints = get_type_hints(kind)
+    names = [item.name for item in fields(kind) if item.name not in preset]
+    values = dict(preset)
+    for item in given:
+        key, equals, text = item.partition("=")
+        key = key.replace("-", "_")
+        if not equals or not text:
+            raise OptionError(f"learner setting {item!r}: must be NAME=VALUE")
+        if key not in names:
+            raise UnknownNameError(f"setting of {name}", key, names)
+        whole = text.split(",") if "tuple" in str(hints[key]) else text
+        value = None if text.lower() == "none" else whole
+        try:
+            values[key] = TypeAdapter(hints[key]).validate_python(value)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"]
+            raise OptionError(f"learner setting {item!r}: {reason}") from None
+    return kind(**values)

@@ -1,0 +1,206 @@
+"""What networks with structure know of the intersections: movements and phases, or neighbours.
+
+Plain numbers, so that a saved policy needs neither network file nor environment.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from ugat_marl.data import AgentLayout
+from ugat_marl.envs import AgentSet, AnyParallelEnv
+from ugat_marl.errors import OptionError
+from ugat_marl.policies.learners.dqn_config import NetworkName
+from ugat_marl.scenarios import GREEN, Intersection, Link, Network, turn_of
+
+MOST_NEIGHBOURS = 5
+"""Intersections that one attends to beside itself, where more are a road away."""
+
+Places = tuple[int, ...]
+"""Places in an observation whose numbers are added up, or positions of agents."""
+
+
+@dataclass(frozen=True)
+class Junction:
+    """One agent's intersection.
+
+    Attributes:
+        movements: For each movement and each kind of number (vehicles, or halting, vehicles and
+            vehicles beyond), its places in the observation.
+        greens: For each phase, the share of each movement's links that it gives green.
+        first_phase: Place in the observation where the one-hot of the current phase begins.
+    """
+
+    movements: tuple[tuple[Places, ...], ...]
+    greens: tuple[tuple[float, ...], ...]
+    first_phase: int
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A network by its name, and the intersections it computes for.
+
+    Attributes:
+        network: As in `DQNConfig`; "mlp" needs none.
+        junctions: For "frap", one for each agent, in their order.
+        neighbours: For "colight", the positions of each agent's neighbours among the agents.
+    """
+
+    network: NetworkName
+    junctions: tuple[Junction, ...] = ()
+    neighbours: tuple[Places, ...] = ()
+
+    @classmethod
+    def of(cls, env: AnyParallelEnv, network: NetworkName) -> Structure | None:
+        """The intersections of an environment of the suite; None for "mlp".
+
+        Raises:
+            OptionError: Another environment, or observations put together by a wrapper where
+                movements are looked for in them.
+        """
+        if network == "mlp":
+            return None
+        base: Any = env.unwrapped
+        roads, observation = getattr(base, "network", None), getattr(base, "env_options", {})
+        if not isinstance(roads, Network) or "observation" not in observation:
+            raise OptionError(
+                f"network {network!r} reads {_READ[network]} from the road network, which "
+                f"{base} does not have; use an environment of ugat_marl.parallel_env, or the "
+                "network 'mlp'"
+            )
+        agents = AgentSet.of(env)
+        if network == "colight":
+            return cls(network, neighbours=_neighbours(agents, base.intersection_of, roads))
+        layouts: Mapping[str, AgentLayout] = base.layouts
+        own = [layouts.get(name) for name in agents.names]
+        for name, size, layout in zip(agents.names, agents.observation_sizes, own, strict=True):
+            if layout is None or layout.size != size:
+                raise OptionError(
+                    f"the observation of agent {name!r} has {size} numbers, its intersection's has "
+                    f"{layout.size if layout else 0}: network {network!r} cannot tell what they "
+                    "are; leave wrappers of observations away, or use the network 'mlp'"
+                )
+        halves = observation["observation"] == "movements"
+        rows = zip(roads.intersections, [x for x in own if x is not None], strict=True)
+        return cls(network, tuple(_junction(item, layout, halves) for item, layout in rows))
+
+    def checked(self, agents: AgentSet) -> Structure:
+        """Itself.
+
+        Raises:
+            ValueError: It is not one of these agents.
+        """
+        if self.network == "mlp" or (self.junctions and self.neighbours):
+            raise ValueError(f"network {self.network!r} with movements or neighbours it has not")
+        if self.network == "colight":
+            self._check_neighbours(len(agents))
+        else:
+            self._check_junctions(agents)
+        return self
+
+    def _check_neighbours(self, agents: int) -> None:
+        if len(self.neighbours) != agents:
+            raise ValueError(f"neighbours of {len(self.neighbours)} agents for {agents}")
+        for position, near in enumerate(self.neighbours):
+            if len({position, *near}) != 1 + len(near) or not {*near} <= {*range(agents)}:
+                raise ValueError(f"agent {position} of {agents} has the neighbours {near}")
+
+    def _check_junctions(self, agents: AgentSet) -> None:
+        if len(self.junctions) != len(agents):
+            raise ValueError(f"{len(self.junctions)} intersections for {len(agents)} agents")
+        kinds = {len(kinds) for junction in self.junctions for kinds in junction.movements}
+        if len(kinds) != 1:
+            raise ValueError(f"movements with {sorted(kinds)} kinds of numbers")
+        sizes = zip(self.junctions, agents.observation_sizes, agents.action_counts, strict=True)
+        for junction, size, actions in sizes:
+            places = [at for kinds in junction.movements for kind in kinds for at in kind]
+            places += [junction.first_phase, junction.first_phase + actions - 1]
+            shares = [share for row in junction.greens for share in row]
+            widths = {len(row) for row in junction.greens}
+            if (
+                not all(0 <= at < size for at in places)
+                or len(junction.greens) != actions
+                or widths != {len(junction.movements)}
+                or not all(0 <= share <= 1 for share in shares)
+            ):
+                raise ValueError(f"{junction} is none of {size} numbers and {actions} phases")
+
+    def written(self) -> dict[str, Any]:
+        """As plain lists, for a checkpoint."""
+        return asdict(self)
+
+
+_READER = TypeAdapter(Structure)
+_READ: Mapping[NetworkName, str] = {"frap": "movements and phases", "colight": "neighbours"}
+
+
+def structure_in(content: Mapping[str, Any], agents: AgentSet) -> Structure | None:
+    """What `Structure.written` left in a checkpoint; None if there is none.
+
+    Raises:
+        ValueError: Broken, or of other agents.
+    """
+    if "structure" not in content:
+        return None
+    return _READER.validate_python(content["structure"]).checked(agents)
+
+
+def _neighbours(
+    agents: AgentSet, light_of: Mapping[str, str], roads: Network
+) -> tuple[Places, ...]:
+    """The nearest intersections one road away from each agent's, as positions of agents."""
+    if {*light_of} != {*agents.names}:
+        raise OptionError(
+            f"network 'colight' does not know the intersections of {', '.join(agents.names[:4])}; "
+            "leave wrappers that rename agents away, or use the network 'mlp'"
+        )
+    at = {light_of[name]: position for position, name in enumerate(agents.names)}
+    items = [roads.intersection(light_of[name]) for name in agents.names]
+
+    def metres(item: Intersection, other: int) -> float:
+        return math.dist(item.position, items[other].position)
+
+    return tuple(
+        tuple(sorted((at[n] for n in item.neighbours), key=partial(metres, item))[:MOST_NEIGHBOURS])
+        for item in items
+    )
+
+
+def _junction(item: Intersection, layout: AgentLayout, halves: bool) -> Junction:
+    """The movements of an intersection; `halves`: halting and moving, and what is beyond, apart."""
+    movements: dict[tuple[str, str], list[Link]] = {}
+    for link in item.links:
+        movements.setdefault((link.from_edge, turn_of(link)), []).append(link)
+    greens = {
+        name: tuple(
+            sum(phase[link.index] in GREEN for link in links) / len(links) for phase in item.phases
+        )
+        for name, links in movements.items()
+    }
+    # what every phase treats alike, a right turn with green throughout, competes with nothing
+    told = [name for name, shares in greens.items() if len(set(shares)) > 1] or list(greens)
+    return Junction(
+        movements=tuple(_places(item, movements[name], halves) for name in told),
+        greens=tuple(zip(*(greens[name] for name in told), strict=True)),
+        first_phase=layout.features,
+    )
+
+
+def _places(item: Intersection, links: Sequence[Link], halves: bool) -> tuple[Places, ...]:
+    """Where in the features the lanes of a movement are."""
+    incoming = tuple(sorted({item.incoming_lanes.index(link.from_lane) for link in links}))
+    if not halves:
+        return (incoming,)
+    outgoing = sorted({item.outgoing_lanes.index(link.to_lane) for link in links})
+    count = len(item.incoming_lanes)
+    return (
+        incoming,
+        tuple(at + count for at in incoming),
+        tuple(at + 2 * count for at in outgoing),
+    )

@@ -1,0 +1,89 @@
+"""The two protocols of the suite: what acts, and what learns.
+
+The driver of UGAT, the evaluation and the conformance kit know nothing else about policies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from ugat_marl.envs import Actions, AnyParallelEnv, Infos, Observations, TrafficEnv
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Chooses a green phase for every intersection.
+
+    Attributes:
+        env_options: Options of `ugat_marl.parallel_env` the policy relies on, such as
+            ``{"observation": "movements"}``; whoever builds an environment for it passes them on.
+    """
+
+    env_options: Mapping[str, Any]
+
+    def reset(self, seed: int) -> None:
+        """Forgets the past; called once before every episode."""
+        ...
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """Maps the observations of all agents to an action for each of them.
+
+        Args:
+            observations: Agent to float32 vector, in the agent's observation space.
+            infos: Agent to info; ``infos[agent]["action_mask"]`` is int8, 1 where a phase may be
+                chosen.
+
+        Returns:
+            Agent to the index of its next green phase.
+        """
+        ...
+
+
+EpisodeCallback = Callable[[int, Mapping[str, float]], None]
+"""Called as ``callback(episode, numbers)`` after every training episode."""
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """Improves a policy by acting in an environment; keeps its state between calls.
+
+    Attributes:
+        episodes: Episodes it has been trained for in its life; saved with its state.
+    """
+
+    episodes: int
+
+    def learn(
+        self,
+        env: AnyParallelEnv,
+        episodes: int,
+        seed: int,
+        on_episode: EpisodeCallback | None = None,
+    ) -> Policy:
+        """Trains for a number of episodes and returns the current greedy policy.
+
+        Called again, it goes on from where it was. `seed` fixes every random choice of this call.
+        """
+        ...
+
+    def policy(self) -> Policy:
+        """The current greedy policy (a snapshot: later learning does not change it)."""
+        ...
+
+    def save(self, path: Path) -> None:
+        """Writes the whole state (networks, optimiser, replay), so that learning can go on."""
+        ...
+
+    def load(self, path: Path) -> None:
+        """Restores what `save` wrote.
+
+        Raises:
+            CheckpointError: Unreadable, not finite, or of another set of agents.
+        """
+        ...
+
+
+PolicyFactory = Callable[[TrafficEnv], Policy]
+"""Makes a policy for an environment; controllers read the network from it."""

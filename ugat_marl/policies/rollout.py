@@ -1,0 +1,189 @@
+"""The one act-step-observe loop, and what is recorded along the way."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.data import Provenance, TransitionLog, TransitionRecorder, version_of
+from ugat_marl.envs import UNITS, Actions, AnyParallelEnv, Infos, Observations, Observer
+from ugat_marl.policies.protocols import Policy
+from ugat_marl.seeding import numpy_generator
+from ugat_marl.simulation import Snapshot
+
+SIMULATING = ("libsumo", "numpy", "ugat-marl")
+"""Packages whose version can change a trajectory; written into every log."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What came of one roll-out.
+
+    Attributes:
+        steps: Decisions made.
+        mean_reward: Mean over decisions and agents.
+        log: All transitions, if asked for.
+    """
+
+    steps: int
+    mean_reward: float
+    log: TransitionLog | None
+
+
+StepCallback = Callable[[int], None]
+"""Called with the number of decisions made so far."""
+
+
+class Stopped(Exception):
+    """A roll-out was ended: another thread failed, or the user interrupted."""
+
+
+def until(stop: threading.Event) -> StepCallback:
+    """A callback that ends a roll-out, with `Stopped`, at the next decision after `stop` is set."""
+
+    def check(_step: int) -> None:
+        if stop.is_set():
+            raise Stopped
+
+    return check
+
+
+def roll_out(
+    env: AnyParallelEnv,
+    policy: Policy,
+    seed: int,
+    *,
+    record: Observer | None = None,
+    on_step: StepCallback | None = None,
+) -> Episode:
+    """Plays one whole episode.
+
+    Args:
+        env: An environment made with the policy's `env_options`.
+        policy: Who acts.
+        seed: Fixes the simulation and the policy's own choices.
+        record: Keeps the transitions, with the observations this observer makes, which may be
+            others than the policy reads; needs an environment of the suite.
+        on_step: Called after every decision.
+    """
+    observations, infos = env.reset(seed=seed)
+    policy.reset(seed)
+    recording = _Recording(env, record, seed) if record else None
+    steps, total = 0, 0.0
+    while env.agents:
+        agents = list(env.agents)
+        actions = policy.act(observations, infos)
+        observations, rewards, _, _, infos = env.step(actions)
+        if recording is not None:
+            recording.add(actions, rewards, infos)
+        total += sum(rewards.values()) / len(agents)
+        steps += 1
+        if on_step is not None:
+            on_step(steps)
+    return Episode(steps, total / max(steps, 1), recording.log() if recording else None)
+
+
+def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 0) -> Observer:
+    """An observer of the environment's network; by default one like the environment's own."""
+    base: Any = env.unwrapped
+    if name is None:
+        name, neighbours = base.options.observation, base.options.neighbours
+    assert name is not None
+    return Observer(base.network, name, neighbours)
+
+
+class _Recording:
+    """The transitions of one episode as an observer sees them; agents have the observer's names."""
+
+    def __init__(self, env: AnyParallelEnv, observer: Observer, seed: int) -> None:
+        self._base: Any = env.unwrapped
+        self._observer = observer
+        self._recorder = TransitionRecorder(provenance_of(env, observer, seed))
+        self._names = dict(zip(self._base.possible_agents, observer.agents, strict=True))
+        self._seen = self._look()
+        self._before: Snapshot = self._base.seen
+        self._step = 0
+
+    def add(self, actions: Actions, rewards: Mapping[str, float], infos: Infos) -> None:
+        then = self._look()
+        executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
+        held = {agent: float(infos[agent].get("delay_s", 0.0)) for agent in self._names}
+        acted, served, got, held = map(self._renamed, (actions, executed, rewards, held))
+        row = self._seen, acted, served, got, then, held, self._served()
+        self._recorder.record(0, self._step, *row)
+        self._seen = then
+        self._step += 1
+
+    def log(self) -> TransitionLog:
+        return self._recorder.log()
+
+    def _served(self) -> dict[str, NDArray[np.float32]] | None:
+        """The features at the last decision without the vehicles that left since, on average."""
+        before, self._before = self._before, self._base.seen
+        left = self._before.mean_left
+        if not len(left) or self._observer.needs_waiting:  # who has left says nothing of waiting
+            return None
+        vectors = self._observer.observe(before.less(left), self._base.phases)
+        own = zip(self._observer.agents, vectors, self._observer.layouts, strict=True)
+        return {agent: vector[: layout.features] for agent, vector, layout in own}
+
+    def _look(self) -> dict[str, NDArray[np.float32]]:
+        vectors = self._observer.observe(self._base.seen, self._base.phases)
+        return dict(zip(self._observer.agents, vectors, strict=True))
+
+    def _renamed(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {self._names[agent]: value for agent, value in values.items()}
+
+
+def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Provenance:
+    """Where a log recorded in `env` (wrapped or not) through `observer` comes from."""
+    base: Any = env.unwrapped
+    return Provenance(
+        scenario=base.scenario.id,
+        scenario_hash=base.scenario.hash,
+        domain=base.domain,
+        seeds=seeds,
+        decision_interval_s=base.decision_interval_s,
+        observation=observer.name,
+        layouts=dict(zip(observer.agents, observer.layouts, strict=True)),
+        versions={name: version_of(name) or "not installed" for name in SIMULATING},
+        units={"observation": UNITS[observer.name], "reward": str(base.options.reward)},
+    )
+
+
+class Exploring:
+    """A policy that at each decision, agent by agent, takes a random permitted phase with chance ε.
+
+    Roll-outs for D_sim and D_real need actions the policy would not take: without them h never sees
+    what they do.
+
+    Args:
+        policy: The policy to follow otherwise.
+        epsilon: Chance of a random phase, in [0, 1].
+    """
+
+    def __init__(self, policy: Policy, epsilon: float) -> None:
+        self._policy = policy
+        self._epsilon = epsilon
+        self.env_options: Mapping[str, Any] = policy.env_options
+        self._generator = numpy_generator(0)
+
+    def reset(self, seed: int) -> None:
+        """Begins an episode; `seed` decides where exploration happens."""
+        self._policy.reset(seed)
+        self._generator = numpy_generator(seed, "exploring")
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """The policy's actions, some of them replaced."""
+        actions = dict(self._policy.act(observations, infos))
+        draws = self._generator.random(len(actions))
+        for agent, draw in zip(sorted(actions), draws, strict=True):
+            if draw < self._epsilon:
+                permitted = np.flatnonzero(infos[agent]["action_mask"])
+                actions[agent] = int(self._generator.choice(permitted))
+        return actions

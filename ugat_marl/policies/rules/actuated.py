@@ -1,0 +1,135 @@
+"""Rules that follow a cycle and let each green go on while it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.envs import Actions, Infos, Observations
+from ugat_marl.policies.rules.streets import Approach, Streets, mask_of
+
+
+class _Extended:
+    """Phases of a smallest cover in turn, each extended up to a longest green.
+
+    A phase lasts at least one decision. It goes on while its lanes still need it, and ends at the
+    longest green if another phase is called. Phases nobody calls are skipped, and where none is
+    called, the light rests.
+    """
+
+    env_options: Mapping[str, Any] = {"observation": "movements"}
+
+    def __init__(self, streets: Streets, longest_s: float) -> None:
+        self._approaches = streets.approaches
+        self._longest = streets.decisions(longest_s)
+        self._place: dict[str, int] = {}
+        self._age: dict[str, int] = {}
+
+    def reset(self, seed: int) -> None:
+        """Forgets whose turn it is."""
+        self._place, self._age = {}, {}
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """The phase each intersection is at in its cycle; where it is masked, an allowed one."""
+        return {
+            agent: self._choose(
+                agent, approach, observations[agent], mask_of(infos, agent, len(approach.served))
+            )
+            for agent, approach in self._approaches.items()
+        }
+
+    def _demand(
+        self, agent: str, approach: Approach, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Lanes on which a green still pays, and lanes that call for one, ``(lanes,)`` each."""
+        raise NotImplementedError
+
+    def _choose(
+        self,
+        agent: str,
+        approach: Approach,
+        observation: NDArray[np.float32],
+        allowed: NDArray[np.bool_],
+    ) -> int:
+        used, calling = self._demand(agent, approach, observation)
+        cycle, served = approach.cycle, approach.served
+        place = self._place.get(agent, -1)
+        age = self._age.get(agent, 0)
+        if place >= 0:
+            lanes = served[cycle[place]]
+            goes_on = age < self._longest and bool((used & lanes).any())
+            calling = calling & ~lanes
+        else:
+            goes_on = False
+        turns = ((place + step) % len(cycle) for step in range(1, len(cycle) + 1))
+        following = [
+            turn
+            for turn in turns
+            if turn != place and allowed[cycle[turn]] and (calling & served[cycle[turn]]).any()
+        ]
+        if goes_on or not following:
+            following = [max(place, 0)]
+        chosen = following[0]
+        self._age[agent] = age + 1 if chosen == place else 1
+        self._place[agent] = chosen
+        return cycle[chosen] if allowed[cycle[chosen]] else int(allowed.argmax())
+
+
+class Actuated(_Extended):
+    """Gap-out control: a green goes on until a gap opens in the stream on every lane it serves.
+
+    With one count per lane in place of a loop at the stop line, the gap is the mean one: a stream
+    at the speed limit with a headway of `gap_s` puts ``free-flow time / gap_s`` vehicles on a lane.
+    A lane with as many, or with anybody standing, still uses its green. Vehicles anywhere on its
+    lanes call a phase.
+
+    Args:
+        streets: The network.
+        longest_s: Longest time from one phase to the next while another one is called (clearance
+            included), rounded up to whole decisions.
+        gap_s: Headway at which a green ends.
+    """
+
+    def __init__(self, streets: Streets, longest_s: float = 40.0, gap_s: float = 3.0) -> None:
+        super().__init__(streets, longest_s)
+        self.longest_s, self.gap_s = longest_s, gap_s
+
+    def _demand(
+        self, agent: str, approach: Approach, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        seen = approach.traffic(agent, observation)
+        stream = np.maximum(approach.free_flow_s / self.gap_s, 1.0)
+        return (seen.halting > 0.5) | (seen.vehicles > stream - 0.5), seen.vehicles > 0.5
+
+
+class DelayActuated(_Extended):
+    """Delay-based control: a green goes on until those who waited for it are moving.
+
+    A lane uses its green while its vehicles have more than `most_waiting_s` vehicle-seconds of
+    standing behind them; with more than that it also calls for one. (After Oertel and Wagner 2011,
+    where each vehicle's own delay is known; here one that moves counts no more, and greens end
+    earlier.)
+
+    Args:
+        streets: The network.
+        longest_s: Longest time from one phase to the next while another one is called (clearance
+            included), rounded up to whole decisions.
+        most_waiting_s: Vehicle-seconds on a lane that neither extend nor call a green.
+    """
+
+    env_options: Mapping[str, Any] = {"observation": "waiting"}
+
+    def __init__(
+        self, streets: Streets, longest_s: float = 40.0, most_waiting_s: float = 10.0
+    ) -> None:
+        super().__init__(streets, longest_s)
+        self.longest_s, self.most_waiting_s = longest_s, most_waiting_s
+
+    def _demand(
+        self, agent: str, approach: Approach, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        waits = approach.waiting_s(agent, observation) > self.most_waiting_s
+        return waits, waits

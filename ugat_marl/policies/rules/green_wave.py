@@ -1,0 +1,131 @@
+"""Fixed time with offsets: along a road the green travels with the vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ugat_marl.envs import Actions, Infos, Observations
+from ugat_marl.policies.rules.streets import Streets, green_indices, mask_of
+from ugat_marl.scenarios import Intersection, Link, edge_of
+
+
+@dataclass(frozen=True)
+class Road:
+    """Intersections one reaches one after the other by driving straight on.
+
+    Attributes:
+        agents: The intersections' agents, in the direction of travel.
+        edges: Edge by which each is entered.
+        arrival_s: Seconds at the speed limit from the first stop line to each of them.
+        lanes: Lanes that lead straight on, over all intersections.
+    """
+
+    agents: tuple[str, ...]
+    edges: tuple[str, ...]
+    arrival_s: tuple[float, ...]
+    lanes: int
+
+
+def main_roads(streets: Streets) -> list[Road]:
+    """Roads that share no intersection and together pass all of them.
+
+    The longest road is taken first, by number of intersections and then of lanes that lead straight
+    on; between equals, and between the two directions of one road, the one that starts at the
+    first agent. The intersections of a road taken end the others.
+    """
+    free = dict(streets.intersections)
+    roads: list[Road] = []
+    while free:
+        found = [road for agent in free for road in _roads_from(agent, free, streets)]
+        best = max(found, key=lambda road: (len(road.agents), road.lanes))  # the first of equals
+        roads.append(best)
+        for agent in best.agents:
+            del free[agent]
+    return roads
+
+
+def _roads_from(agent: str, free: Mapping[str, Intersection], streets: Streets) -> Iterator[Road]:
+    entered = {edge_of(lane): other for other, item in free.items() for lane in item.incoming_lanes}
+    for edge in dict.fromkeys(edge_of(lane) for lane in free[agent].incoming_lanes):
+        agents, edges, arrival_s, lanes = [agent], [edge], [0.0], 0
+        while True:
+            straight = _straight(free[agents[-1]], edges[-1])
+            lanes += len({link.from_lane for link in straight})
+            ahead = [link for link in straight if link.to_edge in entered]
+            following = entered[ahead[0].to_edge] if ahead else agents[-1]
+            if following in agents:
+                break
+            agents.append(following)
+            edges.append(ahead[0].to_edge)
+            arrival_s.append(arrival_s[-1] + streets.free_flow_s[ahead[0].to_lane])
+        yield Road(tuple(agents), tuple(edges), tuple(arrival_s), lanes)
+
+
+class GreenWave:
+    """Fixed time on a common cycle, each signal of a road later by the travel time to it.
+
+    The roads are `main_roads`. On a road every light has the same cycle: the phase that serves
+    straight traffic in the direction of travel for `main_s`, the others of a smallest cover for
+    `green_s` each; a light with fewer phases gives the rest to the main one. Its clock is behind
+    that of the first light by the travel time at the speed limit, rounded to whole decisions. With
+    ``main_s = green_s`` it differs from fixed time by nothing but the offsets (and the order of
+    the phases).
+
+    Args:
+        streets: The network.
+        green_s: Time of each other phase (clearance included), rounded up to whole decisions.
+        main_s: Time of the phase along the road; None for `green_s`.
+    """
+
+    def __init__(
+        self, streets: Streets, green_s: float = 20.0, main_s: float | None = None
+    ) -> None:
+        self.env_options: Mapping[str, Any] = {}
+        self.green_s, self.main_s = green_s, green_s if main_s is None else main_s
+        self._phases = {a: len(item.phases) for a, item in streets.intersections.items()}
+        self._turns: dict[str, list[int]] = {}
+        self._offsets: dict[str, int] = {}
+        for road in main_roads(streets):
+            self._plan(road, streets)
+        self._time = 0
+
+    def offsets(self) -> dict[str, int]:
+        """Agent to the decisions its cycle is behind."""
+        return dict(self._offsets)
+
+    def reset(self, seed: int) -> None:
+        """Starts the clocks again."""
+        self._time = 0
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """The phase whose turn it is; where it is masked, the first allowed one."""
+        actions: Actions = {}
+        for agent, phases in self._phases.items():
+            turns = self._turns[agent]
+            wanted = turns[(self._time - self._offsets[agent]) % len(turns)]
+            allowed = mask_of(infos, agent, phases)
+            actions[agent] = wanted if allowed[wanted] else int(allowed.argmax())
+        self._time += 1
+        return actions
+
+    def _plan(self, road: Road, streets: Streets) -> None:
+        main, other = streets.decisions(self.main_s), streets.decisions(self.green_s)
+        cycles = [streets.approaches[agent].cycle for agent in road.agents]
+        length = main + other * (max(len(cycle) for cycle in cycles) - 1)
+        for agent, edge, arrival_s, cycle in zip(
+            road.agents, road.edges, road.arrival_s, cycles, strict=True
+        ):
+            item = streets.intersections[agent]
+            wanted = {link.index for link in _straight(item, edge)}
+            along = max(cycle, key=lambda p: len(wanted & green_indices(item, item.phases[p])))
+            at = cycle.index(along)
+            others = [*cycle[at + 1 :], *cycle[:at]]
+            turns = [along] * (length - other * len(others))
+            self._turns[agent] = turns + [phase for phase in others for _ in range(other)]
+            self._offsets[agent] = round(arrival_s / streets.decision_interval_s)
+
+
+def _straight(item: Intersection, edge: str) -> list[Link]:
+    return [link for link in item.links if link.direction == "s" and link.from_edge == edge]

@@ -1,0 +1,179 @@
+"""Rules that give every phase a score and take the best one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.envs import WAITING_SCALE_S, Actions, Infos, Observations
+from ugat_marl.policies.rules.streets import Streets, check_length, green_indices, mask_of
+from ugat_marl.scenarios import Intersection
+
+
+class _Scored:
+    """Takes the phase of highest score and holds it for at least `hold_s`.
+
+    The held phase is reconsidered at every decision after that. Between equal scores the phase
+    already shown wins, then the one of lower index.
+    """
+
+    env_options: Mapping[str, Any] = {"observation": "movements"}
+
+    def __init__(self, streets: Streets, weights: Mapping[str, NDArray[np.float64]], hold_s: float):
+        self._weights = weights
+        self._hold = streets.decisions(hold_s)
+        self._shown: dict[str, int] = {}
+        self._age: dict[str, int] = {}
+
+    def reset(self, seed: int) -> None:
+        """Forgets which phases are shown and for how long."""
+        self._shown, self._age = {}, {}
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """The phase of each intersection by the rule, among those its mask allows."""
+        return {
+            agent: self._choose(agent, observations[agent], mask_of(infos, agent, weights.shape[0]))
+            for agent, weights in self._weights.items()
+        }
+
+    def scores(self, agent: str, observation: NDArray[np.float32]) -> NDArray[np.float64]:
+        """The score of every phase of an agent, ``(phases,)``, in vehicles."""
+        weights = self._weights[agent]
+        phases, features = weights.shape
+        check_length(agent, observation, features + phases, self.env_options["observation"])
+        return weights @ observation[:features]
+
+    def _choose(
+        self, agent: str, observation: NDArray[np.float32], allowed: NDArray[np.bool_]
+    ) -> int:
+        shown, age = self._shown.get(agent), self._age.get(agent, 0)
+        if shown is not None and age < self._hold and allowed[shown]:
+            self._age[agent] = age + 1
+            return shown
+        scores = np.where(allowed, self.scores(agent, observation), -np.inf)
+        best = int(scores.argmax())
+        if shown is not None and allowed[shown] and self._stays(scores[shown], scores[best]):
+            best = shown
+        self._age[agent] = age + 1 if best == shown else 1
+        self._shown[agent] = best
+        return best
+
+    def _stays(self, shown: float, best: float) -> bool:
+        """Whether the phase shown goes on, by its score and the highest one."""
+        return shown >= best
+
+
+class LargestQueue(_Scored):
+    """Serves the phase whose incoming lanes hold the most halting vehicles.
+
+    A phase serves a lane when one of the lane's links is green in it; a lane counts once.
+
+    Args:
+        streets: The network.
+        hold_s: Shortest time a phase is kept, rounded up to whole decisions.
+    """
+
+    def __init__(self, streets: Streets, hold_s: float = 20.0) -> None:
+        self.hold_s = hold_s
+        weights = {
+            agent: _queue_weights(item, streets.capacity)
+            for agent, item in streets.intersections.items()
+        }
+        super().__init__(streets, weights, hold_s)
+
+
+class MaxPressure(_Scored):
+    """Serves the phase of highest pressure (Varaiya 2013).
+
+    The pressure of a phase is the sum over the incoming lanes it serves of the vehicles on the lane
+    minus the mean number of vehicles on the lanes its green links lead to. (The mean stands for the
+    turning shares, which a controller does not know; where every lane has one link, it is the sum
+    over links of upstream minus downstream.)
+
+    Args:
+        streets: The network.
+        hold_s: Shortest time a phase is kept, rounded up to whole decisions.
+    """
+
+    def __init__(self, streets: Streets, hold_s: float = 10.0) -> None:
+        self.hold_s = hold_s
+        weights = {
+            agent: _pressure_weights(item, streets.capacity)
+            for agent, item in streets.intersections.items()
+        }
+        super().__init__(streets, weights, hold_s)
+
+
+class MaxPressureLoss(MaxPressure):
+    """Max pressure that counts what a switch loses (after Wang et al. 2022).
+
+    In the next `hold_s` seconds the phase shown serves all the time, another one only after the
+    clearance. So the rule switches if ``best * (1 - clearance / hold) > shown``, pressures below 0
+    counted as 0: a phase is worth a switch only if something can be served by it.
+
+    Args:
+        streets: The network.
+        hold_s: Shortest time a phase is kept, rounded up to whole decisions; the gain and loss of a
+            switch are counted over it.
+    """
+
+    def __init__(self, streets: Streets, hold_s: float = 10.0) -> None:
+        super().__init__(streets, hold_s)
+        lasts_s = self._hold * streets.decision_interval_s
+        self.served_share = max(0.0, 1.0 - streets.clearance_s / lasts_s)
+
+    def _stays(self, shown: float, best: float) -> bool:
+        return max(shown, 0.0) >= self.served_share * max(best, 0.0)
+
+
+class LongestWaiting(_Scored):
+    """Serves the phase whose incoming lanes have waited longest.
+
+    What counts is the sum over the vehicles of a lane of the seconds since each last moved: many
+    who wait a little weigh as much as one who waits long. No approach is forgotten for ever.
+
+    Args:
+        streets: The network.
+        hold_s: Shortest time a phase is kept, rounded up to whole decisions.
+    """
+
+    env_options: Mapping[str, Any] = {"observation": "waiting"}
+
+    def __init__(self, streets: Streets, hold_s: float = 20.0) -> None:
+        self.hold_s = hold_s
+        weights = {
+            agent: approach.served * approach.capacity * WAITING_SCALE_S
+            for agent, approach in streets.approaches.items()
+        }
+        super().__init__(streets, weights, hold_s)
+
+
+def _queue_weights(item: Intersection, capacity: Mapping[str, float]) -> NDArray[np.float64]:
+    """``(phases, 2 * incoming + outgoing)``: halting vehicles that a phase serves, per feature."""
+    incoming = list(item.incoming_lanes)
+    weights = np.zeros((len(item.phases), 2 * len(incoming) + len(item.outgoing_lanes)))
+    for row, phase in enumerate(item.phases):
+        green = green_indices(item, phase)
+        for lane in {link.from_lane for link in item.links if link.index in green}:
+            weights[row, incoming.index(lane)] = capacity[lane]
+    return weights
+
+
+def _pressure_weights(item: Intersection, capacity: Mapping[str, float]) -> NDArray[np.float64]:
+    """``(phases, 2 * incoming + outgoing)``: vehicles upstream minus mean vehicles downstream."""
+    incoming, outgoing = list(item.incoming_lanes), list(item.outgoing_lanes)
+    weights = np.zeros((len(item.phases), 2 * len(incoming) + len(outgoing)))
+    for row, phase in enumerate(item.phases):
+        green = green_indices(item, phase)
+        for lane in incoming:
+            links = [link for link in item.links if link.from_lane == lane and link.index in green]
+            targets = sorted({link.to_lane for link in links})
+            if targets:
+                weights[row, len(incoming) + incoming.index(lane)] = capacity[lane]
+            for target in targets:
+                column = 2 * len(incoming) + outgoing.index(target)
+                weights[row, column] -= capacity[target] / len(targets)
+    return weights

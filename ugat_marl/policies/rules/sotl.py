@@ -1,0 +1,74 @@
+"""Self-organising traffic lights: red lanes collect impatience until it switches the signal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.envs import Actions, Infos, Observations
+from ugat_marl.policies.rules.streets import Approach, Streets, mask_of
+
+
+class SelfOrganising:
+    """SOTL (Gershenson 2005; Cools, Gershenson and D'Hooghe 2007), for any number of phases.
+
+    At every decision each lane adds, while it has red, its vehicles times the decision interval to
+    a sum that its green empties. Once a green has lasted `hold_s` and the lanes of another phase
+    together reach `threshold`, the phase with the largest total is next. (The original's last rule,
+    that a short platoon close to the stop line is not cut, needs positions, which counts per lane
+    do not give.)
+
+    Args:
+        streets: The network.
+        threshold: Vehicle-seconds on red lanes that switch the signal.
+        hold_s: Shortest time a phase is kept, rounded up to whole decisions.
+    """
+
+    def __init__(self, streets: Streets, threshold: float = 600.0, hold_s: float = 10.0) -> None:
+        self.env_options: Mapping[str, Any] = {"observation": "movements"}
+        self.threshold, self.hold_s = threshold, hold_s
+        self._approaches = streets.approaches
+        self._interval_s = streets.decision_interval_s
+        self._hold = streets.decisions(hold_s)
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Empties all sums."""
+        self._shown: dict[str, int] = {}
+        self._age: dict[str, int] = {}
+        self._sums = {agent: np.zeros(len(a.lanes)) for agent, a in self._approaches.items()}
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """The phase of each intersection by the rule, among those its mask allows."""
+        return {
+            agent: self._choose(
+                agent, approach, observations[agent], mask_of(infos, agent, len(approach.served))
+            )
+            for agent, approach in self._approaches.items()
+        }
+
+    def _choose(
+        self,
+        agent: str,
+        approach: Approach,
+        observation: NDArray[np.float32],
+        allowed: NDArray[np.bool_],
+    ) -> int:
+        seen = approach.traffic(agent, observation)
+        shown, age = self._shown.get(agent, seen.shown), self._age.get(agent, self._hold)
+        green = approach.served[shown]
+        sums = np.where(green, 0.0, self._sums[agent] + seen.vehicles * self._interval_s)
+        self._sums[agent] = sums
+        totals = np.where(allowed, approach.served @ sums, -1.0)
+        best = int(totals.argmax())
+        if not allowed[shown]:
+            chosen = best
+        else:
+            switches = age >= self._hold and totals[best] >= self.threshold
+            chosen = best if switches else shown
+        self._age[agent] = age + 1 if chosen == shown else 1
+        self._shown[agent] = chosen
+        return chosen

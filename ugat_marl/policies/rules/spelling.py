@@ -1,0 +1,179 @@
+"""How rules are named: ``name``, ``name:number`` or ``name:number:number``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from ugat_marl.envs import AnyParallelEnv
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.policies.protocols import Policy
+from ugat_marl.policies.rules.actuated import Actuated, DelayActuated
+from ugat_marl.policies.rules.green_wave import GreenWave
+from ugat_marl.policies.rules.plain import FixedTime, ProgrammeControl, Random
+from ugat_marl.policies.rules.scored import (
+    LargestQueue,
+    LongestWaiting,
+    MaxPressure,
+    MaxPressureLoss,
+)
+from ugat_marl.policies.rules.sotl import SelfOrganising
+from ugat_marl.policies.rules.streets import Streets
+from ugat_marl.policies.rules.webster import Webster
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a rule's spelling.
+
+    Attributes:
+        name: What it is.
+        unit: Its unit.
+        default: What it is where the spelling leaves it out.
+        choices: What tuning tries.
+    """
+
+    name: str
+    unit: str
+    default: float
+    choices: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule that can be named.
+
+    Attributes:
+        make: Makes it from the streets and its parameters.
+        parameters: In the order of the spelling.
+    """
+
+    make: Callable[..., Policy]
+    parameters: tuple[Parameter, ...] = ()
+
+
+_HOLDS = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
+_LONGEST = (20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
+
+
+def _held(default: float, choices: tuple[float, ...] = _HOLDS) -> Parameter:
+    return Parameter("shortest time of a phase", "seconds", default, choices)
+
+
+RULES: Mapping[str, Rule] = {
+    "actuated": Rule(
+        Actuated,
+        (
+            Parameter("longest time of a phase", "seconds", 40, _LONGEST),
+            Parameter("headway that ends a green", "seconds", 3, (2, 3, 5)),
+        ),
+    ),
+    "delay-actuated": Rule(
+        DelayActuated,
+        (
+            Parameter("longest time of a phase", "seconds", 40, _LONGEST),
+            Parameter("waiting on a lane that is left out", "vehicle-seconds", 10, (1, 10, 40)),
+        ),
+    ),
+    "fixed-time": Rule(FixedTime, (Parameter("time of a phase", "seconds", 30, _HOLDS),)),
+    "green-wave": Rule(
+        GreenWave,
+        (
+            Parameter("time of a phase", "seconds", 20, (10, 20, 30)),
+            Parameter("time of the phase along the road", "seconds", 30, (20, 30, 40, 60)),
+        ),
+    ),
+    "largest-queue": Rule(LargestQueue, (_held(20),)),
+    "longest-waiting": Rule(LongestWaiting, (_held(20),)),
+    "max-pressure": Rule(MaxPressure, (_held(10),)),
+    "max-pressure-loss": Rule(MaxPressureLoss, (_held(10),)),
+    "programme": Rule(ProgrammeControl),
+    "random": Rule(Random),
+    "sotl": Rule(
+        SelfOrganising,
+        (
+            Parameter(
+                "impatience that switches", "vehicle-seconds", 600, (150, 300, 600, 1200, 2400)
+            ),
+            _held(10, (10, 20, 30)),
+        ),
+    ),
+    "webster": Rule(
+        Webster,
+        (
+            Parameter(
+                "saturation flow", "vehicles an hour and lane", 1800, (900, 1200, 1500, 1800, 2100)
+            ),
+        ),
+    ),
+}
+"""Every rule by name."""
+
+NAMES = tuple(RULES)
+"""The controllers, as `controller_for` spells them."""
+
+STANDARD_RULES = (
+    *(f"largest-queue:{hold_s}" for hold_s in (10, 20, 30, 40)),
+    *(f"max-pressure:{hold_s}" for hold_s in (10, 20, 30)),
+    *(f"max-pressure-loss:{hold_s}" for hold_s in (10, 20)),
+    *(f"actuated:{longest_s}" for longest_s in (40, 80)),
+    "sotl:300:20",
+    "webster:1500",
+    "programme",
+)
+"""What the search for the best rule of a domain tries."""
+
+
+def controller_for(spec: str, env: AnyParallelEnv) -> Policy:
+    """The controller a spelling such as ``"largest-queue:30"`` names.
+
+    Args:
+        spec: A name of `RULES`, and optionally its parameters, each after a colon.
+        env: Any environment of the scenario; only its network is read. The controller's
+            `env_options` say how the environment it acts in must be made.
+
+    Raises:
+        UnknownNameError: No controller of this name.
+        OptionError: A parameter that is not a number above 0, or one too many.
+    """
+    name, values = parse_spec(spec)
+    return RULES[name].make(Streets.of(env), *values)
+
+
+def parse_spec(spec: str) -> tuple[str, tuple[float, ...]]:
+    """Name and parameters of a controller's spelling, defaults filled in.
+
+    Raises:
+        UnknownNameError: No controller of this name.
+        OptionError: Impossible parameters.
+    """
+    name, *texts = spec.split(":")
+    if name not in RULES:
+        raise UnknownNameError("controller", name, NAMES)
+    parameters = RULES[name].parameters
+    if len(texts) > len(parameters):
+        takes = ", ".join(f"{p.name} in {p.unit}" for p in parameters) or "no number"
+        raise OptionError(f"controller {spec!r}: {name} takes {takes}; write {example_of(name)!r}")
+    values = [parameter.default for parameter in parameters]
+    for place, text in enumerate(texts):
+        try:
+            values[place] = float(text)
+        except ValueError:
+            values[place] = math.nan
+        if not 0 < values[place] < math.inf:
+            raise OptionError(
+                f"controller {spec!r}: {text!r} is not a number of {parameters[place].unit} "
+                f"above 0 ({parameters[place].name}); write for example {example_of(name)!r}"
+            )
+    return name, tuple(values)
+
+
+def example_of(name: str) -> str:
+    """The spelling of a rule with its defaults written out."""
+    return spell(name, [parameter.default for parameter in RULES[name].parameters])
+
+
+def spell(name: str, values: tuple[float, ...] | list[float]) -> str:
+    """The spelling of a rule with these parameters."""
+    return ":".join([name, *(f"{value:g}" for value in values)])

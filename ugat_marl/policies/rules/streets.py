@@ -1,0 +1,187 @@
+"""What a rule knows and sees: the network, and lane by lane what detectors tell of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.envs import WAITING_SCALE_S, AnyParallelEnv, Infos
+from ugat_marl.errors import OptionError
+from ugat_marl.scenarios import GREEN, Intersection, Network
+
+MOST_SEARCHED_PHASES = 12
+"""Up to so many phases the smallest cover is searched exhaustively; above, greedily."""
+
+
+@dataclass(frozen=True)
+class Streets:
+    """What a rule knows about the network it controls.
+
+    Attributes:
+        intersections: Agent to intersection.
+        capacity: Lane to the number of vehicles that fit on it, the unit of `movements`.
+        free_flow_s: Lane to the seconds a vehicle needs along it at the speed limit.
+        decision_interval_s: Seconds from one decision to the next.
+        clearance_s: Seconds of yellow and all-red between two greens.
+    """
+
+    intersections: Mapping[str, Intersection]
+    capacity: Mapping[str, float]
+    free_flow_s: Mapping[str, float]
+    decision_interval_s: float
+    clearance_s: float
+
+    @classmethod
+    def of(cls, env: AnyParallelEnv) -> Streets:
+        """The streets below an environment of the suite, wrapped or not."""
+        base: Any = env.unwrapped
+        network: Network = base.network
+        tls_of: Mapping[str, str] = base.intersection_of
+        return cls(
+            {agent: network.intersection(tls_of[agent]) for agent in base.possible_agents},
+            {name: lane.capacity for name, lane in network.lanes.items()},
+            {name: lane.length_m / lane.speed_mps for name, lane in network.lanes.items()},
+            base.decision_interval_s,
+            base.scenario.timing.clearance_s,
+        )
+
+    @cached_property
+    def approaches(self) -> dict[str, Approach]:
+        """Agent to what its rule reads."""
+        return {agent: Approach.of(item, self) for agent, item in self.intersections.items()}
+
+    def decisions(self, seconds: float) -> int:
+        """The fewest decisions that last at least `seconds`."""
+        if not 0 < seconds < math.inf:
+            raise OptionError(f"a phase cannot be held {seconds} s; give a number above 0")
+        return math.ceil(seconds / self.decision_interval_s - 1e-9)
+
+
+class Traffic(NamedTuple):
+    """What an intersection measures of its incoming lanes, ``(lanes,)`` each.
+
+    Attributes:
+        halting: Vehicles that stand.
+        vehicles: Vehicles, standing or not.
+        shown: Phase that is green or cleared towards.
+    """
+
+    halting: NDArray[np.float64]
+    vehicles: NDArray[np.float64]
+    shown: int
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """The incoming lanes of one intersection and the phases that serve them.
+
+    Attributes:
+        lanes: The lanes, in the order of the observation.
+        outgoing: Number of outgoing lanes.
+        capacity: Vehicles that fit on each lane, ``(lanes,)``.
+        free_flow_s: Seconds along each lane at the speed limit, ``(lanes,)``.
+        served: Whether a phase shows green to one of a lane's links, ``(phases, lanes)``.
+        cycle: A smallest set of phases that serves every link.
+    """
+
+    lanes: tuple[str, ...]
+    outgoing: int
+    capacity: NDArray[np.float64]
+    free_flow_s: NDArray[np.float64]
+    served: NDArray[np.bool_]
+    cycle: tuple[int, ...]
+
+    @classmethod
+    def of(cls, item: Intersection, streets: Streets) -> Approach:
+        """The approaches of one intersection."""
+        lanes = list(item.incoming_lanes)
+        served = np.zeros((len(item.phases), len(lanes)), np.bool_)
+        for row, phase in enumerate(item.phases):
+            green = green_indices(item, phase)
+            for link in item.links:
+                if link.index in green:
+                    served[row, lanes.index(link.from_lane)] = True
+        return cls(
+            tuple(lanes),
+            len(item.outgoing_lanes),
+            np.array([streets.capacity[lane] for lane in lanes]),
+            np.array([streets.free_flow_s[lane] for lane in lanes]),
+            served,
+            covering_phases(item),
+        )
+
+    def traffic(self, agent: str, observation: NDArray[np.float32]) -> Traffic:
+        """What the observation `movements` says about the incoming lanes."""
+        lanes, phases = len(self.lanes), len(self.served)
+        end = 2 * lanes + self.outgoing
+        check_length(agent, observation, end + phases, "movements")
+        seen = observation.astype(np.float64)
+        return Traffic(
+            seen[:lanes] * self.capacity,
+            seen[lanes : 2 * lanes] * self.capacity,
+            int(observation[end : end + phases].argmax()),
+        )
+
+    def waiting_s(self, agent: str, observation: NDArray[np.float32]) -> NDArray[np.float64]:
+        """What the observation `waiting` says: vehicle-seconds on each lane, ``(lanes,)``."""
+        lanes = len(self.lanes)
+        check_length(agent, observation, lanes + len(self.served), "waiting")
+        return observation[:lanes].astype(np.float64) * self.capacity * WAITING_SCALE_S
+
+
+def check_length(agent: str, observation: NDArray[np.float32], least: int, name: str) -> None:
+    """Refuses an observation that cannot be the one the rule reads."""
+    if len(observation) < least:
+        raise OptionError(
+            f"agent {agent!r} observes {len(observation)} numbers, the rule reads "
+            f"{least}; make the environment with observation={name!r}"
+        )
+
+
+def mask_of(infos: Infos, agent: str, phases: int) -> NDArray[np.bool_]:
+    """Which phases an agent may ask for, ``(phases,)``; all of them where nothing is said."""
+    mask = infos.get(agent, {}).get("action_mask")
+    return np.ones(phases, np.bool_) if mask is None else np.asarray(mask, dtype=np.bool_)
+
+
+def green_indices(item: Intersection, phase: str) -> frozenset[int]:
+    """The links that are green in a phase."""
+    return frozenset(link.index for link in item.links if phase[link.index] in GREEN)
+
+
+def covering_phases(item: Intersection) -> tuple[int, ...]:
+    """The smallest set of phases in which every servable link is green once, ascending.
+
+    Among sets of equal size the one with the fewest green letters in all (least overlap) is taken,
+    then the first.
+    """
+    served = [green_indices(item, phase) for phase in item.phases]
+    wanted = frozenset[int]().union(*served)
+    if len(served) > MOST_SEARCHED_PHASES:
+        return _greedy_cover(served, wanted)
+    for size in range(1, len(served) + 1):
+        covers = [
+            chosen
+            for chosen in combinations(range(len(served)), size)
+            if frozenset[int]().union(*(served[i] for i in chosen)) == wanted
+        ]
+        if covers:
+            return min(covers, key=lambda chosen: sum(len(served[i]) for i in chosen))
+    raise AssertionError("all phases together serve every servable link")
+
+
+def _greedy_cover(served: list[frozenset[int]], wanted: frozenset[int]) -> tuple[int, ...]:
+    chosen: list[int] = []
+    left = wanted
+    while left:
+        best = max(range(len(served)), key=lambda i: len(served[i] & left))
+        chosen.append(best)
+        left -= served[best]
+    return tuple(sorted(chosen))

@@ -1,1 +1,0 @@
-"""Reads records and draws pictures and tables; computes nothing."""

@@ -1,0 +1,174 @@
+"""The words and numbers of a diagnosis, for its page and for the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from ugat_marl.diagnosis import clock
+
+Record = Mapping[str, Any]
+"""The content of ``diagnosis.json``, or a part of it."""
+
+UNTRIED = 8
+"""Effects named that were not examined; of more, their number is told."""
+
+VERDICTS = {
+    "no_discrepancy": "no discrepancy",
+    "explained": "explained",
+    "not_identifiable": "not identifiable",
+    "partially_explained": "partially explained",
+    "unknown": "unknown",
+}
+
+MEANINGS = {
+    "no_discrepancy": "The scenario as it is could have made these data. That does not say that it "
+    "is right in what the data do not show.",
+    "explained": "With these effects the simulation could have made the data they were judged "
+    "on, and no other explanation of the library comes close.",
+    "not_identifiable": "Several explanations fit equally well. The corrected scenario holds the "
+    "one listed here; which one is true takes another measurement.",
+    "partially_explained": "These effects take off most of the gap, and yet they are not the whole "
+    "explanation. What is missing may bend their values.",
+    "unknown": "Simulation and measurement disagree, and nothing in the library accounts for it. "
+    "Any name would be a guess.",
+}
+
+
+def meaning(record: Record) -> str:
+    """What the verdict means; of a search that was cut short the sentence says it all."""
+    if not record.get("complete", True):
+        return ""
+    text = MEANINGS.get(str(record["verdict"]), "")
+    if record["verdict"] == "unknown" and record["effects"]:
+        text += " What is listed here stands in the log of the signals."
+    return text
+
+
+def effect_name(item: Record) -> str:
+    """The name of an effect with spaces."""
+    return str(item["name"]).replace("_", " ")
+
+
+def place(item: Record) -> str:
+    """Where an effect is."""
+    where = item.get("place")
+    return "everywhere" if where in (None, "*", "") else str(where).replace(">", " → ")
+
+
+def window(span: Sequence[float] | None) -> str:
+    """A stretch of time on the scenario's clock, as h:mm:ss."""
+    return "" if span is None else f"{clock(span[0])} – {clock(span[1])}"
+
+
+def values(item: Record, *, intervals: bool = True) -> str:
+    """The parameters of an effect, with their intervals if wanted."""
+    found = [_parameter(name, given, intervals) for name, given in item["parameters"].items()]
+    return "; ".join(found) or "as such"
+
+
+def _parameter(name: str, given: Record, intervals: bool) -> str:
+    value, low, high = given.get("value"), given.get("low"), given.get("high")
+    unit = str(given.get("unit") or "").replace("^2", "²")
+    text = f"{name.removesuffix('_s').replace('_', ' ')} "
+    text = "" if unit and name in ("seconds", "metres", "mps2", "seconds_per_hour") else text
+    if not intervals or value is None or low is None or high is None or low == high:
+        return f"{text}{number(value)} {unit}".rstrip()
+    middle, low, high = (_rounded(x, high - low) for x in (value, low, high))
+    return f"{text}{middle} {unit}".rstrip() + f" ({low} to {high})"
+
+
+def _rounded(value: float, width: float) -> str:
+    """A number with as many decimals as an interval of this width deserves."""
+    decimals = min(max(1 - math.floor(math.log10(max(width, 1e-9))), 0), 4)
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """A number with three digits, in groups of thousands; a dash where there is none."""
+    if value is None or isinstance(value, bool) or not isinstance(value, int | float):
+        return "–" if value is None else str(value)
+    if not math.isfinite(value):
+        return "–"
+    if abs(value) >= 10**digits:
+        return f"{value:,.0f}".replace(",", "\u00a0").replace("-", "−")
+    return f"{value:.{digits}g}".replace("-", "−")
+
+
+def signed(value: Any) -> str:
+    """A number with its sign."""
+    text = number(value)
+    return text if text[:1] in ("−", "–") or text == "0" else f"+{text}"
+
+
+def share(value: Any) -> str:
+    """A share in per cent; never 100 % where something is missing."""
+    if value is None:
+        return "–"
+    percent = 100 * float(value)
+    if percent < 0:
+        return f"−{share(-value)}"
+    for digits in (0, 1, 2):
+        text = f"{percent:.{digits}f}"
+        if text.partition(".")[0] != "100" or value >= 1:
+            return f"{text} %"
+    return "99.99 %"
+
+
+def chance(value: Any) -> str:
+    """A probability."""
+    if value is None:
+        return "–"
+    return "< 0.001" if value < 0.001 else f"{value:.2g}"
+
+
+def disagreement_place(item: Record) -> str:
+    """Where data and model disagree: the narrowest place that is known."""
+    for key in ("lane", "approach", "tls"):
+        if item.get(key) is not None:
+            return str(item[key])
+    return "all of the network"
+
+
+def strongest(record: Record, count: int) -> list[Record]:
+    """The first disagreements by size, one per statistic and the broadest place first."""
+    found: list[Record] = []
+    seen: set[str] = set()
+    for item in record.get("where") or ():
+        if item["statistic"] not in seen:
+            seen.add(item["statistic"])
+            found.append(item)
+    found.sort(key=lambda item: -abs(item["z"]))
+    return found[:count]
+
+
+def partial(record: Record) -> str | None:
+    """What to say of a diagnosis that is not complete; None if it is."""
+    if record.get("complete", True):
+        return None
+    untried = list(record.get("untried") or ())
+    rest = f", … ({len(untried)} in all)" if len(untried) > UNTRIED else ""
+    left = f" Not examined yet: {joined(untried[:UNTRIED])}{rest}." if untried else ""
+    return (
+        f"Partial result: the budget of {number(record.get('budget_s'))} s ended before the search "
+        f"did.{left} The same command goes on where this one stopped."
+    )
+
+
+def geh_line(record: Record) -> str | None:
+    """What the usual criterion on counts says of the gap; None without counts."""
+    tables = record.get("courtesy") or {}
+    before = (tables.get("before") or {}).get("geh_below_5")
+    after = (tables.get("after") or {}).get("geh_below_5")
+    if before is None:
+        return None
+    text = f"GEH < 5 (usual: on 85 % of counts): {share(before)} before, {share(after)} after"
+    if record["verdict"] != "no_discrepancy" and before >= 0.85:
+        return f"{text}. It passes without any correction: it does not see this gap."
+    return f"{text}."
+
+
+def joined(names: Iterable[str]) -> str:
+    """Names as a list in a sentence."""
+    return ", ".join(str(name).replace("_", " ") for name in names)

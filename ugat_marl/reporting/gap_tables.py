@@ -1,0 +1,112 @@
+"""Controllers x gaps, and what a domain's objective measures, as tables of 80 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from ugat_marl.envs import HIDDEN
+from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
+from ugat_marl.reporting.tables import number
+
+
+def matrix_table(found: Evaluation) -> RenderableType:
+    """What each gap costs each controller, and below it the travel time in every domain."""
+    gaps = gaps_of(found)
+    first = found.domains[0]
+    table = _table(f"{found.scenario}: what each gap costs each controller")
+    table.add_column("policy", max_width=16, overflow="fold")
+    table.add_column(f"{first}\nATT s", justify="right")
+    for gap, domains in gaps.items():
+        unit = "%" if gap == "reward" else "s"
+        heading = f"{gap}\n({len(domains)}) {unit}"
+        table.add_column(heading, justify="right", overflow="fold")
+    for policy, cells in gap_matrix(found).items():
+        start = found.estimate(policy, first, "att_s").mean
+        table.add_row(
+            Text(policy), number(start), *(f"{cell.cost.mean:+.1f}" for cell in cells.values())
+        )
+        worst = [
+            f"{cell.worst.removeprefix('want-')}\n{cell.worst_cost:+.0f}"
+            if cell.worst_cost > 0
+            else "-"
+            for cell in cells.values()
+        ]
+        table.add_row(*(Text(text, style="dim") for text in ("  worst", "", *worst)))
+    legend = (
+        f"Mean over the gap's domains (how many) and seeds: ATT above that in {first}. reward: the "
+        "hidden cost above that of the best of these policies, in %."
+    )
+    return Group(table, Text(legend, style="dim"), _by_domain(found))
+
+
+def hidden_tables(found: Evaluation) -> list[RenderableType]:
+    """What domains with an objective measure beside the usual; nothing where none has one."""
+    told = {result.domain for result in found.results if result.scores.hidden}
+    domains = [domain for domain in found.domains if domain in told]
+    if not domains:
+        return []
+    table = _table(f"{found.scenario}: cost of what is wanted, hidden from training")
+    table.add_column("policy", max_width=22, overflow="fold")
+    for domain in domains:
+        table.add_column(domain.removeprefix("want-"), justify="right", overflow="fold")
+    for policy in found.policies:
+        costs = (found.estimate(policy, domain, "cost").mean for domain in domains)
+        table.add_row(Text(policy), *map(number, costs))
+    legend = ", ".join(HIDDEN[name] for name in _SHORT)
+    return [table, *_measured(found, domains), Text(f"{legend}. docs/gaps.md", style="dim")]
+
+
+_SHORT = {
+    "co2_g": "CO2",
+    "delay_gini": "Gini",
+    "delay_p95_s": "95 %",
+    "person_delay_s": "persons",
+    "hard_brakings": "brakings",
+    "collisions": "collisions",
+}
+
+
+def _measured(found: Evaluation, domains: Sequence[str]) -> list[Table]:
+    """What the costs are made of, once for domains with the same traffic."""
+    alike: dict[tuple[float, ...], list[str]] = {}
+    for domain in domains:
+        values = [
+            found.estimate(policy, domain, name).mean
+            for policy in found.policies
+            for name in _SHORT
+        ]
+        alike.setdefault(tuple(values), []).append(domain)
+    tables: list[Table] = []
+    for values, same in alike.items():
+        table = _table(f"measured in {', '.join(same)}")
+        table.add_column("policy", max_width=22, overflow="fold")
+        for heading in _SHORT.values():
+            table.add_column(heading, justify="right")
+        for place, policy in enumerate(found.policies):
+            own = values[place * len(_SHORT) : (place + 1) * len(_SHORT)]
+            table.add_row(Text(policy), *map(number, own))
+        tables.append(table)
+    return tables
+
+
+def _by_domain(found: Evaluation) -> RenderableType:
+    table = _table("average travel time in s, domain by domain")
+    table.add_column("domain", max_width=22, overflow="fold")
+    for policy in found.policies:
+        table.add_column(policy, justify="right", overflow="fold")
+    for domain in found.domains:
+        values = (found.estimate(policy, domain, "att_s").mean for policy in found.policies)
+        table.add_row(Text(domain), *map(number, values))
+    return table
+
+
+def _table(title: str) -> Table:
+    return Table(
+        box=box.SIMPLE_HEAD, title=Text(title), title_justify="left", pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )  # fmt: skip

@@ -1,0 +1,365 @@
+"""Every intersection with its phases, as SVG and PNG, for people with any eyesight."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.files import replacing
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios import Intersection, Link, Network, Scenario
+
+# Okabe and Ito's colours, which stay apart for every kind of colour blindness; line styles say the
+# same again for those who print in black and white.
+STYLES: dict[str, tuple[str, Literal["solid", "dashed", "dotted"], str]] = {
+    "G": ("#0072B2", "solid", "protected green"),
+    "g": ("#D55E00", "dashed", "permitted: lets others pass"),
+    "s": ("#CC79A7", "dotted", "on red after a stop"),
+    "r": ("#b4bcc6", "solid", "red"),
+}
+_ROAD, _INK, _WALK = "#e9edf1", "#1b2430", "#009E73"
+_COLUMNS, _PER_PAGE = 4, 15
+_PANEL_IN = 2.45
+_ARM_M = 16.0
+_UNDER_TEXT = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+_NAMED = 80
+"""With more intersections than this the overview leaves out their names."""
+
+
+def draw(scenario: Scenario, out: Path, reporter: Reporter) -> list[Path]:
+    """Draws the network of a scenario and all its intersections.
+
+    Args:
+        scenario: What to draw.
+        out: Folder to write to: ``network`` and a picture for every intersection (several if it has
+            more than 15 phases), each as ``.svg`` and ``.png``.
+        reporter: Shows progress.
+
+    Returns:
+        The files.
+
+    Raises:
+        OutputError: The folder cannot be written.
+        ScenarioError: The network cannot be controlled.
+    """
+    network = Network.read(scenario)
+    walks = _crossing_shapes(scenario)
+    written = _save(_overview(network, scenario.id), out / "network")
+    taken = {"network"}
+    with reporter.task("drawing intersections", len(network.intersections)) as advance:
+        for item in network.intersections:
+            name = _file_name(item.id, taken)
+            place = _Place(item, network, walks, _frame(item, network))
+            pages = [
+                range(first, min(first + _PER_PAGE, len(item.phases)))
+                for first in range(0, len(item.phases), _PER_PAGE)
+            ]
+            for number, phases in enumerate(pages, 1):
+                page = f"{name}-{number}" if len(pages) > 1 else name
+                written += _save(_sheet(place, scenario.id, phases), out / page)
+            advance()
+    return written
+
+
+Frame = tuple[float, float, float, float]
+"""Left, bottom, width and height, m."""
+
+
+@dataclass(frozen=True)
+class _Place:
+    """What is drawn again and again on a sheet."""
+
+    item: Intersection
+    network: Network
+    walks: Mapping[str, NDArray[np.float64]]
+    frame: Frame
+
+
+def _crossing_shapes(scenario: Scenario) -> dict[str, NDArray[np.float64]]:
+    """Centre lines of the crossings, by their lanes."""
+    found: dict[str, NDArray[np.float64]] = {}
+    for edge in scenario.network.parse().iter("edge"):
+        if edge.get("function") == "crossing":
+            for lane in edge.iter("lane"):
+                points = [point.split(",")[:2] for point in lane.get("shape", "").split()]
+                found[lane.get("id", "")] = np.array(points, dtype=np.float64)
+    return found
+
+
+def _file_name(tls: str, taken: set[str]) -> str:
+    """A name that any file system takes, not given twice whatever the case of its letters."""
+    name = re.sub(r"[^\w-]+", "_", tls).strip("_")[:80] or "intersection"
+    while name.lower() in taken:
+        name += "_"
+    taken.add(name.lower())
+    return name
+
+
+def _save(figure: Any, path: Path) -> list[Path]:
+    from matplotlib import rc_context
+
+    files = [path.with_name(f"{path.name}{suffix}") for suffix in (".svg", ".png")]
+    for file in files:
+        # Text stays text in the SVG, and the same drawing gives the same bytes.
+        with (
+            replacing(file) as temporary,
+            rc_context({"svg.fonttype": "none", "svg.hashsalt": "u"}),
+        ):
+            kind = file.suffix[1:]
+            figure.savefig(
+                temporary, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else None
+            )
+    return files
+
+
+def _figure(width_in: float, height_in: float) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _sheet(place: _Place, title: str, phases: range) -> Any:
+    """The plan of an intersection and its phases, four panels in a row."""
+    item = place.item
+    rows = math.ceil((len(phases) + 1) / _COLUMNS)
+    columns = min(_COLUMNS, len(phases) + 1)
+    width = max(columns, 3) * _PANEL_IN
+    height = rows * (_PANEL_IN + 0.35) + 1.0
+    figure = _figure(width, height)
+    figure.text(0.02, 1 - 0.12 / height, f"{title}: {_short(item.id, 40)}", size=12, va="top",
+                color=_INK, weight="bold")  # fmt: skip
+    figure.text(0.02, 1 - 0.42 / height, _caption(item), size=8.5, va="top", color=_INK)
+    for panel in range(len(phases) + 1):
+        row, column = divmod(panel, _COLUMNS)
+        left = (column + 0.04) / max(columns, 3)
+        bottom = (height - 0.95 - (row + 1) * (_PANEL_IN + 0.35) + 0.3) / height
+        axes = figure.add_axes((left, bottom, 0.92 / max(columns, 3), _PANEL_IN * 0.92 / height))
+        _roads(axes, place)
+        if panel == 0:
+            axes.set_title("plan: roads, and the letters of their links", size=7.5, color=_INK)
+            _names(axes, place)
+            continue
+        state = item.phases[phases[panel - 1]]
+        axes.set_title(f"phase {phases[panel - 1]}", size=9, color=_INK, weight="bold")
+        _ways(axes, place, state)
+    _legend(figure, item, height)
+    return figure
+
+
+def _caption(item: Intersection) -> str:
+    parts = [f"{len(item.phases)} phases", f"{len(item.incoming_lanes)} incoming lanes",
+             f"{len(item.links)} links"]  # fmt: skip
+    if item.crossings:
+        parts.append(f"{len(item.crossings)} crossings")
+    junctions = len({link.junction for link in item.links})
+    if junctions > 1:
+        parts.append(f"{junctions} junctions under one controller")
+    return ", ".join(parts)
+
+
+def _legend(figure: Any, item: Intersection, height: float) -> None:
+    from matplotlib.lines import Line2D
+
+    shown = {letter for phase in item.phases for letter in phase}
+    lines = [
+        Line2D([], [], color=colour, linestyle=style, linewidth=2, label=label)
+        for letter, (colour, style, label) in STYLES.items()
+        if letter in shown
+    ]
+    if item.crossings:
+        lines.append(
+            Line2D([], [], color=_WALK, linewidth=5, linestyle=(0, (0.6, 0.4)),
+                   dash_capstyle="butt", label="crossing, green")
+        )  # fmt: skip
+    figure.legend(
+        handles=lines, loc="upper left", bbox_to_anchor=(0.012, 1 - 0.58 / height), ncols=5,
+        frameon=False, fontsize=8.5, borderaxespad=0, handlelength=3.2,
+    )  # fmt: skip
+
+
+def _frame(item: Intersection, network: Network) -> Frame:
+    """Left, bottom, width and height of what is drawn: the ways across and some road, square."""
+    ends = np.array(
+        [network.lanes[link.from_lane].shape[-1] for link in item.links]
+        + [network.lanes[link.to_lane].shape[0] for link in item.links]
+    )
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    side = float(max(high - low)) + 2 * max(_ARM_M, 0.15 * float(max(high - low)))
+    middle = (low + high) / 2
+    return (float(middle[0]) - side / 2, float(middle[1]) - side / 2, side, side)
+
+
+def _roads(axes: Any, place: _Place) -> None:
+    from matplotlib.collections import LineCollection
+
+    item, network, frame = place.item, place.network, place.frame
+    left, bottom, width, height = frame
+    axes.set_xlim(left, left + width)
+    axes.set_ylim(bottom, bottom + height)
+    axes.set_aspect("equal")
+    axes.axis("off")
+    names = {*item.incoming_lanes, *item.outgoing_lanes}
+    before = (network.lanes[lane].behind for lane in item.incoming_lanes)
+    names |= {name for found in before for name in found.lanes if name in network.lanes}
+    shapes = [np.array(network.lanes[name].shape) for name in sorted(names)]
+    axes.add_collection(
+        LineCollection(shapes, colors=_ROAD, linewidths=_points(2.9, frame), capstyle="butt")
+    )
+    stops = [_stop_line(np.array(network.lanes[lane].shape)) for lane in item.incoming_lanes]
+    axes.add_collection(LineCollection(stops, colors=_INK, linewidths=1.0))
+
+
+def _points(metres: float, frame: Frame) -> float:
+    """A width in points on a panel."""
+    return max(1.0, metres / frame[2] * _PANEL_IN * 0.92 * 72)
+
+
+def _stop_line(shape: NDArray[np.float64]) -> NDArray[np.float64]:
+    along = _direction(shape[-2], shape[-1])
+    across = 1.4 * np.array([-along[1], along[0]])
+    return np.array([shape[-1] - across, shape[-1] + across])
+
+
+def _direction(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+
+
+def _ways(axes: Any, place: _Place, state: str) -> None:
+    """The links, red ones first, and the crossings that have green."""
+    order = "rsgG"
+    for link in sorted(place.item.links, key=lambda one: order.find(state[one.index])):
+        letter = state[link.index] if state[link.index] in STYLES else "r"
+        _arrow(axes, _curve(link, place.network), letter)
+    _crossings(axes, place, state)
+
+
+def _crossings(axes: Any, place: _Place, state: str = "") -> None:
+    """Crossings as stripes across the road: green ones in colour, others pale."""
+    for crossing in place.item.crossings:
+        if crossing.to_lane not in place.walks:
+            continue
+        green = bool(state) and state[crossing.index] in "Gg"
+        axes.plot(
+            *place.walks[crossing.to_lane].T, color=_WALK if green else STYLES["r"][0],
+            linewidth=5 if green else 3, linestyle=(0, (0.6, 0.4)), dash_capstyle="butt",
+            zorder=5 if green else 2,
+        )  # fmt: skip
+
+
+def _arrow(axes: Any, curve: NDArray[np.float64], letter: str) -> None:
+    colour, style, _ = STYLES[letter]
+    stopped = letter == "r"
+    axes.plot(
+        *curve.T, color=colour, linestyle=style, linewidth=0.7 if stopped else 1.7,
+        zorder=2 if stopped else 3, solid_capstyle="butt",
+    )  # fmt: skip
+    if not stopped:
+        axes.annotate(
+            "", xy=curve[-1], xytext=curve[-4],
+            arrowprops={"arrowstyle": "-|>,head_width=0.22,head_length=0.42", "color": colour,
+                        "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0},
+            zorder=4,
+        )  # fmt: skip
+
+
+def _curve(link: Link, network: Network) -> NDArray[np.float64]:
+    """A Bezier curve from the stop line to the first metres of the lane behind."""
+    before = np.array(network.lanes[link.from_lane].shape)
+    behind = np.array(network.lanes[link.to_lane].shape)
+    start, end = before[-1], behind[0]
+    out, into = _direction(before[-2], before[-1]), _direction(behind[0], behind[1])
+    reach = max(0.42 * float(np.linalg.norm(end - start)), 4.0 if link.direction in "tT" else 0.0)
+    t = np.linspace(0, 1, 24)[:, None]
+    points = (
+        (1 - t) ** 3 * start
+        + 3 * (1 - t) ** 2 * t * (start + reach * out)
+        + 3 * (1 - t) * t**2 * (end - reach * into)
+        + t**3 * end
+    )
+    return np.vstack([points, end + 4.0 * into])
+
+
+def _names(axes: Any, place: _Place) -> None:
+    """All links, and beside every incoming road its name and the numbers of its links."""
+    item, network = place.item, place.network
+    left, bottom, width, height = place.frame
+    by_edge: dict[str, list[str]] = {}
+    for lane in item.incoming_lanes:
+        by_edge.setdefault(network.lanes[lane].edge, []).append(lane)
+    for edge, lanes in by_edge.items():
+        shapes = [np.array(network.lanes[lane].shape) for lane in lanes]
+        end = np.mean([shape[-1] for shape in shapes], axis=0)
+        back = -_direction(shapes[0][-2], shapes[0][-1])
+        point = end + back * 0.17 * width
+        point = np.clip(point, [left + 0.17 * width, bottom + 0.05 * height],
+                        [left + 0.83 * width, bottom + 0.95 * height])  # fmt: skip
+        indices = sorted({link.index for link in item.links if link.from_edge == edge})
+        axes.text(
+            *point, f"{_short(edge, 16)}\n{_ranges(indices)}", size=6.5, ha="center", va="center",
+            color=_INK, bbox=_UNDER_TEXT, zorder=6,
+        )  # fmt: skip
+    for link in item.links:
+        _arrow(axes, _curve(link, network), "r")
+    _crossings(axes, place)
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """``0-2, 5`` of 0, 1, 2, 5."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1].append(number)
+        else:
+            parts.append([number])
+    return ", ".join(f"{p[0]}-{p[-1]}" if len(p) > 1 else f"{p[0]}" for p in parts)
+
+
+def _short(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def _overview(network: Network, title: str) -> Any:
+    """The whole network with the names of its agents."""
+    from matplotlib.collections import LineCollection
+
+    shapes = [np.array(lane.shape) for lane in network.lanes.values()]
+    low, high = _bounds(shapes)
+    width, height = np.maximum(high - low, 1.0)
+    wide = 9.0
+    tall = float(np.clip(wide * height / width, 3.0, 12.0))
+    figure = _figure(wide, tall + 0.5)
+    axes = figure.add_axes((0.01, 0.01, 0.98, tall / (tall + 0.5) - 0.02))
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.axis("off")
+    axes.add_collection(LineCollection(shapes, colors="#aab4c0", linewidths=1.0))
+    axes.set_xlim(low[0] - 0.02 * width, high[0] + 0.02 * width)
+    axes.set_ylim(low[1] - 0.02 * height, high[1] + 0.02 * height)
+    places = np.array([item.position for item in network.intersections])
+    axes.plot(*places.T, "o", color=STYLES["G"][0], markersize=6, zorder=3)
+    figure.text(0.02, 1 - 0.1 / (tall + 0.5), f"{title}: {len(places)} agents", size=12, va="top",
+                color=_INK, weight="bold")  # fmt: skip
+    if len(places) <= _NAMED:
+        for item in network.intersections:
+            axes.annotate(
+                _short(item.id, 18), item.position, xytext=(5, 5), textcoords="offset points",
+                size=7.5, color=_INK, zorder=4,
+                bbox=_UNDER_TEXT,
+            )  # fmt: skip
+    return figure
+
+
+def _bounds(
+    shapes: Iterable[NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    points = np.concatenate(list(shapes))
+    return points.min(axis=0), points.max(axis=0)

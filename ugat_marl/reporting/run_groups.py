@@ -1,0 +1,157 @@
+"""Trainings that belong together: those that differ in seed and domain, and the jobs of a table."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ugat_marl.experiments import Comparison, Trial
+from ugat_marl.reporting.job_names import grounding_of, job_name
+from ugat_marl.reporting.run_records import RunRecord
+
+_APART = (
+    "seed", "real", "real_log", "evaluation_seeds", "tuning_seeds", "rule_budget", "control",
+    "further", "corrected", "randomised", "random_delay_s", "fine_tuned", "oracle",
+    "scenario_hash", "domains",
+)  # fmt: skip
+"""Settings in which trainings of one group may differ: they make no other policy of UGAT."""
+RULE = "best rule there"
+
+
+@dataclass(frozen=True)
+class Group:
+    """Trainings that are compared with intervals over their seeds.
+
+    Attributes:
+        title: What they have in common.
+        rows: As `Comparison.rows` makes them.
+        note: What a reader must know.
+        left_out: Names of what could not take part.
+    """
+
+    title: str
+    rows: Sequence[Mapping[str, Any]]
+    note: str
+    left_out: tuple[str, ...] = ()
+
+
+def groups(records: Sequence[RunRecord]) -> list[Group]:
+    """All groups with more than one training."""
+    found: list[Group] = []
+    for own in _parted(records, _common).values():
+        trials, left_out = _trials(own)
+        if len(own) < 2 or not trials:
+            continue
+        first = own[0]
+        trials.sort(key=lambda trial: _rank(trial.setting))
+        comparison = Comparison(first.scenario, "", first.sim, tuple(trials), {})
+        count = len(comparison.training_seeds)
+        note = f"{count} training seed{'s' * (count != 1)}; "
+        note += "intervals: 95 %, Student's, over them." if count > 1 else "no intervals over them."
+        title = f"{first.scenario}, trained in {first.sim}"
+        title += "" if first.job else f", {grounding_of(first.settings) or 'unknown'} grounding"
+        found.append(Group(title, comparison.rows(), note, left_out))
+    return found
+
+
+def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
+    """Trainings that differ in nothing but their seed, whose curves are drawn as one."""
+    return list(
+        _parted(records, lambda r: (*_common(r), r.real, _ugat(r), job_name(r.settings))).values()
+    )
+
+
+def _common(record: RunRecord) -> tuple[Any, ...]:
+    if record.job:
+        return True, record.scenario, record.sim
+    settings = {k: v for k, v in record.settings.items() if k not in _APART}
+    return False, record.scenario, record.sim, json.dumps(settings, sort_keys=True, default=str)
+
+
+def _ugat(record: RunRecord) -> str:
+    return json.dumps(record.ugat, sort_keys=True, default=str)
+
+
+def _parted(records: Iterable[RunRecord], key: Any) -> dict[Any, list[RunRecord]]:
+    found: dict[Any, list[RunRecord]] = {}
+    for record in records:
+        found.setdefault(key(record), []).append(record)
+    return found
+
+
+def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], tuple[str, ...]]:
+    """What was scored in both domains; and the names of records that were not."""
+    names = job_labels(records)
+    trials: list[Trial] = []
+    left_out: list[str] = []
+    for record, name in zip(records, names, strict=True):
+        own = list(_of_job(record, name)) if record.job else list(_of_run(record))
+        trials += own
+        if not own:
+            left_out.append(record.name)
+    return trials, tuple(left_out)
+
+
+def _of_run(record: RunRecord) -> Iterable[Trial]:
+    found = record.evaluation
+    if found is None or len(found.domains) != 2:
+        return
+    real = found.domains[1]
+    rule = f"rule {found.notes.get(f'best rule in {real}')}"
+    for r in found.results:
+        if r.policy.startswith("rule ") and r.policy != rule:
+            continue
+        setting = RULE if r.policy == rule else r.policy
+        domain = record.sim if r.domain == found.domains[0] else r.domain
+        yield Trial(setting, real, domain, _seed(record), r.seed, r.scores)
+
+
+def _of_job(record: RunRecord, name: str) -> Iterable[Trial]:
+    found = record.evaluation
+    if found is None:
+        return
+    seeds = {d: {r.seed for r in found.results if r.domain == d} for d in found.domains}
+    only = record.settings.get("target")
+    for target in found.domains:
+        if target == record.sim or (only is not None and target != only):
+            continue
+        if seeds[target] != seeds.get(record.sim):
+            continue  # half played
+        for r in found.results:
+            if r.domain in (record.sim, target):
+                yield Trial(name, target, r.domain, _seed(record), r.seed, r.scores)
+
+
+def _rank(setting: str) -> int:
+    """Direct transfer first, then UGAT, controls, and rules last; stable."""
+    order = ("direct transfer", "UGAT", "", "best rule")
+    return next(n for n in (0, 1, 3, 2) if setting.startswith(order[n]))
+
+
+def _seed(record: RunRecord) -> int | None:
+    return int(record.seed) if record.seed.lstrip("-").isdigit() else None
+
+
+def job_labels(records: Sequence[RunRecord]) -> list[str]:
+    """Names of jobs, with the settings of UGAT by which those of the same name differ."""
+    flat = [dict(_flat(record.ugat)) for record in records]
+    names = [job_name(record.settings) for record in records]
+    found: list[str] = []
+    for record, name, own in zip(records, names, flat, strict=True):
+        others = [each for each, other in zip(flat, names, strict=True) if other == name]
+        varied = [key for key, value in own.items() if any(o.get(key) != value for o in others)]
+        usual = {key: Counter(o.get(key) for o in others).most_common(1)[0][0] for key in varied}
+        unusual = [f"{key} {own[key]}" for key in varied if own[key] != usual[key]]
+        found.append(f"{name} ({', '.join(unusual)})" if record.job and unusual else name)
+    return found
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", str(value)

@@ -1,0 +1,342 @@
+"""What folders of trainings hold, read as far as it can be: what is missing is named, never raised.
+
+A folder is one of three things: a run of ``ugat-marl train``, a job of ``ugat-marl paper``, or a
+finished table of it. A folder of such folders stands for all of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import polars as pl
+
+from ugat_marl.data import CHECKPOINT, METRICS, SETTINGS, Metrics
+from ugat_marl.errors import OptionError, UgatMarlError
+from ugat_marl.experiments import QUEUES, Evaluation, read_queues, result_of
+from ugat_marl.reporting.job_names import job_name
+
+RUN, JOB, TABLE, SCORES = "run.json", "job.json", "table.json", "scores.json"
+TABLE_CSV, TABLE_MD = "table.csv", "table.md"
+_DEPTH = 4
+_LONGEST = 200_000_000
+"""Bytes of a file beyond which it is none of ours."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One training.
+
+    Attributes:
+        name: What the page calls it.
+        directory: Where it lies.
+        job: Whether it is a job of ``ugat-marl paper``.
+        settings: All options that are on record, nested as in the configuration; empty for none.
+        hashes: Domain to hash of the scenario in it.
+        versions: Package to version.
+        evaluation: How its policies did.
+        metrics: What was logged.
+        state: How far it had come at the last checkpoint: ``pretrained``, ``iteration``.
+        queues: Halting vehicles by policy, domain, minute and intersection.
+        missing: What is not there or cannot be read, a sentence each.
+        written: When a file in it was last written, in seconds since 1970; nan for never.
+    """
+
+    name: str
+    directory: Path
+    job: bool
+    settings: Mapping[str, Any]
+    hashes: Mapping[str, str]
+    versions: Mapping[str, str]
+    evaluation: Evaluation | None
+    metrics: Metrics | None
+    state: Mapping[str, int] | None
+    queues: pl.DataFrame | None
+    missing: tuple[str, ...]
+    written: float
+
+    @property
+    def scenario(self) -> str:
+        """As its user named it; "" where that is not known."""
+        found = self.settings.get("scenario") or (self.evaluation and self.evaluation.scenario)
+        return str(found or "")
+
+    @property
+    def sim(self) -> str:
+        """The simulation it was trained in."""
+        return str(self.settings.get("sim", "sim"))
+
+    @property
+    def real(self) -> str:
+        """The real domain, "" for none."""
+        if self.evaluation is not None and len(self.evaluation.domains) == 2:
+            return self.evaluation.domains[1]
+        return str(self.settings.get("target" if self.job else "real") or "")
+
+    @property
+    def seed(self) -> str:
+        """Seed of the training, as text."""
+        return "" if self.settings.get("seed") is None else str(self.settings["seed"])
+
+    @property
+    def ugat(self) -> Mapping[str, Any]:
+        """Settings of the algorithm."""
+        found = self.settings.get("ugat")
+        return found if isinstance(found, Mapping) else {}
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is a final evaluation."""
+        return self.evaluation is not None
+
+    def series(self, stage: str, name: str) -> list[tuple[int, float]]:
+        """What was logged under a name, by episode or iteration; the last value of each counts."""
+        rows = self.metrics.rows if self.metrics is not None else []
+        return sorted({step: v for s, step, n, v in rows if (s, n) == (stage, name)}.items())
+
+    def agents(self, name: str) -> dict[str, list[tuple[int, float]]]:
+        """The same per agent: what was logged of an iteration under ``name/agent``."""
+        found: dict[str, dict[int, float]] = {}
+        for stage, step, key, value in self.metrics.rows if self.metrics is not None else []:
+            if stage == "iteration" and key.startswith(f"{name}/"):
+                found.setdefault(key.removeprefix(f"{name}/"), {})[step] = value
+        return {agent: sorted(values.items()) for agent, values in found.items()}
+
+
+@dataclass(frozen=True)
+class TableRecord:
+    """A finished table of ``ugat-marl paper``.
+
+    Attributes:
+        name: What the page calls it.
+        directory: Where it lies.
+        rows: As `comparison.Comparison.rows` makes them.
+        command: How it was made, "" where that is not known.
+        missing: What is not there or cannot be read, a sentence each.
+    """
+
+    name: str
+    directory: Path
+    rows: tuple[Mapping[str, Any], ...]
+    command: str
+    missing: tuple[str, ...]
+
+
+@dataclass
+class _Reader:
+    """Reads files of one folder and keeps what went wrong."""
+
+    directory: Path
+    missing: list[str] = field(default_factory=list)
+
+    def read(self, name: str, how: Callable[[Path], T], without: str) -> T | None:
+        """A file's content, or None and a sentence.
+
+        Args:
+            name: Of the file.
+            how: Reads it; what it raises is kept.
+            without: What cannot be said without it.
+        """
+        path = self.directory / name
+        try:
+            if not path.is_file():
+                self.missing.append(f"{name} is not there: {without}")
+                return None
+            if path.stat().st_size > _LONGEST:
+                raise ValueError(f"it has more than {_LONGEST // 1_000_000} MB")
+            return how(path)
+        except (UgatMarlError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            reason = " ".join(str(error).replace(f"{path}: ", "").split())
+            self.missing.append(f"{name} cannot be used ({reason[:160]}): {without}")
+            return None
+
+
+def read_records(paths: Sequence[Path]) -> list[RunRecord | TableRecord]:
+    """Everything in the folders, in their order, each once.
+
+    Raises:
+        OptionError: A path is no folder, or nothing of the suite lies in it.
+    """
+    found: dict[Path, Path] = {}
+    for path in paths:
+        if not path.is_dir():
+            text = "is a file; give the folder it lies in" if path.exists() else "no such folder"
+            raise OptionError(f"{path}: {text}")
+        folders = list(_folders(path, _DEPTH))
+        if not folders:
+            raise OptionError(
+                f"{path}: neither a run (run.json, table.json) nor a job or table of `ugat-marl "
+                "paper` (job.json, table.csv) lies in it or in its folders"
+            )
+        for folder in folders:
+            found.setdefault(folder.resolve(), folder)
+    names = _names(list(found.values()))
+    return [
+        _table(folder, name) if (folder / TABLE_CSV).is_file() else _run(folder, name)
+        for folder, name in zip(found.values(), names, strict=True)
+    ]
+
+
+def number(value: Any) -> float:
+    """A number of a record, nan where there is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str) or value == "":
+        return math.nan
+    try:
+        return float(value)
+    except ValueError:
+        return math.nan
+
+
+def _folders(path: Path, depth: int) -> Iterable[Path]:
+    if any((path / name).is_file() for name in (RUN, JOB, TABLE, METRICS, TABLE_CSV)):
+        yield path
+    elif depth:
+        try:
+            inner = sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith("."))
+        except OSError:
+            return
+        for folder in inner:
+            yield from _folders(folder, depth - 1)
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """The shortest endings of the paths that differ."""
+    parts = [folder.resolve().parts for folder in folders]
+    for length in range(1, max(map(len, parts), default=1) + 1):
+        names = ["/".join(one[-length:]) for one in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [str(folder) for folder in folders]
+
+
+def _object(path: Path) -> dict[str, Any]:
+    found = json.loads(path.read_text(encoding="utf-8", errors="replace"))
+    if not isinstance(found, dict):
+        raise ValueError("not a JSON object")
+    return found
+
+
+def _run(directory: Path, name: str) -> RunRecord:
+    reader = _Reader(directory)
+    job = (directory / JOB).is_file()
+    kept = _kept(reader, job)
+    settings = kept.get("settings", kept)
+    settings = settings if isinstance(settings, dict) else {}
+    if job:
+        evaluation = reader.read(
+            SCORES, lambda path: _scores(path, settings), "it has not been judged (yet)"
+        )
+    else:
+        evaluation = reader.read(
+            TABLE, Evaluation.read, "the run is under way, or was stopped; no final table"
+        )
+    grounded = not job or isinstance(settings.get("ugat"), dict)
+    without = "nobody knows where and when vehicles stood"
+    queues = reader.read(QUEUES, read_queues, without) if evaluation is not None else None
+    if job and queues is not None:
+        queues = queues.with_columns(policy=pl.lit(job_name(settings)))
+    return RunRecord(
+        name=name,
+        directory=directory,
+        job=job,
+        settings=settings,
+        hashes=_texts(_hashes(directory, kept)),
+        versions=_texts(kept.get("versions")),
+        evaluation=evaluation,
+        metrics=_metrics(reader) if grounded else None,
+        state=_state(reader) if grounded else None,
+        queues=queues,
+        missing=tuple(reader.missing),
+        written=_written(directory),
+    )
+
+
+def _kept(reader: _Reader, job: bool) -> dict[str, Any]:
+    """Options and versions; of runs from before `SETTINGS` what their identity holds."""
+    if job:
+        return reader.read(JOB, _object, "its settings are unknown") or {}
+    if (reader.directory / SETTINGS).is_file():
+        return reader.read(SETTINGS, _object, "some of its options are unknown") or _identity(
+            reader
+        )
+    return _identity(reader)
+
+
+def _identity(reader: _Reader) -> dict[str, Any]:
+    return reader.read(RUN, _object, "its settings are unknown") or {}
+
+
+def _hashes(directory: Path, kept: Mapping[str, Any]) -> Any:
+    try:
+        identity = _object(directory / RUN)
+    except (OSError, ValueError, RecursionError):
+        identity = kept
+    return identity.get("scenario_hash") or identity.get("worlds")
+
+
+def _texts(value: Any) -> dict[str, str]:
+    return {str(k): str(v) for k, v in value.items()} if isinstance(value, dict) else {}
+
+
+def _metrics(reader: _Reader) -> Metrics | None:
+    """The metrics, or those of the last checkpoint."""
+    without = "no learning curves, nothing of the gate"
+    found = reader.read(METRICS, Metrics.read, without)
+    if found is None and (reader.directory / CHECKPOINT / METRICS).is_file():
+        name = f"{CHECKPOINT}/{METRICS}"
+        found = reader.read(name, Metrics.read, without)
+        if found is not None:
+            reader.missing[-1] = reader.missing[-1].replace(without, f"{name} is shown instead")
+    return found
+
+
+def _state(reader: _Reader) -> dict[str, int] | None:
+    if not (reader.directory / CHECKPOINT).is_dir():
+        return None
+    found = reader.read(f"{CHECKPOINT}/state.json", _object, "how far it had come is unknown")
+    if found is None:
+        return None
+    return {k: v for k, v in found.items() if isinstance(v, int)}
+
+
+def _written(directory: Path) -> float:
+    """When the newest of the files that say how things stand was written."""
+    times: list[float] = []
+    for name in (RUN, JOB, TABLE, SCORES, METRICS, f"{CHECKPOINT}/state.json"):
+        with contextlib.suppress(OSError):
+            times.append((directory / name).stat().st_mtime)
+    return max(times, default=math.nan)
+
+
+def _scores(path: Path, settings: Mapping[str, Any]) -> Evaluation:
+    rows = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(rows, list) or not rows:
+        raise ValueError("no scores in it")
+    policy = job_name(settings)
+    results = tuple(result_of({**row, "policy": policy}) for row in rows)
+    return Evaluation(str(settings.get("scenario", "")), "", results, {})
+
+
+def _table(directory: Path, name: str) -> TableRecord:
+    reader = _Reader(directory)
+    rows = reader.read(TABLE_CSV, _csv, "there is nothing to show") or []
+    page = reader.read(TABLE_MD, lambda p: p.read_text(errors="replace"), "its command is unknown")
+    lines = [line.strip() for line in (page or "").splitlines() if line.startswith("    ugat-marl")]
+    return TableRecord(name, directory, tuple(rows), (lines or [""])[0], tuple(reader.missing))
+
+
+def _csv(path: Path) -> list[dict[str, Any]]:
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        rows = [row for row in csv.DictReader(file) if row.get("setting") and row.get("domain")]
+    if not rows:
+        raise ValueError("no rows with a setting and a domain in it")
+    texts = ("scenario", "setting", "domain")
+    return [{k: str(v) if k in texts else number(v) for k, v in row.items()} for row in rows]

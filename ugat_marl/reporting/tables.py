@@ -1,0 +1,216 @@
+"""Evaluations as tables that fit a terminal of 80 columns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from ugat_marl.data import MEASURES
+from ugat_marl.experiments import Estimate, Evaluation, Tuned
+
+
+def transfer_table(found: Evaluation) -> RenderableType:
+    """ATT of every policy in the simulation and the real domains, with gap and regret."""
+    first, *others = found.domains
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        title=Text(f"{found.scenario}: average travel time in s (95 % interval)"),
+        title_justify="left",
+        caption=Text(_caption(found)),
+        caption_justify="left",
+        pad_edge=False,
+    )
+    table.add_column("policy", max_width=22)
+    table.add_column(first, justify="right")
+    for domain in others:
+        for heading in (domain, "Δ", "regret"):
+            table.add_column(heading, justify="right")
+    for policy in found.policies:
+        cells = [_with_interval(found.estimate(policy, first, "att_s"))]
+        for domain in others:
+            cells += [
+                _with_interval(found.estimate(policy, domain, "att_s")),
+                _signed(found.gap(policy, domain, "att_s")),
+                number(found.regret(policy, domain).mean),
+            ]
+        table.add_row(Text(policy), *cells)
+    return table
+
+
+def measures_table(found: Evaluation) -> RenderableType:
+    """One block per domain: all measures, their intervals, and gaps against the first domain."""
+    blocks: list[RenderableType] = []
+    for domain in found.domains:
+        table = Table(
+            box=box.SIMPLE_HEAD,
+            title=Text(f"{found.scenario} in {domain}"),
+            title_justify="left",
+            pad_edge=False,
+            padding=(0, 1, 0, 0),
+        )
+        table.add_column("policy", max_width=18, overflow="fold")
+        headings = ("ATT s", "through.", "reward", "queue", "delay", "delay s", "regret s")
+        for heading in headings:
+            table.add_column(heading, justify="right", no_wrap=True)
+        for policy in found.policies:
+            estimates = [found.estimate(policy, domain, measure) for measure in MEASURES]
+            estimates.append(found.regret(policy, domain))
+            table.add_row(Text(policy), *(number(e.mean) for e in estimates))
+            if not math.isnan(estimates[0].low):
+                halves = (f"±{number((e.high - e.low) / 2)}" for e in estimates)
+                table.add_row(*_dim("  95 % interval", *halves))
+            if domain != found.domains[0]:
+                gaps = [found.gap(policy, domain, measure) for measure in MEASURES]
+                table.add_row(*_dim(f"  gap to {found.domains[0]}", *map(_signed, gaps)))
+        blocks.append(table)
+        blocks += [Text(line, style="dim") for line in _backlog(found, domain)]
+    blocks.append(Text(_legend(found), style="dim"))
+    return Group(*blocks)
+
+
+def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
+    """The best settings of each rule, the best rule first."""
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        title=Text(f"{title}: rules at their best"),
+        title_justify="left",
+        caption=Text(
+            "ATT: mean in s over the tuning seeds, all vehicles due. worst: of the settings "
+            "tried. Numbers after a name are its settings; see docs/controllers.md."
+        ),
+        caption_justify="left",
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("best setting", max_width=28, overflow="fold")
+    for heading in ("ATT s", "worst s", "settings", "episodes"):
+        table.add_column(heading, justify="right")
+    for tuned in sorted(found, key=lambda each: each.best.att_s):
+        worst = max(trial.att_s for trial in tuned.trials)
+        table.add_row(
+            Text(tuned.best.spec),
+            number(tuned.best.att_s),
+            number(worst) if len(tuned.trials) > 1 else "-",
+            str(len(tuned.trials)),
+            str(tuned.episodes),
+        )
+    return table
+
+
+def policy_gap_table(
+    title: str, gap: Mapping[str, Mapping[str, Any]], seeds: int
+) -> RenderableType:
+    """How far the simulation and the corrected one are off the real world, policy by policy.
+
+    Args:
+        title: What the table is of.
+        gap: As `ugat_marl.experiments.policy_gaps.policy_gap` returns it.
+        seeds: Number of episodes behind every number.
+    """
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        title=Text(title),
+        title_justify="left",
+        caption=Text(
+            f"{seeds} seeds. before: |real - sim|, after: |real - corrected|, "
+            "both in s; shrink: share of the gap that is gone."
+        ),
+        caption_justify="left",
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("policy", max_width=24, overflow="fold")
+    for heading in ("sim", "corrected", "real", "before", "after", "shrink"):
+        table.add_column(heading, justify="right")
+    for policy, row in gap.items():
+        att = [row[world] for world in ("sim", "corrected", "real")]
+        table.add_row(
+            Text(policy),
+            *(number(item["mean"]) for item in att),
+            number(row["before"]),
+            number(row["after"]),
+            "-" if row["shrink"] is None else f"{100 * row['shrink']:.0f} %",
+        )
+        if any(item["low"] is not None for item in att):
+            table.add_row(*_dim("  95 % interval", *map(_limits, att)))
+    return table
+
+
+def _limits(att: Mapping[str, float | None]) -> str:
+    low, high = att["low"], att["high"]
+    return "-" if low is None or high is None else f"{number(low)}-{number(high)}"
+
+
+def _backlog(found: Evaluation, domain: str) -> list[str]:
+    """Who kept vehicles out of the network, which throughput and queue do not show."""
+    waiting = {name: found.estimate(name, domain, "backlog").mean for name in found.policies}
+    kept_out = [f"{name} {number(mean)}" for name, mean in waiting.items() if mean >= 0.5]
+    return [f"vehicles due that never entered: {', '.join(kept_out)}"] if kept_out else []
+
+
+def _caption(found: Evaluation) -> str:
+    keys = [f"best rule in {domain}" for domain in found.domains]
+    lines = [f"{key}: {found.notes[key]}" for key in keys if key in found.notes]
+    if corrected := found.notes.get("corrected sim"):
+        lines.append(f"corrected sim: trained in {corrected}")
+    lines += _medians(found)
+    if len(found.domains) == 1:
+        return "\n".join([*lines, f"{_seeds(found)} seeds"])
+    lines.append(
+        f"{_seeds(found)} seeds. Δ: minus {found.domains[0]}. regret: ATT above the best of "
+        "these policies in that domain."
+    )
+    return "\n".join(lines)
+
+
+def _medians(found: Evaluation) -> list[str]:
+    """Medians where a few locked-up episodes carry the mean away."""
+    lines: list[str] = []
+    for domain in found.domains:
+        both = {name: found.estimate(name, domain, "att_s") for name in found.policies}
+        if any(abs(e.mean - e.median) > 0.1 * e.median for e in both.values()):
+            values = ", ".join(f"{name} {number(e.median)}" for name, e in both.items())
+            lines.append(f"medians in {domain}: {values}")
+    return lines
+
+
+def _legend(found: Evaluation) -> str:
+    return (
+        f"{_seeds(found)} seeds. ATT: all vehicles due, scheduled departure to arrival or end. "
+        "queue: halting vehicles per intersection. delay: 1 - v/vmax of incoming lanes. "
+        "delay s: time loss plus departure delay. regret: ATT above the best of these policies."
+    )
+
+
+def _seeds(found: Evaluation) -> int:
+    return len({result.seed for result in found.results})
+
+
+def _dim(*cells: str) -> list[Text]:
+    return [Text(cell, style="dim") for cell in cells]
+
+
+def _with_interval(estimate: Estimate) -> str:
+    if math.isnan(estimate.low):
+        return number(estimate.mean)
+    return f"{number(estimate.mean)} ({number(estimate.low)}-{number(estimate.high)})"
+
+
+def _signed(estimate: Estimate) -> str:
+    text = number(estimate.mean)
+    return text if text.startswith("-") else f"+{text}"
+
+
+def number(value: float) -> str:
+    """Three significant digits, or whole numbers above a hundred."""
+    if math.isnan(value):
+        return "-"
+    if abs(value) >= 99.95:
+        return f"{value:.0f}"
+    return f"{value:.1f}" if abs(value) >= 0.9995 else f"{value:.2f}"

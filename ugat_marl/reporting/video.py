@@ -1,0 +1,306 @@
+"""Episodes as videos: every second of traffic a frame, two policies side by side if asked for."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.envs import Picture, TrafficEnv
+from ugat_marl.errors import OptionError, OutputError
+from ugat_marl.files import replacing
+from ugat_marl.policies import Policy, Stopped, roll_out
+from ugat_marl.simulation import (
+    HALTING_MPS,
+    Launch,
+    Plans,
+    ProcessSimulator,
+    Simulator,
+    Snapshot,
+    Trips,
+    VehiclePicture,
+)
+
+Frame = NDArray[np.uint8]
+_PILLOW = {".gif": "GIF", ".webp": "WEBP"}
+_FFMPEG = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
+_CAPTION_PX = 46
+_WIDE = 1.6  # times as wide as high: pictures then stand below each other
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One instant of an episode.
+
+    Attributes:
+        time_s: On the scenario's clock.
+        vehicles: Where everybody is.
+        states: Traffic light to the state it shows.
+    """
+
+    time_s: float
+    vehicles: VehiclePicture
+    states: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Film:
+    """What was filmed, and how it is announced.
+
+    Attributes:
+        title: Name of the policy.
+        domain: Name of the domain.
+        env: Whose network is drawn.
+        scenes: One per second.
+    """
+
+    title: str
+    domain: str
+    env: TrafficEnv
+    scenes: Sequence[Scene]
+
+
+class Filmed:
+    """A simulator that is looked at in every second of a stretch of the episode.
+
+    Args:
+        inner: Does the work.
+        begin_s: Where the stretch begins, in s from the beginning of the episode.
+        end_s: Where it ends.
+    """
+
+    def __init__(self, inner: Simulator, begin_s: float, end_s: float) -> None:
+        self._inner = inner
+        self._stretch = begin_s, end_s
+        self._start_s = self._now_s = 0.0
+        self.scenes: list[Scene] = []
+
+    def start(self, launch: Launch) -> Snapshot:
+        """Starts a simulation; see `Simulator`."""
+        self._start_s = self._now_s = launch.begin_s
+        self.scenes = []
+        return self._inner.start(launch)
+
+    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+        """Simulates `seconds`, in one go outside of the stretch, second by second inside."""
+        begin_s, end_s = (self._start_s + edge for edge in self._stretch)
+        if self._now_s + seconds <= begin_s or self._now_s >= end_s:
+            self._now_s += seconds
+            return self._inner.advance(seconds, plans)
+        done = 0.0
+        while True:
+            length = min(1.0, seconds - done)
+            snapshot = self._inner.advance(length, between(plans, done, done + length))
+            done += length
+            self._now_s += length
+            if begin_s < self._now_s <= end_s:
+                self.scenes.append(Scene(self._now_s, self.vehicles(), self.signals()))
+            if done >= seconds:
+                return snapshot
+
+    def vehicles(self) -> VehiclePicture:
+        """See `Simulator`."""
+        return self._inner.vehicles()
+
+    def signals(self) -> dict[str, str]:
+        """See `Simulator`."""
+        return self._inner.signals()
+
+    def finish(self) -> Trips:
+        """See `Simulator`."""
+        return self._inner.finish()
+
+    def close(self) -> None:
+        """See `Simulator`."""
+        self._inner.close()
+
+
+def between(plans: Plans, begin_s: float, end_s: float) -> dict[str, list[tuple[float, str]]]:
+    """The part of some signal plans between two times from their beginning."""
+    found: dict[str, list[tuple[float, str]]] = {}
+    for tls, segments in plans.items():
+        start, own = 0.0, list[tuple[float, str]]()
+        for duration, state in segments:
+            shown = min(start + duration, end_s) - max(start, begin_s)
+            if shown > 0:
+                own.append((shown, state))
+            start += duration
+        if own:
+            found[tls] = own
+    return found
+
+
+def film(
+    env: TrafficEnv, policy: Policy, seed: int, begin_s: float, length_s: float, title: str
+) -> Film:
+    """Plays an episode up to the end of a stretch and keeps every second of that.
+
+    Args:
+        env: An environment made with the policy's `env_options`, not yet reset.
+        policy: Who acts.
+        seed: Fixes the episode.
+        begin_s: Where the stretch begins, in s from the beginning of the episode.
+        length_s: How long it is.
+        title: What to call the policy.
+
+    Raises:
+        OptionError: The episode is over before the stretch is.
+    """
+    duration_s = env.scenario.decisions * env.decision_interval_s
+    if begin_s < 0 or length_s < 1 or begin_s + length_s > duration_s:
+        raise OptionError(
+            f"a video of {length_s:g} s from second {begin_s:g} on: the episode has "
+            f"{duration_s:g} s; choose a shorter or earlier stretch"
+        )
+    filmed = Filmed(ProcessSimulator(), begin_s, begin_s + length_s)
+    env._simulator = filmed
+
+    def on_step(step: int) -> None:
+        if step * env.decision_interval_s >= begin_s + length_s:
+            raise Stopped
+
+    with contextlib.suppress(Stopped):
+        roll_out(env, policy, seed, on_step=on_step)
+    return Film(title, env.domain, env, filmed.scenes)
+
+
+def frames(films: Sequence[Film], size_px: int) -> Iterator[Frame]:
+    """The pictures of one film, or of several side by side.
+
+    Args:
+        films: Of the same stretch of the same network.
+        size_px: Longer side of each picture.
+    """
+    pictures = [Picture(each.env.network, each.env.intersection_of, size_px) for each in films]
+    write = _Captions()
+    for scenes in zip(*(each.scenes for each in films), strict=True):
+        shown: list[Frame] = []
+        for each, picture, scene in zip(films, pictures, scenes, strict=True):
+            picture.draw(scene.vehicles, scene.states)
+            shown.append(write(picture.pixels(), each, scene))
+        wide = shown[0].shape[1] > _WIDE * shown[0].shape[0]
+        yield np.concatenate(shown, axis=0 if wide else 1)
+
+
+def require_video(path: Path) -> None:
+    """Refuses a file that cannot become a video here.
+
+    Raises:
+        OptionError: An unknown ending, or one that needs ffmpeg where there is none.
+    """
+    ending = path.suffix.lower()
+    if ending not in (*_PILLOW, *_FFMPEG):
+        known = ", ".join([*_FFMPEG, *_PILLOW])
+        raise OptionError(f"{path}: a video's name ends in one of {known}, not {ending!r}")
+    if ending in _FFMPEG and _ffmpeg() is None:
+        raise OptionError(
+            f"{path}: {ending} needs ffmpeg, which is not here; pip install 'ugat-marl[video]' "
+            f"brings it, or write {path.with_suffix('.gif').name}, which needs nothing"
+        )
+
+
+def write_video(pictures: Iterable[Frame], path: Path, per_second: float) -> None:
+    """Writes frames of one size as a video, whole or not at all.
+
+    Args:
+        pictures: uint8 ``(height, width, 3)``, both even.
+        path: Its ending decides the form: .mp4, .mkv, .mov by ffmpeg; .gif and .webp by Pillow.
+        per_second: Frames per second.
+
+    Raises:
+        OptionError: See `require_video`.
+        OutputError: ffmpeg failed; its own words are in the message.
+    """
+    require_video(path)
+    with replacing(path) as temporary:
+        if path.suffix.lower() in _PILLOW:
+            _by_pillow(pictures, temporary, _PILLOW[path.suffix.lower()], per_second)
+        else:
+            _by_ffmpeg(pictures, temporary, _FFMPEG[path.suffix.lower()], per_second)
+
+
+class _Captions:
+    """Writes above each picture whose it is, what time it is and how many vehicles stand."""
+
+    def __init__(self) -> None:
+        import matplotlib as mpl
+        from PIL import ImageFont
+
+        fonts = Path(mpl.get_data_path()) / "fonts" / "ttf"
+        self._bold = ImageFont.truetype(str(fonts / "DejaVuSans-Bold.ttf"), 16)
+        self._plain = ImageFont.truetype(str(fonts / "DejaVuSans.ttf"), 13)
+
+    def __call__(self, picture: Frame, film: Film, scene: Scene) -> Frame:
+        from PIL import Image, ImageDraw
+
+        band = Image.new("RGB", (picture.shape[1], _CAPTION_PX), "white")
+        draw = ImageDraw.Draw(band)
+        clock = f"{int(scene.time_s) // 3600}:{int(scene.time_s) // 60 % 60:02}"
+        clock += f":{int(scene.time_s) % 60:02}"
+        standing = int((scene.vehicles.speed_mps < HALTING_MPS).sum())
+        numbers = f"{len(scene.vehicles.speed_mps)} vehicles, {standing} standing"
+        draw.text((12, 6), film.title, font=self._bold, fill="#1b2430")
+        text = f"{film.domain} · {clock} · {numbers}"
+        draw.text((12, 27), text, font=self._plain, fill="#5a6675")
+        return np.concatenate([np.asarray(band), picture])
+
+
+def _by_pillow(pictures: Iterable[Frame], path: Path, form: str, per_second: float) -> None:
+    from PIL import Image
+
+    images = (Image.fromarray(picture) for picture in pictures)
+    if form == "GIF":  # few colours are in use; dithering would only flicker
+        images = (i.quantize(256, dither=Image.Dither.NONE) for i in images)
+    first = next(images)
+    first.save(
+        path, format=form, save_all=True, append_images=images, loop=0,
+        duration=round(1000 / per_second),
+    )  # fmt: skip
+
+
+def _by_ffmpeg(pictures: Iterable[Frame], path: Path, form: str, per_second: float) -> None:
+    program = _ffmpeg()
+    assert program is not None
+    stream = iter(pictures)
+    first = next(stream)
+    height, width = first.shape[:2]
+    command = [
+        program, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s",
+        f"{width}x{height}", "-r", f"{per_second:g}", "-i", "-", "-an", "-pix_fmt", "yuv420p",
+        "-crf", "20", "-f", form, str(path),
+    ]  # fmt: skip
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdin is not None
+    assert process.stderr is not None
+    try:
+        process.stdin.write(first.tobytes())
+        for picture in stream:
+            process.stdin.write(picture.tobytes())
+        process.stdin.close()
+    except BrokenPipeError:
+        pass  # it says why
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+    words = process.stderr.read().decode(errors="replace")
+    if process.wait():
+        raise OutputError(f"{path.name}: ffmpeg failed: {' '.join(words.split())[-300:]}")
+
+
+def _ffmpeg() -> str | None:
+    """The program of the package imageio-ffmpeg, or the system's own."""
+    if importlib.util.find_spec("imageio_ffmpeg") is not None:
+        module: Any = importlib.import_module("imageio_ffmpeg")
+        with contextlib.suppress(RuntimeError):  # it is there, but not for this system
+            return str(module.get_ffmpeg_exe())
+    return shutil.which("ffmpeg")

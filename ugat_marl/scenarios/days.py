@@ -1,0 +1,255 @@
+"""Another day of the same expected demand: every vehicle single, drawn again with its own nature.
+
+Between two days of the street the vehicles differ, and with them every count and every gap. A
+simulation that repeats one list of vehicles has less noise than the street and finds differences
+where there are none; so days are drawn from the list by a Poisson bootstrap.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import subprocess
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import parse_xml, replacing, xml_bytes
+from ugat_marl.scenarios.scenario import Document, Scenario
+from ugat_marl.scenarios.settings import seconds_of
+from ugat_marl.scenarios.singles import OwnEdges
+from ugat_marl.seeding import numpy_generator
+
+JITTER_S = 120.0
+"""Departures move by up to this much either way: profiles of the day stay, minutes do not."""
+DEFAULT_SPEED = (1.0, 0.1, 0.2, 2.0)
+"""SUMO's distribution of speedFactor for passenger cars: mean, deviation, least, greatest."""
+
+_TYPES, _VEHICLES = "types.add.xml", "vehicles.rou.xml"
+_NORMAL = re.compile(r"norm(c?)\(([^)]*)\)")
+
+
+@dataclass(frozen=True)
+class _Vehicles:
+    """The vehicles of an explicit scenario as text, ready to be written in any order."""
+
+    types: Document
+    depart_s: NDArray[np.float64]
+    names: tuple[str, ...]
+    heads: tuple[str, ...]
+    tails: tuple[str, ...]
+    speeds: NDArray[np.float64]
+
+
+def explicit(scenario: Scenario) -> Scenario:
+    """The same demand as single vehicles with routes: trips and flows are resolved by duarouter.
+
+    Raises:
+        ScenarioError: duarouter refuses; its own words are in the message.
+    """
+    if all(map(_is_explicit, scenario.routes)):
+        return scenario
+    return replace(scenario, routes=(_routed(scenario),))
+
+
+def ways(scenario: Scenario) -> Iterator[tuple[str, ...]]:
+    """The edges of every vehicle that departs in the scenario's time, one after the other.
+
+    Args:
+        scenario: Any scenario; `explicit` is applied if need be.
+    """
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    for document in explicit(scenario).routes:
+        for vehicle in chain.from_iterable(part.iter("vehicle") for part in document.parts()):
+            route = vehicle.find("route")
+            edges = () if route is None else tuple(route.get("edges", "").split())
+            if edges and begin <= seconds_of(vehicle.get("depart", "0")) < end:
+                yield edges
+
+
+def redrawn(scenario: Scenario, seed: int) -> Scenario:
+    """Another day: a Poisson number of copies of every vehicle, departures jittered.
+
+    The same seed gives the same vehicles, names and speedFactors, whatever effects are applied
+    afterwards, so that two models can be compared on the same day.
+
+    Args:
+        scenario: Any scenario; `explicit` is applied if need be.
+        seed: Which day; any non-negative integer.
+    """
+    scenario = explicit(scenario)
+    vehicles = _vehicles(tuple(document.read() for document in scenario.routes))
+    generator = numpy_generator(seed, "another day")
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    count = len(vehicles.names)
+    copies = generator.poisson(1.0, count)
+    most = 8
+    shifts = generator.uniform(-JITTER_S, JITTER_S, (most, count))
+    draws = generator.standard_normal((most, count))
+    rows: list[tuple[float, str]] = []
+    mean, deviation, least, greatest = vehicles.speeds.T
+    for copy in range(min(int(copies.max(initial=0)), most)):
+        departs = vehicles.depart_s + shifts[copy]
+        departs = np.where(departs < begin, 2 * begin - departs, departs)
+        departs = np.where((departs >= end) & (vehicles.depart_s < end), 2 * end - departs, departs)
+        departs = np.maximum(departs, begin)
+        factors = np.clip(mean + deviation * draws[copy], least, greatest)
+        suffix = f"~{seed}.{copy}"  # effects that choose by name choose others every day
+        for index in np.flatnonzero(copies > copy).tolist():
+            name = quoteattr(vehicles.names[index] + suffix)
+            factor = factors[index]
+            speed = f' speedFactor="{factor:.4f}"' if factor == factor else ""
+            depart = departs[index]
+            rows.append(
+                (
+                    depart,
+                    f'<vehicle id={name} depart="{depart:.2f}"{speed}{vehicles.heads[index]}'
+                    f"{vehicles.tails[index]}</vehicle>",
+                )
+            )
+    rows.sort(key=lambda row: row[0])
+    text = "<routes>\n" + "\n".join(row for _, row in rows) + "\n</routes>\n"
+    return replace(
+        scenario,
+        routes=(Document(_VEHICLES, None, text.encode()),),
+        additional=(*scenario.additional, vehicles.types),
+    )
+
+
+def _is_explicit(document: Document) -> bool:
+    """Whether every vehicle of the file stands there with its own edges, and there is no flow."""
+    if document.path is None or document.content is not None:
+        return _explicit_content(document, 0, 0)
+    state = document.path.stat()
+    return _explicit_content(replace(document, home=None), state.st_size, state.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=8)
+def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
+    """The same, remembered for a file as long as it does not change."""
+    del size, changed_ns
+    singles = OwnEdges()
+    for tag in document.scan():
+        singles.read(tag)
+        if singles.lost:
+            return False
+    return singles.ended()
+
+
+def _routed(scenario: Scenario) -> Document:
+    """All demand of the scenario through duarouter."""
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+        directory = Path(name)
+        out = directory / "routed.rou.xml"
+
+        def files(documents: tuple[Document, ...]) -> str:
+            return ",".join(str(_for_sumo(item, directory)) for item in documents)
+
+        settings = scenario.settings
+        command = [
+            str(sumo_program("duarouter")),
+            "--net-file", files((scenario.network,)),
+            "--route-files", files(scenario.routes),
+            "--output-file", str(out),
+            "--begin", repr(settings.begin_s),
+            "--end", repr(settings.begin_s + settings.duration_s),
+            "--ignore-errors", "true",
+            "--no-warnings", "true",
+            "--no-step-log", "true",
+            "--seed", "1",
+        ]  # fmt: skip
+        if scenario.additional:
+            command += ["--additional-files", files(scenario.additional)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode or not out.exists():
+            said = " ".join(done.stderr.split()) or "no reason given"
+            raise ScenarioError(
+                f"scenario {scenario.id!r}: its trips or flows cannot be turned into routes: {said}"
+            )
+        return Document("routed.rou.xml", None, out.read_bytes())
+
+
+def _for_sumo(document: Document, directory: Path) -> Path:
+    """Where SUMO finds a document: a plain file where it lies, else a copy in `directory`."""
+    path = document.path
+    plain = path is not None and document.content is None and path.suffix != ".gz"
+    if path is not None and plain and "," not in str(path.resolve()):  # it ends a name for SUMO
+        return path.resolve()
+    copy = directory / document.name.removesuffix(".gz").replace(",", "_")
+    with replacing(copy) as temporary, temporary.open("wb") as file:
+        file.writelines(document.pieces())
+    return copy
+
+
+def sumo_program(name: str) -> Path:
+    """A program of the installed eclipse-sumo wheel itself, not the wrapper written in Python."""
+    import sumo
+
+    return Path(sumo.SUMO_HOME) / "bin" / name
+
+
+@functools.lru_cache(maxsize=8)
+def _vehicles(routes: tuple[bytes, ...]) -> _Vehicles:
+    """Takes explicit route files apart; remembered, since days are drawn many times."""
+    types = ET.Element("additional")
+    depart: list[float] = []
+    names: list[str] = []
+    heads: list[str] = []
+    tails: list[str] = []
+    kinds: list[str] = []
+    for content in routes:
+        for item in parse_xml(content, "routes"):
+            if item.tag in ("vType", "vTypeDistribution"):
+                types.append(item)
+            elif item.tag == "vehicle":
+                names.append(item.get("id", ""))
+                depart.append(seconds_of(item.get("depart", "0")))
+                kinds.append(item.get("type", ""))
+                heads.append(_attributes(item))
+                tails.append("".join(ET.tostring(part, "unicode").strip() for part in item))
+    known = {item.get("id", ""): _speed_of(item.attrib) for item in types.iter("vType")}
+    default = known.get("DEFAULT_VEHTYPE", DEFAULT_SPEED)
+    unknown = (np.nan, np.nan, 0.0, np.inf)  # SUMO draws the factor itself
+    speeds = [known.get(kind, unknown if kind else default) for kind in kinds]
+    return _Vehicles(
+        Document(_TYPES, None, xml_bytes(types)),
+        np.array(depart),
+        tuple(names),
+        tuple(heads),
+        tuple(tails),
+        np.array(speeds, dtype=np.float64).reshape(-1, 4),
+    )
+
+
+def _attributes(item: ET.Element) -> str:
+    left = {k: v for k, v in item.attrib.items() if k not in ("id", "depart", "speedFactor")}
+    return "".join(f" {key}={quoteattr(value)}" for key, value in left.items()) + ">"
+
+
+def _speed_of(attributes: Mapping[str, str]) -> tuple[float, float, float, float]:
+    """Mean, deviation, least and greatest of a type's speedFactor; NaN if SUMO had better draw."""
+    text, deviation = attributes.get("speedFactor"), attributes.get("speedDev")
+    passenger = attributes.get("vClass", "passenger") == "passenger"
+    try:
+        if text is None:
+            if not passenger and deviation is None:
+                return (np.nan, np.nan, 0.0, np.inf)
+            return (1.0, float(deviation or 0.1), 0.2, 2.0)
+        if match := _NORMAL.fullmatch(text.replace(" ", "")):
+            values = [float(part) for part in match[2].split(",")]
+            mean, spread = values[:2]
+            least, greatest = values[2:4] if match[1] else (0.2, 2.0)
+            return (mean, spread, least, greatest)
+        return (float(text), float(deviation or 0.0), 0.2, 2.0)
+    except ValueError:
+        return (np.nan, np.nan, 0.0, np.inf)

@@ -1,0 +1,146 @@
+"""What route files ask for: who departs when, over which edges; and whether it can be driven."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import Tag
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.network import Network
+from ugat_marl.scenarios.scenario import Document, Scenario
+from ugat_marl.scenarios.settings import seconds_of
+from ugat_marl.scenarios.singles import OwnEdges
+
+_ROUTED = ("from", "to", "via", "edges")
+_NO_TIME = frozenset({"triggered", "containerTriggered", "split", "now", "begin"})
+
+
+SPARE_S = 600.0
+"""SUMO reads route files so far ahead at most."""
+
+
+@dataclass(frozen=True)
+class Demand:
+    """A count of the vehicles written in a scenario's files.
+
+    Attributes:
+        vehicles: Single vehicles and trips that depart within the episode.
+        flows: Flows within the episode, each of which makes many vehicles.
+        routed: Whether the route files hold single vehicles with their own edges only.
+    """
+
+    vehicles: int
+    flows: int
+    routed: bool = field(default=True, compare=False)
+
+
+def check_demand(
+    scenario: Scenario,
+    network: Network,
+    reporter: Reporter | None = None,
+    *,
+    whole: bool = True,
+) -> Demand:
+    """Reads all route files and checks that they can be driven.
+
+    Args:
+        scenario: Whose files.
+        network: Its network.
+        reporter: Shows progress where a file is long.
+        whole: Whether to read on behind the end of the episode; vehicles are in the order of their
+            departures, so nobody within it is missed.
+
+    Raises:
+        ScenarioError: A route uses an edge the network does not have, vehicles are not in the order
+            of their departures, or no vehicle departs within the episode.
+    """
+    edges = {lane.edge for lane in network.lanes.values()}
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    vehicles = flows = 0
+    routed = True
+    for document in (*scenario.routes, *scenario.additional):
+        latest, own = -math.inf, document in scenario.routes
+        singles = OwnEdges()
+        for item in document.scan(reporter):
+            if own:
+                singles.read(item)
+            if item.name in ("vehicle", "trip", "flow", "route"):
+                used = edges_used(item)
+                if not edges.issuperset(used):
+                    edge = next(edge for edge in used if edge not in edges)
+                    raise _unknown_edge(document, item, edge, scenario)
+            if item.name in ("vehicle", "trip", "flow"):
+                depart = _depart_s(item, document, max(begin, latest))
+                if depart < latest and own:
+                    raise _unsorted(document, item, depart, latest)
+                latest = max(latest, depart)
+                if item.name == "flow":
+                    flows += depart < end and begin < _end_s(item, document)
+                else:
+                    vehicles += begin <= depart < end
+                if own and not whole and latest > end + SPARE_S:
+                    routed &= not singles.lost
+                    break
+        else:
+            routed &= singles.ended()
+    if not vehicles and not flows:
+        files = ", ".join(document.source for document in scenario.routes)
+        raise ScenarioError(
+            f"{files}: no vehicle departs between {begin:g} s and {end:g} s; "
+            "check begin_s and duration_s against the departure times"
+        )
+    return Demand(vehicles, flows, routed)
+
+
+def edges_used(item: Tag) -> list[str]:
+    """The edges a vehicle, trip, flow or route names."""
+    return " ".join(item.attributes.get(key, "") for key in _ROUTED).split()
+
+
+def _who(item: Tag) -> str:
+    name = item.attributes.get("id", "")
+    return f"<{item.name}" + (f" id={name!r}" if name else "") + ">"
+
+
+def _at(document: Document, item: Tag) -> str:
+    return f"{document.source}, line {item.line}"
+
+
+def _unknown_edge(document: Document, item: Tag, edge: str, scenario: Scenario) -> ScenarioError:
+    return ScenarioError(
+        f"{_at(document, item)}: {_who(item)} uses the edge {edge!r}, which "
+        f"{scenario.network.source} does not have; were the routes made for another network?"
+    )
+
+
+def _unsorted(document: Document, item: Tag, depart: float, latest: float) -> ScenarioError:
+    return ScenarioError(
+        f"{_at(document, item)}: {_who(item)} departs at {depart:g} s but stands after one of "
+        f"{latest:g} s, and SUMO would leave it out; sort the file by departure (SUMO's "
+        "tools/route/sort_routes.py does)"
+    )
+
+
+def _depart_s(item: Tag, document: Document, triggered_s: float) -> float:
+    """Seconds; of a departure that something else triggers, `triggered_s`."""
+    key, default = ("begin", "0") if item.name == "flow" else ("depart", "")
+    text = item.attributes.get(key, default)
+    return triggered_s if text in _NO_TIME else _seconds(text, key, item, document)
+
+
+def _end_s(item: Tag, document: Document) -> float:
+    text = item.attributes.get("end")
+    return math.inf if text is None else _seconds(text, "end", item, document)
+
+
+def _seconds(text: str, key: str, item: Tag, document: Document) -> float:
+    try:
+        return seconds_of(text)
+    except ValueError:
+        raise ScenarioError(
+            f"{_at(document, item)}: {key}={text!r} of {_who(item)} is not a time; "
+            "give seconds or h:m:s"
+        ) from None

@@ -1,0 +1,96 @@
+"""Detectors of a street, the vehicles that pass them, and what the signals show meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+DetectorKind = Literal["advance", "stop", "exit"]
+
+
+Split = Literal["fit", "heldout"]
+
+
+SignalLog = tuple[tuple[float, str], ...]
+"""What a traffic light showed: ``(since_s, state)`` at every change, in order of time."""
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A detection zone on one lane.
+
+    Attributes:
+        id: Name.
+        lane: SUMO id of the lane.
+        position_m: Upstream end of the zone, from the lane's start.
+        length_m: Length of the zone; 0 for a point.
+        kind: ``advance`` upstream of a stop line, ``stop`` at it, ``exit`` behind the intersection.
+    """
+
+    id: str
+    lane: str
+    position_m: float
+    length_m: float
+    kind: DetectorKind
+
+
+@dataclass(frozen=True, eq=False)
+class Passages:
+    """Vehicles over one detector in one period, in order of time; all arrays ``(passages,)``.
+
+    Attributes:
+        on_s: When the front reached the zone; NaN if that was before the period.
+        off_s: When the rear left the zone; NaN if that was after the period.
+        speed_mps: Speed, NaN where it was not measured.
+        length_m: Length of the vehicle, NaN where it was not measured.
+    """
+
+    on_s: NDArray[np.float64]
+    off_s: NDArray[np.float64]
+    speed_mps: NDArray[np.float64]
+    length_m: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.on_s)
+
+    @classmethod
+    def none(cls) -> Passages:
+        """No vehicle."""
+        empty = np.empty(0)
+        return cls(empty, empty, empty, empty)
+
+    def at(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Passages:
+        """The chosen passages."""
+        return Passages(
+            self.on_s[chosen], self.off_s[chosen], self.speed_mps[chosen], self.length_m[chosen]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Period:
+    """One stretch of measurement; two periods are two days, or two stretches of one.
+
+    Attributes:
+        id: Name.
+        begin_s: Start on the scenario's clock.
+        end_s: End on the scenario's clock.
+        split: Whether models are fitted to it, or judged on it.
+        signals: Traffic light to what it showed; the first entry is at or before `begin_s`.
+        passages: Detector to its vehicles; a detector that reported nothing is left out.
+    """
+
+    id: str
+    begin_s: float
+    end_s: float
+    split: Split
+    signals: Mapping[str, SignalLog]
+    passages: Mapping[str, Passages]
+
+
+def letter(states: Sequence[str]) -> str:
+    """The letter that decides what vehicles on several links do: green before yellow before red."""
+    return next((x for x in "GgYyur" if x in states), "r")

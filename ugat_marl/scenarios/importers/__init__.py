@@ -1,0 +1,1 @@
+"""Importers: road networks from anywhere, made into scenario directories."""

@@ -1,0 +1,300 @@
+"""Demand from what was counted on roads and turns, or from origins and destinations."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import math
+import tempfile
+import xml.etree.ElementTree as ET
+from bisect import bisect_left
+from collections import defaultdict, deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, pairwise
+from pathlib import Path
+
+import numpy as np
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.days import sumo_program
+from ugat_marl.scenarios.importers.making import ROUTES, Fleet, Vehicles
+from ugat_marl.scenarios.importers.programs import run, tool
+from ugat_marl.scenarios.importers.reading import lines
+from ugat_marl.scenarios.importers.streets import Streets
+from ugat_marl.scenarios.importers.walks import CAR, MOST_VEHICLES, Drive, walked, write_drives
+from ugat_marl.seeding import numpy_generator
+
+_CANDIDATES_VPH = 400.0
+"""Random drives from each entry among which the counts are met."""
+_GOOD_GEH = 5.0
+_MOST_ROWS = 1_000_000
+"""As many as a thousand roads have in ten days of quarters of an hour."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of a table of demand.
+
+    Attributes:
+        roads: The road counted; or two: a turn from one to the other, or origin and destination.
+        count: Vehicles.
+        begin_s: Start of the time they belong to.
+        end_s: Its end.
+        line: Where it stands.
+    """
+
+    roads: tuple[str, ...]
+    count: float
+    begin_s: float
+    end_s: float
+    line: int
+
+
+def read_rows(
+    path: Path, begin_s: float, end_s: float, reporter: Reporter, *, pairs: bool
+) -> list[Row]:
+    """A CSV file with the columns ``count`` and ``edge``, or ``from`` and ``to``.
+
+    The columns ``begin_s`` and ``end_s`` may be added; without them a row is for the whole episode.
+
+    Args:
+        path: The file.
+        begin_s: Start of the episode.
+        end_s: Its end.
+        reporter: Shows progress in a long file.
+        pairs: Whether every row has to have ``from`` and ``to``.
+
+    Raises:
+        ScenarioError: A column is missing, or a value is none; names file and line.
+    """
+    texts = lines(path, reporter)
+    first = next(texts, "")
+    reader = csv.DictReader(chain((first,), texts), delimiter=";" if ";" in first else ",")
+    columns = [name.strip() for name in reader.fieldnames or ()]
+    reader.fieldnames = columns
+    turns = {"from", "to"} <= set(columns)
+    if "count" not in columns or not (turns or ("edge" in columns and not pairs)):
+        wanted = "from, to and count" if pairs else "count and edge, or count, from and to"
+        raise ScenarioError(
+            f"{path}, line 1: the columns {wanted} are needed; there are: {', '.join(columns)}"
+        )
+    found: list[Row] = []
+    total = 0.0
+    for values in _whole(reader, path):
+        where = f"{path}, line {reader.line_num}"
+        roads = tuple(
+            (values[key] or "").strip() for key in (("from", "to") if turns else ("edge",))
+        )
+        count = _number(values["count"], "count", where)
+        row = Row(
+            roads,
+            count,
+            _number(values.get("begin_s") or f"{begin_s}", "begin_s", where),
+            _number(values.get("end_s") or f"{end_s}", "end_s", where),
+            reader.line_num,
+        )
+        if row.end_s <= row.begin_s:
+            raise ScenarioError(
+                f"{where}: end_s ({row.end_s:g}) is not after begin_s ({row.begin_s:g})"
+            )
+        found.append(row)
+        total += count
+        if len(found) > _MOST_ROWS or total > MOST_VEHICLES:
+            raise ScenarioError(
+                f"{where}: more than "
+                + (f"{MOST_VEHICLES} vehicles" if total > MOST_VEHICLES else f"{_MOST_ROWS} rows")
+                + "; keep those of the episode, or sum them up"
+            )
+    if not total:
+        raise ScenarioError(f"{path}: no row counts a vehicle")
+    return found
+
+
+def _whole(reader: csv.DictReader[str], path: Path) -> Iterator[dict[str, str]]:
+    try:
+        yield from reader
+    except csv.Error as error:
+        raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
+
+
+def _number(text: str | None, key: str, where: str) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0):
+        raise ScenarioError(f"{where}: {key} = {text!r} is not a number of at least 0")
+    return value
+
+
+def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehicles:
+    """Vehicles that come by as often as was counted, by SUMO's routeSampler.
+
+    It chooses among random drives through the network; every counted road has to lie on one.
+    """
+
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+        rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=False)
+        streets = Streets.of(parse_xml(read_bytes(network), str(network)))
+        _require_roads(rows, streets, path, network)
+        with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+            work = Path(name)
+            drives = walked(streets, _CANDIDATES_VPH, (1.0, 1.0, 1.0), 3600.0, seed)
+            _require_reached(rows, drives, path)
+            write_drives(work / "candidates.rou.xml", drives)
+            options = _counts_for_sumo(rows, work)
+            out = work / "sampled.rou.xml"
+            begin, end = min(row.begin_s for row in rows), max(row.end_s for row in rows)
+            tool(
+                "routeSampler.py",
+                ["-r", str(work / "candidates.rou.xml"), *options, "-o", str(out),
+                 "--begin", str(begin), "--end", str(end), "--seed", str(seed & 0x7FFFFFFF)],
+            )  # fmt: skip
+            sampled = list(_sampled(out))
+        if not sampled:
+            raise ScenarioError(f"{path}: SUMO's routeSampler found no vehicle for these counts")
+        write_drives(folder / ROUTES, sorted(sampled, key=lambda d: (d.depart_s, d.id)))
+        return Fleet((ROUTES,), (_fit(rows, sampled, path),))
+
+    return vehicles
+
+
+def _require_roads(rows: Iterable[Row], streets: Streets, path: Path, network: Path) -> None:
+    for row in rows:
+        for road in row.roads:
+            if road not in streets.start:
+                raise ScenarioError(
+                    f"{path}, line {row.line}: {road!r} is not a road for cars of {network}"
+                )
+
+
+def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -> None:
+    reached: set[tuple[str, ...]] = {(road,) for drive in drives for road in drive.route}
+    for drive in drives:
+        reached.update(zip(drive.route, drive.route[1:], strict=False))
+    for row in rows:
+        if row.count and row.roads not in reached:
+            raise ScenarioError(
+                f"{path}, line {row.line}: no way through the network comes by "
+                f"{' -> '.join(row.roads)}; leave the row out, or give routes (--routes)"
+            )
+
+
+def _counts_for_sumo(rows: Sequence[Row], work: Path) -> list[str]:
+    """Writes the counts as routeSampler reads them; returns its options."""
+    turns = any(len(row.roads) > 1 for row in rows)
+    by_time: dict[tuple[float, float], list[Row]] = defaultdict(list)
+    for row in rows:
+        by_time[row.begin_s, row.end_s].append(row)
+    root = ET.Element("data")
+    for (begin, end), own in sorted(by_time.items()):
+        interval = ET.SubElement(root, "interval", id="counts", begin=f"{begin}", end=f"{end}")
+        for row in own:
+            count = f"{row.count:g}"
+            first, last = row.roads[0], row.roads[-1]
+            if turns:
+                ends = {"from": first, "to": last, "count": count}
+                ET.SubElement(interval, "edgeRelation", ends)
+            else:
+                ET.SubElement(interval, "edge", id=first, entered=count)
+    write_whole(work / "counts.xml", xml_bytes(root))
+    if turns:
+        return ["--turn-files", str(work / "counts.xml")]
+    return ["--edgedata-files", str(work / "counts.xml"), "--edgedata-attribute", "entered"]
+
+
+def _sampled(path: Path) -> Iterator[Drive]:
+    for number, item in enumerate(parse_xml(read_bytes(path), str(path)).iter("vehicle")):
+        route = item.find("route")
+        if route is not None:
+            edges = tuple(route.get("edges", "").split())
+            yield Drive(f"{edges[0]}_{number}", float(item.get("depart", "0")), edges)
+
+
+def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
+    """How well the counts are met, by the traffic engineers' GEH."""
+    good = 0
+    passed = _passages(drives)
+    for row in rows:
+        departs = passed.get(row.roads, [])
+        made = bisect_left(departs, row.end_s) - bisect_left(departs, row.begin_s)
+        hours = (row.end_s - row.begin_s) / 3600
+        wanted, got = row.count / hours, made / hours
+        geh = math.sqrt(2 * (got - wanted) ** 2 / (got + wanted)) if got + wanted else 0.0
+        good += geh < _GOOD_GEH
+    return f"{good} of {len(rows)} counts of {path.name} are met within a GEH of {_GOOD_GEH:g}"
+
+
+def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
+    """Roads, and turns from one to the next, to the departures of all that come by, in order."""
+    found: dict[tuple[str, ...], list[float]] = defaultdict(list)
+    for drive in sorted(drives, key=lambda drive: drive.depart_s):
+        for passed in chain(zip(drive.route, strict=True), pairwise(drive.route)):
+            found[passed].append(drive.depart_s)
+    return found
+
+
+def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> Vehicles:
+    """Vehicles from origins to destinations, on the fastest ways through the empty network."""
+
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+        rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=True)
+        streets = Streets.of(parse_xml(read_bytes(network), str(network)))
+        _require_roads(rows, streets, path, network)
+        reachable = functools.cache(partial(_reachable, streets))
+        for row in rows:
+            if row.roads[1] not in reachable(row.roads[0]):
+                raise ScenarioError(
+                    f"{path}, line {row.line}: there is no way from {row.roads[0]!r} to "
+                    f"{row.roads[1]!r}"
+                )
+        _route(_trips(rows, seed), network, folder / ROUTES, seed)
+        return Fleet((ROUTES,))
+
+    return vehicles
+
+
+def _trips(rows: Iterable[Row], seed: int) -> bytes:
+    trips: list[tuple[float, str, tuple[str, ...]]] = []
+    for row in rows:
+        random = numpy_generator(seed, "od", *row.roads, row.line)
+        whole = int(row.count) + int(random.random() < row.count % 1)
+        departs = np.sort(row.begin_s + random.random(whole) * (row.end_s - row.begin_s))
+        name = "_".join(row.roads)
+        trips += [(float(t), f"{name}_{row.line}.{i}", row.roads) for i, t in enumerate(departs)]
+    root = ET.Element("routes")
+    ET.SubElement(root, "vType", CAR)
+    for depart, name, (start, goal) in sorted(trips):
+        ends = {"from": start, "to": goal, "departLane": "best", "departSpeed": "max"}
+        ET.SubElement(root, "trip", {"id": name, "type": "car", "depart": f"{depart:.2f}"} | ends)
+    return xml_bytes(root)
+
+
+def _route(trips: bytes, network: Path, out: Path, seed: int) -> None:
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+        work = Path(name)
+        write_whole(work / "trips.xml", trips)
+        (work / "network.net.xml").write_bytes(read_bytes(network))
+        run(
+            "duarouter",
+            [str(sumo_program("duarouter")), "--net-file", str(work / "network.net.xml"),
+             "--route-files", str(work / "trips.xml"), "--output-file", str(work / "out.rou.xml"),
+             "--no-step-log", "true", "--seed", str(seed & 0x7FFFFFFF)],
+        )  # fmt: skip
+        root = parse_xml(read_bytes(work / "out.rou.xml"), "duarouter")
+        write_whole(out, xml_bytes(root))
+
+
+def _reachable(streets: Streets, start: str) -> set[str]:
+    found, waiting = {start}, deque([start])
+    while waiting:
+        for roads in streets.ahead.get(waiting.popleft(), {}).values():
+            for road in roads:
+                if road not in found:
+                    found.add(road)
+                    waiting.append(road)
+    return found

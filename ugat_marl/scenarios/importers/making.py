@@ -1,0 +1,197 @@
+"""A scenario directory from a source of roads and one of vehicles, checked before it is there."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import write_whole
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.demand import Demand, check_demand
+from ugat_marl.scenarios.importers.folder import new_folder
+from ugat_marl.scenarios.importers.phasing import suited
+from ugat_marl.scenarios.network import Network
+from ugat_marl.scenarios.scenario import Scenario, read_scenario, scenario_toml
+
+NETWORK, ROUTES = "network.net.xml", "demand.rou.xml"
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What a source of roads has put into the folder.
+
+    Attributes:
+        description: One line.
+        origin: Where it comes from, for the README: sentences in Markdown.
+        network: Its network; a name in the folder, or the absolute path of a file left in place.
+        routes: Its route files, likewise; empty if the source has no vehicles.
+        additional: Its additional files, likewise.
+        settings: Further values of its ``scenario.toml``.
+        derive: Whether the phases of each light are derived as its lanes allow.
+        notes: What was noticed on the way, for the README and for whoever waits.
+        copied: Files in the folder that are copies, to where they come from.
+    """
+
+    description: str
+    origin: str
+    network: str = NETWORK
+    routes: tuple[str, ...] = ()
+    additional: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    derive: bool = False
+    notes: tuple[str, ...] = ()
+    copied: Mapping[str, Path] = field(default_factory=dict[str, Path])
+
+
+Roads = Callable[[Path, Reporter], Draft]
+"""Puts a network into a folder."""
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """What a source of vehicles has put into the folder.
+
+    Attributes:
+        routes: Its route files: names in the folder, or absolute paths of files left in place.
+        notes: What was noticed on the way.
+        copied: Files in the folder that are copies, to where they come from.
+    """
+
+    routes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    copied: Mapping[str, Path] = field(default_factory=dict[str, Path])
+
+
+Vehicles = Callable[[Path, Path, Reporter], Fleet]
+"""Puts route files for the network (the second path) into a folder."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """A scenario that was made.
+
+    Attributes:
+        scenario: As it lies in its directory.
+        network: Its network.
+        demand: Its demand.
+        notes: What was noticed on the way.
+    """
+
+    scenario: Scenario
+    network: Network
+    demand: Demand
+    notes: tuple[str, ...]
+
+
+def make_scenario(
+    target: Path,
+    roads: Roads,
+    vehicles: Vehicles | None,
+    *,
+    settings: Mapping[str, Any],
+    command: str,
+    force: bool,
+    reporter: Reporter,
+) -> Made:
+    """Makes a scenario directory, whole or not at all.
+
+    Args:
+        target: The directory.
+        roads: Where the roads come from.
+        vehicles: Where the vehicles come from; None if the roads come with vehicles.
+        settings: Values for ``scenario.toml`` that go before those of the source.
+        command: What makes it again, for the README.
+        force: Whether a scenario of this name is replaced.
+        reporter: Shows progress.
+
+    Raises:
+        OutputError: It exists, or cannot be written.
+        ScenarioError: What was made is no sound scenario.
+    """
+    with new_folder(target, force=force) as folder:
+        draft = roads(folder, reporter)
+        copied = dict(draft.copied)
+        with _errors_about(copied, folder):
+            fleet = Fleet(draft.routes)
+            if vehicles:
+                fleet = vehicles(folder, folder / draft.network, reporter)
+                copied |= fleet.copied
+            notes = _write_settings(folder, draft, fleet, settings)
+            scenario = read_scenario(folder)
+            network = Network.read(scenario)
+            demand = check_demand(scenario, network, reporter)
+        made = Made(scenario, network, demand, notes)
+        write_whole(folder / "README.md", _readme(made, draft, command))
+    return Made(read_scenario(target), network, demand, made.notes)
+
+
+def _write_settings(
+    folder: Path, draft: Draft, fleet: Fleet, settings: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """Writes ``scenario.toml``; returns all that was noticed."""
+    own = dict(draft.settings)
+    notes = (*draft.notes, *fleet.notes)
+    if draft.derive and "phases" not in settings.get("control", {}):
+        kinds, more = suited(folder / draft.network)
+        notes += tuple(more)
+        own["intersections"] = {tls: {"phases": kind} for tls, kind in kinds.items()}
+    control = {**own.pop("control", {}), **settings.get("control", {})}
+    content: dict[str, Any] = {
+        "description": draft.description,
+        "network": draft.network,
+        "routes": list(fleet.routes),
+        "additional": list(draft.additional),
+        **own,
+        **{key: value for key, value in settings.items() if key != "control"},
+        "control": control,
+    }
+    content = {key: value for key, value in content.items() if value not in ([], {})}
+    write_whole(folder / "scenario.toml", scenario_toml(content))
+    return notes
+
+
+@contextlib.contextmanager
+def _errors_about(copied: Mapping[str, Path], folder: Path) -> Iterator[None]:
+    """Errors name the files the user has, not copies that are gone when they are read."""
+    try:
+        yield
+    except ScenarioError as error:
+        text = str(error)
+        for name, source in copied.items():
+            text = text.replace(str(folder / name), str(source))
+        raise ScenarioError(text) from None
+
+
+def _readme(made: Made, draft: Draft, command: str) -> str:
+    settings = made.scenario.settings
+    phases = [len(item.phases) for item in made.network.intersections]
+    spread = f"{min(phases)} to {max(phases)}" if len(set(phases)) > 1 else f"{phases[0]}"
+    others = len(made.network.uncontrolled)
+    more = f"; on their own programme: {others} more" if others else ""
+    lines = [
+        f"# {made.scenario.id}",
+        "",
+        f"{draft.description}.",
+        "",
+        f"- **Intersections:** {len(phases)} with {spread} green phases{more}",
+        f"- **Vehicles:** {made.demand.vehicles}"
+        + (f" and {made.demand.flows} flows" if made.demand.flows else "")
+        + f" in {settings.duration_s:g} s",
+        "",
+        "## Origin",
+        "",
+        draft.origin,
+        "",
+        "Made with",
+        "",
+        "```sh",
+        command,
+        "```",
+    ]
+    if made.notes:
+        lines += ["", "## Notes", "", *(f"- {note}" for note in made.notes)]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,221 @@
+"""A road network described in a few lines, and the SUMO network made from it.
+
+The `source.toml` of a shipped scenario names either a grid or single junctions and roads. The lanes
+of an approach are listed from the kerb to the middle of the road, each with the turns it serves at
+the junction ahead: ``["sr", "l"]`` is a lane for straight on and right beside a lane for left.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import xml_bytes
+from ugat_marl.scenarios.importers.programs import netconvert
+
+TURNS = {"l": "left", "s": "straight", "r": "right"}
+STRAIGHT_WITHIN_DEG = 45.0
+"""A road counts as straight on if it leaves within this angle of the approach."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """A signalised junction, or a place where the network ends."""
+
+    id: str
+    x: float
+    y: float
+    signal: bool
+
+
+@dataclass(frozen=True)
+class Road:
+    """One carriageway; `lanes` holds the turns of each lane, kerb first."""
+
+    start: str
+    end: str
+    lanes: tuple[str, ...]
+
+    @property
+    def id(self) -> str:
+        """The edge id in SUMO."""
+        return f"{self.start}_{self.end}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Nodes and roads; everything that netconvert is told and the demand walks over."""
+
+    nodes: dict[str, Node]
+    roads: dict[str, Road]
+
+    def heading_deg(self, road: Road) -> float:
+        """Direction of travel, anticlockwise from east."""
+        start, end = self.nodes[road.start], self.nodes[road.end]
+        return math.degrees(math.atan2(end.y - start.y, end.x - start.x))
+
+    def exits(self, approach: Road) -> dict[str, Road]:
+        """The road behind each turn (``l``, ``s``, ``r``) at the end of `approach`."""
+        found: dict[str, Road] = {}
+        for road in self.roads.values():
+            if road.start != approach.end or road.end == approach.start:
+                continue
+            bend = (self.heading_deg(road) - self.heading_deg(approach) + 180) % 360 - 180
+            turn = "s" if abs(bend) < STRAIGHT_WITHIN_DEG else "l" if bend > 0 else "r"
+            if turn in found:
+                raise ScenarioError(f"{approach.id}: two roads ahead count as {TURNS[turn]}")
+            found[turn] = road
+        return found
+
+    def connections(self, approach: Road) -> list[tuple[int, Road, int]]:
+        """(lane, road entered, lane entered) for every lane and turn of `approach`.
+
+        Right turns enter the lane at the kerb, left turns the one in the middle. Through lanes
+        keep their order and the innermost may enter all lanes that are left: so through traffic
+        needs the whole road, a left turn from another side conflicts with it, and a junction of
+        four arms has the usual eight conflict-free phases.
+        """
+        exits = self.exits(approach)
+        through = [lane for lane, turns in enumerate(approach.lanes) if "s" in turns]
+        found: list[tuple[int, Road, int]] = []
+        for lane, turns in enumerate(approach.lanes):
+            for turn in turns:
+                if turn not in exits:
+                    raise ScenarioError(f"{approach.id} lane {lane}: no road to the {TURNS[turn]}")
+                count = len(exits[turn].lanes)
+                entered = {"r": range(1), "l": range(count - 1, count)}.get(turn)
+                if entered is None:
+                    order = through.index(lane)
+                    entered = range(order, count if lane == through[-1] else order + 1)
+                if not entered:
+                    raise ScenarioError(f"{approach.id}: more lanes straight on than the road has")
+                found.extend((lane, exits[turn], target) for target in entered)
+        return found
+
+
+def read_plan(source: Mapping[str, Any]) -> Plan:
+    """The plan in a parsed `source.toml`, from its table ``grid`` or ``junctions``/``roads``."""
+    if "grid" in source:
+        return grid(**source["grid"])
+    nodes = {
+        id_: Node(id_, *map(float, place), signal=kind == "junctions")
+        for kind in ("junctions", "ends")
+        for id_, place in source[kind].items()
+    }
+    roads: dict[str, Road] = {}
+    for entry in source["roads"]:
+        here, there = entry["between"]
+        for road in (
+            Road(here, there, tuple(entry["there"])),
+            Road(there, here, tuple(entry["back"])),
+        ):
+            roads[road.id] = road
+    return Plan(nodes, roads)
+
+
+def grid(
+    columns: int,
+    rows: int,
+    spacing_m: float,
+    entry_m: float,
+    east_west: Sequence[str],
+    north_south: Sequence[str],
+) -> Plan:
+    """Junctions A1 (south-west), B1, ... A2, ...; ends west1, east1, ..., southA, northA, ...
+
+    Args:
+        columns: Junctions from west to east.
+        rows: Junctions from south to north.
+        spacing_m: Between neighbours.
+        entry_m: Length of the roads into the network.
+        east_west: Lanes of the roads along the rows, kerb first, each with its turns.
+        north_south: Those of the roads along the columns.
+    """
+    letters = [_column(number) for number in range(columns)]
+    nodes: dict[str, Node] = {}
+    roads: dict[str, Road] = {}
+
+    def add(chain: list[Node], lanes: tuple[str, ...]) -> None:
+        for node in chain:
+            nodes[node.id] = node
+        for here, there in zip(chain, chain[1:], strict=False):
+            for road in (Road(here.id, there.id, lanes), Road(there.id, here.id, lanes)):
+                roads[road.id] = road
+
+    width, height = (columns - 1) * spacing_m, (rows - 1) * spacing_m
+    for row in range(rows):
+        y = row * spacing_m
+        inner = [Node(f"{x}{row + 1}", i * spacing_m, y, True) for i, x in enumerate(letters)]
+        west = Node(f"west{row + 1}", -entry_m, y, False)
+        east = Node(f"east{row + 1}", width + entry_m, y, False)
+        add([west, *inner, east], tuple(east_west))
+    for column, letter in enumerate(letters):
+        x = column * spacing_m
+        inner = [nodes[f"{letter}{row + 1}"] for row in range(rows)]
+        south = Node(f"south{letter}", x, -entry_m, False)
+        north = Node(f"north{letter}", x, height + entry_m, False)
+        add([south, *inner, north], tuple(north_south))
+    return Plan(nodes, roads)
+
+
+def _column(number: int) -> str:
+    """A to Z, then AA, AB, ..., as in a spreadsheet."""
+    rest, last = divmod(number, 26)
+    return (_column(rest - 1) if rest else "") + chr(ord("A") + last)
+
+
+def plain_xml(plan: Plan, speed_mps: float) -> dict[str, bytes]:
+    """The three plain-XML documents netconvert reads, by the option that takes them."""
+    nodes, edges, connections = ET.Element("nodes"), ET.Element("edges"), ET.Element("connections")
+    for node in plan.nodes.values():
+        kind = "traffic_light" if node.signal else "dead_end"
+        ET.SubElement(nodes, "node", id=node.id, x=f"{node.x:g}", y=f"{node.y:g}", type=kind)
+    for road in plan.roads.values():
+        attributes = {"id": road.id, "from": road.start, "to": road.end}
+        ET.SubElement(
+            edges, "edge", attributes, numLanes=str(len(road.lanes)), speed=f"{speed_mps:g}"
+        )
+        if not plan.nodes[road.end].signal:
+            continue
+        for lane, entered, target in plan.connections(road):
+            link = {"from": road.id, "to": entered.id, "fromLane": str(lane), "toLane": str(target)}
+            ET.SubElement(connections, "connection", link)
+    return {
+        "--node-files": xml_bytes(nodes),
+        "--edge-files": xml_bytes(edges),
+        "--connection-files": xml_bytes(connections),
+    }
+
+
+def convert(documents: Mapping[str, bytes], options: Mapping[str, Any]) -> bytes:
+    """The .net.xml that netconvert makes, without the comment that holds date and paths.
+
+    Args:
+        documents: From `plain_xml`.
+        options: Further options of netconvert without the leading dashes.
+
+    Raises:
+        ScenarioError: netconvert refused or warned; holds its words.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        arguments: list[str] = []
+        for option, document in documents.items():
+            file = Path(folder) / f"{option.strip('-')}.xml"
+            file.write_bytes(document)
+            arguments += [option, str(file)]
+        arguments += ["--no-turnarounds", "true", "--offset.disable-normalization", "true"]
+        for name, value in options.items():
+            arguments += [
+                f"--{name}",
+                str(value).lower() if isinstance(value, bool) else str(value),
+            ]
+        output = Path(folder) / "network.net.xml"
+        if warnings := netconvert(arguments, output):
+            raise ScenarioError(f"netconvert: {warnings}")
+        return output.read_bytes()

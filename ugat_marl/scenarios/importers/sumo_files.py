@@ -1,0 +1,187 @@
+"""A network, or a whole configuration, that SUMO reads already: copied, or used where it lies."""
+
+from __future__ import annotations
+
+import shutil
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.files import Tag, parse_xml, read_bytes
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.demand import edges_used
+from ugat_marl.scenarios.importers.making import Draft, Fleet, Roads, Vehicles
+from ugat_marl.scenarios.importers.reading import scan
+from ugat_marl.scenarios.scenario import Document, read_scenario
+
+_CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
+
+
+def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
+    """Roads, and perhaps vehicles, of SUMO's own files.
+
+    Args:
+        path: A ``.sumocfg`` or a ``.net.xml``, packed or not.
+        link: Whether files stay where they are and are named by their absolute paths.
+        own_vehicles: Whether the vehicles of a configuration are wanted.
+
+    Raises:
+        OptionError: Neither a configuration nor a network, by its name.
+    """
+    configuration = path.name.endswith(_CONFIGURATIONS)
+    if not configuration and not path.name.removesuffix(".gz").endswith(".xml"):
+        raise OptionError(f"--sumo {str(path)!r}: give a .sumocfg or a .net.xml")
+
+    def roads(folder: Path, reporter: Reporter) -> Draft:
+        if not configuration:
+            _require_root(path, ("net",), "SUMO network", reporter)
+            name = _placed(path, folder, link)
+            return Draft(
+                f"SUMO network {path.name}",
+                _origin([path], link),
+                network=name,
+                copied={path.name: path},
+            )
+        return _configured(path, folder, link, own_vehicles, reporter)
+
+    return roads
+
+
+def given_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
+    """Route files the user has."""
+
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+        leads = _leads(network)
+        for path in paths:
+            for tag in _rooted(path, ("routes", "additional"), "route file", reporter):
+                if tag.name in ("vehicle", "trip", "flow", "route"):
+                    _require_known(tag, leads, path)
+                if tag.name == "route":
+                    _require_connected(tag, leads, path, network)
+        placed = tuple(_placed(path, folder, link) for path in paths)
+        return Fleet(placed, copied={path.name: path for path in paths})
+
+    return vehicles
+
+
+def _configured(
+    path: Path, folder: Path, link: bool, own_vehicles: bool, reporter: Reporter
+) -> Draft:
+    if own_vehicles:
+        scenario = read_scenario(path)
+        network, routes, additional = scenario.network, scenario.routes, scenario.additional
+        settings = scenario.settings.model_dump(mode="json", exclude_defaults=True)
+    else:
+        network, settings = _network_of(path), {}
+        routes = additional = ()
+    times = ("begin_s", "duration_s", "step_length_s", "sumo")
+    kept = {key: settings[key] for key in times if settings.get(key)}
+
+    def placed(documents: Sequence[Document]) -> tuple[str, ...]:
+        return tuple(_put(item, folder, link) for item in documents)
+
+    return Draft(
+        f"SUMO configuration {path.name}",
+        _origin([path], link),
+        network=placed([network])[0],
+        routes=placed(routes),
+        additional=placed(additional),
+        settings=kept,
+        copied={
+            item.name: item.path
+            for item in (network, *routes, *additional)
+            if item.path is not None and item.home is None
+        },
+    )
+
+
+def _network_of(path: Path) -> Document:
+    root: ET.Element = parse_xml(read_bytes(path), str(path))
+    for item in root.iter():
+        if item.tag in ("net-file", "net", "n"):
+            file = path.parent / item.get("value", item.get("v", ""))
+            if not file.is_file():
+                raise ScenarioError(f"{path}: <{item.tag}> names {file}, which does not exist")
+            return Document(file.name, file)
+    raise ScenarioError(f"{path}: no <net-file value=...>; a scenario needs a network")
+
+
+def _put(document: Document, folder: Path, link: bool) -> str:
+    if document.path is not None and document.home is None:
+        return _placed(document.path, folder, link)
+    _require_new(folder / document.name)
+    document.write(folder / document.name)  # without the files it would write
+    return document.name
+
+
+def _placed(path: Path, folder: Path, link: bool) -> str:
+    """The name under which the scenario finds the file: in its folder, or where it is."""
+    if link:
+        return str(path.resolve())
+    _require_new(folder / path.name)
+    shutil.copyfile(path, folder / path.name)
+    return path.name
+
+
+def _require_new(path: Path) -> None:
+    if path.exists():
+        raise ScenarioError(
+            f"two files are called {path.name!r}, which one directory cannot hold; rename one"
+        )
+
+
+def _leads(network: Path) -> dict[str, set[str]]:
+    """The edges that every edge of a network leads to."""
+    root = parse_xml(read_bytes(network), str(network))
+    found: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
+    for item in root.iter("connection"):
+        found.setdefault(item.get("from", ""), set()).add(item.get("to", ""))
+    return found
+
+
+def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
+    """Refuses edges that do not exist, by the file the user has, not the copy to be."""
+    used = edges_used(tag)
+    if leads and not leads.keys() >= set(used):  # a network without roads has its own message
+        edge = next(edge for edge in used if edge not in leads)
+        raise ScenarioError(
+            f"{path}, line {tag.line}: <{tag.name}> uses the edge {edge!r}, which the network does "
+            "not have; were the routes made for another network?"
+        )
+
+
+def _require_connected(tag: Tag, leads: Mapping[str, set[str]], path: Path, network: Path) -> None:
+    """Refuses a route that jumps."""
+    for a, b in pairwise(tag.attributes.get("edges", "").split()):
+        if a in leads and b in leads and b not in leads[a]:
+            raise ScenarioError(
+                f"{path}, line {tag.line}: a route goes from edge {a!r} to {b!r}, but no "
+                f"connection of {network} leads there; route the demand again (duarouter)"
+            )
+
+
+def _require_root(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> None:
+    for _ in _rooted(path, tags, what, reporter):
+        pass
+
+
+def _rooted(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> Iterator[Tag]:
+    """All elements of a file, if its first one is what it should be."""
+    for number, tag in enumerate(scan(path, reporter)):
+        if not number and tag.name not in tags:
+            raise ScenarioError(
+                f"{path}, line {tag.line}: a {what} begins with "
+                f"{' or '.join(f'<{name}>' for name in tags)}, this with <{tag.name}>"
+            )
+        yield tag
+
+
+def _origin(paths: Sequence[Path], link: bool) -> str:
+    names = ", ".join(f"`{path.name}`" for path in paths)
+    kept = "left where it lies and named by its path" if link else "copied as it was"
+    return (
+        f"{names}, {kept}. Who made it decides what may be done with it; keep its licence beside "
+        "it when you pass it on."
+    )

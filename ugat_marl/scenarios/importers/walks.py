@@ -1,0 +1,205 @@
+"""Demand from turning shares: vehicles that enter by chance and turn by chance.
+
+Arrivals at each entry are a Poisson process. A vehicle walks from junction to junction with the
+shares of the turns it finds there until it leaves the network; a walk that would pass a junction
+twice is drawn again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.files import parse_xml, read_bytes, replacing
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.importers.making import ROUTES, Fleet, Vehicles
+from ugat_marl.scenarios.importers.streets import Streets
+from ugat_marl.seeding import numpy_generator
+
+CAR = {
+    "id": "car", "vClass": "passenger", "length": "5.0", "minGap": "2.5", "accel": "2.6",
+    "decel": "4.5", "emergencyDecel": "9.0", "startupDelay": "0.0", "sigma": "0.5", "tau": "1.0",
+    "maxSpeed": "55.55", "speedFactor": "normc(1,0.1,0.2,2)",
+}  # fmt: skip
+"""SUMO's passenger car, spelled out."""
+
+MOST_VEHICLES = 5_000_000
+"""More make no scenario that anybody could drive."""
+_TRIES = 200
+"""Walks that may end in a circle before a vehicle is given up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """One vehicle.
+
+    Attributes:
+        id: Its name.
+        depart_s: When it enters.
+        route: Its roads.
+        type: Its vehicle type, or empty for SUMO's default.
+        speed: How fast it enters: m/s, or ``max``.
+    """
+
+    id: str
+    depart_s: float
+    route: tuple[str, ...]
+    type: str = "car"
+    speed: str = "max"
+
+
+def walked(
+    streets: Streets, vph: float, shares: tuple[float, float, float], length_s: float, seed: int
+) -> list[Drive]:
+    """Vehicles at every entry of a network.
+
+    Args:
+        streets: Where.
+        vph: Vehicles an hour at each entry.
+        shares: Of left turns, straight on and right turns; where one of them is not possible,
+            the others keep their proportion.
+        length_s: For how long vehicles enter.
+        seed: Decides everything.
+
+    Returns:
+        The vehicles in the order of their departures.
+
+    Raises:
+        OptionError: Shares or a rate that are none.
+        ScenarioError: No road leads into the network, or no way through it out again.
+    """
+    if not (math.isfinite(vph) and 0 < vph <= 1e5):
+        raise OptionError(f"--vph {vph:g} is not a number of vehicles an hour; give 1 to 100000")
+    if min(shares) < 0 or not math.isfinite(sum(shares)) or sum(shares) <= 0:
+        raise OptionError(
+            f"--turns {shares}: three shares, none negative and not all 0, are needed"
+        )
+    if not streets.entries:
+        raise ScenarioError(
+            "no road leads into the network from outside, so --vph has nowhere to let vehicles "
+            "in; give routes (--routes) or origins and destinations (--od)"
+        )
+    if vph / 3600 * length_s * len(streets.entries) > MOST_VEHICLES:
+        raise OptionError(
+            f"--vph {vph:g} at {len(streets.entries)} entries for {length_s:g} s makes more than "
+            f"{MOST_VEHICLES} vehicles; lower --vph or --duration-s"
+        )
+    left, straight, right = shares
+    table = {"l": left, "s": straight, "r": right}
+    found: list[Drive] = []
+    due = 0
+    for entry in streets.entries:
+        random = numpy_generator(seed, "entry", entry)
+        for number, moment in enumerate(arrivals(random, vph / 3600, length_s)):
+            due += 1
+            if route := _walk(streets, entry, table, random):
+                found.append(Drive(f"{entry}_{number}", round(moment, 2), route))
+    if not due:
+        raise ScenarioError(
+            f"nobody enters within {length_s:g} s at {vph:g} vehicles an hour; raise --vph or "
+            "--duration-s"
+        )
+    if not found:
+        raise ScenarioError(
+            "no way from an entry of the network to one of its exits was found at random; give "
+            "routes (--routes) or origins and destinations (--od)"
+        )
+    return sorted(found, key=lambda drive: (drive.depart_s, drive.id))
+
+
+def _walk(
+    streets: Streets, entry: str, shares: Mapping[str, float], random: np.random.Generator
+) -> tuple[str, ...]:
+    """Roads from an entry to an exit, passing no junction twice; empty if none was found."""
+    for _ in range(_TRIES):
+        road, route, passed = entry, [entry], {streets.start[entry]}
+        while road not in streets.exits and streets.end[road] not in passed:
+            passed.add(streets.end[road])
+            turns = streets.ahead.get(road, {})
+            possible = {turn: shares[turn] for turn in turns if shares.get(turn, 0) > 0}
+            possible = possible or {turn: 1.0 for turn in turns if turn != "t"}
+            if not possible:
+                break
+            roads = turns[pick(possible, random)]
+            road = pick(dict.fromkeys(roads, 1.0), random)
+            route.append(road)
+        if road in streets.exits and streets.end[road] not in passed:
+            return tuple(route)
+    return ()
+
+
+def arrivals(random: np.random.Generator, rate_per_s: float, length_s: float) -> list[float]:
+    """Poisson arrivals in [0, length_s)."""
+    found: list[float] = []
+    moment = 0.0
+    while rate_per_s > 0:
+        moment -= math.log(1.0 - float(random.random())) / rate_per_s
+        if moment >= length_s:
+            break
+        found.append(moment)
+    return found
+
+
+def pick(shares: Mapping[str, float], random: np.random.Generator) -> str:
+    """A key of `shares`, with probability proportional to its value."""
+    mark = float(random.random()) * sum(shares.values())
+    for name, share in shares.items():
+        mark -= share
+        if mark < 0:
+            return name
+    return next(reversed(list(shares)))
+
+
+def write_drives(
+    path: Path, drives: Iterable[Drive], types: Iterable[Mapping[str, str]] = (CAR,)
+) -> None:
+    """Writes the vehicles as a route file, one after the other.
+
+    Args:
+        path: The file.
+        drives: In the order of their departures.
+        types: Attributes of the vehicle types they name.
+    """
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in _route_file(drives, types))
+
+
+def _route_file(drives: Iterable[Drive], types: Iterable[Mapping[str, str]]) -> Iterator[str]:
+    yield "<?xml version='1.0' encoding='UTF-8'?>"
+    yield "<routes>"
+    for kind in types:
+        yield f"    <vType{_attributes(kind)}/>"
+    for drive in drives:
+        head = {"id": drive.id, "depart": f"{drive.depart_s:.2f}"}
+        if drive.type:
+            head["type"] = drive.type
+        head |= {"departLane": "best", "departSpeed": drive.speed}
+        edges = quoteattr(" ".join(drive.route))
+        yield f"    <vehicle{_attributes(head)}><route edges={edges}/></vehicle>"
+    yield "</routes>"
+
+
+def _attributes(values: Mapping[str, str]) -> str:
+    return "".join(f" {key}={quoteattr(value)}" for key, value in values.items())
+
+
+def turning(
+    vph: float, shares: tuple[float, float, float], begin_s: float, length_s: float, seed: int
+) -> Vehicles:
+    """Vehicles by turning shares, as `walked` draws them, from `begin_s` on."""
+
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+        del reporter
+        streets = Streets.of(parse_xml(read_bytes(network), str(network)))
+        drives = walked(streets, vph, shares, length_s, seed)
+        later = (replace(drive, depart_s=begin_s + drive.depart_s) for drive in drives)
+        write_drives(folder / ROUTES, later)
+        return Fleet((ROUTES,))
+
+    return vehicles

@@ -1,0 +1,378 @@
+"""What a controller will face in a scenario: its intersections, their phases, and the traffic."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import Counter, defaultdict
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.days import explicit
+from ugat_marl.scenarios.demand import Demand, check_demand
+from ugat_marl.scenarios.junctions import Link, foes_of, yields_of
+from ugat_marl.scenarios.network import Intersection, Network
+from ugat_marl.scenarios.phases import RightOfWay, are_foes, turn_of
+from ugat_marl.scenarios.scenario import Scenario
+from ugat_marl.scenarios.settings import seconds_of
+from ugat_marl.scenarios.signals import GREEN
+
+SHORT_M = 50.0
+"""Lanes at lights that are shorter show little of a queue."""
+
+SATURATION_VPH = 1800.0
+"""Vehicles an hour that a lane discharges in green: a headway of 2 s."""
+FILLINGS = 3.0
+"""An episode shorter than so many times the time the network needs to fill shows mostly that."""
+
+
+@dataclass(frozen=True)
+class PhaseFacts:
+    """One green phase.
+
+    Attributes:
+        state: As SUMO writes it.
+        protected: Movements with green that nobody is in the way of, as ``edge turn``.
+        permitted: Movements with green that must let others pass (``g``).
+        crossings: Crossings with green.
+    """
+
+    state: str
+    protected: tuple[str, ...]
+    permitted: tuple[str, ...]
+    crossings: int
+
+
+@dataclass(frozen=True)
+class ApproachFacts:
+    """One road that leads to a traffic light.
+
+    Attributes:
+        edge: The road.
+        lanes: Its lanes.
+        vph: Vehicles an hour whose routes come by.
+        flow_ratio: That as a share of what its lanes would discharge in permanent green.
+        saturation: The same under the network's own programme; above 1 a queue grows without end.
+            None if there is no programme.
+    """
+
+    edge: str
+    lanes: int
+    vph: float
+    flow_ratio: float
+    saturation: float | None
+
+
+@dataclass(frozen=True)
+class IntersectionFacts:
+    """One agent.
+
+    Attributes:
+        id: SUMO's id of its traffic light.
+        junctions: Junctions it controls; more than one are joined under one controller.
+        lanes: Incoming lanes.
+        links: Ways across.
+        movements: Approaches times their turns.
+        conflicts: Pairs of links whose ways cross or merge.
+        phases: What it chooses from.
+        unserved_lanes: Lanes to which no phase gives green.
+        unserved_links: Links that are green in no phase, as ``lane -> lane``.
+        partly_served: Lanes that some phase serves in one direction only: who waits for the other
+            blocks them.
+        lanes_behind: Lanes that are too short, so that those are counted with them who are on the
+            lanes behind.
+        short_lanes: Lanes shorter than `SHORT_M` of a road that goes on upstream, where nobody is
+            counted.
+        always_green: Links that are green in every phase: the signal never stops them.
+        right_on_red: Links that may go on red after a stop.
+        u_turns: Links that turn around.
+        crossings: Links for people on foot.
+        unserved_crossings: Those of them that are green in no phase.
+        foot_phases: Phases in which people on foot alone have green: a controller that sees
+            vehicles has no reason to choose them.
+        clashes: Crossings with green while vehicles that cross them need not wait, as ``phase n:
+            edge turn``.
+        uncontrolled: Links at its junctions without a light.
+        approaches: Its roads with their traffic.
+    """
+
+    id: str
+    junctions: tuple[str, ...]
+    lanes: int
+    links: int
+    movements: int
+    conflicts: int
+    phases: tuple[PhaseFacts, ...]
+    unserved_lanes: tuple[str, ...]
+    unserved_links: tuple[str, ...]
+    partly_served: tuple[str, ...]
+    lanes_behind: tuple[str, ...]
+    short_lanes: tuple[str, ...]
+    always_green: int
+    right_on_red: int
+    u_turns: int
+    crossings: int
+    unserved_crossings: int
+    foot_phases: int
+    clashes: tuple[str, ...]
+    uncontrolled: int
+    approaches: tuple[ApproachFacts, ...]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A scenario as its controllers meet it.
+
+    Attributes:
+        scenario: Its id.
+        duration_s: Length of an episode.
+        decisions: Decisions in it.
+        vehicles: Vehicles that depart within it.
+        flows: Flows within it.
+        first_s: Seconds until the first of them departs.
+        fill_s: Seconds within which 95 in 100 of them could cross the network at the speed limits.
+        shortest_episode_s: Shortest useful episode: until the first vehicle, and `FILLINGS` times
+            as long as the network needs to fill.
+        intersections: The agents.
+        uncontrolled: Traffic lights that are no agents: they have fewer than two green phases.
+    """
+
+    scenario: str
+    duration_s: float
+    decisions: int
+    vehicles: int
+    flows: int
+    first_s: float
+    fill_s: float
+    shortest_episode_s: float
+    intersections: tuple[IntersectionFacts, ...]
+    uncontrolled: tuple[str, ...]
+
+
+def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
+    """Looks at everything that needs no simulation.
+
+    Args:
+        scenario: What to look at.
+        reporter: Shows progress where a route file is long.
+
+    Raises:
+        ScenarioError: The scenario cannot be controlled or driven.
+    """
+    network = Network.read(scenario)
+    demand = check_demand(scenario, network, reporter)
+    root = scenario.network.parse()
+    traffic = _Traffic.of(scenario, network, demand, reporter)
+    free = _free_links(root)
+    short = _short(scenario, network)
+    rules = RightOfWay(foes_of(root), yields_of(root))
+    interval = scenario.control.decision_interval_s
+    shortest = traffic.first_s + FILLINGS * traffic.fill_s
+    shortest = -(-shortest // interval) * interval
+    return Survey(
+        scenario.id,
+        scenario.settings.duration_s,
+        scenario.decisions,
+        demand.vehicles,
+        demand.flows,
+        round(traffic.first_s, 2),
+        round(traffic.fill_s, 1),
+        shortest,
+        tuple(_facts(item, network, rules, free, traffic, short) for item in network.intersections),
+        network.uncontrolled,
+    )
+
+
+def _short(scenario: Scenario, network: Network) -> set[str]:
+    """Lanes with which more would be counted, did agents look as far as `SHORT_M`."""
+    if scenario.control.reach_m >= SHORT_M or "mesosim" in scenario.settings.sumo:
+        return set()
+    farther = Network.read(scenario.with_control(reach_m=SHORT_M))
+    return {
+        name
+        for name, lane in farther.lanes.items()
+        if lane.behind.lanes.keys() - network.lanes[name].behind.lanes.keys()
+    }
+
+
+def _facts(
+    item: Intersection,
+    network: Network,
+    rules: RightOfWay,
+    free: Mapping[str, int],
+    traffic: _Traffic,
+    short: Container[str],
+) -> IntersectionFacts:
+    served = [{i for i, letter in enumerate(phase) if letter in GREEN} for phase in item.phases]
+    ever = set[int]().union(*served)
+    stop_and_go = {i for phase in item.phases for i, letter in enumerate(phase) if letter == "s"}
+    may_go = ever | stop_and_go
+    junctions = tuple(dict.fromkeys(link.junction for link in item.links))
+    moving = {link.from_lane for link in item.links if link.index in may_go}
+    return IntersectionFacts(
+        id=item.id,
+        junctions=junctions,
+        lanes=len(item.incoming_lanes),
+        links=len(item.links),
+        movements=len({_movement(link) for link in item.links}),
+        conflicts=sum(
+            a.from_edge != b.from_edge and are_foes(a, b, rules.foes)
+            for a, b in combinations(item.links, 2)
+        ),
+        phases=tuple(_phase(item, phase) for phase in item.phases),
+        unserved_lanes=tuple(lane for lane in item.incoming_lanes if lane not in moving),
+        unserved_links=tuple(
+            f"{link.from_lane} -> {link.to_lane}" for link in item.links if link.index not in may_go
+        ),
+        partly_served=tuple(lane for lane in item.incoming_lanes if _in_part(lane, item)),
+        lanes_behind=tuple(
+            lane for lane in item.incoming_lanes if network.lanes[lane].behind.lanes
+        ),
+        short_lanes=tuple(lane for lane in item.incoming_lanes if lane in short),
+        always_green=sum(all(link.index in green for green in served) for link in item.links),
+        right_on_red=sum(link.index in stop_and_go for link in item.links),
+        u_turns=sum(link.direction in "tT" for link in item.links),
+        crossings=len(item.crossings),
+        unserved_crossings=sum(
+            all(phase[walk.index] not in GREEN for phase in item.phases) for walk in item.crossings
+        ),
+        foot_phases=sum(not green & {link.index for link in item.links} for green in served),
+        clashes=tuple(_clashes(item, rules)),
+        uncontrolled=sum(free.get(junction, 0) for junction in junctions),
+        approaches=tuple(_approaches(item, network, traffic)),
+    )
+
+
+def _in_part(lane: str, item: Intersection) -> bool:
+    indices = {link.index for link in item.links if link.from_lane == lane}
+    shown = ({state[index] in GREEN for index in indices} for state in item.phases)
+    return any(len(letters) > 1 for letters in shown)
+
+
+def _clashes(item: Intersection, rules: RightOfWay) -> Iterator[str]:
+    """Protected greens of vehicles across a crossing that is green."""
+    for number, phase in enumerate(item.phases):
+        walks = [walk for walk in item.crossings if phase[walk.index] in GREEN]
+        through = [link for link in item.links if phase[link.index] == "G"]
+        found = (
+            f"phase {number}: {_movement(link)}"
+            for link in through
+            if any(link.index != walk.index and are_foes(link, walk, rules.foes) for walk in walks)
+        )
+        yield from dict.fromkeys(found)
+
+
+def _movement(link: Link) -> str:
+    return f"{link.from_edge} {turn_of(link)}"
+
+
+def _phase(item: Intersection, state: str) -> PhaseFacts:
+    def movements(letter: str) -> tuple[str, ...]:
+        return tuple(
+            dict.fromkeys(_movement(link) for link in item.links if state[link.index] == letter)
+        )
+
+    crossings = sum(state[crossing.index] in GREEN for crossing in item.crossings)
+    return PhaseFacts(state, movements("G"), movements("g"), crossings)
+
+
+def _approaches(item: Intersection, network: Network, traffic: _Traffic) -> Sequence[ApproachFacts]:
+    lanes: dict[str, list[str]] = defaultdict(list)
+    for lane in item.incoming_lanes:
+        lanes[network.lanes[lane].edge].append(lane)
+    cycle_s = sum(seconds for seconds, _ in item.programme)
+    found: list[ApproachFacts] = []
+    for edge, own in lanes.items():
+        vph = traffic.vph[edge]
+        capacity = SATURATION_VPH * len(own)
+        green = sum(_green_s(item, lane) for lane in own) / len(own)
+        saturation = None
+        if cycle_s:
+            saturation = vph / (capacity * green / cycle_s) if green else None
+        found.append(
+            ApproachFacts(
+                edge,
+                len(own),
+                round(vph, 1),
+                round(vph / capacity, 3),
+                None if saturation is None else round(saturation, 3),
+            )
+        )
+    return found
+
+
+def _green_s(item: Intersection, lane: str) -> float:
+    """Green of a lane in a cycle of the programme; a lane with several links has the mean."""
+    indices = [link.index for link in item.links if link.from_lane == lane]
+    shown = [
+        sum(seconds for seconds, state in item.programme if state[index] in GREEN)
+        for index in indices
+    ]
+    return sum(shown) / len(shown)
+
+
+def _free_links(root: ET.Element) -> Counter[str]:
+    """Links without a light, by the junction they cross."""
+    ends = {edge.get("id", ""): edge.get("to", "") for edge in root.iter("edge")}
+    return Counter(
+        ends.get(item.get("from", ""), "")
+        for item in root.iter("connection")
+        if item.get("tl") is None
+        and not any(item.get(end, ":").startswith(":") for end in ("from", "to"))
+    )
+
+
+@dataclass(frozen=True)
+class _Traffic:
+    """What the routes bring: vehicles an hour by road, and how long they drive."""
+
+    vph: Counter[str]
+    first_s: float
+    fill_s: float
+
+    @classmethod
+    def of(
+        cls, scenario: Scenario, network: Network, demand: Demand, reporter: Reporter | None
+    ) -> _Traffic:
+        seconds: dict[str, float] = {}
+        for lane in network.lanes.values():
+            seconds[lane.edge] = lane.length_m / max(lane.speed_mps, 0.1)
+        begin = scenario.settings.begin_s
+        end = begin + scenario.settings.duration_s
+        passes: Counter[str] = Counter()
+        lengths_s: list[float] = []
+        first = end
+        for _, depart, edges in drives(scenario, routed=demand.routed, reporter=reporter):
+            if begin <= depart < end:
+                passes.update(edges)
+                lengths_s.append(sum(seconds.get(edge, 0.0) for edge in edges))
+                first = min(first, depart)
+        hours = scenario.settings.duration_s / 3600
+        lengths_s.sort()
+        fill_s = lengths_s[int(0.95 * (len(lengths_s) - 1))] if lengths_s else 0.0
+        return cls(Counter({e: n / hours for e, n in passes.items()}), first - begin, fill_s)
+
+
+def drives(
+    scenario: Scenario, *, routed: bool, reporter: Reporter | None = None
+) -> Iterator[tuple[str, float, list[str]]]:
+    """Name, departure and roads of every vehicle that departs before the end of the episode.
+
+    Args:
+        scenario: Whose demand; it has passed `check_demand`.
+        routed: Whether it holds single vehicles with roads only; others are routed before.
+        reporter: Shows progress where a file is long.
+    """
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    for document in scenario.routes if routed else explicit(scenario).routes:
+        name, depart = "", 0.0
+        for tag in document.scan(reporter):
+            if tag.name == "vehicle":
+                name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
+                depart = seconds_of(text) if text[:1].isdigit() else begin
+                if depart >= end:  # they are in the order of their departures
+                    break
+            elif tag.name == "route" and "id" not in tag.attributes:
+                yield name, depart, tag.attributes.get("edges", "").split()

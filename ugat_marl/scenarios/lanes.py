@@ -1,0 +1,52 @@
+"""The measured lanes of a network, in the order of every array about them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Shares = tuple[tuple[tuple[str, float], ...], ...]
+"""For each measured lane names of others, each with a share in (0, 1]."""
+
+
+class Behind(NamedTuple):
+    """Who is counted with lanes that end before an agent's sight does (`junctions.behind_of`).
+
+    Attributes:
+        lanes: For each measured lane the lanes upstream of it, inside junctions and outside.
+        roads: For each the roads on which it or those begin: vehicles due there that find no room
+            to enter the network stand behind them.
+    """
+
+    lanes: Shares = ()
+    roads: Shares = ()
+
+
+NOBODY = Behind()
+"""Nobody is counted with any lane."""
+
+
+@dataclass(frozen=True)
+class LaneTable:
+    """Which lanes are measured, in the order of every array of a `Snapshot`.
+
+    Attributes:
+        ids: Lane ids of SUMO, ``(lanes,)``.
+        capacity: Vehicles that fit on the lane, ``(lanes,)``, float64.
+        speed_mps: Speed limit, ``(lanes,)``, float64.
+        behind: Who is counted with lanes that are too short.
+    """
+
+    ids: tuple[str, ...]
+    capacity: NDArray[np.float64]
+    speed_mps: NDArray[np.float64]
+    behind: Behind = NOBODY
+
+    def indices(self, lanes: Sequence[str]) -> NDArray[np.int64]:
+        """Positions of `lanes` in the arrays, int64."""
+        position = {lane: index for index, lane in enumerate(self.ids)}
+        return np.array([position[lane] for lane in lanes], dtype=np.int64)

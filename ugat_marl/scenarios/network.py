@@ -1,0 +1,399 @@
+"""Static facts read from a ``.net.xml``: intersections, lanes, links, conflicts, neighbours."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+
+import numpy as np
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import parse_xml
+from ugat_marl.scenarios.junctions import (
+    Link,
+    Upstream,
+    behind_of,
+    crossings_of,
+    foes_of,
+    links_of,
+    neighbours_of,
+    right_on_red_of,
+    yields_of,
+)
+from ugat_marl.scenarios.lanes import NOBODY, Behind, LaneTable
+from ugat_marl.scenarios.phases import (
+    RightOfWay,
+    conflict_free_phases,
+    conflicting_greens,
+    programme_phases,
+)
+from ugat_marl.scenarios.scenario import Scenario
+from ugat_marl.scenarios.signals import GREEN, STATES, check_phases
+
+VEHICLE_SPACE_M = 7.5
+"""Room of a queued default vehicle: 5 m length plus 2.5 m gap."""
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A lane outside of junctions.
+
+    Attributes:
+        id: SUMO id.
+        edge: Its edge.
+        length_m: Length.
+        speed_mps: Speed limit.
+        shape: Centre line, ``((x, y), ...)`` in m.
+        behind: What is counted with it, since it ends before an agent's sight does.
+        room_m: Length on which vehicles are measured: lanes behind included, and the reach.
+    """
+
+    id: str
+    edge: str
+    length_m: float
+    speed_mps: float
+    shape: tuple[tuple[float, float], ...]
+    behind: Upstream = field(default_factory=Upstream)
+    room_m: float = 0.0
+
+    @property
+    def capacity(self) -> float:
+        """Default vehicles that fit on the lane and those behind, at least one."""
+        return max(1.0, max(self.length_m, self.room_m) / VEHICLE_SPACE_M)
+
+
+@dataclass(frozen=True)
+class Intersection:
+    """One traffic light: an agent.
+
+    Attributes:
+        id: SUMO id of the traffic light.
+        incoming_lanes: Lanes that lead to a link, in order of link index.
+        outgoing_lanes: Lanes that links lead to, in order of link index.
+        links: All links by index.
+        phases: Green states the agent chooses from.
+        programme: The network's own programme, ``(duration_s, state)``.
+        neighbours: Traffic lights one road away, in either direction.
+        position: Mean of the junctions' coordinates, m.
+        crossings: Links for people on foot.
+    """
+
+    id: str
+    incoming_lanes: tuple[str, ...]
+    outgoing_lanes: tuple[str, ...]
+    links: tuple[Link, ...]
+    phases: tuple[str, ...]
+    programme: tuple[tuple[float, str], ...]
+    neighbours: tuple[str, ...]
+    position: tuple[float, float]
+    crossings: tuple[Link, ...] = ()
+
+
+@dataclass(frozen=True)
+class Network:
+    """All lanes and all intersections of a scenario.
+
+    Attributes:
+        lanes: Lanes outside of junctions by id.
+        intersections: Traffic lights with at least two green phases, in the order of their ids.
+        uncontrolled: Traffic lights with fewer green phases; they run their own programme.
+    """
+
+    lanes: Mapping[str, Lane]
+    intersections: tuple[Intersection, ...]
+    uncontrolled: tuple[str, ...]
+
+    @classmethod
+    def read(cls, scenario: Scenario) -> Network:
+        """Reads and checks the network of a scenario.
+
+        Raises:
+            ScenarioError: Not a network, no traffic light to control, phases that cannot be shown
+                or whose greens conflict, or settings for a traffic light that does not exist.
+        """
+        document = scenario.network
+        root = parse_xml(document.read(), document.source)
+        if root.tag != "net":
+            raise ScenarioError(
+                f"{document.source}: a SUMO network begins with <net>, this with <{root.tag}>"
+            )
+        try:
+            return cls._of(root, scenario)
+        except (ValueError, IndexError, KeyError) as error:
+            raise ScenarioError(
+                f"{document.source}: a value is missing or is not what SUMO writes there "
+                f"({error}); build the network again with netconvert"
+            ) from None
+
+    @classmethod
+    def _of(cls, root: ET.Element, scenario: Scenario) -> Network:
+        document = scenario.network
+        lanes = _lanes(root)
+        links = links_of(root)
+        programmes = _programmes(root, scenario)
+        if unknown := sorted(set(scenario.settings.intersections) - set(links)):
+            raise ScenarioError(
+                f"scenario {scenario.id!r}: intersections.{unknown[0]} is not a traffic light of "
+                f"{document.source}; it has: {', '.join(sorted(links)) or 'none'}"
+            )
+        _check_lanes(links, lanes, document.source)
+        rules = RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
+        crossings = crossings_of(root)
+        reachable = neighbours_of(links, root)
+        positions = _positions(root)
+        found: list[Intersection] = []
+        uncontrolled: list[str] = []
+        for tls in sorted(links):
+            own = tuple(sorted(links[tls], key=lambda link: (link.index, link.to_lane)))
+            programme = programmes.get(tls, ())
+            walks = tuple(crossings.get(tls, ()))
+            phases = _phases_of(scenario, tls, own, walks, programme, rules)
+            if _choices(phases, own, _source_of(scenario, tls)) < 2:
+                uncontrolled.append(tls)
+                continue
+            found.append(
+                Intersection(
+                    id=tls,
+                    incoming_lanes=_unique(link.from_lane for link in own),
+                    outgoing_lanes=_unique(link.to_lane for link in own),
+                    links=own,
+                    phases=phases,
+                    programme=programme,
+                    neighbours=reachable[tls],
+                    position=_centre([positions[link.junction] for link in own]),
+                    crossings=walks,
+                )
+            )
+        if not found:
+            what = (
+                "only traffic lights with fewer than two green phases"
+                if links
+                else "no traffic light"
+            )
+            raise ScenarioError(
+                f"{document.source}: {what}; an environment needs at least one intersection with "
+                "two green phases (netconvert --tls.guess adds traffic lights)"
+            )
+        agents = {intersection.id for intersection in found}
+        pruned = tuple(_with_neighbours(item, agents) for item in found)
+        reach_m = scenario.control.reach_m
+        return cls(_with_room(lanes, root, agents, reach_m), pruned, tuple(uncontrolled))
+
+    def intersection(self, tls: str) -> Intersection:
+        """The intersection with this SUMO id."""
+        return next(item for item in self.intersections if item.id == tls)
+
+    def lane_table(self) -> LaneTable:
+        """All incoming and outgoing lanes of intersections, each once, in a fixed order."""
+        names = _unique(
+            lane
+            for item in self.intersections
+            for lane in (*item.incoming_lanes, *item.outgoing_lanes)
+        )
+        behind = [self.lanes[name].behind for name in names]
+        return LaneTable(
+            names,
+            np.array([self.lanes[name].capacity for name in names]),
+            np.array([self.lanes[name].speed_mps for name in names]),
+            Behind(
+                tuple(tuple(item.lanes.items()) for item in behind),
+                tuple(tuple(item.roads.items()) for item in behind),
+            )
+            if any(item.lanes or item.roads for item in behind)
+            else NOBODY,
+        )
+
+
+def within(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str, tuple[str, ...]]:
+    """For each name the others at most `hops` roads away, nearest first."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name in neighbours:
+        reached, frontier = [name], [name]
+        for _ in range(hops):
+            ahead = (other for one in frontier for other in neighbours[one])
+            frontier = list(dict.fromkeys(other for other in ahead if other not in reached))
+            reached += frontier
+        found[name] = tuple(reached[1:])
+    return found
+
+
+def signal_widths(scenario: Scenario) -> dict[str, int]:
+    """How many letters the state of each traffic light has, controlled by an agent or not.
+
+    Raises:
+        ScenarioError: The network is not well-formed.
+    """
+    root = parse_xml(scenario.network.read(), scenario.network.source)
+    programmes = _programmes(root, scenario)
+    return {
+        tls: len(programmes[tls][0][1])
+        if tls in programmes
+        else max(link.index for link in links) + 1
+        for tls, links in links_of(root).items()
+    }
+
+
+def _source_of(scenario: Scenario, tls: str) -> str | Sequence[str]:
+    """Where the phases of a traffic light come from; states if they are listed."""
+    own = scenario.settings.intersections.get(tls)
+    return own.phases if own and own.phases is not None else scenario.control.phases
+
+
+def _choices(phases: Sequence[str], links: Sequence[Link], source: str | Sequence[str]) -> int:
+    """Phases between which an agent that sees vehicles can choose.
+
+    At a light for a crossing alone it would never stop the vehicles: that keeps its programme,
+    unless its phases are listed.
+    """
+    if not isinstance(source, str):
+        return len(phases)
+    letters = {link.index for link in links}
+    return sum(any(phase[i] in GREEN for i in letters) for phase in phases)
+
+
+def _phases_of(
+    scenario: Scenario,
+    tls: str,
+    links: tuple[Link, ...],
+    crossings: tuple[Link, ...],
+    programme: tuple[tuple[float, str], ...],
+    rules: RightOfWay,
+) -> tuple[str, ...]:
+    source = _source_of(scenario, tls)
+    width = max(link.index for link in (*links, *crossings)) + 1
+    where = f"scenario {scenario.id!r}, traffic light {tls!r}"
+    if programme:
+        width = _check_programme(programme, width, links, rules.foes, where)
+    if source in ("conflict-free", "permitted"):
+        phases = conflict_free_phases(
+            links, rules, width, where, crossings=crossings, permitted=source == "permitted"
+        )
+    elif source == "programme":
+        phases = programme_phases(programme)
+    else:
+        phases = tuple(source)
+    check_phases(phases, width, where)
+    for phase in phases:
+        _check_greens(phase, links, rules.foes, f"{where}: phase")
+    return phases
+
+
+def _check_programme(
+    programme: Sequence[tuple[float, str]],
+    width: int,
+    links: Sequence[Link],
+    foes: Mapping[str, Sequence[int]],
+    where: str,
+) -> int:
+    """Refuses a programme SUMO or traffic could not live with; returns the letters of its states.
+
+    There may be more letters than links of vehicles: those of pedestrian crossings.
+    """
+    letters = len(programme[0][1])
+    for index, (_, state) in enumerate(programme):
+        what = f"{where}: state {index} of its programme ({state!r})"
+        if len(state) < width or len(state) != letters:
+            raise ScenarioError(
+                f"{what} has {len(state)} letters, but "
+                + (f"it controls {width} links" if len(state) < width else f"state 0 has {letters}")
+                + "; write one letter per link into every <phase> of the <tlLogic>"
+            )
+        if unknown := sorted(set(state) - STATES):
+            raise ScenarioError(f"{what} has unknown letters {unknown}; allowed: {sorted(STATES)}")
+        _check_greens(state, links, foes, f"{where}: state {index} of its programme")
+    return letters
+
+
+def _check_greens(
+    state: str, links: Sequence[Link], foes: Mapping[str, Sequence[int]], what: str
+) -> None:
+    if pair := conflicting_greens(state, links, foes):
+        raise ScenarioError(
+            f"{what} ({state!r}) gives protected green (G) to the links {pair[0]} and {pair[1]}, "
+            "whose paths cross; write g for the one that must yield"
+        )
+
+
+def _check_lanes(
+    links: Mapping[str, Sequence[Link]], lanes: Mapping[str, Lane], source: str
+) -> None:
+    for tls, own in links.items():
+        for lane in (name for link in own for name in (link.from_lane, link.to_lane)):
+            if lane not in lanes:
+                raise ScenarioError(
+                    f"{source}: traffic light {tls!r} controls a connection over lane {lane!r}, "
+                    "which the network does not have; build it again with netconvert"
+                )
+
+
+def _lanes(root: ET.Element) -> dict[str, Lane]:
+    lanes: dict[str, Lane] = {}
+    for edge in root.iter("edge"):
+        if edge.get("function") in ("internal", "crossing", "walkingarea"):
+            continue
+        for lane in edge.iter("lane"):
+            name = lane.get("id", "")
+            lanes[name] = Lane(
+                name,
+                edge.get("id", ""),
+                float(lane.get("length", "0")),
+                float(lane.get("speed", "0")),
+                _shape(lane.get("shape", "")),
+            )
+    return lanes
+
+
+def _with_room(
+    lanes: dict[str, Lane], root: ET.Element, agents: Container[str], reach_m: float
+) -> dict[str, Lane]:
+    """The lanes, those at lights that are too short with what is counted with them."""
+    lengths_m = {name: lane.length_m for name, lane in lanes.items()}
+    for name, own in behind_of(root, lengths_m, max(reach_m, VEHICLE_SPACE_M), agents).items():
+        behind = own if reach_m else Upstream(own.lanes)
+        room_m = sum(lengths_m.get(other, 0.0) * share for other, share in own.lanes.items())
+        room_m = max(lengths_m[name] + room_m, reach_m)
+        lanes[name] = replace(lanes[name], behind=behind, room_m=room_m)
+    return lanes
+
+
+def _shape(text: str) -> tuple[tuple[float, float], ...]:
+    points = (point.split(",") for point in text.split())
+    return tuple((float(xyz[0]), float(xyz[1])) for xyz in points)
+
+
+def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[float, str], ...]]:
+    """The programme SUMO runs: the last one defined, additional files after the network."""
+    programmes: dict[str, tuple[tuple[float, str], ...]] = {}
+    parts = chain.from_iterable(document.parts() for document in scenario.additional)
+    for tree in chain((root,), parts):
+        for logic in tree.iter("tlLogic"):
+            phases = tuple(
+                (float(phase.get("duration", "0")), phase.get("state", ""))
+                for phase in logic.iter("phase")
+            )
+            if phases:
+                programmes[logic.get("id", "")] = phases
+    return programmes
+
+
+def _positions(root: ET.Element) -> dict[str, tuple[float, float]]:
+    positions = {
+        item.get("id", ""): (float(item.get("x", "0")), float(item.get("y", "0")))
+        for item in root.iter("junction")
+    }
+    return {"": (0.0, 0.0), **positions}
+
+
+def _centre(points: list[tuple[float, float]]) -> tuple[float, float]:
+    x, y = np.mean(points, axis=0)
+    return float(x), float(y)
+
+
+def _unique(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names))
+
+
+def _with_neighbours(item: Intersection, agents: set[str]) -> Intersection:
+    return replace(item, neighbours=tuple(n for n in item.neighbours if n in agents))

@@ -1,0 +1,290 @@
+"""Which links may be green together: phases from a programme, or derived from the conflicts.
+
+The conflicts are those of the junction's own right-of-way matrix (``<request foes=...>``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from functools import partial
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.scenarios.junctions import Link, Matrix, has_bit
+from ugat_marl.scenarios.signals import GREEN, YELLOW
+
+MOST_PHASES = 64
+"""More maximal conflict-free sets than this mean a junction that needs an explicit list."""
+
+
+Movement = tuple[str, str]
+"""Approach (edge) and direction."""
+
+Clash = Callable[[Link, Link], bool]
+"""Whether two links must not be green together."""
+
+
+def programme_phases(programme: Sequence[tuple[float, str]]) -> tuple[str, ...]:
+    """The green phases of a signal programme: states with green and without yellow, each once."""
+    return tuple(
+        dict.fromkeys(
+            state for _, state in programme if set(state) & GREEN and not set(state) & YELLOW
+        )
+    )
+
+
+def are_foes(a: Link, b: Link, foes: Matrix) -> bool:
+    """Whether the paths of two links cross or merge, by their junction's matrix."""
+    return has_bit(a, b, foes) or has_bit(b, a, foes)
+
+
+def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple[int, int] | None:
+    """Two links that both have protected green though their paths cross, or None.
+
+    Only crossings that involve a through movement count: many networks draw opposing left turns so
+    tightly that the matrix calls them foes, and give a merging right turn a standing green.
+    """
+    green = [link for link in links if phase[link.index] == "G"]
+    for position, a in enumerate(green):
+        for b in green[position + 1 :]:
+            if (
+                a.from_edge != b.from_edge
+                and a.to_edge != b.to_edge
+                and "s" in (a.direction, b.direction)
+                and are_foes(a, b, foes)
+            ):
+                return a.index, b.index
+    return None
+
+
+@dataclass(frozen=True)
+class RightOfWay:
+    """Who is in whose way at the junctions of a network, and who waits.
+
+    Attributes:
+        foes: Rows that cross or merge.
+        yields: Rows that each row gives way to; empty where nobody asks who waits.
+        right_on_red: Junctions where right turns may go on red after a stop.
+    """
+
+    foes: Matrix
+    yields: Matrix = field(default_factory=dict[str, Sequence[int]])
+    right_on_red: frozenset[str] = frozenset()
+
+    def waits(self, a: Link, b: Link) -> bool:
+        """Whether `a` must let `b` go first."""
+        return bool(self.yields) and has_bit(a, b, self.yields)
+
+
+def conflict_free_phases(
+    links: Sequence[Link],
+    rules: RightOfWay,
+    width: int,
+    source: str,
+    *,
+    crossings: Sequence[Link] = (),
+    permitted: bool = False,
+) -> tuple[str, ...]:
+    """All maximal sets of compatible movements, as SUMO states.
+
+    A movement is a group of links with one approach and one direction; movements that share a
+    letter of the state count as one. Right turns follow: they are green with every phase that gives
+    green to a lane they share or that they do not conflict with.
+    On a 4-arm junction with left lanes this gives the eight phases of the UGAT paper.
+
+    A crossing goes with every phase in which only turning vehicles cross it, who wait (``g``):
+    right turns if there is such a phase, left turns too if not. One that no phase can serve gets
+    green in a phase for people on foot alone.
+
+    Args:
+        links: Links of one traffic light.
+        rules: Right of way at its junctions.
+        width: Letters of a state.
+        source: What to call the traffic light in errors.
+        crossings: Links for people on foot.
+        permitted: Whether left turns may go together with the traffic opposite, which they let pass
+            (``g``).
+
+    Returns:
+        Distinct states, through movements before left turns, in a fixed order.
+
+    Raises:
+        ScenarioError: The network has no right-of-way matrix, or there are too many sets.
+    """
+    if any(link.request < 0 for link in links):
+        raise ScenarioError(
+            f"{source}: the network has no internal lanes, so conflicts are unknown; "
+            'use phases = "programme" or list the phases'
+        )
+    clash = _permitted_clash(links, rules) if permitted else partial(are_foes, foes=rules.foes)
+    groups = _movements(links)
+    following = {name for name in groups if name[1] == "r"}
+    while True:
+        phases = _maximal_phases(groups, following, clash, source)
+        never = [name for name in sorted(following) if not any(name in chosen for chosen in phases)]
+        if not never:
+            break
+        following -= set(never)
+    chosen = [[link for name in phase for link in groups[name]] for phase in phases]
+    letters = {link.index for link in links}
+    walks = [crossing for crossing in crossings if crossing.index not in letters]
+    together = _with_crossings(chosen, walks, rules.foes)
+    return tuple(dict.fromkeys(state_of(green, links, rules, width) for green in together))
+
+
+def _permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
+    """Conflicts but those of left turns that wait for the approach opposite."""
+    through = [link for link in links if link.direction == "s"]
+    crossing = {
+        (a.from_edge, b.from_edge) for a in through for b in through if are_foes(a, b, rules.foes)
+    }
+    straight = {link.from_edge for link in through}
+
+    def clash(a: Link, b: Link) -> bool:
+        if not are_foes(a, b, rules.foes):
+            return False
+        opposite = {a.from_edge, b.from_edge} <= straight and not (
+            {(a.from_edge, b.from_edge), (b.from_edge, a.from_edge)} & crossing
+        )
+        return not opposite or not any(
+            turn_of(x) == "l" and rules.waits(x, y) for x, y in ((a, b), (b, a))
+        )
+
+    return clash
+
+
+def _with_crossings(
+    phases: list[list[Link]], crossings: Sequence[Link], foes: Matrix
+) -> list[list[Link]]:
+    """The phases with the crossings that may be used in them, and one for those left over."""
+    alone: list[Link] = []
+    found = [list(phase) for phase in phases]
+    for crossing in crossings:
+        possible: list[int] = []
+        for turning in ("r", "rl"):
+            possible = [
+                number
+                for number, phase in enumerate(phases)
+                if all(turn_of(link) in turning for link in phase if are_foes(link, crossing, foes))
+            ]
+            if possible:
+                break
+        for number in possible:
+            found[number].append(crossing)
+        if not possible:
+            alone.append(crossing)
+    return [*found, alone] if alone else found
+
+
+def state_of(green: Sequence[Link], links: Sequence[Link], rules: RightOfWay, width: int) -> str:
+    """The state that shows green: protected, or permitted where somebody else goes first."""
+    letters = ["r"] * width
+    for link in links:
+        if link.junction in rules.right_on_red and turn_of(link) == "r":
+            letters[link.index] = "s"
+    for link in green:
+        letters[link.index] = "G"
+    for link in green:
+        if any(link.from_edge != b.from_edge and rules.waits(link, b) for b in green):
+            letters[link.index] = "g"
+    return "".join(letters)
+
+
+def _maximal_phases(
+    groups: Mapping[Movement, Sequence[Link]],
+    following: set[Movement],
+    clash: Clash,
+    source: str,
+) -> list[set[Movement]]:
+    """Maximal sets of the movements that lead, each with the right turns that may follow it."""
+    main = [name for name in groups if name not in following]
+    compatible = {
+        a: {b for b in main if b != a and not _groups_conflict(groups[a], groups[b], clash)}
+        for a in main
+    }
+
+    def through_first(chosen: frozenset[Movement]) -> tuple[int, list[int]]:
+        return sum(name[1] == "l" for name in chosen), sorted(map(main.index, chosen))
+
+    phases: list[set[Movement]] = []
+    for leading in sorted(_maximal_cliques(compatible, source), key=through_first):
+        chosen = set(leading)
+        for name in groups:
+            if name in following and _right_may_go(name, chosen, groups, clash):
+                chosen.add(name)
+        phases.append(chosen)
+    return phases
+
+
+def _movements(links: Sequence[Link]) -> dict[Movement, list[Link]]:
+    """Links by approach and turn; those that share a letter can only be green together."""
+    groups: dict[Movement, list[Link]] = {}
+    for link in links:
+        groups.setdefault((link.from_edge, _turn(link.direction)), []).append(link)
+    # A right turn joins the movement it shares a letter with, not the other way round.
+    for name in sorted(groups, key=lambda name: name[1] == "r"):
+        letters = {link.index for link in groups.get(name, ())}
+        while joined := [
+            other
+            for other, own in groups.items()
+            if other != name and letters & {link.index for link in own}
+        ]:
+            for other in joined:
+                groups[name] += groups.pop(other)
+            letters = {link.index for link in groups[name]}
+    return groups
+
+
+def _turn(direction: str) -> str:
+    """Through, left or right; partial turns and turn-arounds count as the turn they resemble."""
+    return {"L": "l", "t": "l", "T": "l", "R": "r"}.get(direction, direction)
+
+
+def turn_of(link: Link) -> str:
+    """Through, left or right; partial turns and turn-arounds count as the turn they resemble."""
+    return _turn(link.direction)
+
+
+def _groups_conflict(a: Sequence[Link], b: Sequence[Link], clash: Clash) -> bool:
+    return any(x.from_edge != y.from_edge and clash(x, y) for x in a for y in b)
+
+
+def _right_may_go(
+    name: Movement,
+    chosen: Set[Movement],
+    groups: Mapping[Movement, Sequence[Link]],
+    clash: Clash,
+) -> bool:
+    if any(_groups_conflict(groups[name], groups[other], clash) for other in chosen):
+        return False
+    lanes = {link.from_lane for link in groups[name]}
+    sharing = [
+        other
+        for other, links in groups.items()
+        if other != name and lanes & {link.from_lane for link in links}
+    ]
+    return not sharing or any(other in chosen for other in sharing)
+
+
+def _maximal_cliques(
+    compatible: Mapping[Movement, set[Movement]], source: str
+) -> Iterator[frozenset[Movement]]:
+    """Bron-Kerbosch without pivoting: the graphs have a dozen nodes."""
+    found = 0
+    stack = [(frozenset[Movement](), set(compatible), set[Movement]())]
+    while stack:
+        clique, candidates, excluded = stack.pop()
+        if not candidates and not excluded:
+            found += 1
+            if found > MOST_PHASES:
+                raise ScenarioError(
+                    f"{source}: more than {MOST_PHASES} conflict-free phases; "
+                    'use phases = "programme" or list the phases'
+                )
+            yield clique
+            continue
+        for name in sorted(candidates):
+            near = compatible[name]
+            stack.append((clique | {name}, candidates & near, excluded & near))
+            candidates = candidates - {name}
+            excluded = excluded | {name}

@@ -1,0 +1,336 @@
+"""A scenario: road network, demand, timing and signal rules, as one immutable value.
+
+On disk it is a directory with a ``scenario.toml`` and SUMO files, or a plain ``.sumocfg``. Effects
+(see `ugat_marl.effects`) map scenarios to scenarios; a derived one keeps its edited files in memory
+until it is written or simulated.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.errors import ScenarioError, UnknownNameError
+from ugat_marl.files import Document, Draft, child_texts, parse_xml, read_bytes, write_whole
+from ugat_marl.scenarios.settings import (
+    ControlSettings,
+    ScenarioFile,
+    may_be_given,
+    seconds_of,
+    validated,
+)
+from ugat_marl.scenarios.signals import SignalTiming
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A road network with demand and rules, ready to be simulated.
+
+    Attributes:
+        id: Name, ending in ``-vN`` for shipped scenarios.
+        network: The ``.net.xml``.
+        routes: Route files (vehicles, trips, flows).
+        additional: Additional files.
+        settings: Everything else, as in ``scenario.toml``.
+        applied: Descriptions of the effects that made this scenario out of another one.
+    """
+
+    id: str
+    network: Document
+    routes: tuple[Document, ...]
+    additional: tuple[Document, ...]
+    settings: ScenarioFile
+    applied: tuple[str, ...] = field(default=())
+
+    @property
+    def control(self) -> ControlSettings:
+        """Signal timing."""
+        return self.settings.control
+
+    @property
+    def timing(self) -> SignalTiming:
+        """Clearance and minimum green of every intersection."""
+        control = self.control
+        return SignalTiming(control.yellow_s, control.all_red_s, control.min_green_s)
+
+    @property
+    def decisions(self) -> int:
+        """Number of decisions in an episode of the scenario's full duration."""
+        return int(self.settings.duration_s / self.control.decision_interval_s + 1e-9)
+
+    @property
+    def documents(self) -> tuple[Document, ...]:
+        """All files: network, routes, additional."""
+        return (self.network, *self.routes, *self.additional)
+
+    @functools.cached_property
+    def hash(self) -> str:
+        """SHA-256 over the content of all files and all settings, as 64 hex digits."""
+        digest = hashlib.sha256()
+        settings = self.settings.model_dump(mode="json")
+        for cosmetic in ("description", "network", "routes", "additional"):
+            settings.pop(cosmetic)
+        digest.update(json.dumps(settings, sort_keys=True).encode())
+        for document in self.documents:
+            length = sum(len(piece) for piece in document.pieces())
+            digest.update(f"\0{length}\0".encode())
+            for piece in document.pieces():
+                digest.update(piece)
+        return digest.hexdigest()
+
+    def with_control(self, **changes: Any) -> Scenario:
+        """The same scenario with other signal timing (keywords of `ControlSettings`)."""
+        control = {**self.control.model_dump(), **changes}
+        settings = {**self.settings.model_dump(), "control": control}
+        return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
+
+    def with_duration(self, duration_s: float) -> Scenario:
+        """The same scenario, ending earlier or later."""
+        settings = {**self.settings.model_dump(), "duration_s": duration_s}
+        return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
+
+    def write(self, directory: Path) -> Path:
+        """Writes a scenario directory that any SUMO and `read_scenario` can use.
+
+        Returns:
+            `directory`.
+        """
+        names = [document.name for document in self.documents]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ScenarioError(
+                f"scenario {self.id!r}: two of its files are called {twice[0]!r}, which one "
+                "directory cannot hold; rename one of them"
+            )
+        for document in self.documents:
+            document.write(directory / document.name)
+        settings = self.settings.model_dump(mode="json", exclude_defaults=True)
+        settings |= {
+            "network": self.network.name,
+            "routes": [document.name for document in self.routes],
+            "additional": [document.name for document in self.additional],
+        }
+        write_whole(directory / "scenario.toml", scenario_toml(settings, self.applied))
+        return directory
+
+
+def read_scenario(name: str | Path) -> Scenario:
+    """Loads a scenario; effects listed in its ``scenario.toml`` are kept in its settings.
+
+    Args:
+        name: Id of a shipped scenario (``"grid4x4-v1"``), a directory with a ``scenario.toml``, a
+            ``.sumocfg``, or ``"resco:<map>"`` for a network of an installed `sumo-rl` wheel.
+
+    Raises:
+        UnknownNameError: No such scenario.
+        ScenarioError: A file is missing, or the description is not valid.
+    """
+    text = str(name)
+    if text.startswith("resco:"):
+        return _load_sumocfg(_resco_configuration(text.removeprefix("resco:")), text)
+    path = Path(text).expanduser()
+    if path.suffix == ".sumocfg" or path.name.endswith(".sumocfg.xml"):
+        return _load_sumocfg(path, path.name.split(".")[0])
+    if (path / "scenario.toml").is_file():
+        return _load_directory(path)
+    if path.name == "scenario.toml" and path.is_file():
+        return _load_directory(path.parent)
+    shipped = dict(shipped_scenarios())
+    if text in shipped:
+        return _load_directory(shipped[text])
+    if text and path.is_dir():
+        raise ScenarioError(f"{path}: a directory without scenario.toml is not a scenario")
+    raise UnknownNameError(
+        "scenario", text, shipped, "A directory, a .sumocfg file and resco:<map> work as well."
+    )
+
+
+def shipped_scenarios() -> Iterator[tuple[str, Path]]:
+    """Ids and directories of the scenarios that come with the package."""
+    package = Path(__file__).resolve().parents[1]
+    for root in (package / "_scenarios", package.parent / "scenarios"):
+        if root.is_dir():
+            for file in sorted(root.glob("*/scenario.toml")):
+                yield file.parent.name, file.parent
+            return
+
+
+def _load_directory(directory: Path) -> Scenario:
+    file = directory / "scenario.toml"
+    try:
+        raw = tomllib.loads(file.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{file}: not valid TOML: {error}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{file}: cannot be read: {error}") from None
+    settings = validated(raw, str(file))
+
+    def document(name: str, key: str) -> Document:
+        path = directory / name
+        if not path.is_file():
+            raise ScenarioError(f"{file}: {key} names {name!r}, but {path} does not exist")
+        return Document(path.name, path)
+
+    return Scenario(
+        id=directory.resolve().name,
+        network=document(settings.network, "network"),
+        routes=tuple(document(name, "routes") for name in settings.routes),
+        additional=tuple(_quiet(document(name, "additional")) for name in settings.additional),
+        settings=settings,
+    )
+
+
+_SYNONYMS = {
+    "net-file": ("net-file", "net", "n"),
+    "route-files": ("route-files", "routes", "r"),
+    "additional-files": ("additional-files", "additional", "a"),
+    "begin": ("begin", "b"),
+    "end": ("end", "e"),
+    "step-length": ("step-length",),
+}
+"""What SUMO lets the elements of a configuration be called."""
+
+
+def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
+    root = parse_xml(read_bytes(path), str(path))
+    given = {item.tag: item.get("value", item.get("v", "")) for item in root.iter()}
+
+    def value(key: str, default: str = "") -> str:
+        return next((given[name] for name in _SYNONYMS[key] if name in given), default)
+
+    def documents(key: str, what: str = "") -> tuple[Document, ...]:
+        names = _names(value(key), path.parent)
+        if what and not names:
+            raise ScenarioError(f"{path}: no <{key} value=...>; a scenario needs {what}")
+        for name in names:
+            if not (path.parent / name).is_file():
+                raise ScenarioError(
+                    f"{path}: <{key}> names {name!r}, but {path.parent / name} does not exist"
+                )
+        return tuple(Document(Path(name).name, path.parent / name) for name in names)
+
+    def seconds(key: str, default: str) -> float:
+        text = value(key, default)
+        try:
+            return seconds_of(text)
+        except ValueError:
+            raise ScenarioError(f"{path}: {key} = {text!r} is not a time in seconds") from None
+
+    begin, end = seconds("begin", "0"), seconds("end", "-1")
+    if 0 <= end <= begin:
+        raise ScenarioError(f"{path}: end ({end:g} s) is not after begin ({begin:g} s)")
+    network = documents("net-file", "a network")[0]
+    routes, additional = documents("route-files", "vehicles"), documents("additional-files")
+    settings = validated(
+        {
+            "description": f"SUMO configuration {path.name}",
+            "network": network.name,
+            "routes": [document.name for document in routes],
+            "additional": [document.name for document in additional],
+            "begin_s": begin,
+            "duration_s": end - begin if end >= 0 else 3600.0,
+            "step_length_s": seconds("step-length", "1"),
+            "sumo": {
+                item.tag: item.get("value", item.get("v", ""))
+                for section in (*root.iter("processing"), *root.iter("routing"))
+                for item in section
+                if may_be_given(item.tag)
+            },
+        },
+        str(path),
+    )
+    return Scenario(scenario_id, network, routes, tuple(map(_quiet, additional)), settings)
+
+
+def _names(text: str, directory: Path) -> list[str]:
+    """File names separated by commas, or as of old by blanks."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    return [
+        part
+        for name in names
+        for part in ([name] if (directory / name).is_file() else name.split())
+    ]
+
+
+def resco_maps() -> dict[str, Path]:
+    """The RESCO networks of an installed sumo-rl, which is read as files and never imported."""
+    spec = importlib.util.find_spec("sumo_rl")
+    roots = list(spec.submodule_search_locations or []) if spec else []
+    files = [file for root in roots for file in Path(root).glob("nets/RESCO/*/*.sumocfg")]
+    return {file.parent.name: file for file in files}
+
+
+def _resco_configuration(name: str) -> Path:
+    maps = resco_maps()
+    if not maps:
+        raise ScenarioError(
+            f"resco:{name} needs the RESCO networks of the sumo-rl wheel; "
+            "install them with: pip install 'ugat-marl[resco]'"
+        )
+    if name not in maps:
+        raise UnknownNameError("RESCO map", name, maps)
+    return maps[name]
+
+
+def _quiet(document: Document) -> Document:
+    """The document without outputs: detectors and edge data would write beside the user's files."""
+    if not any("file" in tag.attributes for tag in document.scan()):
+        return document
+    draft = None
+    for part in document.parts():
+        for element in part.iter():
+            if "file" in element.attrib:
+                element.set("file", "NUL")
+        draft = draft or Draft(document.name.removesuffix(".gz"), part)
+        draft.add(*child_texts(part))
+    assert draft is not None
+    return draft.document()
+
+
+def _quoted(value: Any) -> str:
+    """A value as TOML, which agrees with JSON but for surrogates and the character DEL."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
+
+
+def scenario_toml(settings: Mapping[str, Any], applied: Sequence[str] = ()) -> str:
+    """The text of a ``scenario.toml``.
+
+    Args:
+        settings: Its keys and values; tables are nested.
+        applied: Descriptions of the effects that made the scenario, kept as comments.
+    """
+    lines = [f"# made by applying {text}" for text in applied]
+    tables: list[str] = []
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            tables += _toml_table(key, value)
+        elif key == "effects":
+            for effect in value:
+                tables += [
+                    "",
+                    "[[effects]]",
+                    *(f"{k} = {_quoted(v)}" for k, v in effect.items()),
+                ]
+        else:
+            lines.append(f"{key} = {_quoted(value)}")
+    return "\n".join(lines + tables) + "\n"
+
+
+def _toml_table(name: str, table: Mapping[str, Any]) -> list[str]:
+    plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
+    lines = ["", f"[{name}]", *(f"{_key(k)} = {_quoted(v)}" for k, v in plain.items())]
+    for key, value in table.items():
+        if isinstance(value, dict):
+            lines += _toml_table(f"{name}.{_key(key)}", value)
+    return lines

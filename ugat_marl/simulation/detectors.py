@@ -1,0 +1,139 @@
+"""Detectors as SUMO has them: instant induction loops, written as XML and read back."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.errors import SimulatorError
+from ugat_marl.files import xml_bytes
+from ugat_marl.scenarios import Detector, DetectorKind, Document, Lane, Network, Passages
+
+STOP_SETBACK_M = 2.5
+"""Upstream of the stop line: the first vehicle of a queue stands on the detector, and its rear
+leaves it once it has really started. Closer to the line the times flip by seconds."""
+ADVANCE_SETBACK_M = 50.0
+EXIT_DISTANCE_M = 10.0
+
+_EVENT = re.compile(
+    rb'id="([^"]*)" time="([\d.]+)" state="(enter|leave)" vehID="([^"]*)" '
+    rb'speed="([-\d.]+)" length="([\d.]+)"'
+)
+_END = "@end"
+
+
+def standard_detectors(network: Network) -> tuple[Detector, ...]:
+    """An advance and a stop detector on every incoming lane, an exit detector on every outgoing."""
+    places: dict[tuple[str, DetectorKind], float] = {}
+    for item in network.intersections:
+        for name in item.incoming_lanes:
+            length = network.lanes[name].length_m
+            places[name, "advance"] = max(length - ADVANCE_SETBACK_M, min(10.0, 0.3 * length))
+            places[name, "stop"] = max(length - STOP_SETBACK_M, 0.6 * length)
+        for name in item.outgoing_lanes:
+            places[name, "exit"] = min(EXIT_DISTANCE_M, 0.5 * network.lanes[name].length_m)
+    return tuple(
+        Detector(f"{kind}:{lane}", lane, round(position, 2), 0.0, kind)
+        for (lane, kind), position in places.items()
+    )
+
+
+def loops_document(
+    detectors: Sequence[Detector], lanes: dict[str, Lane] | None, file: Path
+) -> Document:
+    """An additional file with the loops of the detectors, all of which write to `file`.
+
+    A zone has two loops: its front end tells when a vehicle comes, its rear end when it has gone.
+
+    Args:
+        detectors: What to detect.
+        lanes: Lanes by id, which keep a zone's end on its lane; or None.
+        file: An absolute path.
+    """
+    root = ET.Element("additional")
+    for detector in detectors:
+        ends = {detector.id: detector.position_m}
+        if detector.length_m > 0:
+            end = detector.position_m + detector.length_m
+            if lanes is not None:
+                end = min(end, lanes[detector.lane].length_m - 0.1)
+            ends[detector.id + _END] = end
+        for name, position in ends.items():
+            ET.SubElement(
+                root,
+                "instantInductionLoop",
+                {"id": name, "lane": detector.lane, "pos": f"{position:.3f}", "file": str(file)},
+            )
+    return Document("loops.add.xml", None, xml_bytes(root))
+
+
+def read_loops(
+    file: Path, detectors: Sequence[Detector], begin_s: float, end_s: float
+) -> dict[str, Passages]:
+    """What the detectors saw between two times.
+
+    Raises:
+        SimulatorError: SUMO did not write the file.
+    """
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise SimulatorError(f"SUMO's detections cannot be read ({error.strerror})") from None
+    rows: dict[bytes, list[tuple[float, bool, bytes, float, float]]] = defaultdict(list)
+    for name, time, state, vehicle, speed, length in _EVENT.findall(content):
+        rows[name].append((float(time), state == b"enter", vehicle, float(speed), float(length)))
+    found: dict[str, Passages] = {}
+    for detector in detectors:
+        first = detector.id.encode()
+        last = (detector.id + _END).encode() if detector.length_m > 0 else first
+        passages = _clipped(_passages(rows[first], rows[last]), begin_s, end_s)
+        if len(passages):
+            found[detector.id] = passages
+    return found
+
+
+def _passages(
+    front: list[tuple[float, bool, bytes, float, float]],
+    rear: list[tuple[float, bool, bytes, float, float]],
+) -> Passages:
+    """Pairs the entering of each vehicle at the front end with its leaving at the rear end."""
+    left: dict[bytes, tuple[float, float]] = {
+        vehicle: (time, speed) for time, enters, vehicle, speed, _ in rear if not enters
+    }
+    rows: list[tuple[float, float, float, float]] = []
+    for time, enters, vehicle, speed, length in front:
+        if enters:
+            off, speed_off = left.pop(vehicle, (np.inf, speed))
+            rows.append((time, off, speed_off, length))
+    # A vehicle that was inserted on the loop, or changed lanes onto it, leaves without entering.
+    rows += [(-np.inf, time, speed, np.nan) for time, speed in left.values()]
+    if not rows:
+        return Passages.none()
+    table = np.array(sorted(rows, key=lambda row: min(row[0], row[1])), dtype=np.float64)
+    return Passages(table[:, 0], table[:, 1], table[:, 2], table[:, 3])
+
+
+def _clipped(passages: Passages, begin_s: float, end_s: float) -> Passages:
+    """The part between two times; an end outside of it is unknown."""
+    if not len(passages):
+        return passages
+    inside = (passages.off_s >= begin_s) & (passages.on_s < end_s)
+    # A leaving without an entering has no place in time but its own.
+    inside &= np.isfinite(passages.on_s) | (passages.off_s < end_s)
+    kept = passages.at(inside)
+    return Passages(
+        _known(kept.on_s, kept.on_s >= begin_s),
+        _known(kept.off_s, kept.off_s < end_s),
+        kept.speed_mps,
+        kept.length_m,
+    )
+
+
+def _known(times: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    return np.where(known, times, np.nan)

@@ -1,0 +1,403 @@
+"""The only file that talks to SUMO.
+
+libsumo holds one simulation per process, and a second start replaces the first without a word; here
+it is refused. `ugat_marl.simulation.process` gives the same interface in a process of its own.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import libsumo
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.errors import SimulatorBusy, SimulatorError
+from ugat_marl.files import write_whole
+from ugat_marl.scenarios import NOBODY, Behind, Document, Scenario, Segment, edge_of
+from ugat_marl.simulation.mesoscopic import (
+    QueueLook,
+    add_those_behind,
+    near_the_end,
+    refuse_in_queues,
+)
+from ugat_marl.simulation.snapshots import Snapshot, Trips
+from ugat_marl.simulation.trips import measuring_options, read_trips
+
+Plans = Mapping[str, Sequence[Segment]]
+"""Traffic light to what it shows in the coming seconds; lights left out go on as before."""
+
+_Floats = NDArray[np.float64]
+_TRIPS, _ERRORS = "trips.xml", "errors.log"
+
+
+@dataclass(frozen=True)
+class Launch:
+    """All that is needed to start a simulation, in plain values that can be sent to a process.
+
+    Attributes:
+        arguments: Options of SUMO, without the name of the program.
+        directory: A folder for this simulation's own files; whoever runs it may remove it.
+        begin_s: Start of the simulation on the scenario's clock.
+        lanes: Lanes to measure.
+        waiting: Whether to measure waiting times as well.
+        crossings: Whether to look every second for vehicles that leave a lane's road.
+        gui: Whether to open a window.
+        files: Names and content of the scenario's edited files.
+        zone_m: Length of what is measured apart at the end of each lane, or 0 for nothing.
+        persons: Vehicle types with the persons in each vehicle; what is hidden is then measured.
+        behind: As in `ugat_marl.scenarios.lanes.LaneTable`.
+    """
+
+    arguments: tuple[str, ...]
+    directory: str
+    begin_s: float
+    lanes: tuple[str, ...]
+    waiting: bool = False
+    crossings: bool = False
+    gui: bool = False
+    files: tuple[tuple[str, bytes], ...] = ()
+    zone_m: float = 0.0
+    persons: tuple[tuple[str, float], ...] = ()
+    behind: Behind = NOBODY
+
+    @property
+    def segment_m(self) -> float:
+        """Length of a segment of the mesoscopic model; 0 with car following."""
+        if "--mesosim" not in self.arguments:
+            return 0.0
+        return float(self.arguments[self.arguments.index("--meso-edgelength") + 1])
+
+    def write(self) -> None:
+        """Makes the folder and puts the files into it."""
+        Path(self.directory).mkdir(mode=0o700, exist_ok=True)
+        for name, content in self.files:
+            write_whole(Path(self.directory) / name, content)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The fields for JSON, without the files, which have been written by then."""
+        return {**asdict(replace(self, files=())), "files": ()}
+
+
+@dataclass(frozen=True)
+class VehiclePicture:
+    """Where the vehicles are, for drawing.
+
+    Attributes:
+        position: Front bumpers, m, ``(vehicles, 2)``.
+        angle_deg: Heading, 0 is north, clockwise, ``(vehicles,)``.
+        length_m: Lengths, ``(vehicles,)``.
+        speed_mps: Speeds, ``(vehicles,)``.
+    """
+
+    position: NDArray[np.float64]
+    angle_deg: NDArray[np.float64]
+    length_m: NDArray[np.float64]
+    speed_mps: NDArray[np.float64]
+
+
+class Simulator(Protocol):
+    """One simulation at a time; start, advance repeatedly, finish."""
+
+    def start(self, launch: Launch) -> Snapshot:
+        """Starts a simulation; one that is under way is ended first."""
+        ...
+
+    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+        """Simulates `seconds` under the given signals."""
+        ...
+
+    def vehicles(self) -> VehiclePicture:
+        """Positions of all vehicles now."""
+        ...
+
+    def signals(self) -> dict[str, str]:
+        """State of every traffic light now, including those that run their own programme."""
+        ...
+
+    def finish(self) -> Trips:
+        """Ends the simulation and returns what became of every vehicle due."""
+        ...
+
+    def close(self) -> None:
+        """Ends the simulation, if there is one; may be called again."""
+        ...
+
+
+def launch_of(
+    scenario: Scenario,
+    seed: int,
+    directory: Path,
+    lanes: Sequence[str],
+    *,
+    waiting: bool = False,
+    crossings: bool = False,
+    gui: bool = False,
+    zone_m: float = 0.0,
+    persons: Mapping[str, float] | None = None,
+    behind: Behind = NOBODY,
+) -> Launch:
+    """Lists SUMO's options, and the files that have to be written for it; writes nothing.
+
+    Args:
+        scenario: What to simulate.
+        seed: SUMO's seed; any 31-bit integer.
+        directory: A folder for the simulation alone; it is made when the simulation starts.
+        lanes: Lanes to measure.
+        waiting: Whether to measure waiting times.
+        crossings: Whether to look every second for vehicles that leave a lane's road.
+        gui: Whether to open a window.
+        zone_m: Length of what is to be measured apart at the end of each lane, or 0 for nothing.
+        persons: Vehicle type to its persons, "" for all others, if what is hidden is measured.
+        behind: As in `ugat_marl.scenarios.lanes.LaneTable`.
+    """
+    settings = scenario.settings
+    if "mesosim" in settings.sumo:
+        refuse_in_queues(scenario.id, crossings=crossings, zone=bool(zone_m), gui=gui)
+    files = {
+        "--net-file": [scenario.network],
+        "--route-files": list(scenario.routes),
+        "--additional-files": list(scenario.additional),
+    }
+    arguments: list[str] = []
+    written: dict[str, bytes] = {}
+    for option, documents in files.items():
+        if documents:
+            paths = [_on_disk(item, directory, written) for item in documents]
+            arguments += [option, ",".join(paths)]
+    for option, value in settings.sumo.items():
+        arguments += [f"--{option}", value]
+    arguments += [
+        "--begin", repr(settings.begin_s),
+        "--step-length", repr(settings.step_length_s),
+        "--seed", str(seed & 0x7FFFFFFF),
+        "--time-to-teleport", "-1",
+        "--tripinfo-output", str(directory / _TRIPS),
+        "--tripinfo-output.write-unfinished", "true",
+        "--tripinfo-output.write-undeparted", "true",
+        "--error-log", str(directory / _ERRORS),
+        "--no-step-log", "true",
+        "--duration-log.disable", "true",
+        "--no-warnings", "true",
+    ]  # fmt: skip
+    if persons is not None:
+        arguments += measuring_options(directory)
+    if gui:
+        arguments += ["--start", "true", "--quit-on-end", "true"]
+    return Launch(
+        tuple(arguments),
+        str(directory),
+        settings.begin_s,
+        tuple(lanes),
+        waiting,
+        crossings,
+        gui,
+        tuple(written.items()),
+        zone_m,
+        tuple((persons or {}).items()),
+        behind,
+    )
+
+
+def _on_disk(document: Document, directory: Path, written: dict[str, bytes]) -> str:
+    """A path SUMO can open, of a file to write if need be: a comma ends a name for SUMO."""
+    if document.path is not None and "," not in str(document.path.resolve()):
+        return str(document.path.resolve())
+    name = document.name.removesuffix(".gz").replace(",", "_")
+    while name in written:
+        name = f"_{name}"
+    written[name] = document.read()
+    return str(directory / name)
+
+
+class LibsumoSimulator:
+    """SUMO inside this process.
+
+    Restarting in one process is not always reproducible to the bit (seen on RESCO cologne1); use
+    `ugat_marl.simulation.process.ProcessSimulator` where that matters.
+    """
+
+    def __init__(self) -> None:
+        self._launch: Launch | None = None
+        self._shown: dict[str, str] = {}
+        self._time_s = 0.0
+        self._limits = np.empty(0)
+        self._queues: QueueLook | None = None
+        self._on: dict[str, tuple[int, str]] = {}
+        self._owner = 0
+
+    def start(self, launch: Launch) -> Snapshot:
+        """Starts a simulation.
+
+        Raises:
+            SimulatorBusy: This process already runs a simulation of somebody else.
+            SimulatorError: SUMO refuses; its own words are in the message.
+        """
+        self.close()
+        if libsumo.simulation.isLoaded():
+            raise SimulatorBusy(
+                "this process already runs a SUMO simulation, and libsumo holds only one: close "
+                'the other one, or use simulator="process", which runs any number'
+            )
+        if launch.gui and os.name == "posix" and not os.environ.get("DISPLAY"):
+            raise SimulatorError(  # sumo-gui would end this whole process
+                'render_mode "human" opens a window, but there is no display (DISPLAY is not set); '
+                'use render_mode "rgb_array"'
+            )
+        launch.write()
+        program = "sumo-gui" if launch.gui else "sumo"
+        self._owner = os.getpid()
+        self._launch = launch
+        try:
+            libsumo.start([program, *launch.arguments])
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            self._fail("SUMO did not start", error)
+        self._shown, self._on = {}, {}
+        self._time_s = launch.begin_s
+        self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
+        self._queues = None
+        if launch.segment_m:
+            self._queues = QueueLook(libsumo, launch.lanes, launch.segment_m)
+        return self._snapshot()
+
+    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+        """Simulates `seconds`, showing the planned signal states.
+
+        Raises:
+            SimulatorError: SUMO failed; its own words are in the message.
+        """
+        assert self._launch is not None, "advance before start"
+        changes: dict[float, list[tuple[str, str]]] = defaultdict(list)
+        for tls, segments in plans.items():
+            offset = 0.0
+            for duration, state in segments:
+                changes[offset].append((tls, state))
+                offset += duration
+        begin = self._time_s
+        looks = [float(k) for k in range(1, int(seconds) + 1)] if self._launch.crossings else []
+        left = np.zeros(len(self._launch.lanes))
+        mean_left = left.copy()
+        try:
+            for offset in sorted({*changes, *looks}):
+                if offset > 0:
+                    libsumo.simulation.step(begin + offset)
+                if offset in looks:
+                    self._count_left(left)
+                    mean_left += left / len(looks)
+                for tls, state in changes.get(offset, ()):
+                    if self._shown.get(tls) != state:
+                        libsumo.trafficlight.setRedYellowGreenState(tls, state)
+                        self._shown[tls] = state
+            libsumo.simulation.step(begin + seconds)
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            self._fail(f"SUMO failed after {begin:g} s", error)
+        self._time_s = begin + seconds
+        snapshot = self._snapshot()
+        return replace(snapshot, mean_left=mean_left) if looks else snapshot
+
+    def vehicles(self) -> VehiclePicture:
+        """Positions of all vehicles now."""
+        api = libsumo.vehicle
+        names = api.getIDList()
+        return VehiclePicture(
+            np.array([api.getPosition(name) for name in names], dtype=np.float64).reshape(-1, 2),
+            np.array([api.getAngle(name) for name in names], dtype=np.float64),
+            np.array([api.getLength(name) for name in names], dtype=np.float64),
+            np.array([api.getSpeed(name) for name in names], dtype=np.float64),
+        )
+
+    def signals(self) -> dict[str, str]:
+        """State of every traffic light now."""
+        api = libsumo.trafficlight
+        return {name: api.getRedYellowGreenState(name) for name in api.getIDList()}
+
+    def finish(self) -> Trips:
+        """Ends the simulation; SUMO then writes what became of every vehicle due."""
+        assert self._launch is not None, "finish before start"
+        directory, persons = Path(self._launch.directory), dict(self._launch.persons)
+        self.close()
+        return read_trips(directory / _TRIPS, persons)
+
+    def close(self) -> None:
+        """Ends the simulation of this object, if there is one."""
+        if self._launch is not None:
+            self._launch = None
+            # A forked child has a copy of the simulation and the parent's open files.
+            if self._owner == os.getpid() and libsumo.simulation.isLoaded():
+                libsumo.simulation.close()
+
+    def _count_left(self, left: NDArray[np.float64]) -> None:
+        """Adds to `left`, ``(lanes,)``, who has left a lane's road since the last look."""
+        assert self._launch is not None
+        now: dict[str, tuple[int, str]] = {}
+        for index, lane in enumerate(self._launch.lanes):
+            place = index, edge_of(lane)
+            now.update(dict.fromkeys(libsumo.lane.getLastStepVehicleIDs(lane), place))
+        before, self._on = self._on, now
+        for name, (index, road) in before.items():
+            if now.get(name, (0, ""))[1] != road:
+                left[index] += 1.0
+
+    def _snapshot(self) -> Snapshot:
+        assert self._launch is not None
+        statistic = libsumo.simulation.getParameter
+        departed = int(statistic("", "stats.vehicles.inserted"))
+        backlog = int(statistic("", "stats.vehicles.waiting"))
+        if self._queues is not None:
+            rows = self._queues.look(self._time_s, self._limits)
+            waiting = rows[3] if self._launch.waiting else np.empty(0)
+            return Snapshot(self._time_s, rows[0], rows[1], rows[2], waiting, departed, backlog)
+        lanes, api = self._launch.lanes, libsumo.lane
+        vehicles = np.fromiter(map(api.getLastStepVehicleNumber, lanes), np.float64, len(lanes))
+        taken = np.flatnonzero(vehicles)
+        names = [lanes[index] for index in taken.tolist()]
+
+        def measure(what: Callable[[str], float], empty: _Floats) -> _Floats:
+            """Asks only lanes with vehicles; most of a network is empty at any instant."""
+            values = empty.copy()
+            values[taken] = np.fromiter(map(what, names), np.float64, len(names))
+            return values
+
+        none = np.zeros(len(lanes))
+        halting = measure(api.getLastStepHaltingNumber, none)
+        speed_mps = measure(api.getLastStepMeanSpeed, self._limits)
+        waiting_s = measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0)
+        add_those_behind(libsumo, self._launch.behind, (vehicles, halting, speed_mps, waiting_s))
+        return Snapshot(
+            time_s=self._time_s,
+            vehicles=vehicles,
+            halting=halting,
+            mean_speed_mps=speed_mps,
+            waiting_s=waiting_s,
+            departed=departed,
+            backlog=backlog,
+            near=near_the_end(libsumo, lanes, names, self._launch.zone_m),
+        )
+
+    def _fail(self, what: str, error: Exception) -> None:
+        assert self._launch is not None
+        said = _errors_of(Path(self._launch.directory)) or str(error)
+        self.close()
+        raise SimulatorError(f"{what}: {said}") from None
+
+
+def _errors_of(directory: Path) -> str:
+    """SUMO's error log in one line."""
+    path = directory / _ERRORS
+    return one_line(path.read_text(errors="replace")) if path.exists() else ""
+
+
+def one_line(text: str) -> str:
+    """What SUMO printed as one line, without its formulas."""
+    lines = [line.strip().removeprefix("Error: ") for line in text.splitlines()]
+    return " ".join(line for line in lines if line and line != "Quitting (on error).")
+
+
+def simulates_here() -> bool:
+    """Whether this very process runs a simulation."""
+    return bool(libsumo.simulation.isLoaded())

@@ -1,0 +1,83 @@
+"""What became of every vehicle due, as SUMO reports it at the end."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ugat_marl.errors import SimulatorError
+from ugat_marl.simulation.snapshots import Trips
+
+STATISTICS = "statistics.xml"
+"""Where SUMO writes how many collisions and hard brakings there were, beside its report."""
+
+
+def measuring_options(directory: Path) -> list[str]:
+    """Options of SUMO that measure what is hidden; the traffic is the same with them."""
+    return [
+        "--device.emissions.probability", "1",
+        "--statistic-output", str(directory / STATISTICS),
+        "--emergencydecel.warning-threshold", "0",
+    ]  # fmt: skip
+
+
+def read_trips(path: Path, persons: Mapping[str, float] | None = None) -> Trips:
+    """Reads SUMO's tripinfo file, unfinished and undeparted vehicles included.
+
+    Args:
+        path: The file.
+        persons: Vehicle type to the persons in each vehicle, "" for all others, if SUMO was started
+            with `measuring_options`; what they measure is then read too.
+
+    Raises:
+        SimulatorError: SUMO did not write it, or not all of it.
+    """
+    try:
+        return _trips_in(path, persons or {})
+    except (OSError, ET.ParseError) as error:
+        raise SimulatorError(
+            f"SUMO's report on its vehicles cannot be read ({error}); is there room left in "
+            f"{path.parent.parent}?"
+        ) from None
+
+
+def _trips_in(path: Path, persons: Mapping[str, float]) -> Trips:
+    rows: list[tuple[float, float, bool, bool]] = []
+    emitted_g: list[float] = []
+    carried: list[float] = []
+    co2_mg = 0.0
+    for _, item in ET.iterparse(path):
+        if item.tag == "emissions":  # ends before the trip it belongs to
+            co2_mg = float(item.get("CO2_abs", "0"))
+        if item.tag == "tripinfo":
+            entered = float(item.get("depart", "-1")) >= 0
+            finished = float(item.get("arrival", "-1")) >= 0
+            waited = float(item.get("departDelay", "0"))
+            inside = float(item.get("duration", "0"))
+            lost = float(item.get("timeLoss", "0"))
+            rows.append((waited + inside, waited + lost, finished, entered))
+            if persons:
+                emitted_g.append(co2_mg / 1000.0)
+                carried.append(persons.get(item.get("vType", ""), persons[""]))
+                co2_mg = 0.0
+        item.clear()
+    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    return Trips(
+        table[:, 0],
+        table[:, 1],
+        table[:, 2] > 0,
+        table[:, 3] > 0,
+        np.array(emitted_g, dtype=np.float64),
+        np.array(carried, dtype=np.float64),
+        np.array(_dangers(path.parent / STATISTICS) if persons else ()),
+    )
+
+
+def _dangers(path: Path) -> tuple[float, float]:
+    """Collisions and hard brakings."""
+    safety = ET.parse(path).getroot().find("safety")
+    counts = {} if safety is None else safety.attrib
+    return float(counts.get("collisions", "0")), float(counts.get("emergencyBraking", "0"))
