@@ -28,8 +28,8 @@ from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.policies import (
     BatchedMLP,
-    DQNPolicy,
     InputScale,
+    NetworkPolicy,
     SharedMLP,
     flatten_parameters,
     header,
@@ -149,7 +149,7 @@ class IPPO:
 
     def learn(
         self, env: Env, episodes: int, seed: int, on_episode: Callback | None = None
-    ) -> DQNPolicy:
+    ) -> NetworkPolicy:
         """Trains for `episodes` more; what it draws depends on `seed` and their number so far."""
         if AgentSet.of(env) != self.agents:
             raise OptionError(f"agents are {AgentSet.of(env)}, this learner's {self.agents}")
@@ -160,14 +160,14 @@ class IPPO:
                     on_episode(self.episodes - 1, numbers)
         return self.policy()
 
-    def policy(self) -> DQNPolicy:
+    def policy(self) -> NetworkPolicy:
         """The current policy, greedy; a snapshot.
 
         It is of DQN's class, with logits in place of Q, so that all of `ugat-marl` reads its files.
         """
         parameters = reading_unscaled(self._actor, torch.from_numpy(self._seen.factors))
         hidden, shared = self.config.hidden, self.config.shared
-        return DQNPolicy(self.agents, hidden, parameters, self.env_options, shared)
+        return NetworkPolicy(self.agents, hidden, parameters, self.env_options, shared)
 
     def save(self, path: Path) -> None:
         """Writes the whole state, from which `load` goes on to the same numbers."""

@@ -20,7 +20,7 @@ from ugat_marl.experiments import TransferConfig, transfer
 from ugat_marl.experiments.randomised import RandomisedEnv
 from ugat_marl.experiments.recipes import file_names
 from ugat_marl.grounding import FitConfig, RandomDelays, TimedConfig, UgatConfig
-from ugat_marl.policies import DQNConfig, DQNPolicy
+from ugat_marl.policies import DQNConfig, NetworkPolicy
 from ugat_marl.progress import Silent
 
 SMALL = TransferConfig(
@@ -64,7 +64,7 @@ def unjudged(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def weights(folder: Path, name: str) -> np.ndarray[Any, Any]:
-    return DQNPolicy.load(folder / "policies" / f"{name}.pt").parameters
+    return NetworkPolicy.load(folder / "policies" / f"{name}.pt").parameters
 
 
 def episodes(folder: Path, name: str) -> int:

@@ -31,8 +31,8 @@ from ugat_marl.grounding.uncertainty import MethodName
 from ugat_marl.policies import (
     DQN,
     DQNConfig,
-    DQNPolicy,
     Exploring,
+    NetworkPolicy,
     controller_for,
     observer_of,
     roll_out,
@@ -101,7 +101,7 @@ class KillAt(Silent):
 
 
 def weights(folder: Path, name: str) -> np.ndarray[Any, Any]:
-    return DQNPolicy.load(folder / "policies" / f"{name}.pt").parameters
+    return NetworkPolicy.load(folder / "policies" / f"{name}.pt").parameters
 
 
 def test_a_run_leaves_what_it_promises(unbroken: Path) -> None:

@@ -17,7 +17,7 @@ import ugat_marl
 from ugat_marl.envs import agent_indicator, pad
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding import GateConfig, GroundedActionTransform, GroundedEnv
-from ugat_marl.policies import DQNPolicy, Learner, Policy, load_baseline
+from ugat_marl.policies import Learner, NetworkPolicy, Policy, load_baseline
 from ugat_marl.testing import ToyTraffic, check_policy, failures
 
 FILE = Path(__file__).resolve().parents[2] / "baselines" / "ippo.py"
@@ -391,7 +391,7 @@ def test_it_trains_on_roads(scenario: str, centralised: bool, tmp_path: Path) ->
     assert all(0 < value < 120 for values in result.att_s.values() for value in values)
     told = json.loads((tmp_path / "result.json").read_text())
     assert told["returns"] == result.returns and told["args"]["scenario"] == scenario
-    policy = DQNPolicy.load(tmp_path / "policy.pt")
+    policy = NetworkPolicy.load(tmp_path / "policy.pt")
     assert np.array_equal(policy.parameters, result.policy.parameters)
     env = ugat_marl.parallel_env(scenario, duration_s=60, **policy.env_options)
     learner = IPPO(env, config)

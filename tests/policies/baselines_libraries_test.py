@@ -21,7 +21,14 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.experiments import policy_factory
 from ugat_marl.grounding import GateConfig, GroundedActionTransform, GroundedEnv
-from ugat_marl.policies import BASELINES, DQNPolicy, Learner, Policy, learner_factory, load_baseline
+from ugat_marl.policies import (
+    BASELINES,
+    Learner,
+    NetworkPolicy,
+    Policy,
+    learner_factory,
+    load_baseline,
+)
 from ugat_marl.policies.learners.registry import baselines_folder
 from ugat_marl.testing import ToyTraffic, check_policy, failures
 
@@ -228,7 +235,7 @@ def test_it_keeps_the_protocols_and_its_policies_conform(name: str, tmp_path: Pa
     assert np.array_equal(policy.parameters, before)
     assert not np.array_equal(learner.policy().parameters, before)
     policy.save(tmp_path / "policy.pt")
-    assert np.array_equal(DQNPolicy.load(tmp_path / "policy.pt").parameters, before)
+    assert np.array_equal(NetworkPolicy.load(tmp_path / "policy.pt").parameters, before)
 
 
 @every

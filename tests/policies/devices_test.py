@@ -47,7 +47,7 @@ from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.timed_fitting import fit_timed
 from ugat_marl.grounding.transform import Transform
-from ugat_marl.policies import CPU, DQN, DQNPolicy, device_of, placed, require_device_name
+from ugat_marl.policies import CPU, DQN, NetworkPolicy, device_of, placed, require_device_name
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.replay import Batch
 from ugat_marl.policies.learners.structure import Junction, Structure
@@ -488,7 +488,7 @@ def test_a_run_is_the_same_elsewhere_and_goes_on_here(
         monkeypatch.setattr(f"{module}.device_of", named)
 
     def final(folder: Path) -> np.ndarray[Any, Any]:
-        return DQNPolicy.load(folder / "policies" / "ugat.pt").parameters
+        return NetworkPolicy.load(folder / "policies" / "ugat.pt").parameters
 
     transfer(RUN, tmp_path / "cpu")
     elsewhere = dataclasses.replace(RUN, device="cuda")

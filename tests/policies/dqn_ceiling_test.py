@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tests.policies.dqn_test import QUICK
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.policies import DQN, DQNPolicy
+from ugat_marl.policies import DQN, NetworkPolicy
 from ugat_marl.policies.export import NumpyPolicy, layers_of
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.replay import Replay
@@ -29,10 +29,10 @@ HELD = replace(QUICK, ceiling=0.9)
 
 def policy_of(
     ceiling: Any = None, hidden: tuple[int, ...] = (16,), shared: bool = False, seed: int = 3
-) -> DQNPolicy:
+) -> NetworkPolicy:
     size = DQN(AGENTS, DQNConfig(hidden=hidden, shared=shared)).policy().parameters.size
     weights = np.random.default_rng(seed).normal(size=size).astype(np.float32)
-    return DQNPolicy(AGENTS, hidden, weights, {}, shared, None, ceiling)
+    return NetworkPolicy(AGENTS, hidden, weights, {}, shared, None, ceiling)
 
 
 def seen(wide: list[float], narrow: list[float]) -> dict[str, NDArray[np.float32]]:
@@ -66,10 +66,10 @@ def test_beyond_the_ceiling_everything_looks_the_same() -> None:
 def test_it_survives_file_and_pickle(tmp_path: Path) -> None:
     held = policy_of(CEILING)
     held.save(tmp_path / "policy.pt")
-    for copy in (DQNPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(held))):  # noqa: S301
+    for copy in (NetworkPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(held))):  # noqa: S301
         assert copy.ceiling is not None and np.array_equal(copy.ceiling, CEILING)
     policy_of().save(tmp_path / "plain.pt")
-    assert DQNPolicy.load(tmp_path / "plain.pt").ceiling is None
+    assert NetworkPolicy.load(tmp_path / "plain.pt").ceiling is None
 
 
 def test_a_ceiling_of_other_agents_is_refused(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_ceiling_of_other_agents_is_refused(tmp_path: Path) -> None:
     held._ceiling = torch.zeros(1, 3)
     held.save(tmp_path / "policy.pt")
     with pytest.raises(CheckpointError, match="ceiling of shape"):
-        DQNPolicy.load(tmp_path / "policy.pt")
+        NetworkPolicy.load(tmp_path / "policy.pt")
 
 
 @pytest.mark.parametrize("shared", [False, True])

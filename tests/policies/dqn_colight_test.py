@@ -19,7 +19,7 @@ from ugat_marl.envs import AgentSet, parallel_env
 from ugat_marl.envs.wrappers import frame_stack
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.grounding import neighbours_of
-from ugat_marl.policies import DQN, DQNPolicy, export_policy
+from ugat_marl.policies import DQN, NetworkPolicy, export_policy
 from ugat_marl.policies.learners.colight import HEAD_SIZE, HEADS, CoLight
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.structure import MOST_NEIGHBOURS, Structure, _neighbours
@@ -236,7 +236,7 @@ class OthersCoin(ParallelEnv[str, Any, Any]):
         return dict(zip(self.possible_agents, one_hot, strict=True))
 
 
-def played(env: Any, policy: DQNPolicy, *seeds: int) -> float:
+def played(env: Any, policy: NetworkPolicy, *seeds: int) -> float:
     """Mean reward per decision and agent."""
     rewards: list[float] = []
     for seed in seeds:
@@ -282,7 +282,7 @@ def test_resume_equals_an_unbroken_run_and_policies_survive(tmp_path: Path):
     assert np.array_equal(second.learn(env, 3, seed=1).parameters, unbroken.parameters)
     unbroken.save(tmp_path / "policy.pt")
     observations, _ = env.reset(seed=7)
-    for copy in (DQNPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(unbroken))):  # noqa: S301
+    for copy in (NetworkPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(unbroken))):  # noqa: S301
         assert copy.structure == PAIRS
         for agent, values in unbroken.q_values(observations).items():
             assert np.array_equal(copy.q_values(observations)[agent], values)
@@ -333,7 +333,7 @@ def test_a_policy_file_with_broken_neighbours_is_refused(tmp_path: Path):
     ):
         torch.save({**whole, "structure": {**whole["structure"], **broken}}, path)
         with pytest.raises(CheckpointError, match=r"policy\.pt: not a whole policy"):
-            DQNPolicy.load(path)
+            NetworkPolicy.load(path)
 
 
 def test_it_is_exported_to_torchscript_and_refused_elsewhere(tmp_path: Path):

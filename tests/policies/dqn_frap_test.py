@@ -17,7 +17,7 @@ from ugat_marl.data import AgentLayout
 from ugat_marl.envs import AgentSet, pad, parallel_env
 from ugat_marl.envs.wrappers import frame_stack
 from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.policies import DQN, DQNPolicy, export_policy, learner_factory
+from ugat_marl.policies import DQN, NetworkPolicy, export_policy, learner_factory
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.frap import FRAP
 from ugat_marl.policies.learners.structure import Junction, Structure, _junction
@@ -289,7 +289,7 @@ def test_resume_equals_an_unbroken_run_and_policies_survive(tmp_path: Path):
     assert np.array_equal(second.learn(env, 3, seed=1).parameters, unbroken.parameters)
     unbroken.save(tmp_path / "policy.pt")
     observations, _ = env.reset(seed=7)
-    for copy in (DQNPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(unbroken))):  # noqa: S301
+    for copy in (NetworkPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(unbroken))):  # noqa: S301
         assert copy.structure == toy_structure()
         for agent, values in unbroken.q_values(observations).items():
             assert np.array_equal(copy.q_values(observations)[agent], values)
@@ -328,7 +328,7 @@ def test_a_policy_file_with_a_broken_structure_is_refused(tmp_path: Path):
         structure = {"network": "frap", "junctions": ({**first, **junction}, *rest)}
         torch.save({**whole, "structure": structure}, path)
         with pytest.raises(CheckpointError, match=r"policy\.pt: not a whole policy"):
-            DQNPolicy.load(path)
+            NetworkPolicy.load(path)
 
 
 def test_it_is_exported_to_torchscript_and_refused_elsewhere(tmp_path: Path):

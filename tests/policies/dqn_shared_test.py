@@ -15,7 +15,7 @@ from pettingzoo import ParallelEnv
 
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError
-from ugat_marl.policies import DQN, BatchedMLP, DQNPolicy, Policy
+from ugat_marl.policies import DQN, BatchedMLP, NetworkPolicy, Policy
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.q_network import q_network
 from ugat_marl.policies.learners.shared_mlp import SharedMLP
@@ -216,7 +216,7 @@ def test_a_policy_survives_file_and_pickle(tmp_path: Path):
     policy = DQN.of(env, QUICK).learn(env, 5, seed=0)
     policy.save(tmp_path / "policy.pt")
     observations, _ = env.reset(seed=7)
-    for copy in (DQNPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(policy))):  # noqa: S301
+    for copy in (NetworkPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(policy))):  # noqa: S301
         assert copy.shared
         assert np.array_equal(copy.parameters, policy.parameters)
         for agent, values in policy.q_values(observations).items():
@@ -244,7 +244,7 @@ def test_a_policy_file_whose_kind_and_parameters_disagree_is_refused(tmp_path: P
         content["shared"] = claim
         torch.save(content, path)
         with pytest.raises(CheckpointError, match=r"policy\.pt: not a whole policy"):
-            DQNPolicy.load(path)
+            NetworkPolicy.load(path)
 
 
 def test_policies_and_checkpoints_from_before_the_option_are_independent(tmp_path: Path):
@@ -257,6 +257,6 @@ def test_policies_and_checkpoints_from_before_the_option_are_independent(tmp_pat
         torch.save(content, tmp_path / name)
     other = DQN(agents_of(2), DQNConfig(hidden=(8,)), seed=5)
     other.load(tmp_path / "dqn.pt")
-    for policy in (other.policy(), DQNPolicy.load(tmp_path / "policy.pt")):
+    for policy in (other.policy(), NetworkPolicy.load(tmp_path / "policy.pt")):
         assert not policy.shared
         assert np.array_equal(policy.parameters, learner.policy().parameters)

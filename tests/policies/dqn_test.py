@@ -18,7 +18,7 @@ from pettingzoo import ParallelEnv
 
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
-from ugat_marl.policies import DQN, DQNPolicy, Learner, Policy
+from ugat_marl.policies import DQN, Learner, NetworkPolicy, Policy
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.exploration import StickyExploration
 from ugat_marl.policies.learners.replay import Replay
@@ -325,7 +325,7 @@ def test_policy_is_a_snapshot_and_survives_file_and_pickle(tmp_path: Path):
     assert not np.array_equal(learner.policy().parameters, before)
     policy.save(tmp_path / "policy.pt")
     observations, infos = env.reset(seed=7)
-    for copy in (DQNPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(policy))):  # noqa: S301
+    for copy in (NetworkPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(policy))):  # noqa: S301
         assert np.array_equal(copy.parameters, before)
         assert copy.env_options == {"observation": "count"}
         assert copy.act(observations, infos) == policy.act(observations, infos)
@@ -364,7 +364,7 @@ def test_damaged_and_foreign_checkpoints_are_refused_and_change_nothing(tmp_path
     with pytest.raises(CheckpointError, match="no such"):
         target.load(tmp_path / "nowhere.pt")
     with pytest.raises(CheckpointError, match="expected"):
-        DQNPolicy.load(path)
+        NetworkPolicy.load(path)
     assert np.array_equal(target.policy().parameters, untouched)
 
 
@@ -418,7 +418,7 @@ def test_a_crafted_policy_is_refused(tmp_path: Path, change: tuple[str, list[Any
     content = torch.load(tmp_path / "policy.pt", weights_only=True)
     torch.save(content | dict([change]), tmp_path / "policy.pt")
     with pytest.raises(CheckpointError, match="no network's"):
-        DQNPolicy.load(tmp_path / "policy.pt")
+        NetworkPolicy.load(tmp_path / "policy.pt")
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])

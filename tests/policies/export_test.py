@@ -20,7 +20,7 @@ import ugat_marl
 from ugat_marl.__main__ import main
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.policies import DQN, DQNPolicy, export_policy
+from ugat_marl.policies import DQN, NetworkPolicy, export_policy
 from ugat_marl.policies.export import FORMATS, NumpyPolicy, layers_of
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.testing import ToyTraffic, check_policy, failures, report
@@ -41,7 +41,7 @@ def policy_of(
     hidden: tuple[int, ...] = (16, 16),
     agents: AgentSet = AGENTS,
     ceiling: float | None = None,
-) -> DQNPolicy:
+) -> NetworkPolicy:
     """A policy of random weights, drawn wider than a learner begins with."""
     learner = DQN(agents, DQNConfig(hidden=hidden, shared=shared), seed=4)
     size = learner.policy().parameters.size
@@ -49,7 +49,7 @@ def policy_of(
     held = None
     if ceiling is not None:
         held = np.full((len(agents), agents.widest_observation), ceiling, np.float32)
-    return DQNPolicy(agents, hidden, weights, {"observation": "queue"}, shared, None, held)
+    return NetworkPolicy(agents, hidden, weights, {"observation": "queue"}, shared, None, held)
 
 
 def page_loader(suffix: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Act:
@@ -68,7 +68,7 @@ def page_loader(suffix: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> A
     return names["act"]
 
 
-def exported(policy: DQNPolicy, suffix: str, folder: Path, env: Any = None) -> Path:
+def exported(policy: NetworkPolicy, suffix: str, folder: Path, env: Any = None) -> Path:
     if suffix == ".onnx":
         pytest.importorskip("onnx")
     path = folder / f"policy{suffix}"
@@ -249,7 +249,7 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
             NumpyPolicy.load(path)
 
     refused("another model", model=model[:-9])
-    refused("another model", about=about.replace("exported_policy", "dqn_policy"))
+    refused("another model", about=about.replace("exported_policy", "network_policy"))
     for text in ("", "[]", "{", about.replace('"sha256"', '"sum"'), about[: len(about) // 2]):
         refused("export it again", about=text)
     refused("inputs|outputs|agents", about=about.replace('"a_1",', ""))

@@ -15,7 +15,7 @@ import ugat_marl.experiments.transfers as transfer_module
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import TransferConfig, policy_factory, transfer
 from ugat_marl.grounding import FitConfig, UgatConfig
-from ugat_marl.policies import BASELINES, DQN, DQNPolicy, Learner, learner_factory
+from ugat_marl.policies import BASELINES, DQN, Learner, NetworkPolicy, learner_factory
 from ugat_marl.policies.learners import registry
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.registry import Baseline
@@ -185,7 +185,7 @@ def test_ugat_trains_a_baseline_and_takes_it_up_again(tmp_path: Path) -> None:
     assert files == ["direct-transfer.pt", "more-plain-sim.pt", "ugat.pt"]
     for name in files:
         path = tmp_path / "whole" / "policies" / name
-        assert DQNPolicy.load(path).hidden == (16,)
+        assert NetworkPolicy.load(path).hidden == (16,)
         assert policy_factory(str(path))  # as evaluate reads it
     with pytest.raises(KeyboardInterrupt):
         transfer(SMALL, tmp_path / "broken", reporter=KillIn("grounded, round 2"))
@@ -195,11 +195,11 @@ def test_ugat_trains_a_baseline_and_takes_it_up_again(tmp_path: Path) -> None:
     transfer(SMALL, tmp_path / "broken", resume=True)
     for name in files:
         one, other = (
-            DQNPolicy.load(tmp_path / run / "policies" / name).parameters
+            NetworkPolicy.load(tmp_path / run / "policies" / name).parameters
             for run in ("whole", "broken")
         )
         assert np.array_equal(one, other), name
     direct, grounded = (
-        DQNPolicy.load(tmp_path / "whole" / "policies" / name).parameters for name in files[::2]
+        NetworkPolicy.load(tmp_path / "whole" / "policies" / name).parameters for name in files[::2]
     )
     assert not np.array_equal(direct, grounded)

@@ -18,7 +18,7 @@ from ugat_marl.envs import AnyParallelEnv, parallel_env
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.experiments.evaluation import evaluate, fixed_policy
 from ugat_marl.files import require_writable, write_whole
-from ugat_marl.policies import DQNPolicy, EpisodeCallback
+from ugat_marl.policies import EpisodeCallback, NetworkPolicy
 
 FIRST_SEED = 1000
 """Of the evaluations; the same episodes as in the tables of ``ugat-marl train``."""
@@ -52,7 +52,7 @@ class BaselineArgs:
 class Result(NamedTuple):
     """The policy, the return of each episode, and by episodes trained the ATT of each seed, s."""
 
-    policy: DQNPolicy
+    policy: NetworkPolicy
     returns: list[float]
     att_s: dict[int, list[float]]
 

@@ -23,7 +23,7 @@ from ugat_marl.parallel import (
 )
 from ugat_marl.policies import (
     STANDARD_RULES,
-    DQNPolicy,
+    NetworkPolicy,
     Policy,
     PolicyFactory,
     StepCallback,
@@ -223,7 +223,7 @@ class TrainedPolicy:
         path: Where it was read, for the error.
     """
 
-    policy: DQNPolicy
+    policy: NetworkPolicy
     path: str
 
     def __call__(self, env: TrafficEnv) -> Policy:
@@ -261,7 +261,7 @@ def policy_factory(spec: str) -> PolicyFactory:
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
     if path.suffix != ".pt" and not path.is_file():
         return rule_factory(spec)
-    return TrainedPolicy(DQNPolicy.load(path), str(path))
+    return TrainedPolicy(NetworkPolicy.load(path), str(path))
 
 
 def _pairs(

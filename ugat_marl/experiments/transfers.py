@@ -53,7 +53,7 @@ from ugat_marl.policies import (
     DQN_NAME,
     STANDARD_RULES,
     DQNConfig,
-    DQNPolicy,
+    NetworkPolicy,
     Policy,
     PolicyFactory,
     learner_factory,
@@ -244,7 +244,7 @@ def transfer(
     write_settings(directory, asdict(config))
     try:
         state = State(learner, transform)
-        restore(state, run, DQNPolicy.load)
+        restore(state, run, NetworkPolicy.load)
         policy = _train(config, scenario, env, recorded, state, run, workers)
         assert state.direct is not None  # plain training comes first
         policies: dict[str, Policy] = {DIRECT: state.direct}
@@ -258,7 +258,7 @@ def transfer(
             made.close()
         run.close()
     for file, trained in zip(file_names(policies), policies.values(), strict=True):
-        if isinstance(trained, DQNPolicy):
+        if isinstance(trained, NetworkPolicy):
             trained.save(directory / "policies" / f"{file}.pt")
     queues = QueueRecord()
     table = judge(config, scenario, policies, reporter, queues.watch, workers)

@@ -6,11 +6,10 @@ from .devices import CPU as CPU
 from .devices import device_of as device_of
 from .devices import placed as placed
 from .devices import require_device_name as require_device_name
+from .export import NumpyPolicy as NumpyPolicy
 from .export import export_policy as export_policy
 from .learners.dqn import DQN as DQN
 from .learners.dqn_config import DQNConfig as DQNConfig
-from .learners.dqn_policy import DQNPolicy as DQNPolicy
-from .learners.dqn_policy import header as header
 from .learners.q_network import SharedMLP as SharedMLP
 from .learners.q_network import flatten_parameters as flatten_parameters
 from .learners.q_network import reading_unscaled as reading_unscaled
@@ -35,6 +34,8 @@ from .learners.third_party import linear_layers as linear_layers
 from .learners.third_party import perceptron as perceptron
 from .learners.third_party import roll_out_length as roll_out_length
 from .learners.third_party import seed_generators as seed_generators
+from .network_policy import NetworkPolicy as NetworkPolicy
+from .network_policy import header as header
 from .protocols import EpisodeCallback as EpisodeCallback
 from .protocols import Learner as Learner
 from .protocols import Policy as Policy

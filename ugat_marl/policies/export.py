@@ -33,7 +33,7 @@ from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.files import require_writable, write_whole
 
 if TYPE_CHECKING:
-    from ugat_marl.policies.learners.dqn_policy import DQNPolicy
+    from ugat_marl.policies.network_policy import NetworkPolicy
 
 _KIND = "ugat_marl.exported_policy"
 _OPSET = 17
@@ -45,7 +45,7 @@ Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Weights ``(agents or 1, n_in, n_out)`` and biases ``(agents or 1, 1, n_out)``."""
 
 
-def export_policy(policy: DQNPolicy, path: Path, env: AnyParallelEnv | None = None) -> Path:
+def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None = None) -> Path:
     """Writes a policy for use elsewhere, and a JSON file beside it.
 
     Args:
@@ -77,7 +77,7 @@ def export_policy(policy: DQNPolicy, path: Path, env: AnyParallelEnv | None = No
     return side_car
 
 
-def layers_of(policy: DQNPolicy) -> list[Layer]:
+def layers_of(policy: NetworkPolicy) -> list[Layer]:
     """The policy's network as affine maps with ReLU between them; of one kind, shared or not.
 
     A ceiling c is a layer more: min(x, c) is c - ReLU(c - x).
@@ -168,8 +168,8 @@ class NumpyPolicy:
         return hidden[:, 0, :]
 
 
-def _about(policy: DQNPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
-    from ugat_marl.policies.learners.dqn_policy import header
+def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
+    from ugat_marl.policies.network_policy import header
 
     agents = policy.agents
     own = header(agents, policy.hidden, policy.env_options, policy.shared)
@@ -214,7 +214,7 @@ def _require_fitting(agents: AgentSet, layers: list[Layer]) -> None:
         raise ValueError(f"{width} outputs for {agents.most_actions} actions")
 
 
-def _matrices(policy: DQNPolicy) -> bytes:
+def _matrices(policy: NetworkPolicy) -> bytes:
     arrays: dict[str, NDArray[np.float32]] = {}
     for place, (weight, bias) in enumerate(layers_of(policy)):
         arrays |= {f"weight_{place}": weight, f"bias_{place}": bias}
@@ -223,7 +223,7 @@ def _matrices(policy: DQNPolicy) -> bytes:
     return buffer.getvalue()
 
 
-def _torchscript(policy: DQNPolicy) -> bytes:
+def _torchscript(policy: NetworkPolicy) -> bytes:
     import torch
     from torch import Tensor, nn
 
@@ -259,7 +259,7 @@ def _without_debug_files(archive: io.BytesIO) -> bytes:
     return slim.getvalue()
 
 
-def _onnx(policy: DQNPolicy) -> bytes:
+def _onnx(policy: NetworkPolicy) -> bytes:
     """The graph node by node: torch's own exporter leaves paths of this machine in the file.
 
     Raises:

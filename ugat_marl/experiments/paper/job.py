@@ -29,7 +29,7 @@ from ugat_marl.experiments.recipes import simulated_worlds, train_until
 from ugat_marl.experiments.tuning import tuned_rules
 from ugat_marl.files import write_whole
 from ugat_marl.grounding import RandomDelays, State, UgatConfig, neighbours_of, restore, train_ugat
-from ugat_marl.policies import DQN, DQNConfig, DQNPolicy, Policy, device_of
+from ugat_marl.policies import DQN, DQNConfig, NetworkPolicy, Policy, device_of
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.simulation import end_with_input
 
@@ -175,7 +175,7 @@ def _policy(job: Job, folder: Path, reporter: Reporter) -> Policy:
     """The trained policy; an interrupted training goes on."""
     saved = folder / POLICY
     if saved.exists():
-        return DQNPolicy.load(saved)
+        return NetworkPolicy.load(saved)
     learner = _grounded(job, folder, reporter) if job.ugat else _plain(job, folder, reporter)
     policy = learner.policy()
     policy.save(saved)
@@ -216,7 +216,7 @@ def _grounded(job: Job, folder: Path, reporter: Reporter) -> DQN:
         learner.load(before)
         transform = job.ugat.transform(env.layouts, job.seed, neighbours_of(env))
         state = State(learner, transform, learner.policy(), pretrained=job.ugat.pretrain_episodes)
-        restore(state, run, DQNPolicy.load)
+        restore(state, run, NetworkPolicy.load)
         train_ugat(state, env, sim, real, job.ugat, job.seed, run, device=job.device)
     finally:
         for made in (env, sim, real, run):

@@ -23,7 +23,6 @@ from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.batched import one_thread
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
-from ugat_marl.policies.learners.dqn_policy import DQNPolicy, header, parse_header
 from ugat_marl.policies.learners.exploration import StickyExploration
 from ugat_marl.policies.learners.q_network import (
     Acting,
@@ -35,6 +34,7 @@ from ugat_marl.policies.learners.q_network import (
 from ugat_marl.policies.learners.replay import Replay
 from ugat_marl.policies.learners.scaling import ceilings, input_factors
 from ugat_marl.policies.learners.structure import Structure, structure_in
+from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
 from ugat_marl.policies.protocols import EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
@@ -140,7 +140,7 @@ class DQN:
         episodes: int,
         seed: int,
         on_episode: EpisodeCallback | None = None,
-    ) -> DQNPolicy:
+    ) -> NetworkPolicy:
         """Trains for `episodes` more episodes; goes on from where it was.
 
         Every random choice depends on `seed` and the number of episodes so far only, so that one
@@ -172,7 +172,7 @@ class DQN:
                     on_episode(self.episodes - 1, numbers)
         return self.policy()
 
-    def policy(self) -> DQNPolicy:
+    def policy(self) -> NetworkPolicy:
         """The current greedy policy; later learning does not change it.
 
         It acts by the target networks, the running mean of the learned ones, whose greedy actions
@@ -187,7 +187,7 @@ class DQN:
         ceiling = None
         if self.config.ceiling is not None and self._replay.added:
             ceiling = ceilings(self._replay.recent(CEILING_DECISIONS), self.config.ceiling)
-        return DQNPolicy(self.agents, hidden, weights, options, shared, self.structure, ceiling)
+        return NetworkPolicy(self.agents, hidden, weights, options, shared, self.structure, ceiling)
 
     def _episode(self, env: AnyParallelEnv, seed: int) -> dict[str, float]:
         number = self.episodes

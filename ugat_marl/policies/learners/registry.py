@@ -1,7 +1,7 @@
 """Learners by name: the suite's own DQN, and the files of baselines/, loaded when they are used.
 
 A baseline is a file that offers a learner, called as ``Learner(env, config, seed)``, and a
-dataclass of its settings. Its policies are `DQNPolicy`, so that all of ``ugat-marl`` reads them.
+dataclass of its settings. Its policies are `NetworkPolicy`, which all of ``ugat-marl`` reads.
 """
 
 from __future__ import annotations

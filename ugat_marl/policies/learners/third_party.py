@@ -28,8 +28,8 @@ from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import AgentSet, AnyParallelEnv, Begun, Stepped
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.batched import one_thread
-from ugat_marl.policies.learners.dqn_policy import DQNPolicy, header, parse_header
 from ugat_marl.policies.learners.scaling import InputScale, RewardScale, places
+from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
 from ugat_marl.policies.protocols import EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator
 
@@ -57,7 +57,7 @@ class LibraryLearner(abc.ABC):
         episodes: int,
         seed: int,
         on_episode: EpisodeCallback | None = None,
-    ) -> DQNPolicy:
+    ) -> NetworkPolicy:
         """Trains for `episodes` more episodes; what it draws depends on `seed` and their number.
 
         Raises:
@@ -75,8 +75,8 @@ class LibraryLearner(abc.ABC):
                 self._train(TrainingEnv(env, self, seed, on_episode), episodes, seed)
         return self.policy()
 
-    def policy(self) -> DQNPolicy:
-        """The current greedy policy, a snapshot; of DQN's class, with logits in the place of Q."""
+    def policy(self) -> NetworkPolicy:
+        """Return the current greedy policy, a snapshot; its values are logits."""
         return policy_of(self.agents, self._actors(), self.env_options, self.inputs.factors)
 
     def save(self, path: Path) -> None:
@@ -221,7 +221,7 @@ def policy_of(
     actors: Sequence[Sequence[nn.Linear]],
     env_options: Mapping[str, Any],
     factors: NDArray[np.float32] | None = None,
-) -> DQNPolicy:
+) -> NetworkPolicy:
     """A policy that takes the allowed action of highest output.
 
     Args:
@@ -244,7 +244,7 @@ def policy_of(
         if factors is not None:  # (..., observation, hidden)
             parts[0] = parts[0] * torch.from_numpy(factors)[:, None]
         parameters = torch.cat([part.reshape(-1) for part in parts])
-    return DQNPolicy(agents, hidden, parameters, env_options, shared)
+    return NetworkPolicy(agents, hidden, parameters, env_options, shared)
 
 
 def _shared_parts(agents: AgentSet, layers: Sequence[nn.Linear]) -> list[Tensor]:

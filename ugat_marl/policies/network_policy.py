@@ -1,4 +1,4 @@
-"""The greedy policy a DQN learner hands out: networks frozen at one moment."""
+"""Greedy policies of trained networks, by whichever learner: saved, loaded, sent to processes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.q_network import Held, greedy_actions, q_network
 from ugat_marl.policies.learners.structure import Structure, structure_in
 
-_KIND = "ugat_marl.dqn_policy"
+_KIND = "ugat_marl.network_policy"
 
 
-class DQNPolicy:
-    """Takes every agent's allowed action of highest Q.
+class NetworkPolicy:
+    """Take every agent's allowed action of highest value: Q of DQN, the logit of an actor.
 
     Args:
         agents: The agents it acts for.
@@ -109,7 +109,7 @@ class DQNPolicy:
         write_checkpoint(path, _KIND, content)
 
     @classmethod
-    def load(cls, path: Path) -> DQNPolicy:
+    def load(cls, path: Path) -> NetworkPolicy:
         """Reads a saved policy.
 
         Raises:
@@ -124,10 +124,10 @@ class DQNPolicy:
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{path}: not a whole policy ({error}); save it again") from None
 
-    def __reduce__(self) -> tuple[type[DQNPolicy], tuple[Any, ...]]:
+    def __reduce__(self) -> tuple[type[NetworkPolicy], tuple[Any, ...]]:
         # numpy, since torch would send tensors between processes through shared memory
         own = (self.agents, self.hidden, self.parameters, self.env_options, self.shared)
-        return DQNPolicy, (*own, self.structure, self.ceiling)
+        return NetworkPolicy, (*own, self.structure, self.ceiling)
 
 
 def header(
