@@ -46,6 +46,19 @@ def pytest_report_header() -> str:
     return f"ugat_marl {ugat_marl.__version__} from {Path(ugat_marl.__file__).parent}"
 
 
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Names a failure as it happens; only the process that shows the results speaks."""
+    if report.failed and "PYTEST_XDIST_WORKER" not in os.environ:
+        where = f"{report.nodeid} ({report.when})" if report.when != "call" else report.nodeid
+        print(f"\nFAILED {where}: {_last_line(report.longreprtext)}", flush=True)
+
+
+def _last_line(text: str) -> str:
+    """The line that says what went wrong: the first of pytest's ``E``, or the last there is."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return next((line[1:].strip() for line in lines if line.startswith("E ")), "".join(lines[-1:]))
+
+
 DATA = Path(__file__).parent / "fixtures"
 
 ROUTES = """<routes>

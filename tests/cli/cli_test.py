@@ -27,7 +27,7 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     ("arguments", "says"),
     [
         (["trian", "single-v1"], "'train'"),
-        (["bench", "enf"], "'env'"),
+        (["paper", "mian"], "'main'"),
         (["train", "singel-v1"], "'single-v1'"),
         (["train", "single-v1", "--real", "V44"], "'V4'"),
         (["train", "single-v1", "--real", "sim"], "the simulation itself"),
@@ -99,10 +99,10 @@ def test_help_fits_a_terminal_and_says_what_defaults_mean(
 
 
 def test_help_of_a_group_is_about_the_group(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["blind", "--help"]) == 0
+    assert main(["paper", "--help"]) == 0
     text = capsys.readouterr().out
-    assert "usage: ugat-marl blind COMMAND [options]" in text
-    assert "ugat-marl blind COMMAND --help" in text
+    assert "usage: ugat-marl paper COMMAND [options]" in text
+    assert "ugat-marl paper COMMAND --help" in text
     assert "train" not in text
 
 

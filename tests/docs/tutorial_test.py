@@ -28,5 +28,5 @@ def test_a_command_of_the_tutorial_can_be_given(line: str) -> None:
     words = shlex.split(line)[1:]
     size = 2 if " ".join(words[:2]) in COMMANDS else 1
     module, _, name = COMMANDS[" ".join(words[:size])][0].partition(":")
-    kind = getattr(importlib.import_module(f"ugat_marl.{module}"), name)
+    kind = getattr(importlib.import_module(module), name)
     tyro.cli(kind, args=words[size:])  # leaves the test with an error where it cannot

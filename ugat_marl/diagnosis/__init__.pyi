@@ -10,6 +10,7 @@ from .statistics import added as added
 from .statistics import shift as shift
 from .study import DiagnosisConfig as DiagnosisConfig
 from .study import Study as Study
+from .verdict import conclude as conclude
 from .volume import Routes as Routes
 from .whitening import groups_of as groups_of
 from .whitening import independent as independent
@@ -17,4 +18,6 @@ from .wording import clock as clock
 from .wording import statistic as statistic
 from .workflow import CORRECTED as CORRECTED
 from .workflow import FILE as FILE
+from .workflow import corrected as corrected
 from .workflow import diagnose as diagnose
+from .workflow import where as where
