@@ -73,7 +73,7 @@ scenarios: environment
 oldest: environment-dev
 	"$(PYTHON)" -m venv $(VENV)-oldest
 	$(VENV)-oldest/bin/python -m pip install -q -c constraints-oldest.txt --force-reinstall --no-deps $(VENV)/wheel/*.whl
-	$(VENV)-oldest/bin/python -m pip install -q -c constraints-oldest.txt ugat-marl hypothesis pytest pytest-timeout pytest-xdist sumo-rl==1.4.5
+	$(VENV)-oldest/bin/python -m pip install -q -c constraints-oldest.txt ugat-marl hypothesis pytest pytest-timeout pytest-xdist osmium sumo-rl==1.4.5
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(VENV)-oldest/bin/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
 
 # Every learner of every library, in .venv-compat; LATEST=1 tries each library's newest release in one of its own.
@@ -84,7 +84,7 @@ environment: python
 	@$(ENVIRONMENT)
 
 environment-dev: python
-	@$(ENVIRONMENT) dev resco
+	@$(ENVIRONMENT) dev osm resco
 
 python:
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \

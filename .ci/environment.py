@@ -36,7 +36,7 @@ import gymnasium, lazy_loader, libsumo, matplotlib, numpy, pettingzoo, polars, p
 import scipy, sumo, sumolib, supersuit, tensorboard, torch, tyro
 import ugat_marl
 """
-PROBE_DEV = "import hatchling, hypothesis, pytest, pytest_timeout, xdist"
+PROBE_DEV = "import hatchling, hypothesis, osmium, pytest, pytest_timeout, xdist"
 
 
 class Record(TypedDict):
@@ -224,7 +224,7 @@ def prepare(extras: Sequence[str]) -> None:
 def main() -> None:
     """Parses the extras and prepares the environment, one process at a time."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("extras", nargs="*", help="extras of pyproject.toml, e.g. dev resco")
+    parser.add_argument("extras", nargs="*", help="extras of pyproject.toml, e.g. dev osm resco")
     extras = parser.parse_args().extras
     LOCK.parent.mkdir(exist_ok=True)
     with LOCK.open("w") as lock:

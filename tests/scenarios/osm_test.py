@@ -6,6 +6,7 @@ import gzip
 import math
 import re
 import struct
+import sys
 import tracemalloc
 import zlib
 from dataclasses import replace
@@ -19,7 +20,7 @@ from ugat_marl.files import parse_xml
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Network, Scenario, read_scenario, shipped_scenarios, survey
 from ugat_marl.scenarios.importers.osm_pbf import pbf_to_xml
-from ugat_marl.scenarios.importers.osm_roads import items, write_roads
+from ugat_marl.scenarios.importers.osm_roads import items, unpack, write_roads
 from ugat_marl.scenarios.importers.osm_walks import utm
 from ugat_marl.scenarios.importers.phasing import suited
 from ugat_marl.scenarios.junctions import foes_of
@@ -250,7 +251,10 @@ def as_pbf(osm: Path, *, dense: bool) -> bytes:
         )
     table = b"".join(field(1, text.encode()) for text in texts)
     block = field(1, table) + field(2, group) + field(2, ways)
-    return blob(b"OSMHeader", field(4, b"OsmSchema-V0.6")) + blob(b"OSMData", block)
+    return HEADER + blob(b"OSMData", block)
+
+
+HEADER = blob(b"OSMHeader", field(4, b"OsmSchema-V0.6"))
 
 
 @pytest.mark.parametrize("dense", [True, False])
@@ -262,13 +266,43 @@ def test_protocol_buffers_make_the_same_network(
     assert read_scenario(tmp_path / "a").network.read() == town.network.read()
 
 
-def test_relations_are_unpacked(tmp_path: Path) -> None:
+def content_of(path: Path) -> list[object]:
+    """Nodes, ways and relations with all they hold, places in units of 1e-7 degrees."""
+
+    def numbers(item: object) -> dict[str, str | int]:
+        return {
+            key: round(float(value) * 1e7) if key in ("lat", "lon") else value
+            for key, value in item.attrib.items()  # type: ignore[attr-defined]
+            if key != "version"
+        }
+
+    root = parse_xml(path.read_bytes(), str(path))
+    return [
+        (item.tag, numbers(item), [(part.tag, dict(part.attrib)) for part in item]) for item in root
+    ]
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_osmium_reads_what_the_reader_written_here_reads(dense: bool, tmp_path: Path) -> None:
+    packed = tmp_path / "a.pbf"
+    packed.write_bytes(as_pbf(TOWN, dense=dense) + restriction())
+    pbf_to_xml(packed, tmp_path / "one.osm", Silent())
+    unpack(packed, tmp_path / "two.osm", Silent())
+    assert content_of(tmp_path / "one.osm") == content_of(tmp_path / "two.osm")
+    assert len(content_of(tmp_path / "one.osm")) > 20
+
+
+def restriction() -> bytes:
+    """A block with one relation."""
     table = b"".join(field(1, text) for text in (b"", b"via", b"type", b"restriction <&>"))
     content = field(1, 5) + field(2, varint(2)) + field(3, varint(3)) + field(8, varint(1) * 2)
     content += field(9, steps([7, 4])) + field(10, varint(0) + varint(1))
-    block = field(1, table) + field(2, field(4, content))
-    (tmp_path / "x.pbf").write_bytes(blob(b"OSMData", block))
-    pbf_to_xml(tmp_path / "x.pbf", tmp_path / "x.osm", Silent())
+    return blob(b"OSMData", field(1, table) + field(2, field(4, content)))
+
+
+def test_relations_are_unpacked(tmp_path: Path) -> None:
+    (tmp_path / "x.pbf").write_bytes(HEADER + restriction())
+    unpack(tmp_path / "x.pbf", tmp_path / "x.osm", Silent())
     (relation,) = parse_xml((tmp_path / "x.osm").read_bytes(), "x").iter("relation")
     assert [dict(item.attrib) for item in relation] == [
         {"type": "node", "ref": "7", "role": "via"},
@@ -280,20 +314,30 @@ def test_relations_are_unpacked(tmp_path: Path) -> None:
 def other_packing() -> bytes:
     packed = field(2, 4) + field(4, b"lzma")
     header = field(1, b"OSMData") + field(3, len(packed))
-    return struct.pack(">I", len(header)) + header + packed
+    return HEADER + struct.pack(">I", len(header)) + header + packed
 
 
 def bomb() -> bytes:
-    return blob(b"OSMData", bytes(40 << 20))
+    return HEADER + blob(b"OSMData", bytes(40 << 20))
+
+
+def test_without_pyosmium_the_way_out_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "osmium", None)
+    (tmp_path / "town.osm.pbf").write_bytes(as_pbf(TOWN, dense=True))
+    assert made(tmp_path / "a", tmp_path / "town.osm.pbf") == 2
+    assert "needs pyosmium; run pip install 'ugat-marl[osm]'" in capsys.readouterr().err
+    assert made(tmp_path / "b", TOWN) == 0
 
 
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (as_pbf(TOWN, dense=True)[:-30], "damaged (cut short)"),
+        (as_pbf(TOWN, dense=True)[:-30], "damaged (PBF error: unexpected EOF)"),
         (b"<osm/>" * 9, "not an OpenStreetMap .pbf"),
         (other_packing(), "osmium cat bad.pbf -o extract.osm.gz"),
-        (bomb(), "unpacks to more than the format allows"),
+        (bomb(), "not an OpenStreetMap .pbf, or damaged (PBF error"),
     ],
     ids=["cut", "no pbf", "other packing", "bomb"],
 )

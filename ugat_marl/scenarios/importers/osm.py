@@ -17,8 +17,7 @@ from ugat_marl.files import parse_xml, read_bytes, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.days import sumo_program
 from ugat_marl.scenarios.importers.making import NETWORK, Draft, Roads
-from ugat_marl.scenarios.importers.osm_pbf import pbf_to_xml
-from ugat_marl.scenarios.importers.osm_roads import items, place_of, write_roads
+from ugat_marl.scenarios.importers.osm_roads import items, place_of, unpack, write_roads
 from ugat_marl.scenarios.importers.osm_walks import crossings_for, has_light
 from ugat_marl.scenarios.importers.programs import netconvert
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, links_of
@@ -119,7 +118,7 @@ def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
     """The extract as XML."""
     if not path.name.lower().endswith(".pbf"):
         return path
-    pbf_to_xml(path, work / "unpacked.osm", reporter)
+    unpack(path, work / "unpacked.osm", reporter)
     return work / "unpacked.osm"
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from ugat_marl.errors import ScenarioError
@@ -40,6 +41,43 @@ class Item(NamedTuple):
         if self.start.name != "way" or not _KINDS & self.tags.keys():
             return []
         return [tag.attributes.get("ref", "") for tag in self.inside if tag.name == "nd"]
+
+
+def unpack(path: Path, out: Path, reporter: Reporter) -> None:
+    """Turn an extract in protocol buffers (``.osm.pbf``) into XML.
+
+    Args:
+        path: The ``.pbf``.
+        out: The ``.osm`` to write.
+        reporter: Shows progress.
+
+    Raises:
+        ScenarioError: pyosmium is not installed, or the file is missing, cut short, damaged or
+            compressed in another way than zlib.
+        OutputError: No room for the result.
+    """
+    try:
+        osmium: Any = importlib.import_module("osmium")
+    except ImportError:
+        raise ScenarioError(
+            f"{path}: reading .osm.pbf needs pyosmium; run pip install 'ugat-marl[osm]', or give "
+            "the extract as .osm or .osm.gz"
+        ) from None
+    try:
+        with path.open("rb"), reporter.task(f"unpacking {path.name}", 1) as advance:
+            source, target = osmium.io.File(str(path), "pbf"), osmium.io.File(str(out), "osm")
+            with scratch(), osmium.SimpleWriter(target) as writer:
+                osmium.apply(source, writer)
+            advance()
+    except FileNotFoundError:
+        raise ScenarioError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+    except RuntimeError as error:  # all that libosmium raises
+        raise ScenarioError(
+            f"{path}: not an OpenStreetMap .pbf, or damaged ({error}); copy it again, or convert "
+            f"it with: osmium cat {path.name} -o extract.osm.gz"
+        ) from None
 
 
 def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
