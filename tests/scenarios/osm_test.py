@@ -19,7 +19,6 @@ from ugat_marl.experiments import problems
 from ugat_marl.files import parse_xml
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Network, Scenario, read_scenario, shipped_scenarios, survey
-from ugat_marl.scenarios.importers.osm_pbf import pbf_to_xml
 from ugat_marl.scenarios.importers.osm_roads import items, unpack, write_roads
 from ugat_marl.scenarios.importers.osm_walks import utm
 from ugat_marl.scenarios.importers.phasing import suited
@@ -264,32 +263,6 @@ def test_protocol_buffers_make_the_same_network(
     (tmp_path / "town.osm.pbf").write_bytes(as_pbf(TOWN, dense=dense))
     assert made(tmp_path / "a", tmp_path / "town.osm.pbf") == 0
     assert read_scenario(tmp_path / "a").network.read() == town.network.read()
-
-
-def content_of(path: Path) -> list[object]:
-    """Nodes, ways and relations with all they hold, places in units of 1e-7 degrees."""
-
-    def numbers(item: object) -> dict[str, str | int]:
-        return {
-            key: round(float(value) * 1e7) if key in ("lat", "lon") else value
-            for key, value in item.attrib.items()  # type: ignore[attr-defined]
-            if key != "version"
-        }
-
-    root = parse_xml(path.read_bytes(), str(path))
-    return [
-        (item.tag, numbers(item), [(part.tag, dict(part.attrib)) for part in item]) for item in root
-    ]
-
-
-@pytest.mark.parametrize("dense", [True, False])
-def test_osmium_reads_what_the_reader_written_here_reads(dense: bool, tmp_path: Path) -> None:
-    packed = tmp_path / "a.pbf"
-    packed.write_bytes(as_pbf(TOWN, dense=dense) + restriction())
-    pbf_to_xml(packed, tmp_path / "one.osm", Silent())
-    unpack(packed, tmp_path / "two.osm", Silent())
-    assert content_of(tmp_path / "one.osm") == content_of(tmp_path / "two.osm")
-    assert len(content_of(tmp_path / "one.osm")) > 20
 
 
 def restriction() -> bytes:
