@@ -33,7 +33,7 @@ LOCK = ROOT / ".cache" / "environment.lock"
 OLDEST = (3, 11)
 PROBE = """
 import gymnasium, lazy_loader, libsumo, matplotlib, numpy, pettingzoo, polars, pydantic, rich
-import scipy, sumo, sumolib, supersuit, tensorboard, torch, tyro
+import scipy, sumo, supersuit, tensorboard, torch, tyro
 import ugat_marl
 """
 PROBE_DEV = "import hatchling, hypothesis, osmium, pytest, pytest_timeout, xdist"
