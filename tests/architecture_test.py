@@ -1,4 +1,4 @@
-"""The order of the rooms in docs/architecture.md, and a few rules of the house, held to the code.
+"""The rooms in docs/explanation/architecture.md and rules of the house, held to the code.
 
 Every checker is a function of a source tree, so that each is also run on a small tree that breaks
 its rule and must be caught.
@@ -275,7 +275,7 @@ def is_definition(statement: ast.stmt) -> bool:
 @pytest.fixture(scope="module")
 def suite() -> Tree:
     """The package of this checkout, whichever copy the other tests import."""
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
     return package_tree(ROOT / PACKAGE, documented_rooms(text))
 
 

@@ -31,7 +31,7 @@ from ugat_marl.scenarios import Network
 class BlindGenerate:
     """Hides effects in scenarios, measures them, and seals what was hidden.
 
-    Then follow blind run, blind grade and blind table (docs/blind-tests.md).
+    Then follow blind run, blind grade and blind table (docs/explanation/blind-tests.md).
 
     Examples:
         python -m studies.blind generate --scenario single-v1 --cases 40 --out blind

@@ -1,4 +1,4 @@
-"""Opens the labels of diagnosed cases and says what was right, by docs/blind-tests.md."""
+"""Grades of diagnosed cases against their labels, by docs/explanation/blind-tests.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/controllers.md lists the rules as the code has them."""
+"""docs/reference/rules.md lists the rules as the code has them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from ugat_marl.policies import NAMES, RULES, STANDARD_RULES, parse_spec
 
-PAGE = (Path(__file__).parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rules.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|$", PAGE, flags=re.MULTILINE))
 
 

@@ -31,7 +31,7 @@ from ugat_marl.grounding import METHODS, FitConfig
 from ugat_marl.scenarios import validated
 from ugat_marl.scenarios.settings import ControlSettings, IntersectionSettings, ScenarioFile
 
-PAGE = (Path(__file__).parents[2] / "docs" / "scenarios.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "scenarios.md").read_text()
 
 
 def test_every_key_of_a_scenario_file_is_documented() -> None:
@@ -54,7 +54,7 @@ def test_the_defaults_on_the_page_are_those_of_the_code() -> None:
 def test_the_example_is_a_scenario_file() -> None:
     example = re.search(r"```toml\n(.*?)```", PAGE, flags=re.DOTALL)
     assert example is not None
-    settings = validated(tomllib.loads(example[1]), "docs/scenarios.md")
+    settings = validated(tomllib.loads(example[1]), "docs/how-to/scenarios.md")
     assert settings.intersections["C1"].phases == ("GGrr", "rrGG")
     for record in settings.effects:
         effect_from(record)
@@ -97,14 +97,14 @@ def test_what_is_added_in_ten_lines_works(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_every_uncertainty_is_documented() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "training.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "training.md").read_text()
     table = page.partition("| `--fit.uncertainty` |")[2].partition("\n\n")[0]
     assert tuple(re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE)) == METHODS
     assert f"`{FitConfig().uncertainty}` (default)" in table
 
 
 def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "effects.md").read_text()
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
     assert list(rows) == list(known_effects())
     for name, kind in known_effects().items():
@@ -124,7 +124,7 @@ def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
 
 
 def test_every_effect_on_controllers_is_documented_with_its_fields_and_ranges() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "gaps.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "domains.md").read_text()
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
     others = {kind.name: kind for kind in (Incident, QueueModel, BlockerPatience)}
     for name, kind in {**effects_on_controllers(), **others}.items():

@@ -14,7 +14,9 @@ from ugat_marl.data.measured.atspm_mapping import AtspmMapping, read_mapping
 from ugat_marl.data.measured.tables import TABLES
 from ugat_marl.scenarios import Network, read_scenario, signal_widths
 
-PAGE = (Path(__file__).parents[2] / "docs" / "measured-data.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "measured-data.md").read_text(
+    encoding="utf-8"
+)
 
 
 def test_the_example_is_measured_data(tmp_path: Path) -> None:

@@ -367,7 +367,9 @@ def test_a_wrapped_road_network_conforms(name: str, scenarios: dict[str, Scenari
 
 
 def test_the_page_names_every_wrapper_and_its_example_runs() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "wrappers.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "wrappers.md").read_text(
+        encoding="utf-8"
+    )
     named = set(re.findall(r"^\| `(\w+)\(env", page, flags=re.MULTILINE))
     assert named == {*SINGLE, "appended_mask", "masked_observation"}
     example = re.search(r"```python\n(.*?)```", page, flags=re.DOTALL)

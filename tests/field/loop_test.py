@@ -601,14 +601,14 @@ def test_a_network_answers_for_sixteen_lights_in_time() -> None:
 
 
 def test_the_street_of_the_page_is_driven() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "field.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "field.md").read_text(encoding="utf-8")
     (example,) = [
         block.partition("```")[0]
         for block in page.split("```python\n")[1:]
         if "class CabinetStreet" in block
     ]
     names: dict[str, Any] = {}
-    exec(compile(example, "docs/field.md", "exec"), names)
+    exec(compile(example, "docs/how-to/field.md", "exec"), names)
     body = example.partition("class CabinetStreet")[2].rstrip().splitlines()
     assert len(body) <= 30
 

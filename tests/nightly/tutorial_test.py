@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "tutorials" / "first-city.md").read_text(encoding="utf-8")
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
 

@@ -25,7 +25,7 @@ from ugat_marl.policies.export import FORMATS, NumpyPolicy, layers_of
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.testing import ToyTraffic, check_policy, failures, report
 
-PAGE = (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "export.md").read_text(encoding="utf-8")
 AGENTS = AgentSet(("a_0", "b_0", "a_1", "c_0"), (7, 5, 7, 2), (3, 2, 3, 6))
 SECTIONS = {".onnx": "ONNX", ".ts": "TorchScript", ".npz": "numpy"}
 KINDS = pytest.mark.parametrize(

@@ -35,14 +35,14 @@ class Diagnose:
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         measured: Directory of measured data, as record or import-atspm writes it
-            (docs/measured-data.md); it is never written to.
+            (docs/reference/measured-data.md); it is never written to.
         out: Directory for diagnosis.json, report.html and the corrected scenario; an earlier
             diagnosis in it is replaced.
         budget_s: Time in s after which no further simulation is begun. The result is marked as
             partial then; the same command goes on from there.
         alpha: Chance of naming an effect where there is none.
         seed: Root of the simulated days; the same data and seed give the same diagnosis.
-        leave_out: Names of effects (docs/effects.md) that are not examined.
+        leave_out: Names of effects (docs/reference/effects.md) that are not examined.
         cache: Folder of remembered simulations.
         workers: Simulations at a time.
         ray: Simulate on Ray instead.

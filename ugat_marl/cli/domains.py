@@ -62,7 +62,7 @@ class Domains:
         theirs = sum(bool(item.counterpart) for item in listed)
         console.print(
             f"{len(listed)} domains, {theirs} with a counterpart in Sim2Signal (arXiv:2609.01676). "
-            "Effects and their units: docs/effects.md, docs/gaps.md",
+            "Effects and their units: docs/reference/effects.md, docs/reference/domains.md",
             markup=False,
         )
         return 0

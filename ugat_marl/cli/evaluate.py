@@ -36,7 +36,7 @@ class Evaluate:
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         policies: Rules (such as fixed-time:30, actuated:40, largest-queue:20, max-pressure:10,
-            programme; docs/controllers.md has them all) and files of trained policies.
+            programme; docs/reference/rules.md has them all) and files of trained policies.
         domains: Domains; gaps are taken against the first. "all" is sim and every named domain,
             observation, action, transition or reward all of that gap: see ugat-marl domains.
         seeds: Number of episodes of each policy in each domain.

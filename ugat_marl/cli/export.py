@@ -16,7 +16,7 @@ from ugat_marl.policies import NetworkPolicy, export_policy
 
 @dataclass(frozen=True)
 class Export:
-    """Writes a trained policy as TorchScript, ONNX or plain matrices; docs/export.md reads them.
+    """Write a trained policy as TorchScript, ONNX or matrices; see docs/how-to/export.md.
 
     Examples:
         ugat-marl export runs/demo/policies/ugat.pt --out ugat.onnx --scenario grid2x2-v1

@@ -37,7 +37,7 @@ class Field:
 
     Counts are read once per decision. Minimum green and clearance are kept
     whatever the policy asks for; where counts are stale, missing or absurd, or
-    the policy fails, lights follow a fixed-time plan (docs/field.md).
+    the policy fails, lights follow a fixed-time plan (docs/how-to/field.md).
 
     Examples:
         ugat-marl field single-v1 --policy largest-queue:20 --start --domain V4

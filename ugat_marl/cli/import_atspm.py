@@ -20,7 +20,7 @@ class ImportAtspm:
 
     The log has the columns TimeStamp, DeviceId, EventId and Parameter.
 
-    The mapping says which lights and lanes they mean (docs/measured-data.md).
+    The mapping says which lights and lanes they mean (docs/reference/measured-data.md).
 
     Examples:
         ugat-marl import-atspm my-scenario events.parquet mapping.toml --out street

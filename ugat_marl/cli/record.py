@@ -27,7 +27,7 @@ class Record:
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
-        out: Directory to write (docs/measured-data.md); measured data in it are replaced.
+        out: Directory to write (docs/reference/measured-data.md); measured data in it are replaced.
         domain: World to measure: sim, V1 to V4, effects (headway=1.4+acceleration=1), or the
             directory of another scenario on the same network.
         policy: Who controls the signals: a rule (fixed-time:30, largest-queue:20,

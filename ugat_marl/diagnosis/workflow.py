@@ -58,8 +58,8 @@ def diagnose(
         reporter: Shows progress.
 
     Returns:
-        The content of ``diagnosis.json``; docs/diagnosis.md explains every key. The policy gap of
-        an earlier diagnosis in `directory` is kept where the same was found.
+        The content of ``diagnosis.json``; docs/explanation/diagnosis.md explains every key. The
+        policy gap of an earlier diagnosis in `directory` is kept where the same was found.
 
     Raises:
         MeasuredDataError: The data hold nothing to compare.

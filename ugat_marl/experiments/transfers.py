@@ -113,7 +113,7 @@ class TransferConfig:
         placebo: A negative control, with which grounding must do nothing: "same-world" takes D_real
             from the simulation, "shuffled" deals out anew what followed in D_real, "noise" puts
             noise in the place of f.
-        learner: What learns: dqn, the suite's own; or a baseline (docs/learner.md).
+        learner: What learns: dqn, the suite's own; or a baseline (docs/how-to/learners.md).
         learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; the
             parts of a tuple are divided by commas.
         device: Where dqn's updates and the fits of f and h are computed: cpu, cuda, or cuda:N.

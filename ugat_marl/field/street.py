@@ -1,7 +1,7 @@
 """The street as a controller meets it: counts with their time, lights to set, a clock.
 
 `TraciStreet` lets a SUMO that runs elsewhere stand in for it; another street is a class with the
-five methods of `Street` (docs/field.md has one).
+five methods of `Street` (docs/how-to/field.md has one).
 """
 
 from __future__ import annotations

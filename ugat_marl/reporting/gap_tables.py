@@ -58,7 +58,11 @@ def hidden_tables(found: Evaluation) -> list[RenderableType]:
         costs = (found.estimate(policy, domain, "cost").mean for domain in domains)
         table.add_row(Text(policy), *map(number, costs))
     legend = ", ".join(HIDDEN[name] for name in _SHORT)
-    return [table, *_measured(found, domains), Text(f"{legend}. docs/gaps.md", style="dim")]
+    return [
+        table,
+        *_measured(found, domains),
+        Text(f"{legend}. docs/reference/domains.md", style="dim"),
+    ]
 
 
 _SHORT = {

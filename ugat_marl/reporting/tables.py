@@ -82,7 +82,7 @@ def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
         title_justify="left",
         caption=Text(
             "ATT: mean in s over the tuning seeds, all vehicles due. worst: of the settings "
-            "tried. Numbers after a name are its settings; see docs/controllers.md."
+            "tried. Numbers after a name are its settings; see docs/reference/rules.md."
         ),
         caption_justify="left",
         pad_edge=False,

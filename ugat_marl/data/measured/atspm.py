@@ -72,7 +72,8 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
     Args:
         events: CSV or Parquet with TimeStamp, DeviceId, EventId and Parameter.
         mapping: TOML that maps devices to traffic lights, phases and overlaps to links, channels
-            to detectors, and local time to the scenario's clock (``docs/measured-data.md``).
+            to detectors, and local time to the scenario's clock
+            (``docs/reference/measured-data.md``).
         scenario: The scenario whose clock is meant.
         network: Its network.
 

@@ -145,7 +145,7 @@ def read_mapping(
     except pydantic.ValidationError as error:
         said = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:4]]
         raise MeasuredDataError(
-            f"{path}: {'; '.join(said)}; docs/measured-data.md has the keys"
+            f"{path}: {'; '.join(said)}; docs/reference/measured-data.md has the keys"
         ) from None
     if bool(mapping.zero) == bool(mapping.periods):
         raise MeasuredDataError(

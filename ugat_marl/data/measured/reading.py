@@ -31,7 +31,7 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     """Reads measured data; the files are never written to.
 
     Args:
-        directory: Holds the files described in ``docs/measured-data.md``.
+        directory: Holds the files described in ``docs/reference/measured-data.md``.
         scenario: The scenario whose clock and demand the data are compared with.
         network: Its network.
 
@@ -46,7 +46,7 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     if not directory.is_dir():
         raise MeasuredDataError(
             f"{directory}: no such directory; measured data are a directory with periods.csv, "
-            "detectors.csv, signals and detections (docs/measured-data.md)"
+            "detectors.csv, signals and detections (docs/reference/measured-data.md)"
         )
     found: list[Finding] = []
     paths = {table.stem: table.path(directory) for table in tables.TABLES}
@@ -105,7 +105,7 @@ def _missing(directory: Path, table: Table) -> MeasuredDataError:
     there = ", ".join(sorted(path.name for path in directory.iterdir())[:8]) or "nothing"
     return MeasuredDataError(
         f"{directory}: no {' or '.join(table.names())}; there is {there}. "
-        "docs/measured-data.md describes the files"
+        "docs/reference/measured-data.md describes the files"
     )
 
 
