@@ -11,7 +11,7 @@ from collections import Counter
 import numpy as np
 
 from studies.blind.drawing import Drawn
-from ugat_marl.effects import DetectorEffect, Effect
+from ugat_marl.effects import Effect
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Period, Scenario
 from ugat_marl.seeding import derive_seed
@@ -37,7 +37,7 @@ class Consequences:
         A setting is judged as a whole: beside drivers who brake as usual an emergency braking is
         never seen, and V1 to V4 have one all the same.
         """
-        alone = [(effect,) for effect in drawn.effects if not isinstance(effect, DetectorEffect)]
+        alone = [(effect,) for effect in drawn.effects if not effect.on_detectors]
         for effects in [drawn.effects] if drawn.group == "setting" else alone:
             key = (scenario.hash, policy)
             plain = self._plain.get(key)

@@ -24,7 +24,7 @@ from ugat_marl.effects import (
     effects_on_controllers,
     known_effects,
 )
-from ugat_marl.effects.acting import PHASE_ORDERS
+from ugat_marl.effects.actuators import PHASE_ORDERS
 from ugat_marl.envs import HIDDEN
 from ugat_marl.files import xml_bytes
 from ugat_marl.grounding import METHODS, FitConfig

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 import ugat_marl
 from ugat_marl.effects import effects_on_controllers, in_domain, load_scenario, parse_domain
-from ugat_marl.effects.acting import ACTING, PHASE_ORDERS
-from ugat_marl.envs.actuators import Cabinet, successors
+from ugat_marl.effects.actuators import ACTING, PHASE_ORDERS, successors
+from ugat_marl.envs.actuators import Actuators
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.scenarios import Network, signals, validated
 from ugat_marl.testing.episodes import play, random_actions
@@ -27,18 +27,18 @@ EXAMPLES = (
 )  # fmt: skip
 
 
-def cabinet(domain: str, name: str = "single-v1", seed: int = 1) -> Cabinet:
-    made = Cabinet.of(parse_domain(domain), NETWORKS[name], TIMING, 10.0)
+def actuators(domain: str, name: str = "single-v1", seed: int = 1) -> Actuators:
+    made = Actuators.of(parse_domain(domain), NETWORKS[name], TIMING, 10.0)
     assert made is not None
     made.reset(seed)
     return made
 
 
 class Light:
-    """One intersection behind its cabinet and its signal machine, second by second."""
+    """One intersection behind its actuators and its signal machine, second by second."""
 
     def __init__(self, domain: str, timing: signals.SignalTiming = TIMING) -> None:
-        self.cabinet = cabinet(domain)
+        self.actuators = actuators(domain)
         self.timing = timing
         self.phases = NETWORKS["single-v1"].intersections[0].phases
         self.state = signals.initial_state(timing)
@@ -48,11 +48,11 @@ class Light:
     @property
     def allowed(self) -> set[int]:
         """What the mask allows now."""
-        return set(np.flatnonzero(self.cabinet.masks([self.state])[0]).tolist())
+        return set(np.flatnonzero(self.actuators.masks([self.state])[0]).tolist())
 
     def step(self, command: int) -> int:
         """Gives a command; returns the phase that is shown or cleared towards afterwards."""
-        (asked,) = self.cabinet.obey([command], [self.state])
+        (asked,) = self.actuators.obey([command], [self.state])
         self.asked.append(asked)
         self.state, segments = signals.advance(self.phases, self.state, asked, 10.0, self.timing)
         for seconds, shown in segments:
@@ -99,7 +99,7 @@ def test_impossible_values(text: str, error: type[Exception], message: str) -> N
 
 
 def test_without_effects_there_is_nothing_to_do() -> None:
-    assert Cabinet.of(parse_domain("V4"), NETWORKS["single-v1"], TIMING, 10.0) is None
+    assert Actuators.of(parse_domain("V4"), NETWORKS["single-v1"], TIMING, 10.0) is None
     assert in_domain(load_scenario("single-v1"), "min_green=15").control.min_green_s == 15
 
 
@@ -251,10 +251,10 @@ def test_the_signal_machine_keeps_its_rules(
 ) -> None:
     timing = signals.SignalTiming(3.0, 2.0, min_green_s)
     light = Light("+".join(domains), timing)
-    made = Cabinet.of(parse_domain("+".join(domains)), NETWORKS["single-v1"], timing, 10.0)
+    made = Actuators.of(parse_domain("+".join(domains)), NETWORKS["single-v1"], timing, 10.0)
     assert made is not None
     made.reset(4)
-    light.cabinet = made
+    light.actuators = made
     for command in commands:
         assert light.allowed
         light.step(command)

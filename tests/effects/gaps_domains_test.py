@@ -27,9 +27,10 @@ from ugat_marl.effects import (
     parse_domain,
     spelled_out,
 )
+from ugat_marl.effects.actuators import successors
+from ugat_marl.effects.sensors import DeadDetectors
 from ugat_marl.envs import HIDDEN, TrafficEnv
-from ugat_marl.envs.actuators import successors
-from ugat_marl.envs.sensors import Sensing
+from ugat_marl.envs.sensors import Sensors
 from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.scenarios import signals
 from ugat_marl.simulation import Snapshot
@@ -201,8 +202,9 @@ class Trace:
     @property
     def alive(self) -> NDArray[np.bool_]:
         """Which of these lanes have a detector that works."""
-        assert self.env._sensing is not None
-        return ~self.env._sensing.dead[self.incoming]
+        assert self.env._sensors is not None
+        dead = [x.dead for x in self.env._sensors.chain if isinstance(x, DeadDetectors)]
+        return ~dead[0][self.incoming] if dead else np.ones(len(self.incoming), dtype=np.bool_)
 
     def cars(self, what: str) -> set[Any]:
         """Values of all vehicles that are no trucks and do not block a lane."""
@@ -246,13 +248,14 @@ def check_error(trace: Trace, vehicles: float) -> None:
 def check_failure(trace: Trace, share: float) -> None:
     assert not trace.counted[:, ~trace.alive].any()
     drawn: list[float] = []
-    sensing = trace.env._sensing
-    assert isinstance(sensing, Sensing)
+    sensors = trace.env._sensors
+    assert isinstance(sensors, Sensors)
+    (detectors,) = (x for x in sensors.chain if isinstance(x, DeadDetectors))
     for seed in range(300):
-        sensing.reset(seed)
-        drawn.append(float(sensing.dead.mean()))
+        sensors.reset(seed)
+        drawn.append(float(detectors.dead.mean()))
     about(float(np.mean(drawn)), share, 0.02)
-    trace.env._sensing = sensing
+    trace.env._sensors = sensors
 
 
 def check_zone(trace: Trace, metres: float) -> None:
@@ -291,10 +294,10 @@ def check_delay(trace: Trace, seconds: float) -> None:
 
 def check_lost_commands(trace: Trace, share: float) -> None:
     assert any(c != s for c, s in zip(trace.commands, trace.shown, strict=True)) or share < 0.2
-    cabinet = trace.env._cabinet
-    assert cabinet is not None
+    actuators = trace.env._actuators
+    assert actuators is not None
     state = signals.SignalState(0, 0, 100.0)
-    obeyed = np.mean([cabinet.obey([3], [state])[0] == 3 for _ in range(3000)])
+    obeyed = np.mean([actuators.obey([3], [state])[0] == 3 for _ in range(3000)])
     about(float(obeyed), 1.0 - share, 0.02)
 
 

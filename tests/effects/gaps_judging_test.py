@@ -11,8 +11,9 @@ import pytest
 import ugat_marl
 from ugat_marl.data import Scores
 from ugat_marl.effects import OBJECTIVES, in_domain, load_scenario, parse_domain
+from ugat_marl.effects.objectives import NORMS
 from ugat_marl.envs import HIDDEN
-from ugat_marl.envs.objectives import NORMS, PERSONS, PERSONS_IN_A_CAR, Judge, gini, hidden_measures
+from ugat_marl.envs.objectives import PERSONS, PERSONS_IN_A_CAR, Objectives, gini, hidden_measures
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.simulation import Trips, read_trips
 from ugat_marl.simulation.trips import STATISTICS
@@ -26,6 +27,12 @@ def trips(delays: list[float], persons: list[float], co2_g: list[float], **other
         np.array(delays), np.array(delays), yes, other.get("entered", yes),
         np.array(co2_g), np.array(persons), np.array(other.get("dangers", (0.0, 0.0))),
     )  # fmt: skip
+
+
+def objectives(wanted: str, scenario: str) -> Objectives:
+    made = Objectives.of(parse_domain(f"objective={wanted}"), load_scenario(scenario))
+    assert made is not None
+    return made
 
 
 # --- by hand
@@ -59,7 +66,7 @@ def test_hidden_measures() -> None:
 
 @pytest.mark.parametrize("wanted", OBJECTIVES)
 def test_the_cost_is_the_weighted_sum(wanted: str) -> None:
-    judge = Judge(wanted, load_scenario("single-v1"))
+    judge = objectives(wanted, "single-v1")
     scores = Scores(100, 90, 500, -3, 20.0, 0.4, 50, 520, 515, 5)
     told = trips([0, 30], [1.5, 1.5], [300, 900], dangers=(1.0, 2.0))
     hidden = judge.judged(scores, told).hidden
@@ -73,7 +80,7 @@ def test_the_cost_is_the_weighted_sum(wanted: str) -> None:
 
 
 def test_persons_follow_the_vehicle_s_class() -> None:
-    persons = Judge("person-delay", load_scenario("mixed-v1")).persons
+    persons = objectives("person-delay", "mixed-v1").persons
     assert persons == {"": PERSONS_IN_A_CAR, "car": PERSONS_IN_A_CAR, "truck": PERSONS["truck"]}
 
 

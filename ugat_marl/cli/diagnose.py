@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import Ray, Workers, workers_of
 from ugat_marl.data import Measured, read_measured
 from ugat_marl.diagnosis import CORRECTED, FILE, DiagnosisConfig, default_cache, diagnose
-from ugat_marl.effects import DetectorEffect, known_effects, load_scenario
+from ugat_marl.effects import known_effects, load_scenario
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
@@ -165,4 +165,4 @@ def _say_what_cannot_be_seen(measured: Measured, console: Console) -> None:
 
 def _in_the_model(effect: Mapping[str, Any]) -> bool:
     """Whether an effect changes the simulation, and not only what detectors see."""
-    return not issubclass(known_effects()[effect["name"]], DetectorEffect)
+    return not known_effects()[effect["name"]].on_detectors

@@ -21,11 +21,11 @@ import numpy as np
 from ugat_marl.data import version_of
 from ugat_marl.diagnosis.arrivals import Due, corrected
 from ugat_marl.diagnosis.features import FEATURES, Tally, tally
-from ugat_marl.diagnosis.replay import WHEN, Day, Replay
+from ugat_marl.diagnosis.replay import Day, Replay
 from ugat_marl.diagnosis.site import Greens, Site
 from ugat_marl.diagnosis.standstill import locked_up
 from ugat_marl.diagnosis.unmeasured import Unmeasured
-from ugat_marl.effects import DetectorEffect, Effect
+from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
 from ugat_marl.files import user_cache, write_whole
 from ugat_marl.parallel import Workers, parts_at_a_time
@@ -248,7 +248,7 @@ class Engine:
         new = key not in self._known
         found = self._known.get(key) or self._remembered(key)
         if found is None:
-            others = tuple(effect for effect in effects if not isinstance(effect, WHEN))
+            others = tuple(effect for effect in effects if not effect.on_departures)
             if self._replay.answering and len(others) < len(effects):
                 found = self._asked_for(self._one(others, number), effects, number)
             else:
@@ -272,7 +272,7 @@ class Engine:
         """The same simulated day, of a model that asks for other vehicles."""
         if given.counted is None or given.due is None:
             return self._counted(effects, number)
-        physics = [effect for effect in effects if not isinstance(effect, DetectorEffect)]
+        physics = [effect for effect in effects if not effect.on_detectors]
         period = self.periods[number % len(self.periods)]
         seed = derive_seed(self._seed, "replicate", number)
         due = Due(self._replay.asked(physics, period, seed), given.due.given)
@@ -285,8 +285,8 @@ class Engine:
 
     def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
         """A day as the detectors saw it; faults of detectors cost no further simulation."""
-        faults = tuple(effect for effect in effects if isinstance(effect, DetectorEffect))
-        physics = tuple(effect for effect in effects if not isinstance(effect, DetectorEffect))
+        faults = tuple(effect for effect in effects if effect.on_detectors)
+        physics = tuple(effect for effect in effects if not effect.on_detectors)
         key = self._key(physics, number)
         day = self._days.get(key)
         if day is None:

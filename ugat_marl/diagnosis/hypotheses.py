@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.effects import SETTINGS, DetectorEffect, Effect, known_effects
+from ugat_marl.effects import SETTINGS, Effect, known_effects
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
 
@@ -54,7 +54,7 @@ class Hypothesis:
     @property
     def faults_only(self) -> bool:
         """Whether it concerns detectors and not traffic."""
-        return issubclass(known_effects()[self.name], DetectorEffect)
+        return known_effects()[self.name].on_detectors
 
     def effect(self, values: Sequence[float]) -> Effect:
         """The effect with these values of the free fields, brought into range."""
@@ -226,7 +226,7 @@ def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """The order in which effects are applied: a truck keeps its own acceleration, say."""
 
     def rank(effect: Effect) -> tuple[int, str]:
-        if isinstance(effect, DetectorEffect):
+        if effect.on_detectors:
             return (4, str(effect))
         if effect.name in ORDER:
             return (0, str(effect))

@@ -23,10 +23,6 @@ from ugat_marl.data import as_logged
 from ugat_marl.diagnosis.arrivals import Array, Arrivals, Due
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.effects import (
-    DemandLevel,
-    DemandSurge,
-    DemandTiming,
-    DetectorEffect,
     Effect,
     detector_effects,
     late_greens,
@@ -54,8 +50,6 @@ WARM_UP_S = 600.0
 """Simulated before a period that does not begin with the scenario, under its own first signals."""
 
 _DAYS = 64
-WHEN = (DemandLevel, DemandSurge, DemandTiming)
-"""How many vehicles depart, and when: measured arrivals say that of the day they belong to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +118,7 @@ class Replay:
         day = self._day(seed)
         scenario, due = _with(day, effects), None
         if self._arrivals is not None:
-            others = [item for item in effects if not isinstance(item, WHEN)]
+            others = [item for item in effects if not item.on_departures]
             drivers = scenario if len(others) == len(effects) else _with(day, others)
             scenario, due = self._arrivals.given(scenario, drivers, period)
         scenario = parked_at_other_times(scenario, derive_seed(seed, "parking"))
@@ -133,11 +127,10 @@ class Replay:
             done = persistently(lambda: self._run(scenario, period, seed, directory))
         seen = done.period
         for effect in (*self._own, *effects):
-            if isinstance(effect, DetectorEffect):
-                seen = effect.observe(seen, self._detectors, self._owner)
+            seen = effect.observe(seen, self._detectors, self._owner)
         return Day(_logged(seen), done.travel_time_s, due)
 
-    def observed(self, effects: Sequence[DetectorEffect], period: Period) -> Period:
+    def observed(self, effects: Sequence[Effect], period: Period) -> Period:
         """A simulated period as other detectors would have seen it; costs no simulation."""
         for effect in effects:
             period = effect.observe(period, self._detectors, self._owner)

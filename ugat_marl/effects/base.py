@@ -1,16 +1,17 @@
-"""What an effect is, and the hash that decides which vehicles it meets."""
+"""Base of all effects, and the hash that decides which vehicles an effect meets."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, ClassVar, Literal
 
+from ugat_marl.effects.controllers import Actuator, Cost, Sensor
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.scenarios import Scenario
+from ugat_marl.scenarios import Detector, Network, Period, Scenario, SignalTiming
 
 EVERYWHERE = "*"
 """As a place: all of them."""
@@ -19,6 +20,10 @@ TextKind = Literal["lane", "edge", "traffic light", "detector", "model", "phase 
 
 _FORBIDDEN = frozenset(" \t\n\r|\\'\";,<>&")
 """Characters that ids in SUMO cannot have; a comma ends a value in the text form."""
+
+
+Owner = Mapping[str, str]
+"""Detector to the traffic light whose controller records it."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +60,16 @@ class Text:
 class Effect:
     """A physical effect; subclasses are frozen dataclasses whose fields are its parameters.
 
+    An effect does something at one of three places and leaves the others as they are: to the files
+    of a scenario (`apply`), to what detectors report (`observe`), or between a controller and its
+    street (`sensor`, `actuator`, `cost`).
+
     Attributes:
-        name: How files, the command line and verdicts call it.
+        name: Name in files, on the command line and in verdicts.
         ranges: Unit and plausible range of each field that is a number.
-        texts: What each other field names.
+        texts: Kind of name that each other field holds.
+        on_detectors: True if it changes what detectors report, and no traffic.
+        on_departures: True if it changes which vehicles depart or when, and not how they drive.
 
     Raises:
         OptionError: A value is outside its plausible range, or a name cannot be one.
@@ -68,14 +79,14 @@ class Effect:
     name: ClassVar[str]
     ranges: ClassVar[dict[str, Parameter]] = {}
     texts: ClassVar[dict[str, Text]] = {}
+    on_detectors: ClassVar[bool] = False
+    on_departures: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name in self.texts:
-                object.__setattr__(self, item.name, self._name(item.name, value))
-            else:
-                object.__setattr__(self, item.name, self._number(item.name, value))
+        for field in fields(self):
+            value = getattr(self, field.name)
+            checked = self._name if field.name in self.texts else self._number
+            object.__setattr__(self, field.name, checked(field.name, value))
         begin, end = getattr(self, "begin_s", None), getattr(self, "end_s", None)
         if begin is not None and end is not None and begin >= end:
             raise OptionError(
@@ -83,15 +94,59 @@ class Effect:
             )
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """A scenario in which the effect is present; `scenario` itself does not change."""
-        raise TypeError(f"{type(self).__name__} does not say how it is applied")
+        """Return a scenario in which the effect is present; `scenario` itself does not change."""
+        raise NotImplementedError(f"{type(self).__name__} has no apply()")
+
+    @staticmethod
+    def apply_all(scenario: Scenario, effects: Sequence[Any]) -> Scenario:
+        """Apply effects that have this method in common, one after the other."""
+        for effect in effects:
+            scenario = effect.apply(scenario)
+        return scenario
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Return what detectors would have reported instead.
+
+        Args:
+            period: What was measured; it does not change itself.
+            detectors: All detectors.
+            owner: Detector to its traffic light, see `owners`.
+
+        Raises:
+            UnknownNameError: No such detector.
+        """
+        del detectors, owner
+        return period
+
+    def sensor(self, network: Network, decision_interval_s: float) -> Sensor | None:
+        """Make what changes the view of the controllers of a network; None if nothing does."""
+        del network, decision_interval_s
+        return None
+
+    def actuator(
+        self, network: Network, timing: SignalTiming, decision_interval_s: float
+    ) -> Actuator | None:
+        """Make what changes the commands of the controllers of a network; None if nothing does.
+
+        Raises:
+            ScenarioError: The phases of an intersection do not allow it.
+        """
+        del network, timing, decision_interval_s
+        return None
+
+    def cost(self) -> Cost | None:
+        """Make the cost by which controllers are judged; None if it stays as it is."""
+        return None
 
     def record(self) -> dict[str, Any]:
-        """Name and parameters, as in ``[[effects]]`` of a scenario file."""
-        return {"name": self.name} | {item.name: getattr(self, item.name) for item in fields(self)}
+        """Return name and parameters, as in ``[[effects]]`` of a scenario file."""
+        return {"name": self.name} | self._values()
+
+    def _values(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __str__(self) -> str:
-        values = (getattr(self, item.name) for item in fields(self))
+        values = self._values().values()
         texts = (value if isinstance(value, str) else f"{value:.12g}" for value in values)
         return f"{self.name}={','.join(texts)}"
 
@@ -127,14 +182,14 @@ class Effect:
 
 @dataclass(frozen=True)
 class ControllerEffect(Effect):
-    """An effect on what controllers see, do or are judged by; traffic and detectors stay alone.
+    """An effect on what controllers see, do or are judged by; traffic and detectors stay the same.
 
-    The environment keeps it, so the scenario goes on listing it in its own `effects`: there it is
-    hashed, written and read again. No files change.
+    No files change. The scenario goes on listing the effect in its own `effects`, where it is
+    hashed, written and read again, and the environment asks the effect for its part.
     """
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Lists the effect in the scenario; the last of two of the same name counts."""
+        """List the effect in the scenario; the last of two of the same name counts."""
         others = [item for item in scenario.settings.effects if item.get("name") != self.name]
         listed = sorted([*others, self.record()], key=lambda item: str(item.get("name")))
         settings = scenario.settings.model_copy(update={"effects": tuple(listed)})
@@ -143,14 +198,14 @@ class ControllerEffect(Effect):
 
 
 def draw(salt: str, *names: str) -> float:
-    """A number in [0, 1) that belongs to a vehicle, or to whatever is named.
+    """Return a number in [0, 1) that belongs to a vehicle, or to anything else with a name.
 
-    It takes the place of a random generator: a share of 0.2 is all vehicles with a number below
-    0.2, so that they are among the ones met at 0.3, and nothing depends on who comes first.
+    It takes the place of a random generator. A share of 0.2 is all vehicles with a number below
+    0.2: they are among those met at 0.3, and the order of vehicles does not matter.
 
     Args:
-        salt: What is decided; other decisions about the same vehicle are independent.
-        *names: Whom it is decided for.
+        salt: Name of the decision; other decisions about the same vehicle are independent.
+        *names: Names of the vehicle, or of what else the decision is about.
     """
     digest = hashlib.blake2b("\0".join((salt, *names)).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") / 2.0**64

@@ -99,6 +99,7 @@ class DemandLevel(Effect):
     """So many times as many vehicles start on an edge, or everywhere (``"*"``)."""
 
     name: ClassVar[str] = "demand_level"
+    on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, Parameter]] = {"factor": _FACTOR}
     texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
     edge: str
@@ -118,6 +119,7 @@ class DemandSurge(Effect):
     """So many times as many vehicles start on an edge (``"*"``: everywhere) during a while."""
 
     name: ClassVar[str] = "demand_surge"
+    on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME, "factor": _FACTOR}
     texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
     edge: str
@@ -142,6 +144,7 @@ class DemandTiming(Effect):
     """
 
     name: ClassVar[str] = "demand_timing"
+    on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -7200.0, 7200.0)}
     texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
     edge: str

@@ -1,15 +1,15 @@
-"""Effects on what is measured, and not on the traffic: clocks, misses, and broken detectors."""
+"""Effects on what detectors report, and not on the traffic: clocks, misses, broken detectors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text, draw
+from ugat_marl.effects.base import EVERYWHERE, Effect, Owner, Parameter, Text, draw
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Detector, Passages, Period, Scenario
@@ -17,12 +17,9 @@ from ugat_marl.scenarios import Detector, Passages, Period, Scenario
 _TIME = Parameter("s", 0.0, 1e7)
 _CLOCK = Text("traffic light", everywhere=True)
 
-Owner = Mapping[str, str]
-"""Detector to the traffic light whose controller records it."""
-
 
 def owners(scenario: Scenario, detectors: Sequence[Detector]) -> dict[str, str]:
-    """The traffic light of every detector: the one at the end of its lane, or behind it.
+    """Return the traffic light of every detector: the one at the end of its lane, or behind it.
 
     An exit detector belongs to the light it stands behind, any other to the light it leads to.
     Detectors at no traffic light are left out.
@@ -39,10 +36,12 @@ def owners(scenario: Scenario, detectors: Sequence[Detector]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class DetectorEffect(Effect):
-    """An effect on what is measured; the simulation itself is not touched."""
+    """An effect on what detectors report; the simulation itself is not touched."""
+
+    on_detectors: ClassVar[bool] = True
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Notes the effect; the scenario runs as before.
+        """Note the effect; the scenario runs as before.
 
         Raises:
             UnknownNameError: No such traffic light.
@@ -53,19 +52,6 @@ class DetectorEffect(Effect):
                 places = places_of(scenario)
                 places.check(self.name, text.kind, name, places.lights)
         return replace(scenario, applied=(*scenario.applied, str(self)))
-
-    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """What would have been measured instead.
-
-        Args:
-            period: What was measured; it does not change itself.
-            detectors: All detectors.
-            owner: Detector to its traffic light, see `owners`.
-
-        Raises:
-            UnknownNameError: No such detector.
-        """
-        raise TypeError(f"{type(self).__name__} does not say what it does")
 
 
 @dataclass(frozen=True)
@@ -79,7 +65,7 @@ class Undercount(DetectorEffect):
     share: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Leaves out passages, chosen by a hash of the detector and their number and time."""
+        """Leave out passages, chosen by a hash of the detector and their number and time."""
         del owner
 
         def thinned(name: str, passages: Passages) -> Passages:
@@ -104,7 +90,7 @@ class SignalClock(DetectorEffect):
     seconds: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Shifts all stamps of the detectors."""
+        """Shift all stamps of the detectors."""
         del detectors
         shift = self.seconds
         return _edited(period, _at(self.place, period, owner), lambda _, p: _moved(p, shift, shift))
@@ -121,7 +107,7 @@ class ClockDrift(DetectorEffect):
     seconds_per_hour: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Shifts stamps in proportion to the time since the period began."""
+        """Shift stamps in proportion to the time since the period began."""
         del detectors
         rate = self.seconds_per_hour / 3600.0
 
@@ -135,7 +121,7 @@ class ClockDrift(DetectorEffect):
 
 @dataclass(frozen=True)
 class Stuck(DetectorEffect):
-    """A detector is on for a whole while, whatever passes."""
+    """A detector is on all the time between two times, whatever passes."""
 
     name: ClassVar[str] = "stuck"
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
@@ -145,7 +131,7 @@ class Stuck(DetectorEffect):
     end_s: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """One long passage without speed takes the place of all that were on then."""
+        """Replace all passages of that time by a long one without speed."""
         del owner
         names = _named(self, self.detector, detectors)
         begin, end = max(self.begin_s, period.begin_s), min(self.end_s, period.end_s)
@@ -178,7 +164,7 @@ class Dropout(DetectorEffect):
     end_s: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Leaves out all passages of that time."""
+        """Leave out all passages of that time."""
         del owner
 
         def silent(name: str, passages: Passages) -> Passages:
@@ -198,11 +184,11 @@ class Swapped(DetectorEffect):
     other: str
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Exchanges the passages of the two."""
+        """Exchange the passages of the two."""
         del owner
-        (one,), (two,) = (_named(self, x, detectors) for x in (self.detector, self.other))
-        passages = {name: x for name, x in period.passages.items() if name not in (one, two)}
-        for name, source in ((one, two), (two, one)):
+        (first,), (second,) = (_named(self, x, detectors) for x in (self.detector, self.other))
+        passages = {name: x for name, x in period.passages.items() if name not in (first, second)}
+        for name, source in ((first, second), (second, first)):
             if source in period.passages:
                 passages[name] = period.passages[source]
         return replace(period, passages=passages)
@@ -214,10 +200,9 @@ def observed(
     detectors: Sequence[Detector],
     owner: Owner,
 ) -> Period:
-    """Applies the effects on measurement among `effects`, one after the other."""
+    """Apply the effects on detectors among `effects`, one after the other."""
     for effect in effects:
-        if isinstance(effect, DetectorEffect):
-            period = effect.observe(period, detectors, owner)
+        period = effect.observe(period, detectors, owner)
     return period
 
 
@@ -231,12 +216,12 @@ def _named(effect: Effect, place: str, detectors: Sequence[Detector]) -> set[str
 
 
 def _at(place: str, period: Period, owner: Owner) -> set[str]:
-    """The detectors recorded by one traffic light's controller, or by all."""
+    """Return the detectors recorded by one traffic light's controller, or by all."""
     return {x for x in period.passages if place in (EVERYWHERE, owner.get(x))}
 
 
 def _edited(period: Period, names: set[str], change: Callable[[str, Passages], Passages]) -> Period:
-    """The period with other passages at some detectors; one left without any is left out."""
+    """Return the period with other passages at some detectors; empty detectors are left out."""
     passages = dict(period.passages)
     for name in sorted(names):
         changed = change(name, passages.get(name, Passages.none()))
@@ -254,7 +239,7 @@ def _moved(
 
 
 def _within(passages: Passages, begin_s: float, end_s: float) -> NDArray[np.bool_]:
-    """Whether a passage began in the window, or was under way when it did."""
+    """Return True for each passage that overlaps the window."""
     on = np.where(np.isnan(passages.on_s), -np.inf, passages.on_s)
     off = np.where(np.isnan(passages.off_s), np.inf, passages.off_s)
     return (on < end_s) & (off > begin_s)

@@ -8,12 +8,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.effects.acting import ACTING
-from ugat_marl.effects.base import ControllerEffect, Effect
+from ugat_marl.effects.actuators import ACTING
+from ugat_marl.effects.base import Effect
 from ugat_marl.effects.demand import DemandLevel, DemandSurge, DemandTiming
 from ugat_marl.effects.detectors import (
     ClockDrift,
-    DetectorEffect,
     Dropout,
     SignalClock,
     Stuck,
@@ -23,9 +22,9 @@ from ugat_marl.effects.detectors import (
 from ugat_marl.effects.domains import NAMED
 from ugat_marl.effects.engine import BlockerPatience, QueueModel, Reach
 from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
-from ugat_marl.effects.judging import JUDGING
-from ugat_marl.effects.observing import OBSERVING, DetectionZone
+from ugat_marl.effects.objectives import JUDGING
 from ugat_marl.effects.roads import Incident, LaneClosure, LocalSpeed, Parking
+from ugat_marl.effects.sensors import OBSERVING, DetectionZone
 from ugat_marl.effects.signals import AllRedTime, LateGreen, YellowTime
 from ugat_marl.effects.turning import Turning
 from ugat_marl.effects.vehicles import (
@@ -41,9 +40,7 @@ from ugat_marl.effects.vehicles import (
     ReactionStep,
     RedRunning,
     StartupDelay,
-    VehicleEffect,
     YellowRunning,
-    apply_together,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
 from ugat_marl.scenarios import Scenario, read_scenario
@@ -226,13 +223,8 @@ def describe(domain: Domain) -> str:
 
 def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
     """Applies effects one after the other."""
-    for _, group in groupby(effects, lambda effect: isinstance(effect, VehicleEffect)):
-        some = list(group)
-        if alike := [effect for effect in some if isinstance(effect, VehicleEffect)]:
-            scenario = apply_together(scenario, alike)
-        else:
-            for effect in some:
-                scenario = effect.apply(scenario)
+    for apply_all, group in groupby(effects, lambda effect: effect.apply_all):
+        scenario = apply_all(scenario, list(group))
     return scenario
 
 
@@ -248,25 +240,22 @@ def load_scenario(name: str | Path | Scenario) -> Scenario:
     return apply_effects(plain, effects)
 
 
-def detector_effects(scenario: Scenario) -> tuple[DetectorEffect, ...]:
-    """The effects on detectors that were applied to a scenario.
+def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:
+    """Return the effects on detectors that were applied to a scenario.
 
-    They leave its files as they are, so that whoever measures it has to ask for them.
+    They leave its files as they are, so that the code that measures it has to ask for them.
     """
-    found: list[DetectorEffect] = []
-    for text in scenario.applied:
-        kind = _EFFECTS.get(text.partition("=")[0])
-        if kind is not None and issubclass(kind, DetectorEffect):
-            effect = _effect_from_text(text)  # undoes str(effect)
-            assert isinstance(effect, DetectorEffect)
-            found.append(effect)
-    return tuple(found)
+    names = (text.partition("=")[0] for text in scenario.applied)
+    return tuple(
+        _effect_from_text(text)  # undoes str(effect)
+        for name, text in zip(names, scenario.applied, strict=True)
+        if name in _EFFECTS and _EFFECTS[name].on_detectors
+    )
 
 
-def controller_effects(scenario: Scenario) -> tuple[ControllerEffect, ...]:
-    """The effects on controllers that were applied to a scenario."""
-    found = map(effect_from, scenario.settings.effects)
-    return tuple(effect for effect in found if isinstance(effect, ControllerEffect))
+def controller_effects(scenario: Scenario) -> tuple[Effect, ...]:
+    """Return the effects on controllers that were applied to a scenario."""
+    return tuple(map(effect_from, scenario.settings.effects))
 
 
 def in_domain(scenario: Scenario, domain: Domain) -> Scenario:

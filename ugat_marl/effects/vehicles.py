@@ -43,8 +43,23 @@ class VehicleEffect(Effect):
     attribute: ClassVar[str]
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets the attribute in every vehicle type, SUMO's default type included."""
-        return apply_together(scenario, (self,))
+        """Set the attribute in every vehicle type, SUMO's default type included."""
+        return self.apply_all(scenario, (self,))
+
+    @staticmethod
+    def apply_all(scenario: Scenario, effects: Sequence[VehicleEffect]) -> Scenario:
+        """Apply effects one after the other; the files are read and written once."""
+        step_s = scenario.settings.step_length_s
+
+        def change(root: ET.Element) -> bool:
+            types = driven_types(root)
+            for item in types:
+                for effect in effects:
+                    effect.write(item, step_s)
+            return bool(types)
+
+        edited = edit_scenario(with_default_types(scenario), change, "<vType", applied="")
+        return replace(edited, applied=(*scenario.applied, *map(str, effects)))
 
     def write(self, item: ET.Element, step_s: float) -> None:
         """Puts the effect into one type, of a scenario with this step length."""
@@ -54,21 +69,6 @@ class VehicleEffect(Effect):
         """The same, of the effect's number."""
         del step_s
         _set(item, self.attribute, number)
-
-
-def apply_together(scenario: Scenario, effects: Sequence[VehicleEffect]) -> Scenario:
-    """The scenario with one such effect after the other; its files are gone through once."""
-    step_s = scenario.settings.step_length_s
-
-    def change(root: ET.Element) -> bool:
-        types = driven_types(root)
-        for item in types:
-            for effect in effects:
-                effect.write(item, step_s)
-        return bool(types)
-
-    edited = edit_scenario(with_default_types(scenario), change, "<vType", applied="")
-    return replace(edited, applied=(*scenario.applied, *map(str, effects)))
 
 
 def _set(item: ET.Element, attribute: str, number: float) -> None:

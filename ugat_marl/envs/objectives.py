@@ -1,4 +1,4 @@
-"""What controllers are judged by and never trained on: emissions, fairness, safety, persons."""
+"""Hidden objectives: emissions, fairness, safety and persons, which no training sees."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Scores
-from ugat_marl.effects import OBJECTIVES, Effect, Objective
+from ugat_marl.effects import Cost, Effect
 from ugat_marl.scenarios import Scenario
 from ugat_marl.simulation import Trips
 
@@ -23,19 +23,8 @@ HIDDEN: dict[str, str] = {
     "hard_brakings": "hard brakings [1/1000 veh]",
     "collisions": "collisions [1/1000 veh]",
 }
-"""What a domain with an objective measures beside `ugat_marl.data.metrics.MEASURES`, with
+"""Measures of a domain with an objective beside `ugat_marl.data.metrics.MEASURES`, with their
 headings."""
-
-NORMS: dict[str, float] = {
-    "queue": 10.0,
-    "delay": 1.0,
-    "co2_g": 300.0,
-    "delay_gini": 0.5,
-    "person_delay_s": 60.0,
-    "hard_brakings": 10.0,
-    "collisions": 1.0,
-}
-"""What makes each measure 1 in a cost: round numbers of the size they have in shipped scenarios."""
 
 PERSONS: dict[str, float] = {
     "bus": 25.0,
@@ -54,16 +43,19 @@ PERSONS_IN_A_CAR = 1.5
 """Persons assumed in any other vehicle."""
 
 
-class Judge:
-    """Knows what the owner of the street wants.
+class Objectives:
+    """Measures of an episode that are hidden from training, and their cost.
 
     Args:
-        wanted: Name of the objective.
-        scenario: Whose vehicle types say how many persons travel.
+        cost: Cost of the measures.
+        scenario: Its vehicle types decide how many persons travel.
+
+    Attributes:
+        persons: Vehicle type to the persons in each vehicle, "" for all other types.
     """
 
-    def __init__(self, wanted: str, scenario: Scenario) -> None:
-        self._weights = OBJECTIVES[wanted]
+    def __init__(self, cost: Cost, scenario: Scenario) -> None:
+        self._cost = cost
         self.persons: dict[str, float] = {"": PERSONS_IN_A_CAR}
         for document in (*scenario.additional, *scenario.routes):
             for item in document.scan():
@@ -72,28 +64,27 @@ class Judge:
                     self.persons[item.attributes.get("id", "")] = carried
 
     @classmethod
-    def of(cls, effects: Sequence[Effect], scenario: Scenario) -> Judge | None:
-        """The judge of a scenario with these effects; None if nothing hidden is wanted."""
+    def of(cls, effects: Sequence[Effect], scenario: Scenario) -> Objectives | None:
+        """Return the objectives of a scenario with these effects; None if nothing is hidden."""
         for effect in effects:
-            if isinstance(effect, Objective):
-                return cls(effect.wanted, scenario)
+            if (cost := effect.cost()) is not None:
+                return cls(cost, scenario)
         return None
 
     def judged(self, scores: Scores, trips: Trips) -> Scores:
-        """The scores with what is hidden, and its cost.
+        """Return the scores with the hidden measures and their cost.
 
         Args:
             scores: Of an episode.
-            trips: What became of its vehicles, emissions and persons included.
+            trips: Of its vehicles, emissions and persons included.
         """
         hidden = hidden_measures(trips)
-        known = {"queue": scores.queue, "delay": scores.delay, **hidden}
-        parts = (weight * known[name] / NORMS[name] for name, weight in self._weights.items())
-        return replace(scores, hidden={"cost": sum(parts), **hidden})
+        cost = self._cost({"queue": scores.queue, "delay": scores.delay, **hidden})
+        return replace(scores, hidden={"cost": cost, **hidden})
 
 
 def hidden_measures(trips: Trips) -> dict[str, float]:
-    """The measures of `HIDDEN`, but for the cost.
+    """Return the measures of `HIDDEN`, without the cost.
 
     CO2 is the mean over vehicles that entered, of what each emitted until it arrived or the episode
     ended (SUMO's emission model HBEFA, by the emission class of the vehicle's type). The Gini
@@ -115,7 +106,7 @@ def hidden_measures(trips: Trips) -> dict[str, float]:
 
 
 def gini(values: NDArray[np.float64]) -> float:
-    """Gini coefficient of values of at least 0: 0 if all are equal, towards 1 if one has it all."""
+    """Return the Gini coefficient of values >= 0: 0 if all are equal, near 1 if one has it all."""
     total = _sum(values)
     if total <= 0:
         return 0.0
@@ -124,5 +115,5 @@ def gini(values: NDArray[np.float64]) -> float:
 
 
 def _sum(values: NDArray[np.float64]) -> float:
-    """The exact sum; numpy's own depends on where in memory the values lie."""
+    """Return the exact sum; numpy's own depends on where in memory the values lie."""
     return math.fsum(values.tolist())

@@ -23,13 +23,13 @@ from ugat_marl.effects import (
     with_late_programmes,
 )
 from ugat_marl.envs.actions import checked_delays, checked_phases
-from ugat_marl.envs.actuators import Cabinet
-from ugat_marl.envs.objectives import Judge
+from ugat_marl.envs.actuators import Actuators
+from ugat_marl.envs.objectives import Objectives
 from ugat_marl.envs.observations import Observer, joint_space
 from ugat_marl.envs.options import EnvOptions
 from ugat_marl.envs.rendering import Picture
 from ugat_marl.envs.rewards import Rewarder
-from ugat_marl.envs.sensors import Sensing
+from ugat_marl.envs.sensors import Sensors
 from ugat_marl.errors import EpisodeError, OptionError
 from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Network, Scenario, check_demand, signals
@@ -83,9 +83,10 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._observer = Observer(self.network, options.observation, options.neighbours)
         self._rewarder = Rewarder(self.network, options.reward)
         effects = controller_effects(self.scenario)
-        self._sensing = Sensing.of(effects, self.network, self.decision_interval_s)
-        self._cabinet = Cabinet.of(effects, self.network, self._timing, self.decision_interval_s)
-        self._judge = Judge.of(effects, self.scenario)
+        self._sensors = Sensors.of(effects, self.network, self.decision_interval_s)
+        interval_s = self.decision_interval_s
+        self._actuators = Actuators.of(effects, self.network, self._timing, interval_s)
+        self._objectives = Objectives.of(effects, self.scenario)
         self._name_agents()
         self._state_space = joint_space(list(self.observation_spaces.values()))
         self._simulator: Simulator | None = None
@@ -189,8 +190,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if not self.agents:
             raise EpisodeError("step() needs a running episode; call reset() first")
         requested = checked_phases(actions, self.agents, self.action_spaces)
-        if self._cabinet is not None:
-            requested = self._cabinet.obey(requested, self._states)
+        if self._actuators is not None:
+            requested = self._actuators.obey(requested, self._states)
         before = self._snapshot
         self._advance(requested)
         rewards = self._rewarder.rewards(before, self._snapshot)
@@ -301,12 +302,12 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             waiting=self._observer.needs_waiting or self._rewarder.needs_waiting,
             crossings=self.options.crossings,
             gui=self.render_mode == "human",
-            zone_m=self._sensing.zone_m if self._sensing else 0.0,
-            persons=self._judge.persons if self._judge else None,
+            zone_m=self._sensors.zone_m if self._sensors else 0.0,
+            persons=self._objectives.persons if self._objectives else None,
             behind=self._lanes.behind,
         )
         self.agents = []
-        for part in (self._sensing, self._cabinet):
+        for part in (self._sensors, self._actuators):
             if part is not None:
                 part.reset(seed)
         self._look(self._simulator.start(launch))
@@ -331,7 +332,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     def _look(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
-        self._seen = snapshot if self._sensing is None else self._sensing.see(snapshot)
+        self._seen = snapshot if self._sensors is None else self._sensors.see(snapshot)
 
     def _observe(self) -> dict[str, NDArray[np.float32]]:
         seen = self._observer.observe(self._seen, self.phases)
@@ -339,8 +340,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     def _infos(self) -> dict[str, dict[str, Any]]:
         infos: dict[str, dict[str, Any]] = {}
-        if self._cabinet is not None:
-            masks = self._cabinet.masks(self._states)
+        if self._actuators is not None:
+            masks = self._actuators.masks(self._states)
             return {
                 agent: {"action_mask": mask, "executed_action": state.phase}
                 for agent, mask, state in zip(self.agents, masks, self._states, strict=True)
@@ -369,7 +370,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.agents = []
         trips = self._simulator.finish()
         scores = self._recorder.scores(trips)
-        self._scores = self._judge.judged(scores, trips) if self._judge else scores
+        self._scores = self._objectives.judged(scores, trips) if self._objectives else scores
 
 
 def parallel_env(

@@ -1,0 +1,276 @@
+"""Effects on what becomes of a controller's commands: the action gap.
+
+Each effect makes an `Actuator`. It changes which phase the signal machine is asked for; that
+machine keeps minimum green, yellow and all-red in any case.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.effects.base import ControllerEffect, Effect, Parameter, Text
+from ugat_marl.effects.controllers import Actuator, Commands
+from ugat_marl.errors import ScenarioError
+from ugat_marl.scenarios import Intersection, Network, Scenario, SignalState, SignalTiming
+from ugat_marl.seeding import numpy_generator
+
+PHASE_ORDERS = ("cyclic", "barrier-leading", "barrier-lagging", "barrier-both")
+"""Rules for which phase may follow which, see `successors`."""
+
+_INSTANT_S = 1e-6
+
+
+@dataclass(frozen=True)
+class ExecutionDelay(ControllerEffect):
+    """Commands are carried out so late, in whole decisions; until then the light stays."""
+
+    name: ClassVar[str] = "execution_delay"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 600.0)}
+    seconds: float
+
+    def actuator(
+        self, network: Network, timing: SignalTiming, decision_interval_s: float
+    ) -> Actuator:
+        """Make a line on which commands are under way for some decisions."""
+        del timing
+        nothing = (None,) * len(network.intersections)
+        return _Late(nothing, round(self.seconds / decision_interval_s))
+
+
+class _Late(Actuator):
+    def __init__(self, nothing: Commands, decisions: int) -> None:
+        self._nothing = nothing
+        self._decisions = decisions
+
+    def reset(self, seed: int) -> None:
+        del seed
+        self._under_way: deque[Commands] = deque([self._nothing] * self._decisions)
+
+    def send(self, commands: Commands) -> Commands:
+        self._under_way.append(commands)
+        return self._under_way.popleft()
+
+    @property
+    def under_way(self) -> Sequence[Commands]:
+        return self._under_way
+
+
+@dataclass(frozen=True)
+class LostCommands(ControllerEffect):
+    """A command to one light is lost with this chance; the light stays as it is."""
+
+    name: ClassVar[str] = "lost_commands"
+    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    share: float
+
+    def actuator(
+        self, network: Network, timing: SignalTiming, decision_interval_s: float
+    ) -> Actuator:
+        """Make a line on which commands are lost, light by light."""
+        del network, timing, decision_interval_s
+        return _Lossy(self.share)
+
+
+class _Lossy(Actuator):
+    stage = 1
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def reset(self, seed: int) -> None:
+        self._random = numpy_generator(seed, "cabinet", LostCommands.name)
+
+    def send(self, commands: Commands) -> Commands:
+        lost = self._random.random(len(commands)) < self._share
+        return [None if gone else phase for gone, phase in zip(lost, commands, strict=True)]
+
+
+@dataclass(frozen=True)
+class PhaseOrder(ControllerEffect):
+    """Only some phases may follow a phase; a command for another one is not obeyed."""
+
+    name: ClassVar[str] = "phase_order"
+    texts: ClassVar[dict[str, Text]] = {"rule": Text("phase order", allowed=PHASE_ORDERS)}
+    rule: str
+
+    def actuator(
+        self, network: Network, timing: SignalTiming, decision_interval_s: float
+    ) -> Actuator:
+        """Make lights that keep to the order.
+
+        Raises:
+            ScenarioError: The phases of an intersection have no barrier.
+        """
+        del timing, decision_interval_s
+        return _Ordered([successors(item, self.rule) for item in network.intersections])
+
+
+class _Ordered(Actuator):
+    def __init__(self, following: Sequence[Sequence[Sequence[int]]]) -> None:
+        self._following = following
+
+    def restrict(self, mask: NDArray[np.int8], place: int, state: SignalState) -> None:
+        allowed = {state.phase, *self._following[place][state.phase]}
+        mask[[phase for phase in range(len(mask)) if phase not in allowed]] = 0
+
+
+@dataclass(frozen=True)
+class MaxGreen(ControllerEffect):
+    """No green lasts longer, in whole decisions; the next phase allowed follows by itself."""
+
+    name: ClassVar[str] = "max_green"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 10.0, 600.0)}
+    seconds: float
+
+    def actuator(
+        self, network: Network, timing: SignalTiming, decision_interval_s: float
+    ) -> Actuator:
+        """Make lights that end a green before it is too long."""
+        del network
+        return _Bounded(self.seconds, timing.clearance_s, decision_interval_s)
+
+
+class _Bounded(Actuator):
+    def __init__(self, most_green_s: float, clearance_s: float, interval_s: float) -> None:
+        self._most_green_s = most_green_s
+        self._clearance_s = clearance_s
+        self._interval_s = interval_s
+
+    def restrict(self, mask: NDArray[np.int8], place: int, state: SignalState) -> None:
+        del place
+        green_s = state.elapsed_s - self._clearance_s if state.clearing else state.elapsed_s
+        if green_s + self._interval_s > self._most_green_s + _INSTANT_S:
+            mask[state.phase] = 0
+
+
+@dataclass(frozen=True)
+class MinGreen(Effect):
+    """Every green of the signals the agents control lasts at least so many s, in whole steps."""
+
+    name: ClassVar[str] = "min_green"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 120.0)}
+    seconds: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """Set `control.min_green_s`."""
+        step = scenario.settings.step_length_s
+        changed = scenario.with_control(min_green_s=round(self.seconds / step) * step)
+        return replace(changed, applied=(*scenario.applied, str(self)))
+
+
+ACTING: tuple[type[Effect], ...] = (ExecutionDelay, LostCommands, PhaseOrder, MaxGreen, MinGreen)
+"""Effects on what becomes of commands."""
+
+
+def successors(item: Intersection, rule: str = "") -> list[list[int]]:
+    """Return for each phase of an intersection the others that may follow it, by index.
+
+    Without a rule any may follow any. ``"cyclic"``: only the next one in the list of phases. The
+    other rules are those of NEMA controllers, whose barrier separates the phases of one street from
+    those of the streets that cross it. Two phases belong to one street if they serve the same
+    approach, right turns and permitted left turns apart, or if a chain of such phases joins them.
+    On a street any phase may follow any; from one street to another one allowed are
+
+    - ``"barrier-leading"``: only into the phase of the left turns, if the other street has one;
+    - ``"barrier-lagging"``: only out of the phase of the through movements, if this one has one;
+    - ``"barrier-both"``: only out of the one into the other.
+
+    Args:
+        item: The intersection.
+        rule: One of `PHASE_ORDERS`, or "".
+
+    Raises:
+        ScenarioError: All phases belong to one street, so that there is no barrier.
+    """
+    count = len(item.phases)
+    if rule == "cyclic":
+        return [[(phase + 1) % count] for phase in range(count)]
+    if not rule:
+        return [[other for other in range(count) if other != phase] for phase in range(count)]
+    streets = _streets(item)
+    if len(set(streets)) < 2:
+        raise ScenarioError(
+            f"phase order {rule!r}: the phases of traffic light {item.id!r} have no barrier, since "
+            "they all serve the same approaches; use 'cyclic', or other phases"
+        )
+    enters, leaves = _first_phases(item, streets), _last_phases(item, streets)
+
+    def may_follow(phase: int, other: int) -> bool:
+        if streets[phase] == streets[other]:
+            return True
+        leading, lagging = other in enters, phase in leaves
+        return {
+            "barrier-leading": leading,
+            "barrier-lagging": lagging,
+            "barrier-both": leading and lagging,
+        }[rule]
+
+    return [
+        [other for other in range(count) if other != phase and may_follow(phase, other)]
+        for phase in range(count)
+    ]
+
+
+class _Served(NamedTuple):
+    """Approaches a phase serves: by through movements, and by protected left turns."""
+
+    through: frozenset[str]
+    left: frozenset[str]
+
+    @classmethod
+    def by(cls, item: Intersection, phase: str) -> _Served:
+        through = {x.from_edge for x in item.links if x.direction == "s" and phase[x.index] in "Gg"}
+        left = {x.from_edge for x in item.links if x.direction in "lLt" and phase[x.index] == "G"}
+        return cls(frozenset(through), frozenset(left))
+
+
+def _streets(item: Intersection) -> list[int]:
+    """Return the street of each phase, by number; phases with a common approach share it."""
+    served = [_Served.by(item, phase) for phase in item.phases]
+    streets = list(range(len(served)))
+    for one, other in itertools.combinations(range(len(served)), 2):
+        if (served[one].through | served[one].left) & (served[other].through | served[other].left):
+            old, new = streets[other], streets[one]
+            streets = [new if street == old else street for street in streets]
+    return streets
+
+
+def _first_phases(item: Intersection, streets: Sequence[int]) -> set[int]:
+    """Return the phases of most left turns and nothing else, or all of a street without any."""
+    return _most(
+        streets,
+        [
+            0 if served.through else len(served.left)
+            for served in (_Served.by(item, phase) for phase in item.phases)
+        ],
+    )
+
+
+def _last_phases(item: Intersection, streets: Sequence[int]) -> set[int]:
+    """Return the phases of most through movements and nothing else, or all of a street without."""
+    return _most(
+        streets,
+        [
+            0 if served.left else len(served.through)
+            for served in (_Served.by(item, phase) for phase in item.phases)
+        ],
+    )
+
+
+def _most(streets: Sequence[int], counts: Sequence[int]) -> set[int]:
+    """Return the phases that have the highest count on their street."""
+    best = dict.fromkeys(streets, 0)
+    for street, count in zip(streets, counts, strict=True):
+        best[street] = max(best[street], count)
+    return {
+        phase
+        for phase, (street, count) in enumerate(zip(streets, counts, strict=True))
+        if count == best[street]
+    }

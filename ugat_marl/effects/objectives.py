@@ -1,0 +1,58 @@
+"""Effects on what controllers are judged by: the reward gap.
+
+A domain with an objective has the same traffic and the same rewards. At the end of an episode its
+scores also hold the cost to the owner of the street and the measures it is made of, which no
+training ever sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ugat_marl.effects.base import ControllerEffect, Text
+from ugat_marl.effects.controllers import Cost
+
+OBJECTIVES: dict[str, dict[str, float]] = {
+    "efficiency": {"queue": 1.0, "delay": 1.0},
+    "emissions": {"queue": 0.5, "co2_g": 2.0},
+    "fairness": {"queue": 0.5, "delay_gini": 2.0},
+    "safety": {"queue": 0.5, "hard_brakings": 5.0, "collisions": 5.0},
+    "person-delay": {"person_delay_s": 1.0},
+}
+"""Weights of measures by the name of the objective. Those of queue, emissions, fairness and safety
+are Sim2Signal's (Al Rafi et al. 2026)."""
+
+NORMS: dict[str, float] = {
+    "queue": 10.0,
+    "delay": 1.0,
+    "co2_g": 300.0,
+    "delay_gini": 0.5,
+    "person_delay_s": 60.0,
+    "hard_brakings": 10.0,
+    "collisions": 1.0,
+}
+"""Value of each measure that counts as 1 in a cost: round numbers of their size in the shipped
+scenarios."""
+
+
+@dataclass(frozen=True)
+class Objective(ControllerEffect):
+    """The street's owner wants something: emissions, fairness, safety or person delay count."""
+
+    name: ClassVar[str] = "objective"
+    texts: ClassVar[dict[str, Text]] = {"wanted": Text("objective", allowed=tuple(OBJECTIVES))}
+    wanted: str
+
+    def cost(self) -> Cost:
+        """Return the weighted sum of measures, each divided by its norm."""
+        return self._weighted_sum  # a method, so that an environment can be pickled
+
+    def _weighted_sum(self, measures: Mapping[str, float]) -> float:
+        weights = OBJECTIVES[self.wanted]
+        return sum(weight * measures[name] / NORMS[name] for name, weight in weights.items())
+
+
+JUDGING: tuple[type[ControllerEffect], ...] = (Objective,)
+"""Effects on what controllers are judged by."""

@@ -1,0 +1,255 @@
+"""Effects on what controllers see: the observation gap. Traffic, rewards and scores stay the same.
+
+A *count* is what a lane's detector reports: vehicles and halting vehicles on the lane, and with
+them their waiting time. Each effect makes a `Sensor` that changes counts on their way to the
+controllers.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.effects.base import ControllerEffect, Parameter
+from ugat_marl.effects.controllers import Reading, Sensor, Stage
+from ugat_marl.scenarios import Network
+from ugat_marl.seeding import numpy_generator
+
+
+def _stream(seed: int, effect: type[ControllerEffect]) -> np.random.Generator:
+    return numpy_generator(seed, "sensing", effect.name)
+
+
+@dataclass(frozen=True)
+class CountingNoise(ControllerEffect):
+    """Every count is off by a normal error of this standard deviation, as a share of the count."""
+
+    name: ClassVar[str] = "counting_noise"
+    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    share: float
+
+    def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
+        """Make detectors whose relative error is drawn for each lane and decision."""
+        del network, decision_interval_s
+        return _Noise(self.share)
+
+
+class _Noise(Sensor):
+    stage = Stage.NOISE
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def reset(self, seed: int) -> None:
+        self._random = _stream(seed, CountingNoise)
+
+    def read(self, reading: Reading) -> Reading:
+        drawn = self._random.standard_normal(reading.counts.shape[1])
+        factors = np.maximum(1.0 + self._share * drawn, 0.0)
+        return replace(reading, counts=reading.counts * factors)
+
+
+@dataclass(frozen=True)
+class CountingError(ControllerEffect):
+    """Every count is off by a normal error of so many vehicles, also on an empty lane."""
+
+    name: ClassVar[str] = "counting_error"
+    ranges: ClassVar[dict[str, Parameter]] = {"vehicles": Parameter("veh", 0.0, 100.0)}
+    vehicles: float
+
+    def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
+        """Make detectors whose absolute error is drawn for each lane and decision."""
+        del network, decision_interval_s
+        return _Error(self.vehicles)
+
+
+class _Error(Sensor):
+    stage = Stage.ERROR
+
+    def __init__(self, vehicles: float) -> None:
+        self._vehicles = vehicles
+
+    def reset(self, seed: int) -> None:
+        self._random = _stream(seed, CountingError)
+
+    def read(self, reading: Reading) -> Reading:
+        drawn = self._random.standard_normal(reading.counts.shape[1])
+        counts = reading.counts.copy()
+        counts[:2] = np.maximum(counts[:2] + self._vehicles * drawn, 0.0)
+        return replace(reading, counts=counts)
+
+
+@dataclass(frozen=True)
+class DetectorFailure(ControllerEffect):
+    """This share of all lanes, drawn for each episode, has a dead detector, which reports 0."""
+
+    name: ClassVar[str] = "detector_failure"
+    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    share: float
+
+    def sensor(self, network: Network, decision_interval_s: float) -> DeadDetectors:
+        """Make detectors some of which are dead."""
+        del decision_interval_s
+        return DeadDetectors(self.share, len(network.lane_table().ids))
+
+
+class DeadDetectors(Sensor):
+    """Detectors some of which report 0 for a whole episode.
+
+    The ones that are dead at a low share are among those that are dead at a higher one.
+
+    Args:
+        share: Chance of each lane.
+        lanes: Number of lanes.
+
+    Attributes:
+        dead: True for each lane with a dead detector in this episode, bool ``(lanes,)``.
+    """
+
+    stage = Stage.FAILURE
+
+    def __init__(self, share: float, lanes: int) -> None:
+        self._share = share
+        self._lanes = lanes
+        self.dead: NDArray[np.bool_] = np.zeros(lanes, dtype=np.bool_)
+
+    def reset(self, seed: int) -> None:
+        """Draw the dead detectors of the episode."""
+        self.dead = _stream(seed, DetectorFailure).random(self._lanes) < self._share
+        self._alive = (~self.dead).astype(np.float64)
+
+    def read(self, reading: Reading) -> Reading:
+        """Pass on the readings of the others."""
+        left = reading.mean_left
+        return replace(
+            reading,
+            counts=reading.counts * self._alive,
+            mean_left=left * self._alive if len(left) else left,
+        )
+
+
+@dataclass(frozen=True)
+class DetectionZone(ControllerEffect):
+    """Only vehicles within so many metres before a stop line are seen."""
+
+    name: ClassVar[str] = "detection_zone"
+    ranges: ClassVar[dict[str, Parameter]] = {"metres": Parameter("m", 1.0, 1000.0)}
+    metres: float
+
+    def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
+        """Make zones at the stop lines; lanes without one are not seen."""
+        del decision_interval_s
+        return _Zone(self.metres, network)
+
+
+class _Zone(Sensor):
+    stage = Stage.ZONE
+
+    def __init__(self, metres: float, network: Network) -> None:
+        self.zone_m = metres
+        incoming = {lane for item in network.intersections for lane in item.incoming_lanes}
+        self._at_stop_line = np.array(
+            [lane in incoming for lane in network.lane_table().ids], dtype=np.float64
+        )
+
+    def read(self, reading: Reading) -> Reading:
+        return replace(reading, counts=reading.near * self._at_stop_line)
+
+
+@dataclass(frozen=True)
+class ObservationDelay(ControllerEffect):
+    """Counts arrive so late, in whole decisions; the phase shown is known at once."""
+
+    name: ClassVar[str] = "observation_delay"
+    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 600.0)}
+    seconds: float
+
+    def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
+        """Make a line on which counts are under way for some decisions."""
+        del network
+        return _Late(round(self.seconds / decision_interval_s))
+
+
+class _Late(Sensor):
+    stage = Stage.DELAY
+
+    def __init__(self, decisions: int) -> None:
+        self._decisions = decisions
+
+    def reset(self, seed: int) -> None:
+        del seed
+        self._under_way: deque[NDArray[np.float64]] = deque()
+
+    def read(self, reading: Reading) -> Reading:
+        self._under_way.append(reading.counts)
+        if len(self._under_way) > self._decisions:
+            return replace(reading, counts=self._under_way.popleft())
+        return replace(reading, counts=np.zeros_like(reading.counts))
+
+
+@dataclass(frozen=True)
+class LostReadings(ControllerEffect):
+    """A lane's reading is lost with this chance at each decision; the last one is seen again."""
+
+    name: ClassVar[str] = "lost_readings"
+    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    share: float
+
+    def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
+        """Make a line on which readings are lost, lane by lane."""
+        del network, decision_interval_s
+        return _Lossy(self.share)
+
+
+class _Lossy(Sensor):
+    stage = Stage.LOSS
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def reset(self, seed: int) -> None:
+        self._random = _stream(seed, LostReadings)
+        self._last: NDArray[np.float64] | None = None
+
+    def read(self, reading: Reading) -> Reading:
+        last = np.zeros_like(reading.counts) if self._last is None else self._last
+        lost = self._random.random(reading.counts.shape[1]) < self._share
+        self._last = np.where(lost, last, reading.counts)
+        return replace(reading, counts=self._last)
+
+
+@dataclass(frozen=True)
+class QuantisedCounts(ControllerEffect):
+    """Counts are multiples of so many vehicles, rounded to the nearest."""
+
+    name: ClassVar[str] = "quantised_counts"
+    ranges: ClassVar[dict[str, Parameter]] = {"vehicles": Parameter("veh", 1.0, 100.0)}
+    vehicles: float
+
+    def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
+        """Make detectors that count in steps; halves are rounded up."""
+        del network, decision_interval_s
+        return _Steps(self.vehicles)
+
+
+class _Steps(Sensor):
+    stage = Stage.ROUNDING
+
+    def __init__(self, vehicles: float) -> None:
+        self._vehicles = vehicles
+
+    def read(self, reading: Reading) -> Reading:
+        counts = reading.counts.copy()
+        counts[:2] = np.floor(counts[:2] / self._vehicles + 0.5) * self._vehicles
+        return replace(reading, counts=counts)
+
+
+OBSERVING: tuple[type[ControllerEffect], ...] = (
+    CountingNoise, CountingError, DetectorFailure, DetectionZone, ObservationDelay, LostReadings,
+    QuantisedCounts,
+)  # fmt: skip
+"""Effects on what controllers see."""
