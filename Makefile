@@ -7,6 +7,8 @@
 #   make compat     the learners of other libraries: what runs where (LATEST=1: their newest releases)
 #   make bench      the figures of docs/, measured on this machine
 #   make scenarios  builds the shipped scenarios again from their sources
+#   make docs       builds the documentation site; broken links and names fail
+#   make words      how docstrings open, how long lines and paragraphs of pages are
 #
 # PYTHON=... picks the interpreter, TESTS=... the tests, ARGS=... adds options to the command run.
 
@@ -27,7 +29,7 @@ unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV
 export PYTHONSAFEPATH := 1
 export PYTHONNOUSERSITE := 1
 
-.PHONY: help demo test test-all check static format lint types architecture bench scenarios oldest compat python environment environment-dev
+.PHONY: help demo test test-all check static format lint types architecture words docs bench scenarios oldest compat python environment environment-dev
 .DEFAULT_GOAL := help
 
 help:
@@ -68,6 +70,12 @@ bench: environment-dev
 
 scenarios: environment
 	PYTHONSAFEPATH= $(BIN)/python scenarios/build.py $(ARGS)
+
+words: python
+	@"$(PYTHON)" .ci/words.py
+
+docs: python
+	@"$(PYTHON)" .ci/site.py
 
 # The lower ends of the version ranges, in an environment of their own.
 oldest: environment-dev

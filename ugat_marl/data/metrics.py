@@ -30,8 +30,7 @@ class Scores:
         due: Vehicles scheduled to depart before the end.
         departed: Vehicles that entered the network.
         backlog: Vehicles due at the end that never entered.
-        hidden: What only a domain with an objective measures; see
-        `ugat_marl.envs.objectives.HIDDEN`.
+        hidden: Measures of a domain with an objective; see `ugat_marl.envs.HIDDEN`.
     """
 
     att_s: float

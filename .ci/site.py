@@ -1,0 +1,124 @@
+"""Build the documentation site from the pages of the repository, strictly.
+
+Run by `make docs`: ``python .ci/site.py``. The pages are staged in ``.cache/site/pages`` in the same
+tree as in the repository, so that a link that works on a code host works in the site too. A page of
+reference is written for each room, with all that its ``__init__.pyi`` exports. Broken links and
+names that cannot be resolved fail the build.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = ROOT / ".cache" / "site" / "pages"
+VENV = ROOT / ".venv-docs"
+CONSTRAINTS = ROOT / "constraints-docs.txt"
+PACKAGE = ROOT / "ugat_marl"
+SOURCES = (
+    "*.md",
+    "LICENSE",
+    "CITATION.cff",
+    "constraints*.txt",
+    "docs/**/*",
+    "results/**/*",
+    "scenarios/**/*",
+    "baselines/*",
+    ".ci/run",
+)
+
+
+def stage() -> None:
+    """Copy the pages and what they link to, and write the pages of reference."""
+    shutil.rmtree(PAGES, ignore_errors=True)
+    for pattern in SOURCES:
+        for path in sorted(ROOT.glob(pattern)):
+            if path.is_file() and "__pycache__" not in path.parts:
+                target = PAGES / path.relative_to(ROOT)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, target)
+    folder = PAGES / "docs" / "reference" / "python"
+    folder.mkdir(parents=True)
+    (folder / "ugat_marl.md").write_text(reference("ugat_marl", PACKAGE / "__init__.pyi"))
+    for stub in sorted(PACKAGE.glob("*/__init__.pyi")):
+        name = stub.parent.name
+        (folder / f"{name}.md").write_text(reference(f"ugat_marl.{name}", stub))
+
+
+def reference(module: str, stub: Path) -> str:
+    """Return the page of a module: its docstring, then every name that its stub exports."""
+    docstring = ast.get_docstring(ast.parse(stub.with_suffix(".py").read_text())) or ""
+    title = f"# `{module}`\n\n{re.sub(r'``', '`', docstring)}\n"
+    homes = [(home(f"{module}.{source}", name), name) for source, name in exports(stub)]
+    blocks = [f"\n::: {place}.{name}\n" for place, name in homes if not unpacked(place, name)]
+    values = [f"`{name}`" for place, name in homes if unpacked(place, name)]
+    more = f"\nValues: {', '.join(values)}.\n" if values else ""
+    return title + "".join(blocks) + more
+
+
+def exports(stub: Path) -> list[tuple[str, str]]:
+    """Return the modules and names that a stub exports, classes before functions before values."""
+    found = [
+        (node.module or "", alias.name)
+        for node in ast.parse(stub.read_text()).body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if node.module  # a submodule as a whole has names of its own
+    ]
+    return sorted(set(found), key=lambda pair: (not pair[1][:1].isupper(), pair[1].lower()))
+
+
+def unpacked(module: str, name: str) -> bool:
+    """Return whether a name comes from the unpacking of a tuple, which griffe does not follow."""
+    file = ROOT.joinpath(*module.split(".")).with_suffix(".py")
+    return any(
+        isinstance(target, ast.Tuple) and name in {ast.unparse(item) for item in target.elts}
+        for node in ast.parse(file.read_text()).body
+        if isinstance(node, ast.Assign)
+        for target in node.targets
+    )
+
+
+def home(module: str, name: str) -> str:
+    """Return the module that defines a name, followed over imports and stubs."""
+    folder = ROOT.joinpath(*module.split("."))
+    file = folder / "__init__.pyi" if folder.is_dir() else folder.with_suffix(".py")
+    for node in ast.parse(file.read_text()).body:
+        if isinstance(node, ast.ImportFrom) and node.module:
+            if name in {alias.asname or alias.name for alias in node.names}:
+                return home(f"{module}.{node.module}" if node.level else node.module, name)
+    return module
+
+
+def environment() -> Path:
+    """Return the interpreter of an environment with MkDocs, made where there is none."""
+    python = VENV / "bin" / "python"
+    if not python.exists():
+        venv.create(VENV, with_pip=True, clear=True)
+    install = [str(python), "-m", "pip", "install", "-q", "--disable-pip-version-check"]
+    wanted = ["mkdocs-material", "mkdocstrings-python", "ruff"]
+    subprocess.run([*install, "-c", str(CONSTRAINTS), *wanted], check=True)
+    return python
+
+
+def main() -> int:
+    """Stage, build, and return MkDocs' exit code."""
+    python = environment()
+    stage()
+    build = [str(python), "-m", "mkdocs", "build", "--strict", "-q"]
+    variables = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(build, cwd=ROOT, env=variables, check=False)
+    if done.returncode == 0:
+        print("the site is in .cache/site/html/README.html")
+    return done.returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())
