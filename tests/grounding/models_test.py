@@ -13,7 +13,6 @@ from ugat_marl.grounding import METHODS, InverseConfig, InverseModel, Stack, sta
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.scaling import FARTHEST, Standardiser
 from ugat_marl.grounding.uncertainty import Method, MethodName
-from ugat_marl.policies.batched import pad
 from ugat_marl.seeding import torch_generator
 
 # One has the widest observation, another the most phases, a third the most features.
@@ -35,7 +34,10 @@ def drawn(layout: AgentLayout, seed: int) -> tuple[torch.Tensor, torch.Tensor, t
 def stacked() -> tuple[Stack, torch.Tensor, torch.Tensor, torch.Tensor]:
     stack = Stack(LAYOUTS)
     rows = [drawn(layout, i) for i, layout in enumerate(LAYOUTS.values())]
-    here, there = (pad([row[k] for row in rows], stack.width) for k in (0, 1))
+    here, there = (
+        torch.stack([nn.functional.pad(row[k], (0, stack.width - row[k].shape[1])) for row in rows])
+        for k in (0, 1)
+    )
     return stack, here, there, torch.stack([row[2] for row in rows])
 
 

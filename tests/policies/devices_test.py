@@ -50,7 +50,7 @@ from ugat_marl.grounding.transform import Transform
 from ugat_marl.policies import CPU, DQN, NetworkPolicy, device_of, placed, require_device_name
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.replay import Batch
-from ugat_marl.policies.learners.structure import Junction, Structure
+from ugat_marl.policies.networks.structure import Junction, Structure
 
 THERE = torch.device("meta")
 """The one device beside the CPU that every torch knows; its tensors hold nothing, ours do."""

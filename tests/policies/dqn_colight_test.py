@@ -20,9 +20,9 @@ from ugat_marl.envs.wrappers import frame_stack
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.grounding import neighbours_of
 from ugat_marl.policies import DQN, NetworkPolicy, export_policy
-from ugat_marl.policies.learners.colight import HEAD_SIZE, HEADS, CoLight
 from ugat_marl.policies.learners.dqn import DQNConfig
-from ugat_marl.policies.learners.structure import MOST_NEIGHBOURS, Structure, _neighbours
+from ugat_marl.policies.networks.colight import HEAD_SIZE, HEADS, CoLight
+from ugat_marl.policies.networks.structure import MOST_NEIGHBOURS, Structure, _neighbours
 from ugat_marl.scenarios import Intersection, Network
 from ugat_marl.testing import ToyTraffic
 

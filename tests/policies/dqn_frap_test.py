@@ -19,8 +19,8 @@ from ugat_marl.envs.wrappers import frame_stack
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.policies import DQN, NetworkPolicy, export_policy, learner_factory
 from ugat_marl.policies.learners.dqn import DQNConfig
-from ugat_marl.policies.learners.frap import FRAP
-from ugat_marl.policies.learners.structure import Junction, Structure, _junction
+from ugat_marl.policies.networks.frap import FRAP
+from ugat_marl.policies.networks.structure import Junction, Structure, _junction
 from ugat_marl.scenarios import Intersection, Link
 from ugat_marl.testing import ToyTraffic
 

@@ -17,8 +17,8 @@ from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError
 from ugat_marl.policies import DQN, BatchedMLP, NetworkPolicy, Policy
 from ugat_marl.policies.learners.dqn import DQNConfig
-from ugat_marl.policies.learners.q_network import q_network
-from ugat_marl.policies.learners.shared_mlp import SharedMLP
+from ugat_marl.policies.networks.batched import SharedMLP
+from ugat_marl.policies.networks.q_network import q_network
 from ugat_marl.testing import ToyTraffic
 
 QUICK = DQNConfig(

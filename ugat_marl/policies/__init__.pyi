@@ -1,7 +1,3 @@
-from .batched import BatchedLinear as BatchedLinear
-from .batched import BatchedMLP as BatchedMLP
-from .batched import mask_of as mask_of
-from .batched import one_thread as one_thread
 from .devices import CPU as CPU
 from .devices import device_of as device_of
 from .devices import placed as placed
@@ -10,9 +6,6 @@ from .export import NumpyPolicy as NumpyPolicy
 from .export import export_policy as export_policy
 from .learners.dqn import DQN as DQN
 from .learners.dqn_config import DQNConfig as DQNConfig
-from .learners.q_network import SharedMLP as SharedMLP
-from .learners.q_network import flatten_parameters as flatten_parameters
-from .learners.q_network import reading_unscaled as reading_unscaled
 from .learners.registry import BASELINES as BASELINES
 from .learners.registry import DQN_NAME as DQN_NAME
 from .learners.registry import LearnerFactory as LearnerFactory
@@ -36,6 +29,13 @@ from .learners.third_party import roll_out_length as roll_out_length
 from .learners.third_party import seed_generators as seed_generators
 from .network_policy import NetworkPolicy as NetworkPolicy
 from .network_policy import header as header
+from .networks.batched import BatchedLinear as BatchedLinear
+from .networks.batched import BatchedMLP as BatchedMLP
+from .networks.batched import SharedMLP as SharedMLP
+from .networks.batched import mask_of as mask_of
+from .networks.batched import one_thread as one_thread
+from .networks.q_network import flatten_parameters as flatten_parameters
+from .networks.q_network import reading_unscaled as reading_unscaled
 from .protocols import EpisodeCallback as EpisodeCallback
 from .protocols import Learner as Learner
 from .protocols import Policy as Policy

@@ -16,8 +16,8 @@ from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import Actions, AgentSet, Infos, Observations
 from ugat_marl.errors import CheckpointError
 from ugat_marl.policies.devices import CPU
-from ugat_marl.policies.learners.q_network import Held, greedy_actions, q_network
-from ugat_marl.policies.learners.structure import Structure, structure_in
+from ugat_marl.policies.networks.q_network import Held, greedy_actions, q_network
+from ugat_marl.policies.networks.structure import Structure, structure_in
 
 _KIND = "ugat_marl.network_policy"
 

@@ -20,21 +20,21 @@ from torch import Tensor, nn
 from ugat_marl.data import read_checkpoint, tensors_like, write_checkpoint
 from ugat_marl.envs import AgentSet, AnyParallelEnv
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
-from ugat_marl.policies.batched import one_thread
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
 from ugat_marl.policies.learners.exploration import StickyExploration
-from ugat_marl.policies.learners.q_network import (
+from ugat_marl.policies.learners.replay import Replay
+from ugat_marl.policies.learners.scaling import ceilings, input_factors
+from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
+from ugat_marl.policies.networks.batched import one_thread
+from ugat_marl.policies.networks.q_network import (
     Acting,
     flatten_parameters,
     greedy_actions,
     q_network,
     reading_unscaled,
 )
-from ugat_marl.policies.learners.replay import Replay
-from ugat_marl.policies.learners.scaling import ceilings, input_factors
-from ugat_marl.policies.learners.structure import Structure, structure_in
-from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
+from ugat_marl.policies.networks.structure import Structure, structure_in
 from ugat_marl.policies.protocols import EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 

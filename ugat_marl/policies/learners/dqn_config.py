@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from ugat_marl.errors import OptionError
-
-NetworkName = Literal["mlp", "frap", "colight"]
+from ugat_marl.policies.networks.structure import NetworkName
 
 CEILING_DECISIONS = 1_000
 """How far back a ceiling looks: long enough for a quantile, too short for early exploration."""

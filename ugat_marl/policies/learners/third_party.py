@@ -27,9 +27,9 @@ from torch import Tensor, nn
 from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import AgentSet, AnyParallelEnv, Begun, Stepped
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
-from ugat_marl.policies.batched import one_thread
 from ugat_marl.policies.learners.scaling import InputScale, RewardScale, places
 from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
+from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.policies.protocols import EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator
 

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.envs import AgentSet
-from ugat_marl.policies.batched import BatchedMLP
 from ugat_marl.policies.devices import CPU
-from ugat_marl.policies.learners.colight import CoLight
-from ugat_marl.policies.learners.frap import FRAP
-from ugat_marl.policies.learners.shared_mlp import SharedMLP
-from ugat_marl.policies.learners.structure import Structure
+from ugat_marl.policies.networks.batched import BatchedMLP, SharedMLP
+from ugat_marl.policies.networks.colight import CoLight
+from ugat_marl.policies.networks.frap import FRAP
+from ugat_marl.policies.networks.structure import Structure
 
 
 def q_network(

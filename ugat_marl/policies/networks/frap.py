@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.envs import AgentSet
-from ugat_marl.policies.batched import BatchedLinear, BatchedMLP, mask_of
-from ugat_marl.policies.learners.structure import Junction
+from ugat_marl.policies.networks.batched import BatchedLinear, BatchedMLP, mask_of
+from ugat_marl.policies.networks.structure import Junction
 
 
 class FRAP(nn.Module):

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.envs import AgentSet
-from ugat_marl.policies.batched import BatchedLinear, mask_of
-from ugat_marl.policies.learners.shared_mlp import SharedMLP
+from ugat_marl.policies.networks.batched import BatchedLinear, SharedMLP, mask_of
 
 HEADS = 5
 """Heads of attention, the number Wei et al. found best."""

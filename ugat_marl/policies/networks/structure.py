@@ -9,15 +9,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.envs import AgentSet, AnyParallelEnv
 from ugat_marl.errors import OptionError
-from ugat_marl.policies.learners.dqn_config import NetworkName
 from ugat_marl.scenarios import GREEN, Intersection, Link, Network, turn_of
+
+NetworkName = Literal["mlp", "frap", "colight"]
+"""Networks a policy may have; `q_network` builds them."""
 
 MOST_NEIGHBOURS = 5
 """Intersections that one attends to beside itself, where more are a road away."""
