@@ -15,7 +15,7 @@ from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import Curve, Training
 from ugat_marl.experiments.learning_curves import made_now
 from ugat_marl.policies import BASELINES
-from ugat_marl.policies.learners.registry import baselines_folder
+from ugat_marl.policies.learners.catalogue import baselines_folder
 from ugat_marl.progress import Silent
 
 FILE = baselines_folder() / "results.py"

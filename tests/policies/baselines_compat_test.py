@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from ugat_marl.policies import BASELINES
-from ugat_marl.policies.learners.registry import baselines_folder
+from ugat_marl.policies.learners.catalogue import baselines_folder
 
 FILE = baselines_folder() / "compat.py"
 if not FILE.is_file():

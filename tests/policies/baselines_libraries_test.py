@@ -29,7 +29,7 @@ from ugat_marl.policies import (
     learner_factory,
     load_baseline,
 )
-from ugat_marl.policies.learners.registry import baselines_folder
+from ugat_marl.policies.learners.catalogue import baselines_folder
 from ugat_marl.testing import ToyTraffic, check_policy, failures
 
 if not baselines_folder().is_dir():

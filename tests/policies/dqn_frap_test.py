@@ -229,11 +229,6 @@ def test_impossible_settings_are_named(settings: dict[str, Any], told: str):
         DQNConfig(**settings)
 
 
-def test_runs_from_before_the_option_have_the_identity_they_had():
-    assert "network" not in DQNConfig().identity
-    assert DQNConfig(network="frap").identity["network"] == "frap"
-
-
 # --- what it learns, and how it is kept --------------------------------------------------------
 
 

@@ -245,18 +245,3 @@ def test_a_policy_file_whose_kind_and_parameters_disagree_is_refused(tmp_path: P
         torch.save(content, path)
         with pytest.raises(CheckpointError, match=r"policy\.pt: not a whole policy"):
             NetworkPolicy.load(path)
-
-
-def test_policies_and_checkpoints_from_before_the_option_are_independent(tmp_path: Path):
-    learner = DQN(agents_of(2), DQNConfig(hidden=(8,)), seed=4)
-    learner.save(tmp_path / "dqn.pt")
-    learner.policy().save(tmp_path / "policy.pt")
-    for name in ("dqn.pt", "policy.pt"):
-        content = torch.load(tmp_path / name, weights_only=True)
-        assert content.pop("shared") is False
-        torch.save(content, tmp_path / name)
-    other = DQN(agents_of(2), DQNConfig(hidden=(8,)), seed=5)
-    other.load(tmp_path / "dqn.pt")
-    for policy in (other.policy(), NetworkPolicy.load(tmp_path / "policy.pt")):
-        assert not policy.shared
-        assert np.array_equal(policy.parameters, learner.policy().parameters)

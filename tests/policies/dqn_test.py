@@ -19,8 +19,7 @@ from pettingzoo import ParallelEnv
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies import DQN, Learner, NetworkPolicy, Policy
-from ugat_marl.policies.learners.dqn import DQNConfig
-from ugat_marl.policies.learners.exploration import StickyExploration
+from ugat_marl.policies.learners.dqn import DQNConfig, StickyExploration
 from ugat_marl.policies.learners.replay import Replay
 
 QUICK = DQNConfig(

@@ -399,7 +399,7 @@ def _other_env(
 def _identity(
     config: TransferConfig, scenario: Scenario, env: TrafficEnv, controls: Sequence[Control]
 ) -> dict[str, Any]:
-    settings = {**asdict(config), "dqn": config.dqn.identity, "ugat": config.ugat.identity}
+    settings = {**asdict(config), "ugat": config.ugat.identity}
     for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", "device", "corrected", *ADDED):
         settings.pop(other)
     if config.placebo == "none":  # runs from before there were any can be resumed

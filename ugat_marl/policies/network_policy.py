@@ -173,7 +173,7 @@ def parse_header(
     if {len(agents)} != {len(each) for each in sizes} or min(*sizes[0], *sizes[1], *hidden) < 1:
         raise ValueError("its agents or the sizes of its layers are no network's")
     options = cast(dict[str, Any], json.loads(content["env_options"]))
-    shared = content.get("shared", False)  # older files do not have it
+    shared = content["shared"]
     if not isinstance(shared, bool):
         raise TypeError(f"shared = {shared!r} is not a bool")
     return agents, hidden, options, shared

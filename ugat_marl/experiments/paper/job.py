@@ -81,7 +81,7 @@ class Job:
     @property
     def identity(self) -> dict[str, Any]:
         """What decides the policy: a job with the same is the same job."""
-        settings = {**asdict(self), "dqn": self.dqn.identity}
+        settings = asdict(self)
         settings["ugat"] = None if self.ugat is None else self.ugat.identity
         for other in ("domains", "evaluation_seeds", "scenario", "device"):
             settings.pop(other)

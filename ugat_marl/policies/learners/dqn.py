@@ -1,12 +1,13 @@
 """Deep Q-learning for all intersections at once: a network for each, or one that they share.
 
 Mnih et al. 2015 with double Q-learning (van Hasselt et al. 2016), a softly updated target network
-and exploration that persists. It is the learner of the UGAT paper, made stronger: with a weak one,
-under-training passes for a gap between domains.
+and exploration in bouts. It is the learner of the UGAT paper, made stronger: with a weak learner,
+under-training looks like a gap between domains.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,17 +19,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.data import read_checkpoint, tensors_like, write_checkpoint
-from ugat_marl.envs import AgentSet, AnyParallelEnv
+from ugat_marl.envs import AgentSet, AnyParallelEnv, Mask
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
-from ugat_marl.policies.learners.exploration import StickyExploration
 from ugat_marl.policies.learners.replay import Replay
 from ugat_marl.policies.learners.scaling import ceilings, input_factors
 from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
 from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.policies.networks.q_network import (
-    Acting,
     flatten_parameters,
     greedy_actions,
     q_network,
@@ -42,7 +41,7 @@ _KIND = "ugat_marl.dqn"
 _COUNTERS = ("episodes", "decisions", "updates")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 _SCALED = ("mlp", "colight")
-"""Networks whose first layer reads observations, and so can take over what they are scaled by."""
+"""Networks whose first layer reads observations and can take the factors of a scale over."""
 
 
 @dataclass
@@ -56,20 +55,97 @@ class _Tally:
     updates: int = 0
 
 
-class DQN:
-    """Learns one Q-network per agent of a parallel environment, or one for all of them.
+class StickyExploration:
+    """Mix bouts of one exploratory action into greedy actions, independently for every agent.
 
-    Works for any `ParallelEnv` with Box vectors and Discrete actions in which all agents stay to
+    A green of 10 s tells little about a phase: most of it is yellow, all-red and starting up. The
+    worth of a phase shows when it is held, so an agent repeats its exploratory action.
+
+    A bout lasts 1 to `longest` decisions (uniform). Bouts begin at a rate that makes `epsilon` the
+    long-run share of *decisions* that are exploratory, for every length of the bouts.
+
+    Args:
+        agents: Number of agents.
+        longest: Longest bout, in decisions; 1 is plain epsilon-greedy.
+        generator: Source of every random choice.
+    """
+
+    def __init__(self, agents: int, longest: int, generator: np.random.Generator) -> None:
+        self._longest = longest
+        self._generator = generator
+        self._action = np.zeros(agents, dtype=np.int64)
+        self._left = np.zeros(agents, dtype=np.int64)
+
+    def choose(self, greedy: NDArray[np.int64], allowed: Mask, epsilon: float) -> NDArray[np.int64]:
+        """Replace some greedy actions by exploratory ones.
+
+        Args:
+            greedy: Greedy action of every agent, ``(agents,)``.
+            allowed: Allowed actions, ``(agents, actions)``.
+            epsilon: Share of exploratory decisions, 0 to 1.
+
+        Returns:
+            The action of every agent; always an allowed one.
+        """
+        agents, actions = allowed.shape
+        mean_length = (1 + self._longest) / 2
+        rate = epsilon / (epsilon + mean_length * (1 - epsilon))
+        begins = (self._left == 0) & (self._generator.random(agents) < rate)
+        drawn = np.where(allowed, self._generator.random((agents, actions)), -1.0).argmax(axis=1)
+        length = self._generator.integers(1, self._longest + 1, agents)
+        self._action = np.where(begins, drawn, self._action)
+        self._left = np.where(begins, length, self._left)
+        # a bout ends early when the environment no longer allows its action
+        self._left *= allowed[np.arange(agents), self._action]
+        chosen = np.where(self._left > 0, self._action, greedy)
+        self._left = np.maximum(self._left - 1, 0)
+        return chosen
+
+
+class Acting:
+    """Networks that choose the actions of a training, always on the CPU.
+
+    Where the learning networks are on the CPU, they choose as well. Where they are on a GPU, a copy
+    chooses, which takes over the weights once they have changed.
+
+    Args:
+        online: The learning networks.
+        weights: Their parameters, as `flatten_parameters` returned them.
+    """
+
+    def __init__(self, online: nn.Module, weights: nn.Parameter) -> None:
+        self._network, self._weights, self._online_weights = online, weights, weights
+        self._updates = -1
+        if weights.device != CPU:
+            self._network = copy.deepcopy(online).to(CPU)
+            self._weights = flatten_parameters(self._network)
+
+    def network(self, updates: int) -> nn.Module:
+        """Return the networks after `updates` updates."""
+        if self._weights is not self._online_weights and self._updates != updates:
+            self._weights.data.copy_(self._online_weights.data)
+            self._updates = updates
+        return self._network
+
+    def forget(self) -> None:
+        """Copy the weights at the next call, whatever the number of updates."""
+        self._updates = -1
+
+
+class DQN:
+    """Learn one Q-network per agent of a parallel environment, or one for all of them.
+
+    It works for any `ParallelEnv` with Box vectors and Discrete actions in which all agents stay to
     the end; spaces may differ between agents. Episodes that end by truncation are bootstrapped
-    through; a terminated agent's future counts as zero reward.
+    through. The future of a terminated agent counts as zero reward.
 
     Args:
         agents: Names and sizes of the agents; `DQN.of(env)` reads them from an environment.
         config: Settings.
         seed: Seed of the initial weights.
         env_options: Options of the environment the learned policy relies on.
-        structure: What a network other than "mlp" knows of the intersections; `DQN.of` reads it.
-        device: Where updates are computed; actions are chosen, and transitions kept, on the CPU.
+        structure: Movements or neighbours for a network other than "mlp"; `DQN.of` reads them.
+        device: Device of the updates; actions are chosen, and transitions kept, on the CPU.
 
     Raises:
         OptionError: The network of `config` is not that of `structure`.
@@ -122,7 +198,7 @@ class DQN:
         env_options: Mapping[str, Any] | None = None,
         device: torch.device = CPU,
     ) -> DQN:
-        """A learner for the agents of `env`; its options come along if it declares them.
+        """Make a learner for the agents of `env`; take its options over if it declares them.
 
         Raises:
             OptionError: `env` has a space this learner cannot use, or no road network where the
@@ -141,7 +217,7 @@ class DQN:
         seed: int,
         on_episode: EpisodeCallback | None = None,
     ) -> NetworkPolicy:
-        """Trains for `episodes` more episodes; goes on from where it was.
+        """Train for `episodes` more episodes; continue where the last call ended.
 
         Every random choice depends on `seed` and the number of episodes so far only, so that one
         call for four episodes equals two calls for two.
@@ -173,11 +249,11 @@ class DQN:
         return self.policy()
 
     def policy(self) -> NetworkPolicy:
-        """The current greedy policy; later learning does not change it.
+        """Return the current greedy policy; later learning does not change it.
 
-        It acts by the target networks, the running mean of the learned ones, whose greedy actions
-        swing from episode to episode (measured on Hangzhou after 20 to 60 episodes, one seed: 6 to
-        26 s of mean travel time worse).
+        The policy acts by the target networks, the running mean of the learned ones. Greedy actions
+        of the learned networks swing from episode to episode: on Hangzhou, after 20 to 60 episodes
+        with one seed, their mean travel time was 6 to 26 s worse.
         """
         hidden, shared = self.config.hidden, self.config.shared
         weights, options = self._target_weights, self.env_options
@@ -218,11 +294,9 @@ class DQN:
             tally.reward += float(reward.mean())
             if self._is_time_to_update():
                 loss, q = self._update(sampling)
-                tally.loss, tally.q, tally.updates = (
-                    tally.loss + loss,
-                    tally.q + q,
-                    tally.updates + 1,
-                )
+                tally.loss += loss
+                tally.q += q
+                tally.updates += 1
         self.episodes += 1
         updates = max(1, tally.updates)
         return {
@@ -245,7 +319,7 @@ class DQN:
         return self.config.shared or self.config.network != "mlp"
 
     def _measure(self) -> None:
-        """Scales rewards and observations by those of the decisions so far."""
+        """Set the scales of rewards and observations by those of the decisions so far."""
         config = self.config
         if config.scale_inputs and config.network in _SCALED:
             seen = self._replay.observations()
@@ -258,10 +332,11 @@ class DQN:
         self._centre, self._scale = mean.to(self.device), scale.to(self.device)
 
     def _update(self, generator: torch.Generator) -> tuple[float, float]:
-        """One gradient step of all agents; returns mean loss and mean Q before it."""
+        """Make one gradient step of all agents; return mean loss and mean Q before it."""
         batch = self._replay.sample(self.config.batch_size, generator)
         batch = batch.scaled(self._inputs).to(self.device)
         with torch.no_grad():
+            # double Q-learning: the online networks choose, the target networks evaluate
             best = self._online(batch.next_observation)
             best = best.masked_fill_(~batch.next_allowed, -torch.inf).argmax(-1, keepdim=True)
             future = self._target(batch.next_observation).gather(-1, best).squeeze(-1)
@@ -301,14 +376,14 @@ class DQN:
         return reward
 
     def save(self, path: Path) -> None:
-        """Writes the whole state, from which `load` goes on to the same numbers.
+        """Write the whole state; a learner that loads it goes on to the same numbers.
 
         Raises:
             CheckpointError: The networks have diverged (NaN); a file at `path` stays as it was.
         """
-        own = self.structure
+        config = self.config
         content = {
-            **header(self.agents, self.config.hidden, self.env_options, self.config.shared, own),
+            **header(self.agents, config.hidden, self.env_options, config.shared, self.structure),
             "counters": {name: getattr(self, name) for name in _COUNTERS}
             | {"added": self._replay.added},
             "tensors": {name: x.to(CPU, copy=True) for name, x in self._tensors().items()},
@@ -320,7 +395,7 @@ class DQN:
         write_checkpoint(path, _KIND, content)
 
     def load(self, path: Path) -> None:
-        """Restores what `save` wrote; settings but those of the network remain this learner's own.
+        """Restore a saved state; all settings but those of the network remain this learner's own.
 
         Raises:
             CheckpointError: Missing, cut short, not finite, or of other agents or sizes. The
@@ -345,7 +420,7 @@ class DQN:
             moments = tensors_like(
                 path, content["adam"], self._moments() if content["adam"] else {}
             )
-            if min(counters.values()) < 0 or not self._chosen(stored["action"]):
+            if min(counters.values()) < 0 or not self._are_actions(stored["action"]):
                 raise ValueError("counters below 0, or actions that no agent has")
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a whole checkpoint ({error!r})") from None
@@ -356,7 +431,7 @@ class DQN:
             tensor.copy_(tensors[name])
         self._replay.restore(stored, counters["added"])
         self._adam.state.clear()
-        if moments:  # Adam reads them where the weights lie, side by side
+        if moments:  # Adam reads them on the device of the weights, contiguous
             placed = {name: moments[name].contiguous().to(self.device) for name in _MOMENTS}
             self._adam.state[self._weights] = placed
         self._acting.forget()
@@ -365,7 +440,7 @@ class DQN:
         weights = self._weights.data
         return dict(zip(_MOMENTS, (weights.new_zeros(()), weights, weights), strict=True))
 
-    def _chosen(self, actions: Tensor) -> bool:
+    def _are_actions(self, actions: Tensor) -> bool:
         counts = torch.tensor(self.agents.action_counts).unsqueeze(1)
         return bool(((actions >= 0) & (actions < counts)).all())
 
@@ -383,9 +458,9 @@ def _network_of(structure: Structure | None) -> str:
     return "mlp" if structure is None else structure.network
 
 
-def _require_same(path: Path, what: str, found: object, own: object) -> None:
-    if found != own:
+def _require_same(path: Path, attribute: str, saved: object, expected: object) -> None:
+    if saved != expected:
         raise CheckpointError(
-            f"{path}: its {what} are {found}, this learner's {own}; give the checkpoint of this "
-            "scenario and these settings, or train a new one"
+            f"{path}: its {attribute} are {saved}, this learner's {expected}; give the checkpoint "
+            "of this scenario and these settings, or train a new one"
         )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, get_args
+from dataclasses import dataclass
+from typing import get_args
 
 from ugat_marl.errors import OptionError
 from ugat_marl.policies.networks.structure import NetworkName
@@ -109,16 +109,6 @@ class DQNConfig:
             self.warmup_decisions <= self.replay_capacity,
             f"at most replay_capacity ({self.replay_capacity})",
         )
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """The settings by which trainings are told apart; later ones only if they are used."""
-        settings = asdict(self)
-        if self.network == "mlp":  # runs from before there were others can be resumed
-            settings.pop("network")
-        if self.ceiling is None:
-            settings.pop("ceiling")
-        return settings
 
     def _require_network(self) -> None:
         known = get_args(NetworkName)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.envs import AgentSet
-from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.networks.batched import BatchedMLP, SharedMLP
 from ugat_marl.policies.networks.colight import CoLight
 from ugat_marl.policies.networks.frap import FRAP
@@ -91,33 +89,3 @@ def reading_unscaled(network: nn.Module, factors: Tensor) -> Tensor:
     first = next(name for name, _ in named if name.endswith("weight"))  # (..., n_in, n_out)
     factor = factors.unsqueeze(-1)
     return nn.utils.parameters_to_vector(p * factor if name == first else p for name, p in named)
-
-
-class Acting:
-    """The networks that choose actions in training, on the CPU wherever others learn.
-
-    On the CPU they are the learning ones themselves; elsewhere copies, brought up to date when
-    weights have changed since they were last asked for.
-
-    Args:
-        online: The networks that learn.
-        weights: Their parameters, as `flatten_parameters` left them.
-    """
-
-    def __init__(self, online: nn.Module, weights: nn.Parameter) -> None:
-        self._network, self._weights, self._learnt = online, weights, weights
-        self._updates = -1
-        if weights.device != CPU:
-            self._network = copy.deepcopy(online).to(CPU)
-            self._weights = flatten_parameters(self._network)
-
-    def network(self, updates: int) -> nn.Module:
-        """The networks after so many updates."""
-        if self._weights is not self._learnt and self._updates != updates:
-            self._weights.data.copy_(self._learnt.data)
-            self._updates = updates
-        return self._network
-
-    def forget(self) -> None:
-        """Weights were put in place otherwise than by an update."""
-        self._updates = -1

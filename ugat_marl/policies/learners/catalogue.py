@@ -1,7 +1,8 @@
-"""Learners by name: the suite's own DQN, and the files of baselines/, loaded when they are used.
+"""Every learner by name: the suite's own DQN, and those in the files of baselines/.
 
-A baseline is a file that offers a learner, called as ``Learner(env, config, seed)``, and a
-dataclass of its settings. Its policies are `NetworkPolicy`, which all of ``ugat-marl`` reads.
+A new learner is a file in baselines/ with a class that keeps the protocol `Learner` and is called
+as ``Learner(env, config, seed)``, a dataclass of its settings, and a row in `BASELINES`. Its
+policies are `NetworkPolicy`, which all of ``ugat-marl`` reads. A file is loaded when it is used.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ def settings_of(name: str) -> dict[str, Any]:
         OptionError: Its library is not installed.
     """
     if name == DQN_NAME:
-        return DQNConfig().identity
+        return asdict(DQNConfig())
     return asdict(_baseline_config(name, ()))
 
 

@@ -16,13 +16,13 @@ from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import TransferConfig, policy_factory, transfer
 from ugat_marl.grounding import FitConfig, UgatConfig
 from ugat_marl.policies import BASELINES, DQN, Learner, NetworkPolicy, learner_factory
-from ugat_marl.policies.learners import registry
+from ugat_marl.policies.learners import catalogue
+from ugat_marl.policies.learners.catalogue import Baseline
 from ugat_marl.policies.learners.dqn import DQNConfig
-from ugat_marl.policies.learners.registry import Baseline
 from ugat_marl.progress import Silent
 from ugat_marl.testing import ToyTraffic
 
-if not registry.baselines_folder().is_dir():
+if not catalogue.baselines_folder().is_dir():
     pytest.skip("baselines/ is neither here nor in the package", allow_module_level=True)
 
 PLAIN = """
@@ -72,8 +72,8 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "broken": Baseline("broken", "Plain", "Config"),
         "gone": Baseline("gone", "Plain", "Config"),
     }
-    monkeypatch.setattr(registry, "BASELINES", named)
-    monkeypatch.setattr(registry, "baselines_folder", lambda: tmp_path)
+    monkeypatch.setattr(catalogue, "BASELINES", named)
+    monkeypatch.setattr(catalogue, "baselines_folder", lambda: tmp_path)
     for name in named:
         monkeypatch.delitem(sys.modules, f"ugat_marl_baseline_{name}", raising=False)
     return tmp_path
@@ -131,7 +131,7 @@ def test_dqn_is_the_suites_own() -> None:
 def test_every_baseline_has_a_file_and_an_extra() -> None:
     import tomllib
 
-    folder = registry.baselines_folder()
+    folder = catalogue.baselines_folder()
     assert {f"{item.file}.py" for item in BASELINES.values()} <= {p.name for p in folder.iterdir()}
     project = Path(__file__).resolve().parents[2] / "pyproject.toml"
     extras = tomllib.loads(project.read_text())["project"]["optional-dependencies"]

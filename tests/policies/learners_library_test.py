@@ -25,8 +25,8 @@ from ugat_marl.policies import (
     roll_out_length,
     seed_generators,
 )
+from ugat_marl.policies.learners.library import policy_of
 from ugat_marl.policies.learners.scaling import LEAST, RewardScale
-from ugat_marl.policies.learners.third_party import policy_of
 from ugat_marl.seeding import derive_seed
 from ugat_marl.testing import ToyTraffic
 
