@@ -66,7 +66,7 @@ architecture: environment-dev
 	$(BIN)/python -m pytest -q tests/architecture_test.py
 
 bench: environment-dev
-	$(BIN)/ugat-marl bench all $(ARGS)
+	PYTHONPATH=. PYTHONSAFEPATH= $(BIN)/python -m studies.bench all $(ARGS)
 
 scenarios: environment
 	PYTHONSAFEPATH= $(BIN)/python scenarios/build.py $(ARGS)
