@@ -9,7 +9,7 @@ import pytest
 
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
-from ugat_marl.policies import Streets
+from ugat_marl.policies import ControlledNetwork
 from ugat_marl.policies.rules.actuated import Actuated, DelayActuated
 from ugat_marl.policies.rules.green_wave import GreenWave, main_roads
 from ugat_marl.policies.rules.webster import Webster, webster_plan
@@ -24,9 +24,9 @@ FREE_FLOW_S = {"n_0": 24.0, "w_0": 12.0, "e_0": 6.0, "out_0": 24.0}
 AGENT = "signal_0"
 
 
-def streets() -> Streets:
+def streets() -> ControlledNetwork:
     item = Intersection("x", INCOMING, ("out_0",), LINKS, PHASES, (), (), (0.0, 0.0))
-    return Streets({AGENT: item}, CAPACITY, FREE_FLOW_S, 10.0, 5.0)
+    return ControlledNetwork({AGENT: item}, CAPACITY, FREE_FLOW_S, 10.0, 5.0)
 
 
 def movements(halting: Any, vehicles: Any, shown: int = 0) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def test_webster_forgets_old_counts():
     assert counted[1] == pytest.approx(0.05, rel=0.05)
 
 
-def row_of(lights: int, apart_s: float) -> Streets:
+def row_of(lights: int, apart_s: float) -> ControlledNetwork:
     """Lights in a row from west to east; side streets from the north."""
     items: dict[str, Intersection] = {}
     free_flow_s: dict[str, float] = {}
@@ -153,7 +153,7 @@ def row_of(lights: int, apart_s: float) -> Streets:
         items[f"signal_{k}"] = Intersection(
             f"x{k}", incoming, outgoing, links, phases, (), (), (0.0, 0.0)
         )
-    return Streets(items, dict.fromkeys(free_flow_s, 40.0), free_flow_s, 10.0, 5.0)
+    return ControlledNetwork(items, dict.fromkeys(free_flow_s, 40.0), free_flow_s, 10.0, 5.0)
 
 
 def test_the_main_road_runs_through_all_lights():
@@ -179,10 +179,10 @@ def test_the_green_travels_with_the_vehicles():
 
 
 def test_the_roads_of_a_grid_share_no_light():
-    grid = Streets.of(parallel_env("grid2x2-v1"))
+    grid = ControlledNetwork.of(parallel_env("grid2x2-v1"))
     roads = main_roads(grid)
     assert sorted(agent for road in roads for agent in road.agents) == sorted(grid.intersections)
     assert [len(road.agents) for road in roads] == [2, 2]
-    (arterial,) = main_roads(Streets.of(parallel_env("arterial1x5-v1")))
+    (arterial,) = main_roads(ControlledNetwork.of(parallel_env("arterial1x5-v1")))
     assert len(arterial.agents) == 5
     assert np.diff(arterial.arrival_s) == pytest.approx([20.0] * 4, abs=1.5)

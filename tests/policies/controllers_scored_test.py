@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ugat_marl.policies import Streets
-from ugat_marl.policies.rules.scored import LongestWaiting, MaxPressure, MaxPressureLoss
+from ugat_marl.policies import ControlledNetwork
+from ugat_marl.policies.rules.phase_scores import LongestWaiting, MaxPressure, MaxPressureLoss
 from ugat_marl.policies.rules.sotl import SelfOrganising
 from ugat_marl.scenarios import Intersection, Link
 
@@ -19,9 +19,11 @@ CAPACITY = {"n_0": 40.0, "w_0": 20.0, "e_0": 10.0, "out_0": 40.0}
 AGENT = "signal_0"
 
 
-def streets(clearance_s: float = 5.0) -> Streets:
+def streets(clearance_s: float = 5.0) -> ControlledNetwork:
     item = Intersection("x", INCOMING, ("out_0",), LINKS, PHASES, (), (), (0.0, 0.0))
-    return Streets({AGENT: item}, CAPACITY, dict.fromkeys(CAPACITY, 20.0), 10.0, clearance_s)
+    return ControlledNetwork(
+        {AGENT: item}, CAPACITY, dict.fromkeys(CAPACITY, 20.0), 10.0, clearance_s
+    )
 
 
 def movements(*vehicles: int, out: int = 0, shown: int = 0) -> dict[str, Any]:

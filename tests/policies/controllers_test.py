@@ -12,20 +12,20 @@ import pytest
 
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.policies import (
-    NAMES,
+    RULE_NAMES,
     RULES,
     STANDARD_RULES,
+    ControlledNetwork,
     FixedTime,
     Policy,
-    Streets,
     controller_for,
+    format_spec,
     parse_spec,
-    spell,
 )
-from ugat_marl.policies.rules.plain import ProgrammeControl, Random
-from ugat_marl.policies.rules.scored import LargestQueue, MaxPressure
-from ugat_marl.policies.rules.spelling import example_of
-from ugat_marl.policies.rules.streets import covering_phases
+from ugat_marl.policies.rules.approaches import covering_phases
+from ugat_marl.policies.rules.catalogue import example_of
+from ugat_marl.policies.rules.open_loop import ProgrammeControl, Random
+from ugat_marl.policies.rules.phase_scores import LargestQueue, MaxPressure
 from ugat_marl.scenarios import Intersection, Lane, Link, Network, SignalTiming
 
 # Two approaches. Lane n_0 goes straight (to s_0) or right (to w_0), lane n_1 left (to e_0 or e_1);
@@ -49,8 +49,8 @@ def crossing(phases: tuple[str, ...] = PHASES, links: tuple[Link, ...] = LINKS) 
     return Intersection("x", INCOMING, OUTGOING, links, phases, (), (), (0.0, 0.0))
 
 
-def streets(interval_s: float = 10.0) -> Streets:
-    return Streets({AGENT: crossing()}, CAPACITY, FREE_FLOW_S, interval_s, 5.0)
+def streets(interval_s: float = 10.0) -> ControlledNetwork:
+    return ControlledNetwork({AGENT: crossing()}, CAPACITY, FREE_FLOW_S, interval_s, 5.0)
 
 
 def env(**changes: Any) -> Any:
@@ -129,7 +129,7 @@ def test_a_phase_that_stays_best_goes_on_and_ties_do_not_switch():
 
 
 @pytest.mark.parametrize(
-    "spec", [*(name for name in NAMES if name != "programme"), "fixed-time:10"]
+    "spec", [*(name for name in RULE_NAMES if name != "programme"), "fixed-time:10"]
 )
 def test_masked_phases_are_not_chosen(spec: str):
     controller = controller_for(spec, env())
@@ -183,7 +183,7 @@ def test_random_depends_on_the_seed_only_and_is_uniform_over_the_allowed():
 
 
 def test_environment_options_say_what_each_controller_needs():
-    options = {name: dict(controller_for(name, env()).env_options) for name in NAMES}
+    options = {name: dict(controller_for(name, env()).env_options) for name in RULE_NAMES}
     movements = {"observation": "movements"}
     assert options == {
         "actuated": movements,
@@ -202,7 +202,7 @@ def test_environment_options_say_what_each_controller_needs():
     assert controller_for("programme", env()).act(observe(), ALL) == {AGENT: 0}
 
 
-@pytest.mark.parametrize("spec", [*STANDARD_RULES, *NAMES])
+@pytest.mark.parametrize("spec", [*STANDARD_RULES, *RULE_NAMES])
 def test_every_controller_is_a_policy_that_can_be_sent_to_a_worker(spec: str):
     controller = controller_for(spec, env())
     assert isinstance(controller, Policy)
@@ -242,7 +242,7 @@ def test_spellings():
         LargestQueue(streets(), -1)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", RULE_NAMES)
 def test_the_written_out_defaults_and_all_that_tuning_tries_are_spellings(name: str):
     rule = RULES[name]
     assert parse_spec(example_of(name)) == parse_spec(name)
@@ -250,12 +250,14 @@ def test_the_written_out_defaults_and_all_that_tuning_tries_are_spellings(name: 
         for value in parameter.choices:
             values = [p.default for p in rule.parameters]
             values[place] = value
-            assert parse_spec(spell(name, values)) == (name, tuple(values))
+            assert parse_spec(format_spec(name, values)) == (name, tuple(values))
 
 
 def test_several_intersections_are_held_apart():
     other = dataclasses.replace(crossing(), id="y")
-    two = Streets({AGENT: crossing(), "signal_1": other}, CAPACITY, FREE_FLOW_S, 10.0, 5.0)
+    two = ControlledNetwork(
+        {AGENT: crossing(), "signal_1": other}, CAPACITY, FREE_FLOW_S, 10.0, 5.0
+    )
     rule = LargestQueue(two, 20)
 
     def both(first: dict[str, int], second: dict[str, int]) -> Any:

@@ -15,7 +15,7 @@ from ugat_marl.effects import describe, load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import BUDGET, LEAST_BUDGET, TUNED_RULES, tune
 from ugat_marl.files import require_writable, write_whole
-from ugat_marl.policies import NAMES, RULES
+from ugat_marl.policies import RULE_NAMES, RULES
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import tuning_table
 
@@ -58,7 +58,7 @@ class Tune:
             raise OptionError(f"--rules holds one twice: {' '.join(self.rules)}")
         for name in self.rules:
             if name not in RULES:
-                raise UnknownNameError("rule", name, NAMES)
+                raise UnknownNameError("rule", name, RULE_NAMES)
         if self.budget < LEAST_BUDGET:
             raise OptionError(f"--budget {self.budget}: must be at least {LEAST_BUDGET}")
         if self.workers is not None and self.workers < 1:

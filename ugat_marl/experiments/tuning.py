@@ -24,7 +24,7 @@ from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race
 from ugat_marl.experiments.scores import Trial, Tuned
 from ugat_marl.files import user_cache, write_whole
 from ugat_marl.parallel import Workers
-from ugat_marl.policies import NAMES, RULES, spell
+from ugat_marl.policies import RULE_NAMES, RULES, format_spec
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario
 
@@ -37,7 +37,7 @@ BUDGET = 24
 LEAST_BUDGET = 2
 """One episode each of two settings."""
 
-TUNED_RULES = tuple(name for name in NAMES if name != "random")
+TUNED_RULES = tuple(name for name in RULE_NAMES if name != "random")
 """The rules a search for the best one tunes."""
 
 UNTUNED_EPISODES = 3
@@ -77,7 +77,7 @@ def tune(
         OptionError: A budget below 2.
     """
     if name not in RULES:
-        raise UnknownNameError("controller", name, NAMES)
+        raise UnknownNameError("controller", name, RULE_NAMES)
     if budget < LEAST_BUDGET:
         raise OptionError(f"budget = {budget}: must be at least {LEAST_BUDGET} episodes")
     specs = settings_of(name, budget)
@@ -168,12 +168,12 @@ def settings_of(name: str, budget: int) -> list[str]:
     """The spellings of a rule that a budget pays to race: the usual one, others spread evenly."""
     rule = RULES[name]
     values = itertools.product(*(parameter.choices for parameter in rule.parameters))
-    specs = [spell(name, list(each)) for each in values]
+    specs = [format_spec(name, list(each)) for each in values]
     many = len(specs)
     while many > 1 and sum(_fields(many)) > budget:
         many -= 1
     kept = [(2 * k + 1) * len(specs) // (2 * many) for k in range(many)]
-    usual = specs.index(spell(name, [parameter.default for parameter in rule.parameters]))
+    usual = specs.index(format_spec(name, [parameter.default for parameter in rule.parameters]))
     kept[min(range(many), key=lambda k: abs(kept[k] - usual))] = usual
     return [specs[k] for k in kept]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import OptionError
-from ugat_marl.policies import FixedTime, Streets
+from ugat_marl.policies import ControlledNetwork, FixedTime
 from ugat_marl.scenarios import Network, Segment, SignalState, SignalTiming, signals
 
 _ENDING = frozenset("yYoO")
@@ -127,7 +127,7 @@ def fixed_time(
     Its answers are by traffic light. It is a clock for all lights, so that it is the same whenever
     a light joins.
     """
-    streets = Streets(
+    streets = ControlledNetwork(
         {item.id: item for item in network.intersections},
         {name: lane.capacity for name, lane in network.lanes.items()},
         {name: lane.length_m / lane.speed_mps for name, lane in network.lanes.items()},

@@ -1,38 +1,39 @@
-"""Controllers that follow a rule: what a learned policy has to beat.
+"""Controllers that follow a rule; a learned policy has to beat them.
 
 The rules read queues and vehicles from the observation `movements` (two of them waiting times from
 `waiting`), as a detector would give them; a rule never looks into the simulator.
 """
 
 from ugat_marl.policies.rules.actuated import Actuated, DelayActuated
-from ugat_marl.policies.rules.green_wave import GreenWave
-from ugat_marl.policies.rules.plain import FixedTime, ProgrammeControl, Random
-from ugat_marl.policies.rules.scored import (
-    LargestQueue,
-    LongestWaiting,
-    MaxPressure,
-    MaxPressureLoss,
-)
-from ugat_marl.policies.rules.sotl import SelfOrganising
-from ugat_marl.policies.rules.spelling import (
-    NAMES,
+from ugat_marl.policies.rules.approaches import ControlledNetwork, covering_phases
+from ugat_marl.policies.rules.catalogue import (
+    RULE_NAMES,
     RULES,
     STANDARD_RULES,
     Parameter,
     Rule,
     controller_for,
     example_of,
+    format_spec,
     parse_spec,
-    spell,
 )
-from ugat_marl.policies.rules.streets import Streets, covering_phases
+from ugat_marl.policies.rules.green_wave import GreenWave
+from ugat_marl.policies.rules.open_loop import FixedTime, ProgrammeControl, Random
+from ugat_marl.policies.rules.phase_scores import (
+    LargestQueue,
+    LongestWaiting,
+    MaxPressure,
+    MaxPressureLoss,
+)
+from ugat_marl.policies.rules.sotl import SelfOrganising
 from ugat_marl.policies.rules.webster import Webster, webster_plan
 
 __all__ = [
-    "NAMES",
     "RULES",
+    "RULE_NAMES",
     "STANDARD_RULES",
     "Actuated",
+    "ControlledNetwork",
     "DelayActuated",
     "FixedTime",
     "GreenWave",
@@ -45,12 +46,11 @@ __all__ = [
     "Random",
     "Rule",
     "SelfOrganising",
-    "Streets",
     "Webster",
     "controller_for",
     "covering_phases",
     "example_of",
+    "format_spec",
     "parse_spec",
-    "spell",
     "webster_plan",
 ]

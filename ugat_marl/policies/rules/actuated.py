@@ -1,4 +1,4 @@
-"""Rules that follow a cycle and let each green go on while it is used."""
+"""Actuated rules: a cycle of phases, each extended while traffic uses its green."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.streets import Approach, Streets, mask_of
+from ugat_marl.policies.rules.approaches import Approach, ControlledNetwork, allowed_phases
 
 
 class _Extended:
@@ -22,21 +22,24 @@ class _Extended:
 
     env_options: Mapping[str, Any] = {"observation": "movements"}
 
-    def __init__(self, streets: Streets, longest_s: float) -> None:
-        self._approaches = streets.approaches
-        self._longest = streets.decisions(longest_s)
+    def __init__(self, network: ControlledNetwork, longest_s: float) -> None:
+        self._approaches = network.approaches
+        self._longest = network.decisions(longest_s)
         self._place: dict[str, int] = {}
         self._age: dict[str, int] = {}
 
     def reset(self, seed: int) -> None:
-        """Forgets whose turn it is."""
+        """Forget the place in the cycle."""
         self._place, self._age = {}, {}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """The phase each intersection is at in its cycle; where it is masked, an allowed one."""
+        """Return the phase that is due in each cycle; where it is masked, an allowed one."""
         return {
             agent: self._choose(
-                agent, approach, observations[agent], mask_of(infos, agent, len(approach.served))
+                agent,
+                approach,
+                observations[agent],
+                allowed_phases(infos, agent, len(approach.served)),
             )
             for agent, approach in self._approaches.items()
         }
@@ -44,7 +47,7 @@ class _Extended:
     def _demand(
         self, agent: str, approach: Approach, observation: NDArray[np.float32]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Lanes on which a green still pays, and lanes that call for one, ``(lanes,)`` each."""
+        """Return masks of the lanes that use a green, and of those that call one, ``(lanes,)``."""
         raise NotImplementedError
 
     def _choose(
@@ -79,22 +82,24 @@ class _Extended:
 
 
 class Actuated(_Extended):
-    """Gap-out control: a green goes on until a gap opens in the stream on every lane it serves.
+    """Gap-out control: extend a green until a gap opens in the stream on every lane it serves.
 
     With one count per lane in place of a loop at the stop line, the gap is the mean one: a stream
     at the speed limit with a headway of `gap_s` puts ``free-flow time / gap_s`` vehicles on a lane.
-    A lane with as many, or with anybody standing, still uses its green. Vehicles anywhere on its
-    lanes call a phase.
+    A lane with as many vehicles, or with a standing one, still uses its green. A vehicle anywhere
+    on the lanes of a phase calls it.
 
     Args:
-        streets: The network.
+        network: The controlled network.
         longest_s: Longest time from one phase to the next while another one is called (clearance
             included), rounded up to whole decisions.
         gap_s: Headway at which a green ends.
     """
 
-    def __init__(self, streets: Streets, longest_s: float = 40.0, gap_s: float = 3.0) -> None:
-        super().__init__(streets, longest_s)
+    def __init__(
+        self, network: ControlledNetwork, longest_s: float = 40.0, gap_s: float = 3.0
+    ) -> None:
+        super().__init__(network, longest_s)
         self.longest_s, self.gap_s = longest_s, gap_s
 
     def _demand(
@@ -106,7 +111,7 @@ class Actuated(_Extended):
 
 
 class DelayActuated(_Extended):
-    """Delay-based control: a green goes on until those who waited for it are moving.
+    """Delay-based control: extend a green until the vehicles that waited for it are moving.
 
     A lane uses its green while its vehicles have more than `most_waiting_s` vehicle-seconds of
     standing behind them; with more than that it also calls for one. (After Oertel and Wagner 2011,
@@ -114,7 +119,7 @@ class DelayActuated(_Extended):
     earlier.)
 
     Args:
-        streets: The network.
+        network: The controlled network.
         longest_s: Longest time from one phase to the next while another one is called (clearance
             included), rounded up to whole decisions.
         most_waiting_s: Vehicle-seconds on a lane that neither extend nor call a green.
@@ -123,9 +128,9 @@ class DelayActuated(_Extended):
     env_options: Mapping[str, Any] = {"observation": "waiting"}
 
     def __init__(
-        self, streets: Streets, longest_s: float = 40.0, most_waiting_s: float = 10.0
+        self, network: ControlledNetwork, longest_s: float = 40.0, most_waiting_s: float = 10.0
     ) -> None:
-        super().__init__(streets, longest_s)
+        super().__init__(network, longest_s)
         self.longest_s, self.most_waiting_s = longest_s, most_waiting_s
 
     def _demand(

@@ -1,4 +1,4 @@
-"""Fixed time with offsets: along a road the green travels with the vehicles."""
+"""Green waves: fixed time with offsets, so that the green travels with the vehicles."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.streets import Streets, green_indices, mask_of
+from ugat_marl.policies.rules.approaches import ControlledNetwork, allowed_phases, green_indices
 from ugat_marl.scenarios import Intersection, Link, edge_of
 
 
 @dataclass(frozen=True)
 class Road:
-    """Intersections one reaches one after the other by driving straight on.
+    """A chain of intersections, each reached from the one before by driving straight on.
 
     Attributes:
         agents: The intersections' agents, in the direction of travel.
@@ -28,17 +28,17 @@ class Road:
     lanes: int
 
 
-def main_roads(streets: Streets) -> list[Road]:
-    """Roads that share no intersection and together pass all of them.
+def main_roads(network: ControlledNetwork) -> list[Road]:
+    """Find roads that share no intersection and together pass all of them.
 
     The longest road is taken first, by number of intersections and then of lanes that lead straight
     on; between equals, and between the two directions of one road, the one that starts at the
     first agent. The intersections of a road taken end the others.
     """
-    free = dict(streets.intersections)
+    free = dict(network.intersections)
     roads: list[Road] = []
     while free:
-        found = [road for agent in free for road in _roads_from(agent, free, streets)]
+        found = [road for agent in free for road in _roads_from(agent, free, network)]
         best = max(found, key=lambda road: (len(road.agents), road.lanes))  # the first of equals
         roads.append(best)
         for agent in best.agents:
@@ -46,7 +46,9 @@ def main_roads(streets: Streets) -> list[Road]:
     return roads
 
 
-def _roads_from(agent: str, free: Mapping[str, Intersection], streets: Streets) -> Iterator[Road]:
+def _roads_from(
+    agent: str, free: Mapping[str, Intersection], network: ControlledNetwork
+) -> Iterator[Road]:
     entered = {edge_of(lane): other for other, item in free.items() for lane in item.incoming_lanes}
     for edge in dict.fromkeys(edge_of(lane) for lane in free[agent].incoming_lanes):
         agents, edges, arrival_s, lanes = [agent], [edge], [0.0], 0
@@ -59,12 +61,12 @@ def _roads_from(agent: str, free: Mapping[str, Intersection], streets: Streets) 
                 break
             agents.append(following)
             edges.append(ahead[0].to_edge)
-            arrival_s.append(arrival_s[-1] + streets.free_flow_s[ahead[0].to_lane])
+            arrival_s.append(arrival_s[-1] + network.free_flow_s[ahead[0].to_lane])
         yield Road(tuple(agents), tuple(edges), tuple(arrival_s), lanes)
 
 
 class GreenWave:
-    """Fixed time on a common cycle, each signal of a road later by the travel time to it.
+    """Fixed time on a common cycle, each signal of a road delayed by the travel time to it.
 
     The roads are `main_roads`. On a road every light has the same cycle: the phase that serves
     straight traffic in the direction of travel for `main_s`, the others of a smallest cover for
@@ -74,57 +76,57 @@ class GreenWave:
     the phases).
 
     Args:
-        streets: The network.
+        network: The controlled network.
         green_s: Time of each other phase (clearance included), rounded up to whole decisions.
         main_s: Time of the phase along the road; None for `green_s`.
     """
 
     def __init__(
-        self, streets: Streets, green_s: float = 20.0, main_s: float | None = None
+        self, network: ControlledNetwork, green_s: float = 20.0, main_s: float | None = None
     ) -> None:
         self.env_options: Mapping[str, Any] = {}
         self.green_s, self.main_s = green_s, green_s if main_s is None else main_s
-        self._phases = {a: len(item.phases) for a, item in streets.intersections.items()}
+        self._phases = {a: len(item.phases) for a, item in network.intersections.items()}
         self._turns: dict[str, list[int]] = {}
         self._offsets: dict[str, int] = {}
-        for road in main_roads(streets):
-            self._plan(road, streets)
+        for road in main_roads(network):
+            self._plan(road, network)
         self._time = 0
 
     def offsets(self) -> dict[str, int]:
-        """Agent to the decisions its cycle is behind."""
+        """Return the delay of each agent's cycle, in decisions."""
         return dict(self._offsets)
 
     def reset(self, seed: int) -> None:
-        """Starts the clocks again."""
+        """Start the clocks again."""
         self._time = 0
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """The phase whose turn it is; where it is masked, the first allowed one."""
+        """Return the phase whose turn it is; where it is masked, the first allowed one."""
         actions: Actions = {}
         for agent, phases in self._phases.items():
             turns = self._turns[agent]
             wanted = turns[(self._time - self._offsets[agent]) % len(turns)]
-            allowed = mask_of(infos, agent, phases)
+            allowed = allowed_phases(infos, agent, phases)
             actions[agent] = wanted if allowed[wanted] else int(allowed.argmax())
         self._time += 1
         return actions
 
-    def _plan(self, road: Road, streets: Streets) -> None:
-        main, other = streets.decisions(self.main_s), streets.decisions(self.green_s)
-        cycles = [streets.approaches[agent].cycle for agent in road.agents]
+    def _plan(self, road: Road, network: ControlledNetwork) -> None:
+        main, other = network.decisions(self.main_s), network.decisions(self.green_s)
+        cycles = [network.approaches[agent].cycle for agent in road.agents]
         length = main + other * (max(len(cycle) for cycle in cycles) - 1)
         for agent, edge, arrival_s, cycle in zip(
             road.agents, road.edges, road.arrival_s, cycles, strict=True
         ):
-            item = streets.intersections[agent]
+            item = network.intersections[agent]
             wanted = {link.index for link in _straight(item, edge)}
             along = max(cycle, key=lambda p: len(wanted & green_indices(item, item.phases[p])))
             at = cycle.index(along)
             others = [*cycle[at + 1 :], *cycle[:at]]
             turns = [along] * (length - other * len(others))
             self._turns[agent] = turns + [phase for phase in others for _ in range(other)]
-            self._offsets[agent] = round(arrival_s / streets.decision_interval_s)
+            self._offsets[agent] = round(arrival_s / network.decision_interval_s)
 
 
 def _straight(item: Intersection, edge: str) -> list[Link]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.streets import Approach, Streets, mask_of
+from ugat_marl.policies.rules.approaches import Approach, ControlledNetwork, allowed_phases
 
 
 class SelfOrganising:
@@ -22,30 +22,35 @@ class SelfOrganising:
     do not give.)
 
     Args:
-        streets: The network.
-        threshold: Vehicle-seconds on red lanes that switch the signal.
+        network: The controlled network.
+        threshold: Vehicle-seconds on the red lanes of a phase at which it gets green.
         hold_s: Shortest time a phase is kept, rounded up to whole decisions.
     """
 
-    def __init__(self, streets: Streets, threshold: float = 600.0, hold_s: float = 10.0) -> None:
+    def __init__(
+        self, network: ControlledNetwork, threshold: float = 600.0, hold_s: float = 10.0
+    ) -> None:
         self.env_options: Mapping[str, Any] = {"observation": "movements"}
         self.threshold, self.hold_s = threshold, hold_s
-        self._approaches = streets.approaches
-        self._interval_s = streets.decision_interval_s
-        self._hold = streets.decisions(hold_s)
+        self._approaches = network.approaches
+        self._interval_s = network.decision_interval_s
+        self._hold = network.decisions(hold_s)
         self.reset(0)
 
     def reset(self, seed: int) -> None:
-        """Empties all sums."""
+        """Empty all sums."""
         self._shown: dict[str, int] = {}
         self._age: dict[str, int] = {}
         self._sums = {agent: np.zeros(len(a.lanes)) for agent, a in self._approaches.items()}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """The phase of each intersection by the rule, among those its mask allows."""
+        """Return the phase of each intersection by the rule, among those its mask allows."""
         return {
             agent: self._choose(
-                agent, approach, observations[agent], mask_of(infos, agent, len(approach.served))
+                agent,
+                approach,
+                observations[agent],
+                allowed_phases(infos, agent, len(approach.served)),
             )
             for agent, approach in self._approaches.items()
         }

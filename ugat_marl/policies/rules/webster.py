@@ -1,4 +1,4 @@
-"""Webster's fixed-time plan, from counts the signal makes itself."""
+"""Webster's fixed-time plan, from vehicles counted during control."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.streets import Approach, Streets, mask_of
+from ugat_marl.policies.rules.approaches import Approach, ControlledNetwork, allowed_phases
 
 LONGEST_CYCLE_S = 180.0
-"""Cycles are cut here: near saturation the formula knows no bound."""
+"""Longest cycle: near saturation the formula has no bound."""
 
 MEMORY_S = 900.0
-"""Counts older than this weigh less than 1/e."""
+"""Age at which a count has lost a factor of e in weight."""
 
 FIRST_PHASE_S = 20.0
-"""Time of each phase while nothing has been counted."""
+"""Time of each phase before the first count."""
 
 
 def webster_plan(
     ratios: Sequence[float], clearance_s: float, decision_interval_s: float
 ) -> list[int]:
-    """Decisions of each phase: Webster's cycle, split as the critical flow ratios are.
+    """Return the decisions of each phase: Webster's cycle, split by the critical flow ratios.
 
     The cycle is ``(1.5 L + 5) / (1 - Y)`` with L the clearances of all phases (start-up loss and
     the use of yellow taken to cancel) and Y the sum of the ratios, at most `LONGEST_CYCLE_S`.
@@ -56,55 +56,55 @@ def webster_plan(
 class Webster:
     """Cycle and splits by Webster (1958), counted anew before each cycle.
 
-    Counts come from the observation as it goes, not from an episode before: so the rule needs no
-    other traffic than that it controls, follows the demand, and works in any domain. What
-    arrives on a lane is what its number of vehicles grows by between two decisions with red
-    in between: nobody leaves. Lanes that never have red are not counted, and need no green of
-    their own. A lane that several phases of the cycle serve spreads its flow over them.
+    Counts come from the running episode, not from an earlier one: the rule follows the demand and
+    works in any domain. The arrivals on a lane are the growth of its number of vehicles between two
+    decisions with red in between, when no vehicle leaves. Lanes that never have red are not
+    counted, and need no green of their own. If several phases of the cycle serve a lane, its flow
+    is spread over them.
 
     Args:
-        streets: The network.
+        network: The controlled network.
         saturation_vph: Vehicles an hour that a lane discharges in green.
     """
 
-    def __init__(self, streets: Streets, saturation_vph: float = 1800.0) -> None:
+    def __init__(self, network: ControlledNetwork, saturation_vph: float = 1800.0) -> None:
         self.env_options: Mapping[str, Any] = {"observation": "movements"}
         self.saturation_vph = saturation_vph
-        self._streets = streets
+        self._network = network
         self.reset(0)
 
     def reset(self, seed: int) -> None:
-        """Forgets all counts and starts every cycle again."""
-        self._counts = {a: _RedCounts(w) for a, w in self._streets.approaches.items()}
+        """Forget all counts and start every cycle again."""
+        self._counts = {a: _RedCounts(w) for a, w in self._network.approaches.items()}
         self._plans: dict[str, list[int]] = {}
         self._left: dict[str, list[int]] = {}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """The phase whose turn it is; where it is masked, the first allowed one."""
+        """Return the phase whose turn it is; where it is masked, the first allowed one."""
         actions: Actions = {}
-        for agent, approach in self._streets.approaches.items():
-            self._counts[agent].add(agent, observations[agent], self._streets.decision_interval_s)
+        for agent, approach in self._network.approaches.items():
+            self._counts[agent].add(agent, observations[agent], self._network.decision_interval_s)
             if not self._left.get(agent):
                 plan = self.plan(agent)
                 self._left[agent] = [
                     phase for phase, n in zip(approach.cycle, plan, strict=True) for _ in range(n)
                 ]
             wanted = self._left[agent].pop(0)
-            allowed = mask_of(infos, agent, len(approach.served))
+            allowed = allowed_phases(infos, agent, len(approach.served))
             actions[agent] = wanted if allowed[wanted] else int(allowed.argmax())
         return actions
 
     def plan(self, agent: str) -> list[int]:
-        """Decisions of each phase of an agent's cycle, by what has been counted so far."""
-        streets, approach = self._streets, self._streets.approaches[agent]
+        """Return the decisions of each phase of an agent's cycle, by the counts so far."""
+        network, approach = self._network, self._network.approaches[agent]
         flows = self._counts[agent].flows_per_s()
         if flows is None:
-            return [streets.decisions(FIRST_PHASE_S)] * len(approach.cycle)
+            return [network.decisions(FIRST_PHASE_S)] * len(approach.cycle)
         served = approach.served[list(approach.cycle)]
         spread = flows / np.maximum(served.sum(axis=0), 1)
         ratios = (served * spread).max(axis=1) * 3600.0 / self.saturation_vph
         return webster_plan(
-            [float(ratio) for ratio in ratios], streets.clearance_s, streets.decision_interval_s
+            [float(ratio) for ratio in ratios], network.clearance_s, network.decision_interval_s
         )
 
 
@@ -119,7 +119,7 @@ class _RedCounts:
         self._shown = 0
 
     def add(self, agent: str, observation: NDArray[np.float32], interval_s: float) -> None:
-        """Takes in the vehicles after another decision interval."""
+        """Count the vehicles after another decision interval."""
         seen = self._approach.traffic(agent, observation)
         if self._before is not None:
             served = self._approach.served
@@ -130,7 +130,7 @@ class _RedCounts:
         self._before, self._shown = seen.vehicles, seen.shown
 
     def flows_per_s(self) -> NDArray[np.float64] | None:
-        """Vehicles per second and lane, ``(lanes,)``; None before the first red."""
+        """Return vehicles per second and lane, ``(lanes,)``; None before the first red."""
         if not self._red_s.any():
             return None
         return np.maximum(self._arrived, 0.0) / np.maximum(self._red_s, 1e-9)

@@ -1,4 +1,4 @@
-"""What a rule knows and sees: the network, and lane by lane what detectors tell of it."""
+"""Approaches of the controlled intersections, and the traffic that detectors count on them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Intersection, Network
 
 MOST_SEARCHED_PHASES = 12
-"""Up to so many phases the smallest cover is searched exhaustively; above, greedily."""
+"""Largest number of phases for an exhaustive search of the smallest cover; above, it is greedy."""
 
 
 @dataclass(frozen=True)
-class Streets:
-    """What a rule knows about the network it controls.
+class ControlledNetwork:
+    """Static facts about the network that a rule controls.
 
     Attributes:
         intersections: Agent to intersection.
@@ -39,8 +39,8 @@ class Streets:
     clearance_s: float
 
     @classmethod
-    def of(cls, env: AnyParallelEnv) -> Streets:
-        """The streets below an environment of the suite, wrapped or not."""
+    def of(cls, env: AnyParallelEnv) -> ControlledNetwork:
+        """Read the network of an environment of the suite, wrapped or not."""
         base: Any = env.unwrapped
         network: Network = base.network
         tls_of: Mapping[str, str] = base.intersection_of
@@ -54,23 +54,23 @@ class Streets:
 
     @cached_property
     def approaches(self) -> dict[str, Approach]:
-        """Agent to what its rule reads."""
+        """Agent to the approach its rule reads."""
         return {agent: Approach.of(item, self) for agent, item in self.intersections.items()}
 
     def decisions(self, seconds: float) -> int:
-        """The fewest decisions that last at least `seconds`."""
+        """Return the fewest decisions that last at least `seconds`."""
         if not 0 < seconds < math.inf:
             raise OptionError(f"a phase cannot be held {seconds} s; give a number above 0")
         return math.ceil(seconds / self.decision_interval_s - 1e-9)
 
 
 class Traffic(NamedTuple):
-    """What an intersection measures of its incoming lanes, ``(lanes,)`` each.
+    """Vehicles counted on the incoming lanes of an intersection, ``(lanes,)`` each.
 
     Attributes:
-        halting: Vehicles that stand.
-        vehicles: Vehicles, standing or not.
-        shown: Phase that is green or cleared towards.
+        halting: Standing vehicles.
+        vehicles: All vehicles, standing or moving.
+        shown: Phase that is green, or that follows the clearance under way.
     """
 
     halting: NDArray[np.float64]
@@ -99,8 +99,8 @@ class Approach:
     cycle: tuple[int, ...]
 
     @classmethod
-    def of(cls, item: Intersection, streets: Streets) -> Approach:
-        """The approaches of one intersection."""
+    def of(cls, item: Intersection, network: ControlledNetwork) -> Approach:
+        """Collect the approaches of one intersection."""
         lanes = list(item.incoming_lanes)
         served = np.zeros((len(item.phases), len(lanes)), np.bool_)
         for row, phase in enumerate(item.phases):
@@ -111,14 +111,14 @@ class Approach:
         return cls(
             tuple(lanes),
             len(item.outgoing_lanes),
-            np.array([streets.capacity[lane] for lane in lanes]),
-            np.array([streets.free_flow_s[lane] for lane in lanes]),
+            np.array([network.capacity[lane] for lane in lanes]),
+            np.array([network.free_flow_s[lane] for lane in lanes]),
             served,
             covering_phases(item),
         )
 
     def traffic(self, agent: str, observation: NDArray[np.float32]) -> Traffic:
-        """What the observation `movements` says about the incoming lanes."""
+        """Read the traffic on the incoming lanes from the observation `movements`."""
         lanes, phases = len(self.lanes), len(self.served)
         end = 2 * lanes + self.outgoing
         check_length(agent, observation, end + phases, "movements")
@@ -130,14 +130,14 @@ class Approach:
         )
 
     def waiting_s(self, agent: str, observation: NDArray[np.float32]) -> NDArray[np.float64]:
-        """What the observation `waiting` says: vehicle-seconds on each lane, ``(lanes,)``."""
+        """Read vehicle-seconds of waiting, ``(lanes,)``, from the observation `waiting`."""
         lanes = len(self.lanes)
         check_length(agent, observation, lanes + len(self.served), "waiting")
         return observation[:lanes].astype(np.float64) * self.capacity * WAITING_SCALE_S
 
 
 def check_length(agent: str, observation: NDArray[np.float32], least: int, name: str) -> None:
-    """Refuses an observation that cannot be the one the rule reads."""
+    """Refuse an observation with fewer numbers than the rule reads."""
     if len(observation) < least:
         raise OptionError(
             f"agent {agent!r} observes {len(observation)} numbers, the rule reads "
@@ -145,21 +145,21 @@ def check_length(agent: str, observation: NDArray[np.float32], least: int, name:
         )
 
 
-def mask_of(infos: Infos, agent: str, phases: int) -> NDArray[np.bool_]:
-    """Which phases an agent may ask for, ``(phases,)``; all of them where nothing is said."""
+def allowed_phases(infos: Infos, agent: str, phases: int) -> NDArray[np.bool_]:
+    """Return a mask of the phases an agent may choose, ``(phases,)``; by default all of them."""
     mask = infos.get(agent, {}).get("action_mask")
     return np.ones(phases, np.bool_) if mask is None else np.asarray(mask, dtype=np.bool_)
 
 
 def green_indices(item: Intersection, phase: str) -> frozenset[int]:
-    """The links that are green in a phase."""
+    """Return the indices of the links that are green in a phase."""
     return frozenset(link.index for link in item.links if phase[link.index] in GREEN)
 
 
 def covering_phases(item: Intersection) -> tuple[int, ...]:
-    """The smallest set of phases in which every servable link is green once, ascending.
+    """Return the smallest set of phases that gives every servable link green, ascending.
 
-    Among sets of equal size the one with the fewest green letters in all (least overlap) is taken,
+    Among sets of equal size, take the one with the fewest green letters in all (least overlap),
     then the first.
     """
     served = [green_indices(item, phase) for phase in item.phases]

@@ -1,4 +1,7 @@
-"""How rules are named: ``name``, ``name:number`` or ``name:number:number``."""
+"""Every rule by name, and its spelling: ``name``, ``name:number`` or ``name:number:number``.
+
+A new rule is a class in a module of this folder and a row in `RULES`.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,16 @@ from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.policies.protocols import Policy
 from ugat_marl.policies.rules.actuated import Actuated, DelayActuated
+from ugat_marl.policies.rules.approaches import ControlledNetwork
 from ugat_marl.policies.rules.green_wave import GreenWave
-from ugat_marl.policies.rules.plain import FixedTime, ProgrammeControl, Random
-from ugat_marl.policies.rules.scored import (
+from ugat_marl.policies.rules.open_loop import FixedTime, ProgrammeControl, Random
+from ugat_marl.policies.rules.phase_scores import (
     LargestQueue,
     LongestWaiting,
     MaxPressure,
     MaxPressureLoss,
 )
 from ugat_marl.policies.rules.sotl import SelfOrganising
-from ugat_marl.policies.rules.streets import Streets
 from ugat_marl.policies.rules.webster import Webster
 
 
@@ -28,10 +31,10 @@ class Parameter:
     """A number of a rule's spelling.
 
     Attributes:
-        name: What it is.
+        name: Meaning, for messages.
         unit: Its unit.
-        default: What it is where the spelling leaves it out.
-        choices: What tuning tries.
+        default: Value where the spelling leaves it out.
+        choices: Values that tuning tries.
     """
 
     name: str
@@ -45,7 +48,7 @@ class Rule:
     """A rule that can be named.
 
     Attributes:
-        make: Makes it from the streets and its parameters.
+        make: Maker of the rule from the network and its parameters.
         parameters: In the order of the spelling.
     """
 
@@ -110,8 +113,8 @@ RULES: Mapping[str, Rule] = {
 }
 """Every rule by name."""
 
-NAMES = tuple(RULES)
-"""The controllers, as `controller_for` spells them."""
+RULE_NAMES = tuple(RULES)
+"""Names of all rules."""
 
 STANDARD_RULES = (
     *(f"largest-queue:{hold_s}" for hold_s in (10, 20, 30, 40)),
@@ -122,11 +125,11 @@ STANDARD_RULES = (
     "webster:1500",
     "programme",
 )
-"""What the search for the best rule of a domain tries."""
+"""Rules that the search for the best rule of a domain tries."""
 
 
 def controller_for(spec: str, env: AnyParallelEnv) -> Policy:
-    """The controller a spelling such as ``"largest-queue:30"`` names.
+    """Make the rule of a spelling such as ``"largest-queue:30"``.
 
     Args:
         spec: A name of `RULES`, and optionally its parameters, each after a colon.
@@ -138,11 +141,11 @@ def controller_for(spec: str, env: AnyParallelEnv) -> Policy:
         OptionError: A parameter that is not a number above 0, or one too many.
     """
     name, values = parse_spec(spec)
-    return RULES[name].make(Streets.of(env), *values)
+    return RULES[name].make(ControlledNetwork.of(env), *values)
 
 
 def parse_spec(spec: str) -> tuple[str, tuple[float, ...]]:
-    """Name and parameters of a controller's spelling, defaults filled in.
+    """Return the name and the parameters of a spelling, defaults filled in.
 
     Raises:
         UnknownNameError: No controller of this name.
@@ -150,7 +153,7 @@ def parse_spec(spec: str) -> tuple[str, tuple[float, ...]]:
     """
     name, *texts = spec.split(":")
     if name not in RULES:
-        raise UnknownNameError("controller", name, NAMES)
+        raise UnknownNameError("controller", name, RULE_NAMES)
     parameters = RULES[name].parameters
     if len(texts) > len(parameters):
         takes = ", ".join(f"{p.name} in {p.unit}" for p in parameters) or "no number"
@@ -170,10 +173,10 @@ def parse_spec(spec: str) -> tuple[str, tuple[float, ...]]:
 
 
 def example_of(name: str) -> str:
-    """The spelling of a rule with its defaults written out."""
-    return spell(name, [parameter.default for parameter in RULES[name].parameters])
+    """Return the spelling of a rule with its defaults written out."""
+    return format_spec(name, [parameter.default for parameter in RULES[name].parameters])
 
 
-def spell(name: str, values: tuple[float, ...] | list[float]) -> str:
-    """The spelling of a rule with these parameters."""
+def format_spec(name: str, values: tuple[float, ...] | list[float]) -> str:
+    """Return the spelling of a rule with these parameters."""
     return ":".join([name, *(f"{value:g}" for value in values)])

@@ -1,4 +1,4 @@
-"""Rules that see nothing: a clock, the network's own programme, a die."""
+"""Rules without an observation: fixed time, the programme of the network, random phases."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.streets import Streets, mask_of
+from ugat_marl.policies.rules.approaches import ControlledNetwork, allowed_phases
 from ugat_marl.seeding import numpy_generator
 
 
@@ -16,65 +16,65 @@ class FixedTime:
     """Equal splits: each phase of a smallest set that serves every link, in turn.
 
     Args:
-        streets: The network.
+        network: The controlled network.
         green_s: Time from one phase to the next (its clearance included), rounded up to whole
             decisions.
     """
 
-    def __init__(self, streets: Streets, green_s: float = 30.0) -> None:
+    def __init__(self, network: ControlledNetwork, green_s: float = 30.0) -> None:
         self.env_options: Mapping[str, Any] = {}
         self.green_s = green_s
-        self._decisions = streets.decisions(green_s)
-        self._cycle = {a: w.cycle for a, w in streets.approaches.items()}
-        self._phases = {a: len(item.phases) for a, item in streets.intersections.items()}
+        self._decisions = network.decisions(green_s)
+        self._cycle = {a: w.cycle for a, w in network.approaches.items()}
+        self._phases = {a: len(item.phases) for a, item in network.intersections.items()}
         self._time = 0
 
     def reset(self, seed: int) -> None:
-        """Starts the cycle again."""
+        """Start the cycle again."""
         self._time = 0
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """The phase whose turn it is; where it is masked, the first allowed one."""
+        """Return the phase whose turn it is; where it is masked, the first allowed one."""
         turn = self._time // self._decisions
         self._time += 1
         actions: Actions = {}
         for agent, cycle in self._cycle.items():
             wanted = cycle[turn % len(cycle)]
-            allowed = mask_of(infos, agent, self._phases[agent])
+            allowed = allowed_phases(infos, agent, self._phases[agent])
             actions[agent] = wanted if allowed[wanted] else int(allowed.argmax())
         return actions
 
 
 class ProgrammeControl:
-    """Leaves the signals to the network's own programme; its actions say nothing."""
+    """Leave the signals to the programme of the network; its actions are ignored."""
 
-    def __init__(self, streets: Streets) -> None:
+    def __init__(self, network: ControlledNetwork) -> None:
         self.env_options: Mapping[str, Any] = {"signals": "programme"}
-        self._agents = tuple(streets.intersections)
+        self._agents = tuple(network.intersections)
 
     def reset(self, seed: int) -> None:
-        """Nothing to forget."""
+        """Do nothing: the rule has no memory."""
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """0 for every agent; the environment ignores it."""
+        """Return 0 for every agent; the environment ignores it."""
         return dict.fromkeys(self._agents, 0)
 
 
 class Random:
-    """Draws one of the allowed phases, each with equal probability, at every decision."""
+    """Draw one of the allowed phases, each with equal probability, at every decision."""
 
-    def __init__(self, streets: Streets) -> None:
+    def __init__(self, network: ControlledNetwork) -> None:
         self.env_options: Mapping[str, Any] = {}
-        self._phases = {a: len(item.phases) for a, item in streets.intersections.items()}
+        self._phases = {a: len(item.phases) for a, item in network.intersections.items()}
         self._generator = numpy_generator(0, "random-controller")
 
     def reset(self, seed: int) -> None:
-        """Starts the stream of `seed`."""
+        """Start the random stream of `seed`."""
         self._generator = numpy_generator(seed, "random-controller")
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """A random allowed phase for every agent."""
+        """Draw an allowed phase for every agent."""
         return {
-            agent: int(self._generator.choice(np.flatnonzero(mask_of(infos, agent, phases))))
+            agent: int(self._generator.choice(np.flatnonzero(allowed_phases(infos, agent, phases))))
             for agent, phases in self._phases.items()
         }

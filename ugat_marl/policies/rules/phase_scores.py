@@ -1,4 +1,4 @@
-"""Rules that give every phase a score and take the best one."""
+"""Rules that score every phase and take the best one: queues, pressure, waiting times."""
 
 from __future__ import annotations
 
@@ -9,12 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.envs import WAITING_SCALE_S, Actions, Infos, Observations
-from ugat_marl.policies.rules.streets import Streets, check_length, green_indices, mask_of
+from ugat_marl.policies.rules.approaches import (
+    ControlledNetwork,
+    allowed_phases,
+    check_length,
+    green_indices,
+)
 from ugat_marl.scenarios import Intersection
 
 
 class _Scored:
-    """Takes the phase of highest score and holds it for at least `hold_s`.
+    """Take the phase of highest score and hold it for at least `hold_s`.
 
     The held phase is reconsidered at every decision after that. Between equal scores the phase
     already shown wins, then the one of lower index.
@@ -22,25 +27,29 @@ class _Scored:
 
     env_options: Mapping[str, Any] = {"observation": "movements"}
 
-    def __init__(self, streets: Streets, weights: Mapping[str, NDArray[np.float64]], hold_s: float):
+    def __init__(
+        self, network: ControlledNetwork, weights: Mapping[str, NDArray[np.float64]], hold_s: float
+    ):
         self._weights = weights
-        self._hold = streets.decisions(hold_s)
+        self._hold = network.decisions(hold_s)
         self._shown: dict[str, int] = {}
         self._age: dict[str, int] = {}
 
     def reset(self, seed: int) -> None:
-        """Forgets which phases are shown and for how long."""
+        """Forget the phases shown and their ages."""
         self._shown, self._age = {}, {}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """The phase of each intersection by the rule, among those its mask allows."""
+        """Return the phase of each intersection by the rule, among those its mask allows."""
         return {
-            agent: self._choose(agent, observations[agent], mask_of(infos, agent, weights.shape[0]))
+            agent: self._choose(
+                agent, observations[agent], allowed_phases(infos, agent, weights.shape[0])
+            )
             for agent, weights in self._weights.items()
         }
 
     def scores(self, agent: str, observation: NDArray[np.float32]) -> NDArray[np.float64]:
-        """The score of every phase of an agent, ``(phases,)``, in vehicles."""
+        """Return the score of every phase of an agent, ``(phases,)``, in vehicles."""
         weights = self._weights[agent]
         phases, features = weights.shape
         check_length(agent, observation, features + phases, self.env_options["observation"])
@@ -62,31 +71,31 @@ class _Scored:
         return best
 
     def _stays(self, shown: float, best: float) -> bool:
-        """Whether the phase shown goes on, by its score and the highest one."""
+        """Return true if the phase shown goes on, given its score and the highest one."""
         return shown >= best
 
 
 class LargestQueue(_Scored):
-    """Serves the phase whose incoming lanes hold the most halting vehicles.
+    """Serve the phase whose incoming lanes hold the most halting vehicles.
 
     A phase serves a lane when one of the lane's links is green in it; a lane counts once.
 
     Args:
-        streets: The network.
+        network: The controlled network.
         hold_s: Shortest time a phase is kept, rounded up to whole decisions.
     """
 
-    def __init__(self, streets: Streets, hold_s: float = 20.0) -> None:
+    def __init__(self, network: ControlledNetwork, hold_s: float = 20.0) -> None:
         self.hold_s = hold_s
         weights = {
-            agent: _queue_weights(item, streets.capacity)
-            for agent, item in streets.intersections.items()
+            agent: _queue_weights(item, network.capacity)
+            for agent, item in network.intersections.items()
         }
-        super().__init__(streets, weights, hold_s)
+        super().__init__(network, weights, hold_s)
 
 
 class MaxPressure(_Scored):
-    """Serves the phase of highest pressure (Varaiya 2013).
+    """Serve the phase of highest pressure (Varaiya 2013).
 
     The pressure of a phase is the sum over the incoming lanes it serves of the vehicles on the lane
     minus the mean number of vehicles on the lanes its green links lead to. (The mean stands for the
@@ -94,61 +103,61 @@ class MaxPressure(_Scored):
     over links of upstream minus downstream.)
 
     Args:
-        streets: The network.
+        network: The controlled network.
         hold_s: Shortest time a phase is kept, rounded up to whole decisions.
     """
 
-    def __init__(self, streets: Streets, hold_s: float = 10.0) -> None:
+    def __init__(self, network: ControlledNetwork, hold_s: float = 10.0) -> None:
         self.hold_s = hold_s
         weights = {
-            agent: _pressure_weights(item, streets.capacity)
-            for agent, item in streets.intersections.items()
+            agent: _pressure_weights(item, network.capacity)
+            for agent, item in network.intersections.items()
         }
-        super().__init__(streets, weights, hold_s)
+        super().__init__(network, weights, hold_s)
 
 
 class MaxPressureLoss(MaxPressure):
     """Max pressure that counts what a switch loses (after Wang et al. 2022).
 
     In the next `hold_s` seconds the phase shown serves all the time, another one only after the
-    clearance. So the rule switches if ``best * (1 - clearance / hold) > shown``, pressures below 0
+    clearance. The rule switches if ``best * (1 - clearance / hold) > shown``, pressures below 0
     counted as 0: a phase is worth a switch only if something can be served by it.
 
     Args:
-        streets: The network.
+        network: The controlled network.
         hold_s: Shortest time a phase is kept, rounded up to whole decisions; the gain and loss of a
             switch are counted over it.
     """
 
-    def __init__(self, streets: Streets, hold_s: float = 10.0) -> None:
-        super().__init__(streets, hold_s)
-        lasts_s = self._hold * streets.decision_interval_s
-        self.served_share = max(0.0, 1.0 - streets.clearance_s / lasts_s)
+    def __init__(self, network: ControlledNetwork, hold_s: float = 10.0) -> None:
+        super().__init__(network, hold_s)
+        lasts_s = self._hold * network.decision_interval_s
+        self.served_share = max(0.0, 1.0 - network.clearance_s / lasts_s)
 
     def _stays(self, shown: float, best: float) -> bool:
         return max(shown, 0.0) >= self.served_share * max(best, 0.0)
 
 
 class LongestWaiting(_Scored):
-    """Serves the phase whose incoming lanes have waited longest.
+    """Serve the phase whose incoming lanes have waited longest.
 
-    What counts is the sum over the vehicles of a lane of the seconds since each last moved: many
-    who wait a little weigh as much as one who waits long. No approach is forgotten for ever.
+    The score of a lane is the sum, over its vehicles, of the seconds since each last moved: many
+    short waits weigh as much as one long wait. No approach starves.
 
     Args:
-        streets: The network.
+        network: The controlled network.
         hold_s: Shortest time a phase is kept, rounded up to whole decisions.
     """
 
     env_options: Mapping[str, Any] = {"observation": "waiting"}
 
-    def __init__(self, streets: Streets, hold_s: float = 20.0) -> None:
+    def __init__(self, network: ControlledNetwork, hold_s: float = 20.0) -> None:
         self.hold_s = hold_s
         weights = {
             agent: approach.served * approach.capacity * WAITING_SCALE_S
-            for agent, approach in streets.approaches.items()
+            for agent, approach in network.approaches.items()
         }
-        super().__init__(streets, weights, hold_s)
+        super().__init__(network, weights, hold_s)
 
 
 def _queue_weights(item: Intersection, capacity: Mapping[str, float]) -> NDArray[np.float64]:
