@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ugat_marl.diagnosis import default_cache
+from ugat_marl.diagnosis import Tally, default_cache
 from ugat_marl.diagnosis import engine as module
 from ugat_marl.diagnosis.engine import Engine, OutOfTime, Replicate
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
 from ugat_marl.diagnosis.replay import Day, Replay
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.unmeasured import Unmeasured
@@ -71,9 +72,20 @@ def an_engine(
     seed: int = 3,
     periods: Sequence[Period] = PERIODS,
     deadline: float | None = None,
+    base_days: int = 0,
 ) -> tuple[Engine, Streets]:
     streets = Streets(site)
-    made = Engine(scenario, site, streets, periods, seed, cache=cache, deadline=deadline, workers=3)
+    made = Engine(
+        scenario,
+        site,
+        streets,
+        periods,
+        seed,
+        cache=cache,
+        deadline=deadline,
+        workers=3,
+        base_days=base_days,
+    )
     return made, streets
 
 
@@ -306,14 +318,24 @@ def test_the_cache_lies_where_caches_lie(monkeypatch: pytest.MonkeyPatch, tmp_pa
 # --- days of many models at once -----------------------------------------------------------------
 
 
-def test_days_that_were_set_aside_are_passed_over(scenario: Scenario, site: Site) -> None:
-    made, _ = an_engine(scenario, site, None)
-    assert made.first(4) == [0, 1, 2, 3]
-    assert made.first(0) == []
-    made.set_aside = frozenset({0, 2, 3})
-    assert made.first(4) == [1, 4, 5, 6]
-    other, _ = an_engine(scenario, site, None)
-    assert other.first(2) == [0, 1], "another engine has days of its own"
+def test_days_on_which_traffic_stood_still_are_passed_over(
+    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every, _ = an_engine(scenario, site, None)
+    assert every.first(4) == [0, 1, 2, 3]
+    assert every.first(0) == []
+
+    def counted(effects: Sequence[Effect], numbers: Sequence[int]) -> list[Replicate]:
+        assert not effects
+        bins = np.zeros((len(numbers), len(BIN_FEATURES), 1, 1))
+        bins[:, 0, 0, 0] = [10.0 if n in (0, 3) else 100.0 + n % 3 for n in numbers]
+        return [Replicate(Tally(np.zeros((len(FEATURES), 1, 2)), day), 60.0) for day in bins]
+
+    made, _ = an_engine(scenario, site, None, base_days=20)
+    monkeypatch.setattr(made, "replicates", counted)
+    assert made.usual.set_aside == {0, 3}
+    assert made.usual.day_to_day == pytest.approx(1.4826)
+    assert made.first(4) == [1, 2, 4, 5]
 
 
 def test_prepared_days_are_those_that_are_simulated_one_by_one(

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.engine import Engine, Replicate
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.fit import FAR, NEARBY, SETTLING_DAYS, SHORTEST_S, Fitter, Members
+from ugat_marl.diagnosis.fit import FAR, NEARBY, SETTLING_DAYS, SHORTEST_S, Fitter
+from ugat_marl.diagnosis.hypotheses import Members
 from ugat_marl.diagnosis.intervals import uncertainty
+from ugat_marl.diagnosis.standstill import Usual
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.effects import Effect
 
@@ -41,6 +43,8 @@ def day(number: int, values: dict[str, float], street: int = 0) -> Tally:
 
 class World(Engine):
     """Simulates by a formula."""
+
+    usual = Usual()
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, ...]] = []
@@ -174,6 +178,8 @@ def test_a_fit_that_stopped_early_takes_a_last_step() -> None:
 class LocksUp(World):
     """Traffic stands still on one day of every model but the scenario as it is."""
 
+    usual = Usual(day_to_day=10.0)
+
     def played(self, number: int, effects: Sequence[Effect]) -> Tally:
         found = super().played(number, effects)
         found.bins[0] = 1000.0 + 10.0 * np.sin(number)
@@ -185,7 +191,6 @@ class LocksUp(World):
 
 def test_a_day_on_which_a_model_locks_up_is_no_part_of_it() -> None:
     fitter = a_fitter({"headway": 1.43}, street=14, world=LocksUp())
-    fitter.engine.day_to_day = 10.0
     model = fitter.simulate(start((HEADWAY, 1.5)))
     assert list(model.days) == [0, 1, 2, 4, 5, 6, 7]
     mean = model.reference.blocks["network"].mean[0, :WIDTH]

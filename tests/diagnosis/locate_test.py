@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
-from ugat_marl.diagnosis.locate import Disagreement, locate
+from ugat_marl.diagnosis.locate import locate
+from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.site import Site, SiteLane
 from ugat_marl.diagnosis.statistics import Pools
 
@@ -129,6 +131,6 @@ def test_disagreements_can_be_written(reference: Reference) -> None:
     bump = np.zeros((len(BIN_FEATURES), PLACES, BINS))
     bump[1, 0, :3] = 40.0
     for item in found(reference, days(8, 5, shift, bump)):
-        again = json.loads(json.dumps(item.as_dict(), allow_nan=False))
+        again = json.loads(json.dumps(asdict(item), allow_nan=False))
         assert 0 <= again["p"] <= 1
         assert again["window"] is None or len(again["window"]) == 2

@@ -10,9 +10,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ugat_marl.diagnosis import Hypothesis, residual
-from ugat_marl.diagnosis.fit import Fitted, Fitter, Members
+from ugat_marl.diagnosis import Hypothesis, records
+from ugat_marl.diagnosis.fit import Fitter
+from ugat_marl.diagnosis.hypotheses import Members
 from ugat_marl.diagnosis.pruning import NEGLIGIBLE, pruned
+from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.progress import Advance, Silent
 
 HEADWAY = (Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05), (1.5,))
@@ -44,21 +46,19 @@ class Ledger:
         members = self.refined.get(names(start.members), start.members)
         return replace(start, members=members)
 
-    def test(self, model: Fitted) -> residual.Tested:
+    def test(self, model: Fitted) -> records.Tested:
         self.tested.append(names(model.members))
         return self.with_chance(self.simulate(model.members, 16))
 
-    def with_chance(self, model: Fitted, errors: float = 0.0) -> residual.Tested:
+    def with_chance(self, model: Fitted, errors: float = 0.0) -> records.Tested:
         chance = cast(Any, Chance(self.chances[names(model.members)]))
-        return residual.Tested(
-            model, cast(Any, None), chance, np.full(len(model.values), errors), {}
-        )
+        return records.Tested(model, chance, np.full(len(model.values), errors), {})
 
     def left(self, *members: tuple[Hypothesis, tuple[float, ...]], errors: float = 0.0) -> Members:
         best = self.with_chance(self.simulate(members, 16), errors)
         fitter = cast(Fitter, cast(object, self))
         blank = cast(Any, None)
-        base = residual.Tested(Fitted((), {}, blank, blank, 0.0), blank, blank, np.empty(0), {})
+        base = records.Tested(Fitted((), {}, blank, blank, 0.0), blank, np.empty(0), {})
         return pruned(best, base, fitter, lambda model: model, self.test, 0.05).model.members
 
 

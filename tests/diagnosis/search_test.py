@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.search import FARTHEST, Proposal, Ray, between, propose
+from ugat_marl.diagnosis.records import Proposed
+from ugat_marl.diagnosis.search import FARTHEST, Ray, between, propose
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.whitening import Whitener
 
@@ -76,7 +77,7 @@ def whitener(
     return Whitener(reference, [day(row) for row in rows], 0.0)
 
 
-def values(proposal: Proposal) -> dict[str, float]:
+def values(proposal: Proposed) -> dict[str, float]:
     return {hypothesis.name: found[0] for hypothesis, found in proposal.members}
 
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from ugat_marl.diagnosis import Hypothesis
 from ugat_marl.diagnosis.faults import one_behind_the_other
 from ugat_marl.diagnosis.features import FEATURES
-from ugat_marl.diagnosis.select import Selection
+from ugat_marl.diagnosis.records import EffectRecord, Located, Parameter, Selected
 from ugat_marl.diagnosis.verdict import (
     combined,
     conclude,
@@ -54,9 +56,17 @@ SITE: Any = SimpleNamespace(
 LATE = Hypothesis("late_green", (("place", "*"),), ("seconds",), ((2.0,),), (0.0,))
 
 
+def selected(best: Any, complete: bool = True) -> Selected:
+    return Selected(best, (), complete, examined=frozenset())
+
+
+def located(base: Any) -> Located:
+    return Located(base, (), complete=True, examined=frozenset())
+
+
 def test_an_effect_everywhere() -> None:
     record = effect_record(HEADWAY, (1.45,), (0.02,))
-    assert record == {
+    assert asdict(record) == {
         "name": "headway",
         "place": None,
         "window": None,
@@ -73,15 +83,15 @@ def test_an_effect_everywhere() -> None:
 
 def test_an_effect_with_place_and_window() -> None:
     record = effect_record(SURGE, (1.8,), (0.1,))
-    assert record["place"] == "S_C"
-    assert record["window"] == [300.0, 900.0]
-    assert set(record["parameters"]) == {"factor"}
+    assert record.place == "S_C"
+    assert record.window == (300.0, 900.0)
+    assert set(record.parameters) == {"factor"}
 
 
 def test_a_fixed_number_is_given_without_an_interval() -> None:
-    parameters = effect_record(PARKING, (25.0,), (2.0,))["parameters"]
-    assert parameters["dwell_s"] == {"value": 40.0, "low": None, "high": None, "unit": "s"}
-    assert parameters["per_hour"]["value"] == 25.0
+    parameters = effect_record(PARKING, (25.0,), (2.0,)).parameters
+    assert parameters["dwell_s"] == Parameter(40.0, None, None, "s")
+    assert parameters["per_hour"].value == 25.0
 
 
 def test_two_places_are_joined() -> None:
@@ -89,9 +99,9 @@ def test_two_places_are_joined() -> None:
 
 
 def test_intervals_stay_in_range() -> None:
-    parameters = effect_record(TURNING, (0.05,), (1.0,))["parameters"]
-    assert parameters["share"]["low"] == 0.0
-    assert parameters["share"]["high"] == 1.0
+    parameters = effect_record(TURNING, (0.05,), (1.0,)).parameters
+    assert parameters["share"].low == 0.0
+    assert parameters["share"].high == 1.0
 
 
 @pytest.mark.parametrize(
@@ -101,7 +111,8 @@ def test_intervals_stay_in_range() -> None:
 )  # fmt: skip
 def test_records_can_be_written(hypothesis: Hypothesis, values: tuple[float, ...]) -> None:
     record = effect_record(hypothesis, values, (0.1,) * len(values))
-    assert json.loads(json.dumps(record, allow_nan=False)) == record
+    written = json.dumps(asdict(record), allow_nan=False)
+    assert TypeAdapter(EffectRecord).validate_json(written) == record
 
 
 def test_effects_in_words() -> None:
@@ -136,7 +147,14 @@ def test_what_to_measure_next_is_said_in_words() -> None:
         before=SimpleNamespace(p=0.0, distance=1000.0), after=best.residual, shrink=0.9
     )
     selector: Any = None
-    found = conclude(best, Selection(best, (), complete=True), selector, won, 0.05, SITE)
+    found = conclude(
+        located(best),
+        selected(best),
+        selector,
+        won,
+        0.05,
+        SITE,
+    )
     assert found.verdict == "partially_explained"
     assert found.next_measurement is not None
     assert "time over detector, 2nd and 3rd (discharge)" in found.next_measurement
@@ -158,7 +176,12 @@ def test_only_a_search_that_ended_says_that_the_library_lacks_it(
     selector: Any = None
     contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
     found = conclude(
-        contradicted, Selection(best, (), complete=complete), selector, nothing_won, 0.05, SITE
+        located(contradicted),
+        selected(best, complete),
+        selector,
+        nothing_won,
+        0.05,
+        SITE,
     )
     assert found.verdict == "unknown"
     assert ("no effect of the library explains it" in found.sentence) == complete
@@ -188,7 +211,14 @@ def test_the_end_of_a_range_is_no_answer(
     )
     selector: Any = None
     contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
-    found = conclude(contradicted, Selection(best, (), complete=True), selector, won, 0.05, SITE)
+    found = conclude(
+        located(contradicted),
+        selected(best),
+        selector,
+        won,
+        0.05,
+        SITE,
+    )
     assert found.verdict == verdict
     assert ("as far as the effect goes" in found.sentence) == (verdict != "explained")
 
@@ -225,7 +255,14 @@ def test_vehicles_that_leave_are_not_taken_for_counters_that_miss_them(
     )
     selector: Any = None
     contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
-    found = conclude(contradicted, Selection(best, (), complete=True), selector, won, 0.05, SITE)
+    found = conclude(
+        located(contradicted),
+        selected(best),
+        selector,
+        won,
+        0.05,
+        SITE,
+    )
     assert found.verdict == ("not_identifiable" if between else "explained")
     assert all(name in (found.next_measurement or "") for name in between or ())
 
@@ -249,7 +286,14 @@ def test_a_hint_that_is_not_confirmed_is_weighed_with_the_other_periods(
     before = SimpleNamespace(p=heldout, distance=950.0)
     verification: Any = SimpleNamespace(before=before, after=before, shrink=None)
     selector: Any = None
-    found = conclude(best, Selection(best, (), complete=True), selector, verification, 0.05, SITE)
+    found = conclude(
+        located(best),
+        selected(best),
+        selector,
+        verification,
+        0.05,
+        SITE,
+    )
     assert found.verdict == verdict
 
 

@@ -70,7 +70,7 @@ def test_the_simulation_is_no_real_world() -> None:
 def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> Path:
     """What a diagnosis leaves, as far as it matters here."""
     record = {
-        "schema": "ugat-marl/diagnosis/1",
+        "schema": "ugat-marl/diagnosis/2",
         "scenario": SCENARIO.id,
         "verdict": "explained" if corrected else "unknown",
         "hashes": {"scenario": SCENARIO.hash},

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import Ray, Workers, workers_of
 from ugat_marl.data import Measured, read_measured
-from ugat_marl.diagnosis import CORRECTED, FILE, DiagnosisConfig, default_cache, diagnose
+from ugat_marl.diagnosis import (
+    CORRECTED,
+    FILE,
+    Diagnosis,
+    DiagnosisConfig,
+    NamedEffect,
+    default_cache,
+    diagnose,
+)
 from ugat_marl.effects import known_effects, load_scenario
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import require_writable
@@ -78,13 +85,14 @@ class Diagnose:
         try:
             with workers_of(self.workers, self.ray) as workers:
                 config = replace(config, workers=workers)
-                record = diagnose(scenario, measured, self.out, config, Bars(console))
+                diagnosis = diagnose(scenario, measured, self.out, config, Bars(console))
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command goes on where it stopped") from None
+        record = diagnosis.to_json()
         console.print(diagnosis_summary(record))
         if self.report:
-            write_diagnosis_page(record, network, self.out / REPORT, self._commands(record))
-        self._say_where(record, console)
+            write_diagnosis_page(record, network, self.out / REPORT, self._commands(diagnosis))
+        self._say_where(diagnosis, console)
         return 0
 
     def _config(self) -> DiagnosisConfig:
@@ -118,33 +126,33 @@ class Diagnose:
                 "--cache"
             ) from None
 
-    def _commands(self, record: Mapping[str, Any]) -> list[str]:
+    def _commands(self, diagnosis: Diagnosis) -> list[str]:
         """The command itself, and what comes next."""
         given = ["ugat-marl", "diagnose", self.scenario, str(self.measured), "--out", str(self.out)]
         given += ["--budget-s", f"{self.budget_s:g}", "--alpha", f"{self.alpha:g}"]
         given += ["--seed", str(self.seed)]
         if self.leave_out:
             given += ["--leave-out", *self.leave_out]
-        return [shlex.join(given), *self._next(record)]
+        return [shlex.join(given), *self._next(diagnosis)]
 
-    def _next(self, record: Mapping[str, Any]) -> list[str]:
+    def _next(self, diagnosis: Diagnosis) -> list[str]:
         """The command that uses the corrected scenario, if anything in it is corrected."""
-        if record["corrected"] is None or not any(map(_in_the_model, record["effects"])):
+        if diagnosis.corrected is None or not any(map(_in_the_model, diagnosis.effects)):
             return []
         corrected = str(self.out / CORRECTED)
         return [
             shlex.join(["ugat-marl", "train", self.scenario, "--sim", corrected]) + " --real REAL"
         ]
 
-    def _say_where(self, record: Mapping[str, Any], console: Console) -> None:
+    def _say_where(self, diagnosis: Diagnosis, console: Console) -> None:
         lines = [f"diagnosis: {self.out / FILE}"]
         if self.report:
             lines.append(f"page:      {self.out / REPORT}")
-        if record["corrected"] is not None:
+        if diagnosis.corrected is not None:
             lines.append(f"corrected: {self.out / CORRECTED}")
-        if following := self._next(record):
+        if following := self._next(diagnosis):
             lines.append(f"use it:    {following[0]}")
-        elif record["effects"]:
+        elif diagnosis.effects:
             lines.append("The effects are faults of detectors; the simulation stays as it is.")
         console.print("\n" + "\n".join(lines), soft_wrap=True, markup=False)
 
@@ -163,6 +171,6 @@ def _say_what_cannot_be_seen(measured: Measured, console: Console) -> None:
     console.print(text, markup=False)
 
 
-def _in_the_model(effect: Mapping[str, Any]) -> bool:
+def _in_the_model(effect: NamedEffect) -> bool:
     """Whether an effect changes the simulation, and not only what detectors see."""
-    return not known_effects()[effect["name"]].on_detectors
+    return not known_effects()[effect.name].on_detectors

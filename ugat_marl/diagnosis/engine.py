@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import io
 import itertools
@@ -23,7 +24,7 @@ from ugat_marl.diagnosis.arrivals import Due, corrected
 from ugat_marl.diagnosis.features import FEATURES, Tally, tally
 from ugat_marl.diagnosis.replay import Day, Replay
 from ugat_marl.diagnosis.site import Greens, Site
-from ugat_marl.diagnosis.standstill import locked_up
+from ugat_marl.diagnosis.standstill import Usual, locked_up
 from ugat_marl.diagnosis.unmeasured import Unmeasured
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
@@ -75,12 +76,8 @@ class Engine:
         cache: Folder of remembered tallies, or None.
         deadline: ``time.monotonic()`` at which new simulations are refused, or None.
         workers: Simulations at a time, None for one per core; or an executor that simulates days.
+        base_days: Days of the scenario as it is that say which days are ordinary; 0 if all are.
     """
-
-    set_aside: frozenset[int] = frozenset()
-    """Numbers of days that `first` passes over."""
-    day_to_day: float = 0.0
-    """How much the vehicles counted on a day differ at least from day to day."""
 
     def __init__(
         self,
@@ -93,7 +90,9 @@ class Engine:
         cache: Path | None = None,
         deadline: float | None = None,
         workers: Workers = None,
+        base_days: int = 0,
     ) -> None:
+        self._base_days = base_days
         self.site = site
         self.periods = tuple(periods)
         self.simulated = 0
@@ -143,9 +142,19 @@ class Engine:
         finally:
             self._known_by = None
 
+    @functools.cached_property
+    def usual(self) -> Usual:
+        """Ordinary days of the scenario as it is; they are simulated if they are not known yet.
+
+        Raises:
+            OutOfTime: The budget does not suffice for that.
+        """
+        days = self.replicates([], range(self._base_days))
+        return Usual.of([day.tally for day in days]) if days else Usual()
+
     def first(self, count: int) -> list[int]:
-        """The numbers of the first days; those that were set aside are passed over."""
-        numbers = (number for number in itertools.count() if number not in self.set_aside)
+        """Return the numbers of the first days that are ordinary under the scenario as it is."""
+        numbers = (number for number in itertools.count() if number not in self.usual.set_aside)
         return list(itertools.islice(numbers, count))
 
     def ordinary(
@@ -162,7 +171,7 @@ class Engine:
             advance: Called after every one.
         """
         days = self.replicates(effects, numbers, advance)
-        aside = locked_up([day.tally for day in days], self.day_to_day)
+        aside = locked_up([day.tally for day in days], self.usual.day_to_day)
         known = enumerate(zip(numbers, days, strict=True))
         return {number: day for place, (number, day) in known if place not in aside}
 

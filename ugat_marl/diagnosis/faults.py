@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ugat_marl.diagnosis.features import INDEX
-from ugat_marl.diagnosis.fit import Members
-from ugat_marl.diagnosis.hypotheses import Hypothesis
+from ugat_marl.diagnosis.hypotheses import Hypothesis, Members
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Distance, Reference
 from ugat_marl.scenarios import Passages, Period, edge_of

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import Tally
-from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, ordered
-from ugat_marl.diagnosis.statistics import Distance, Pools, Reference, shift, shrunk
+from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_of
+from ugat_marl.diagnosis.records import Fitted
+from ugat_marl.diagnosis.statistics import Pools, Reference, shift, shrunk
 from ugat_marl.diagnosis.whitening import Whitener
-from ugat_marl.effects import EVERYWHERE, Effect
+from ugat_marl.effects import EVERYWHERE
 
 Array = NDArray[np.float64]
 
-Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
-"""A set of effects: hypotheses and the values of their free fields."""
 
 Change = tuple[dict[str, Array], float]
 """What moving a free value does to the statistics, and how far it was moved."""
@@ -41,48 +40,9 @@ INTERPOLATION = 0.02
 round what the street does not."""
 
 
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A model that was simulated.
-
-    Attributes:
-        members: Its effects.
-        days: Its simulated days by their numbers.
-        reference: Its statistics.
-        distance: From the data that were fitted.
-        cost: Distance, penalty for noise, and price of the effects: less is better.
-    """
-
-    members: Members
-    days: Mapping[int, Tally]
-    reference: Reference
-    distance: Distance
-    cost: float
-
-    @property
-    def tallies(self) -> tuple[Tally, ...]:
-        """Its simulated days."""
-        return tuple(self.days.values())
-
-    @property
-    def effects(self) -> tuple[Effect, ...]:
-        """The effects in the order in which they are applied."""
-        return effects_of(self.members)
-
-    @property
-    def values(self) -> Array:
-        """All free values, one after the other."""
-        return np.array([value for _, values in self.members for value in values])
-
-
 def cost_of(model: Fitted) -> float:
     """What models are ranked by."""
     return model.cost
-
-
-def effects_of(members: Members) -> tuple[Effect, ...]:
-    """Effects of a set, in order."""
-    return ordered([hypothesis.effect(values) for hypothesis, values in members])
 
 
 class Fitter:

@@ -80,6 +80,9 @@ class Hypothesis:
         return abs(values[0] - self.nominal[0]) >= self.least
 
 
+Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
+"""A set of effects: hypotheses and the values of their free fields."""
+
 LATE_STEP_S = 0.1
 """Lost time is fitted in tenths: fractions of a simulation step are spread over many greens."""
 
@@ -287,3 +290,34 @@ def a_few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
     low = [level for level in levels if level < nominal]
     high = [level for level in levels if level > nominal]
     return tuple(side[len(side) // 2] for side in (low, high) if side)
+
+
+def effects_of(members: Members) -> tuple[Effect, ...]:
+    """Effects of a set, in order."""
+    return ordered([hypothesis.effect(values) for hypothesis, values in members])
+
+
+def each_left_out(members: Members) -> list[Members]:
+    """The set without each of its effects."""
+    return [_without(members, index) for index in range(len(members))]
+
+
+def merged(members: Members, new: Members) -> Members:
+    """A model with further effects, or with other values; those at nothing are left out."""
+    found = {hypothesis.key: (hypothesis, values) for hypothesis, values in members}
+    for hypothesis, values in new:
+        found[hypothesis.key] = (hypothesis, values)
+    return tuple(
+        (hypothesis, values)
+        for hypothesis, values in found.values()
+        if hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
+    )
+
+
+def _without(members: Members, place: int) -> Members:
+    return (*members[:place], *members[place + 1 :])
+
+
+def names_of(members: Members) -> str:
+    """Names of the effects, for progress and notes."""
+    return "+".join(hypothesis.name for hypothesis, _ in members)

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ugat_marl.diagnosis.features import Tally
-from ugat_marl.diagnosis.fit import Fitted, Fitter, derivatives, replaced
+from ugat_marl.diagnosis.fit import Fitter, derivatives, replaced
+from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.statistics import Array, shift
 
 HALF_INTERVAL = 1.96

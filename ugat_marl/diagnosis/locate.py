@@ -4,52 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
+from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
 
 SHOWN = 40
 _REGIME_OF_BINS = ("volume", "volume", "volume", "storage")
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """One place and regime in which data and model differ.
-
-    Attributes:
-        tls: Traffic light, or None for all of the network.
-        approach: Edge, or None for all.
-        lane: Lane, or None for all.
-        regime: discharge, free flow, approach to red, yellow, storage, volume or vehicles.
-        statistic: The one that differs most.
-        window: Begin and end on the scenario's clock, s; None for all of the time.
-        size: Measured minus simulated, in `unit`.
-        unit: Of the statistic.
-        z: The same in standard deviations.
-        p: Chance of this under the model.
-    """
-
-    tls: str | None
-    approach: str | None
-    lane: str | None
-    regime: str
-    statistic: str
-    window: tuple[float, float] | None
-    size: float
-    unit: str
-    z: float
-    p: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """The fields for JSON."""
-        found = asdict(self)
-        found["window"] = None if self.window is None else list(self.window)
-        return found
 
 
 def locate(
@@ -58,8 +23,8 @@ def locate(
     distance: Distance,
     alpha: float,
     span: tuple[float, float] | None,
-) -> list[Disagreement]:
-    """All disagreements that survive the control of false discoveries, strongest first.
+) -> tuple[Disagreement, ...]:
+    """Find all disagreements that survive the control of false discoveries, strongest first.
 
     The control is that of Benjamini and Hochberg (1995) over all statistics of all pools and all
     stretches of time. The statistics of a place are then gathered by regime.
@@ -83,7 +48,7 @@ def locate(
     for rank, item in enumerate(found, start=1):
         if item.p <= alpha * rank / max(tested, 1):
             kept = rank
-    return _gathered(found[:kept])[:SHOWN]
+    return tuple(_gathered(found[:kept])[:SHOWN])
 
 
 def _chance(z: float) -> float:

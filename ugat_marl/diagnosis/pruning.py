@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ugat_marl.diagnosis.fit import SETTLING_DAYS, Fitted, Fitter, cost_of
+from ugat_marl.diagnosis.fit import SETTLING_DAYS, Fitter, cost_of
+from ugat_marl.diagnosis.hypotheses import each_left_out, merged, names_of
 from ugat_marl.diagnosis.intervals import HALF_INTERVAL
-from ugat_marl.diagnosis.members import each_left_out, merged, names_of
-from ugat_marl.diagnosis.residual import Tested
+from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.progress import Reporter, Silent
 
 NEGLIGIBLE = 150.0

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import Tally
-from ugat_marl.diagnosis.fit import Fitted
+from ugat_marl.diagnosis.records import Residual
 from ugat_marl.diagnosis.statistics import Distance, Pools, Reference
 
 Array = NDArray[np.float64]
@@ -26,26 +26,6 @@ Directed = Callable[[Distance], Mapping[str, float]]
 _DRAWS = 40
 ONE_DAY = 0.25
 """Chance above which data without some day are nothing unusual."""
-
-
-@dataclass(frozen=True)
-class Residual:
-    """The test of one model on one data set.
-
-    Attributes:
-        distance: Of the data from the model, in total.
-        floor: What 99 of 100 data sets of the model itself would stay below, in total.
-        expected: Mean distance of data sets of the model itself.
-        p: Chance of a distance like this under the model: smallest over the blocks, corrected for
-            their number.
-        blocks: The same for every statistic that is tested.
-    """
-
-    distance: float
-    floor: float
-    expected: float
-    p: float
-    blocks: dict[str, float]
 
 
 class Null:
@@ -148,22 +128,3 @@ def _statistics(found: Distance, directed: Directed | None) -> dict[str, float]:
 def _log_moments(values: Sequence[float]) -> tuple[float, float]:
     logs = np.log(np.maximum(values, 1e-9))
     return float(logs.mean()), max(float(logs.std(ddof=1)), 0.02)
-
-
-@dataclass(frozen=True, eq=False)
-class Tested:
-    """A fitted model with the test of what it leaves.
-
-    Attributes:
-        model: The model.
-        null: Its own distribution of distances.
-        residual: The test on the fitted periods.
-        errors: Standard errors of its free values.
-        extra: What they make uncertain in the statistics, and the tolerance.
-    """
-
-    model: Fitted
-    null: Null
-    residual: Residual
-    errors: Array
-    extra: dict[str, Array]

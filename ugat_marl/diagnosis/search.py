@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.hypotheses import Hypothesis
+from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Distance, Reference, softened, without_noise
 from ugat_marl.diagnosis.whitening import Whitener
 
@@ -54,19 +55,6 @@ class Ray:
         return self.hypothesis.clipped(values)
 
 
-@dataclass(frozen=True, eq=False)
-class Proposal:
-    """A set of effects to simulate.
-
-    Attributes:
-        members: Hypotheses and values of their free fields.
-        expected: Distance that is left if all goes as on the rays.
-    """
-
-    members: tuple[tuple[Hypothesis, tuple[float, ...]], ...]
-    expected: float
-
-
 def between(rays: Sequence[Ray]) -> list[Ray]:
     """The rays, and further ones half-way between strengths of the same hypothesis.
 
@@ -101,7 +89,7 @@ def _side(ray: Ray) -> bool:
 
 def propose(
     rays: Sequence[Ray], whitener: Whitener, price: float, largest: int = 3
-) -> list[Proposal]:
+) -> list[Proposed]:
     """Sets of effects in order of what they would leave.
 
     Args:
@@ -120,7 +108,7 @@ def propose(
     gram = basis @ basis.T
     match = basis @ target
     start = float(target @ target)
-    best: dict[tuple[object, ...], Proposal] = {}
+    best: dict[tuple[object, ...], Proposed] = {}
     kept = list(range(len(rays)))
     for size in range(1, largest + 1):
         if size == 3 and len(kept) > 40:  # the strongest alone or in pairs
@@ -143,7 +131,7 @@ def propose(
                     for index, strength in zip(chosen, found, strict=True)
                 )
                 if all(_is_something(hypothesis, values) for hypothesis, values in members):
-                    best[keys] = Proposal(members, cost)
+                    best[keys] = Proposed(members, cost)
     return sorted(best.values(), key=lambda item: item.expected)
 
 
@@ -169,7 +157,7 @@ def _least_squares(
     return np.clip(found, -FARTHEST, FARTHEST)
 
 
-def _useful(best: dict[tuple[object, ...], Proposal], rays: Sequence[Ray], count: int) -> list[int]:
+def _useful(best: dict[tuple[object, ...], Proposed], rays: Sequence[Ray], count: int) -> list[int]:
     """Rays of the hypotheses in the best sets so far."""
     keys: list[str] = []
     for item in sorted(best.values(), key=lambda item: item.expected):
@@ -183,7 +171,7 @@ def _useful(best: dict[tuple[object, ...], Proposal], rays: Sequence[Ray], count
     return found[:count]
 
 
-def promising(proposals: Sequence[Proposal]) -> list[Proposal]:
+def promising(proposals: Sequence[Proposed]) -> list[Proposed]:
     """The best sets of each size, if a larger one promises more than a smaller one."""
     if not proposals:
         return []

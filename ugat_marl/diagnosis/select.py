@@ -8,22 +8,23 @@ from dataclasses import dataclass, replace
 
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import Tally
-from ugat_marl.diagnosis.fit import (
-    SETTLING_DAYS,
-    WIDE,
-    Fitted,
-    Fitter,
+from ugat_marl.diagnosis.fit import SETTLING_DAYS, WIDE, Fitter, cost_of
+from ugat_marl.diagnosis.hypotheses import (
+    Hypothesis,
     Members,
-    cost_of,
+    a_few,
+    both_ways,
     effects_of,
+    merged,
+    names_of,
+    settings_as_members,
 )
-from ugat_marl.diagnosis.hypotheses import Hypothesis, a_few, both_ways, settings_as_members
 from ugat_marl.diagnosis.intervals import uncertainty
 from ugat_marl.diagnosis.local import Proposer
 from ugat_marl.diagnosis.matched import Directions
-from ugat_marl.diagnosis.members import merged, names_of
 from ugat_marl.diagnosis.pruning import pruned
-from ugat_marl.diagnosis.residual import Null, Tested
+from ugat_marl.diagnosis.records import Fitted, Located, Selected, Tested
+from ugat_marl.diagnosis.residual import Null
 from ugat_marl.diagnosis.search import Ray, between, promising, propose, squared_gap
 from ugat_marl.diagnosis.whitening import Whitener
 from ugat_marl.effects import Effect
@@ -72,21 +73,6 @@ class Effort:
     test: int = 36
 
 
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """What the search came to.
-
-    Attributes:
-        best: The model selected; without effects if none was worth its price.
-        rivals: Other sets of effects that were fitted, best first.
-        complete: Whether the search ended by itself, and not by the budget.
-    """
-
-    best: Tested
-    rivals: tuple[Fitted, ...]
-    complete: bool
-
-
 class Selector:
     """Searches for the effects that make the difference.
 
@@ -130,7 +116,7 @@ class Selector:
         self.examined: set[str] = set()
 
     def looked_closer(self, base: Tested) -> Tested:
-        """The test of the scenario as it is once it is known where single effects would show.
+        """Test the scenario as it is where single effects would show.
 
         Raises:
             OutOfTime: The budget does not suffice for that.
@@ -139,11 +125,11 @@ class Selector:
         self._places = tuple(self._bank(base.model, self._proposer.everywhere(), 0, "places"))
         directions = Directions((*self._library_rays(base.model, 0), *self._places))
         null = self._null(base.model.tallies, len(data), directions, ())
-        return replace(base, null=null, residual=null.test(data))
+        return replace(base, residual=null.test(data))
 
-    def select(self, base: Tested) -> Selection:
-        """The search, from the scenario as it is."""
-        best = base
+    def select(self, located: Located) -> Selected:
+        """Search from the scenario as it is."""
+        base = best = located.base
         complete = True
         try:
             for number in range(ROUNDS):
@@ -161,7 +147,8 @@ class Selector:
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
             if cheapest.cost < best.model.cost:
                 best = self._untested(cheapest, base)
-        return Selection(best, tuple(sorted(self._seen.values(), key=cost_of)), complete)
+        rivals = tuple(sorted(self._seen.values(), key=cost_of))
+        return Selected(best, rivals, complete, located.examined | self.examined)
 
     def test(self, model: Fitted) -> Tested:
         """Simulates more days of a model and tests what it leaves."""
@@ -184,7 +171,7 @@ class Selector:
         fitted = tuple(change for change, _ in fitter.changes(model))
         directions = Directions((*self._rays, *self._places), extra, fitted)
         null = self._null(days, len(fitter.data), directions, model.effects)
-        return Tested(model, null, null.test(fitter.data, extra), errors, extra)
+        return Tested(model, null.test(fitter.data, extra), errors, extra)
 
     def _days(self, model: Fitted) -> list[Tally]:
         engine = self._fitter.engine
@@ -193,8 +180,7 @@ class Selector:
 
     def _untested(self, model: Fitted, base: Tested) -> Tested:
         """A model for whose test there was no time: its errors are unknown."""
-        residual = base.null.test(self._fitter.data)
-        return Tested(model, base.null, residual, 0.0 * model.values, {})
+        return Tested(model, base.residual, 0.0 * model.values, {})
 
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Adds, changes or removes effects; None if nothing is worth it."""

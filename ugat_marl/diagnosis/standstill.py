@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,29 @@ LOCKED_UP = 5.0
 RARE = 0.1
 """Share of days up to which such days are not part of a model: five measured days rather have none.
 The test of what is left does not hang on one of them."""
+
+
+@dataclass(frozen=True)
+class Usual:
+    """Ordinary days of the scenario as it is.
+
+    Attributes:
+        set_aside: Numbers of its days on which traffic came to a standstill.
+        day_to_day: Robust standard deviation of the vehicles counted on the others.
+    """
+
+    set_aside: frozenset[int] = frozenset()
+    day_to_day: float = 0.0
+
+    @classmethod
+    def of(cls, tallies: Sequence[Tally]) -> Usual:
+        """Tell the ordinary days from the others.
+
+        Args:
+            tallies: All days from the first on.
+        """
+        aside = frozenset(locked_up(tallies))
+        return cls(aside, day_to_day([day for n, day in enumerate(tallies) if n not in aside]))
 
 
 def day_to_day(tallies: Sequence[Tally]) -> float:

@@ -14,16 +14,16 @@ from ugat_marl.data import Measured, follows_traffic
 from ugat_marl.diagnosis.counted import bins_together, counts_tally, without_gaps
 from ugat_marl.diagnosis.engine import Engine, default_cache
 from ugat_marl.diagnosis.features import Tally
-from ugat_marl.diagnosis.fit import Fitted, Fitter
+from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, library
 from ugat_marl.diagnosis.local import Proposer
 from ugat_marl.diagnosis.matched import Directions
 from ugat_marl.diagnosis.reach import unreached
+from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
-from ugat_marl.diagnosis.residual import Directed, Null, Tested
+from ugat_marl.diagnosis.residual import Directed, Null
 from ugat_marl.diagnosis.select import Effort, Selector
 from ugat_marl.diagnosis.site import Site
-from ugat_marl.diagnosis.standstill import day_to_day, locked_up
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, added, shift
 from ugat_marl.diagnosis.volume import Routes
 from ugat_marl.effects import Effect
@@ -140,8 +140,9 @@ class Study:
             raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
         lights = site.intersections
         answering = any(follows_traffic(measured.periods, tls) for tls in lights)
+        effort = config.effort or effort_for(len(lights))
 
-        def simulating(answering: bool) -> Engine:
+        def simulating(answering: bool, base_days: int) -> Engine:
             return Engine(
                 scenario,
                 site,
@@ -151,9 +152,10 @@ class Study:
                 cache=config.cache or default_cache(),
                 deadline=time.monotonic() + config.budget_s,
                 workers=config.workers,
+                base_days=base_days,
             )
 
-        engine = simulating(answering)
+        engine = simulating(answering, effort.base)
         return cls(
             scenario,
             network,
@@ -164,10 +166,10 @@ class Study:
             Pools.of(site, 1 if measured.has_events else bins_together(measured.counts)),
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
-            config.effort or effort_for(len(site.intersections)),
+            effort,
             _tallies(site, engine, measured, periods),
             _tallies(site, engine, measured, measured.of("heldout") or periods),
-            simulating(False) if answering else None,
+            simulating(False, 0) if answering else None,
             ruled_out,
         )
 
@@ -189,11 +191,9 @@ class Study:
             numbers = range(min(DOUBT_DAYS, self.effort.base))
             with reporter.task("the same with other vehicles", len(numbers)) as advance:
                 self.other_days.replicates([], numbers, advance)  # remembered for `doubt`
-        aside = locked_up([day.tally for day in days])
-        self.engine.set_aside = frozenset(aside)
+        aside = self.engine.usual.set_aside
         known = {number: day.tally for number, day in enumerate(days) if number not in aside}
         tallies = list(known.values())
-        self.engine.day_to_day = day_to_day(tallies)
         reference = Reference(self.pools, tallies, speeds=self.speeds, doubt=self.doubt())
         counts = sum(float(day.bins[:3].sum()) for day in tallies) / len(tallies)
         if counts < 1.0:
@@ -203,8 +203,8 @@ class Study:
             )
         distance = reference.distance(self.fit)
         model = Fitted((), known, reference, distance, distance.total)
-        null = self.null(tallies, len(self.fit))
-        return Tested(model, null, null.test(self.fit), np.empty(0), {})
+        residual = self.null(tallies, len(self.fit)).test(self.fit)
+        return Tested(model, residual, np.empty(0), {})
 
     def null(
         self,

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from ugat_marl.diagnosis.faults import one_behind_the_other
 from ugat_marl.diagnosis.features import FEATURES
-from ugat_marl.diagnosis.fit import Fitted, Members
-from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis
+from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members
 from ugat_marl.diagnosis.intervals import HALF_INTERVAL
-from ugat_marl.diagnosis.residual import Tested
-from ugat_marl.diagnosis.select import Selection, Selector
+from ugat_marl.diagnosis.records import (
+    Conclusion,
+    EffectRecord,
+    Fitted,
+    Located,
+    Parameter,
+    Selected,
+    Verified,
+)
+from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.site import Site
-from ugat_marl.diagnosis.verify import Verification
 from ugat_marl.diagnosis.wording import amount, clock, listed, statistic
-from ugat_marl.effects import known_effects
-
-Verdict = Literal[
-    "no_discrepancy", "explained", "not_identifiable", "partially_explained", "unknown"
-]
+from ugat_marl.effects import Effect, known_effects
 
 INDISTINCT = 25.0
 """Models whose distances differ by less fit equally well: a likelihood ratio above e^12 either way
@@ -37,44 +38,25 @@ CONFIRMED = 10.0
 """What the effects must take off the distance of the held-out periods."""
 
 
-@dataclass(frozen=True, eq=False)
-class Conclusion:
-    """A verdict with its grounds.
-
-    Attributes:
-        verdict: Which.
-        best: The model it speaks of.
-        indistinct: Other models that fit as well.
-        sentence: The verdict for people.
-        next_measurement: What would tell the rivals apart, or show what is missing.
-    """
-
-    verdict: Verdict
-    best: Tested
-    indistinct: tuple[Fitted, ...]
-    sentence: str
-    next_measurement: str | None
-
-
 def conclude(
-    base: Tested,
-    selection: Selection,
+    located: Located,
+    selection: Selected,
     selector: Selector,
-    verification: Verification,
+    verification: Verified,
     alpha: float,
     site: Site,
 ) -> Conclusion:
-    """Draws the conclusion of a search.
+    """Draw the conclusion of a search.
 
     Args:
-        base: The test of the scenario as it is.
-        selection: What was found.
+        located: The scenario as it is.
+        selection: The result of the search.
         selector: Tests rivals.
         verification: The held-out periods.
         alpha: Level of the tests.
         site: Lanes and detectors.
     """
-    best = selection.best
+    base, best = located.base, selection.best
     confirmed = verification.before.distance - verification.after.distance >= CONFIRMED
     chance = combined(base.residual.p, verification.before.p)
     if chance > alpha and not confirmed and selection.complete:
@@ -107,7 +89,41 @@ def conclude(
     return Conclusion("unknown", best, (), _unexplained(selection) + ".", _look_at(selection))
 
 
-def _sufficient(selection: Selection, selector: Selector, alpha: float, site: Site) -> Conclusion:
+def unchallenged(
+    located: Located, ruled_out: Collection[str], timing: Sequence[Effect]
+) -> Conclusion:
+    """Conclude that the scenario as it is could have made the data.
+
+    Args:
+        located: The scenario as it is.
+        ruled_out: Effects the data cannot show.
+        timing: Effects that are read off the signal log.
+    """
+    blind = f"; {len(ruled_out)} effects could not be examined" if ruled_out else ""
+    sentence = f"Nothing in the data contradicts the scenario as it is{blind}."
+    if timing:
+        named = " and ".join(map(str, timing))
+        sentence = f"The signal log has {named}; with that, nothing contradicts the scenario."
+    if not located.complete:
+        sentence += " The budget ended before single effects were looked for."
+    verdict = "explained" if timing else "no_discrepancy"
+    return Conclusion(verdict, located.base, (), sentence, None)
+
+
+def unverified(located: Located, selected: Selected) -> tuple[Verified, Conclusion]:
+    """Conclude what can be said when the budget ended before the model was verified."""
+    residual = located.base.residual
+    members = selected.best.model.members
+    nearest = f" The nearest so far is {describe_members(members)}." if members else ""
+    sentence = (
+        "Simulation and measurement disagree; the budget ended before an explanation was verified."
+        f"{nearest} Run the same command again to go on."
+    )
+    conclusion = Conclusion("unknown", selected.best, (), sentence, None)
+    return Verified(residual, residual, None), conclusion
+
+
+def _sufficient(selection: Selected, selector: Selector, alpha: float, site: Site) -> Conclusion:
     """The conclusion where a set of effects leaves no more than chance."""
     best = selection.best
     names = describe_members(best.model.members)
@@ -136,7 +152,7 @@ def _sufficient(selection: Selection, selector: Selector, alpha: float, site: Si
     return Conclusion("explained", best, (), sentence, None)
 
 
-def _unexplained(selection: Selection) -> str:
+def _unexplained(selection: Selected) -> str:
     """That nothing was found, which only a search that came to its end says of the library."""
     if selection.complete:
         return "Simulation and measurement disagree, and no effect of the library explains it"
@@ -152,7 +168,7 @@ def combined(one: float, other: float) -> float:
     return product * (1.0 - math.log(product))
 
 
-def _rivals(selection: Selection, selector: Selector, alpha: float) -> tuple[Fitted, ...]:
+def _rivals(selection: Selected, selector: Selector, alpha: float) -> tuple[Fitted, ...]:
     """Other sets of effects that leave no more than chance and are hardly farther away."""
     best = selection.best.model
     names = _kinds(best.members)
@@ -187,7 +203,7 @@ def _kinds(members: Members) -> set[str]:
     return {hypothesis.name for hypothesis, _ in members}
 
 
-def _look_at(selection: Selection) -> str | None:
+def _look_at(selection: Selected) -> str | None:
     """The regime in which most is left; as long as more time may explain it, no measurement."""
     if not selection.complete:
         return None
@@ -233,31 +249,31 @@ def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
     return text
 
 
-def place_and_window(hypothesis: Hypothesis) -> tuple[str | None, list[float] | None]:
-    """The texts of an effect joined, and its window."""
+def place_and_window(
+    hypothesis: Hypothesis,
+) -> tuple[str | None, tuple[float, float] | None]:
+    """Return the texts of an effect joined, and its window."""
     fixed = dict(hypothesis.fixed)
     texts = [value for value in fixed.values() if isinstance(value, str)]
-    window = [float(fixed[key]) for key in WINDOW] if set(WINDOW) <= set(fixed) else None
+    begin, end = (fixed.get(key) for key in WINDOW)
+    window = None if begin is None or end is None else (float(begin), float(end))
     return (">".join(texts) if texts else None), window
 
 
 def effect_record(
-    hypothesis: Hypothesis, values: tuple[float, ...], errors: tuple[float, ...]
-) -> dict[str, Any]:
-    """An effect for ``diagnosis.json``, with 95 % intervals of its numbers."""
+    hypothesis: Hypothesis, values: tuple[float, ...], errors: tuple[float, ...] | None = None
+) -> EffectRecord:
+    """Write an effect, with 95 % intervals of its numbers if their errors are known."""
     place, window = place_and_window(hypothesis)
     ranges = known_effects()[hypothesis.name].ranges
-    parameters: dict[str, Any] = {}
-    for name, value, error in zip(hypothesis.free, values, errors, strict=True):
-        allowed = ranges[name]
-        parameters[name] = {
-            "value": value,
-            "low": max(value - HALF_INTERVAL * error, allowed.low),
-            "high": min(value + HALF_INTERVAL * error, allowed.high),
-            "unit": allowed.unit,
-        }
+    parameters: dict[str, Parameter] = {}
+    for index, (name, value) in enumerate(zip(hypothesis.free, values, strict=True)):
+        allowed, low, high = ranges[name], None, None
+        if errors is not None:
+            low = max(value - HALF_INTERVAL * errors[index], allowed.low)
+            high = min(value + HALF_INTERVAL * errors[index], allowed.high)
+        parameters[name] = Parameter(value, low, high, allowed.unit)
     for name, value in hypothesis.fixed:
         if not isinstance(value, str) and name not in WINDOW:
-            unit = ranges[name].unit
-            parameters[name] = {"value": value, "low": None, "high": None, "unit": unit}
-    return {"name": hypothesis.name, "place": place, "window": window, "parameters": parameters}
+            parameters[name] = Parameter(value, None, None, ranges[name].unit)
+    return EffectRecord(hypothesis.name, place, window, parameters)

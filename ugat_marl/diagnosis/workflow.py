@@ -1,4 +1,4 @@
-"""The diagnosis from data to a corrected scenario: locate, hypothesise, fit, select, apply, verify.
+"""The diagnosis from data to a corrected scenario: locate, propose, fit, select, verify, correct.
 
 Every simulated day is remembered, so that a diagnosis that was interrupted goes on where it was,
 and one of the same scenario under the same signals needs few simulations.
@@ -6,39 +6,49 @@ and one of the same scenario under the same signals needs few simulations.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from ugat_marl.data import Measured, versions_of
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.fit import Fitted
-from ugat_marl.diagnosis.locate import Disagreement, locate
-from ugat_marl.diagnosis.residual import Tested
-from ugat_marl.diagnosis.select import Selection, Selector
+from ugat_marl.diagnosis.locate import locate
+from ugat_marl.diagnosis.records import (
+    CORRECTED,
+    SCHEMA,
+    Conclusion,
+    Diagnosis,
+    Disagreement,
+    EffectRecord,
+    Explanation,
+    FitEvidence,
+    Fitted,
+    HeldOut,
+    Located,
+    LogGrounds,
+    NamedEffect,
+    Parameter,
+    PolicyGap,
+    SearchGrounds,
+    Selected,
+    Splits,
+    Tables,
+    Tested,
+    Verdict,
+    Verified,
+)
+from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.signal_timing import IN_THE_LOG, timing_effects
 from ugat_marl.diagnosis.study import DiagnosisConfig, Study
-from ugat_marl.diagnosis.verdict import Conclusion, conclude, describe_members, effect_record
-from ugat_marl.diagnosis.verify import (
-    Verification,
-    courtesy,
-    lanes_table,
-    statistics_table,
-    travel_times,
-    verify,
-)
+from ugat_marl.diagnosis.verdict import conclude, effect_record, unchallenged, unverified
+from ugat_marl.diagnosis.verify import tables_of, verify_model
 from ugat_marl.effects import Effect, apply_effects
-from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
-__all__ = ["DiagnosisConfig", "Study", "corrected", "diagnose", "where"]
-
-SCHEMA = "ugat-marl/diagnosis/1"
-FILE, CORRECTED = "diagnosis.json", "corrected"
-_ALTERNATIVES = 12
+ALTERNATIVES = 12
+"""Other sets of effects that are written."""
 
 
 def diagnose(
@@ -47,14 +57,14 @@ def diagnose(
     directory: Path,
     config: DiagnosisConfig | None = None,
     reporter: Reporter | None = None,
-) -> dict[str, Any]:
-    """Finds where scenario and data disagree, names the missing effects, and adds them.
+) -> Diagnosis:
+    """Find where scenario and data disagree, name the missing effects, and add them.
 
     Args:
         scenario: The simulation.
         measured: The data; see `ugat_marl.data.measured.reading.read_measured`.
         directory: ``diagnosis.json`` and the scenario ``corrected`` go there.
-        config: How.
+        config: Budget, level of the tests, seed.
         reporter: Shows progress.
 
     Returns:
@@ -67,58 +77,74 @@ def diagnose(
     config = config or DiagnosisConfig()
     reporter = reporter or Silent()
     study = Study.of(scenario, measured, config)
-    for item in study.measured.findings:
-        reporter.say(f"note: {item.text}")
+    for finding in study.measured.findings:
+        reporter.say(f"note: {finding.text}")
     read = timing_effects(scenario, study.network, measured)
     timing = tuple(effect for effect in read if effect.name not in config.leave_out)
+    named = timing
     try:
         base = study.base(reporter)
     except OutOfTime:
-        record = _nothing_simulated(study, timing)
+        diagnosis = _nothing_simulated(study, timing)
     else:
-        record = _compared(study, base, timing, reporter)
-    effects = record.pop("_effects")
-    record |= _head(study)
-    record["corrected"] = CORRECTED if effects else None
+        diagnosis, found = _compared(study, base, timing, reporter)
+        named += found
     place = directory / CORRECTED
     if (place / "scenario.toml").is_file():  # of an earlier diagnosis
         shutil.rmtree(place)
-    if effects:
-        corrected(scenario, effects, place)
-    record = _plain(record)
-    record["policy_gap"] = _known_gap(directory / FILE, record)
-    text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
-    write_whole(directory / FILE, text + "\n")
-    return json.loads(text)
+    if named:
+        apply_effects(scenario, named).write(place)
+        diagnosis = replace(diagnosis, corrected=CORRECTED)
+    written = Diagnosis.from_json(diagnosis.to_json())  # as precise as the file
+    written = replace(written, policy_gap=_known_gap(directory, written))
+    written.write(directory)
+    return written
 
 
 def _compared(
     study: Study, base: Tested, timing: tuple[Effect, ...], reporter: Reporter
-) -> dict[str, Any]:
-    """The record, once the scenario as it is has been simulated."""
-    alpha = study.config.alpha
+) -> tuple[Diagnosis, tuple[Effect, ...]]:
+    """Run all stages, once the scenario as it is has been simulated.
+
+    Returns:
+        The record, and the effects that the search names.
+    """
     selector = study.selector(base, reporter)
+    located = locate_gap(study, base, selector)
+    if located.base.residual.p > study.config.alpha:
+        verified = verify_model(study, located.base, located.base)
+        conclusion = unchallenged(located, study.ruled_out, timing)
+        return _record(study, timing, located, None, verified, conclusion), ()
+    selected = selector.select(located)
+    try:
+        verified = verify_model(study, located.base, selected.best)
+        conclusion = conclude(located, selected, selector, verified, study.config.alpha, study.site)
+        if conclusion.verdict == "no_discrepancy":
+            verified = Verified(verified.before, verified.before, None)
+            conclusion = _beside_the_log(study, located, conclusion, timing)
+        diagnosis = _record(study, timing, located, selected, verified, conclusion)
+    except OutOfTime:
+        selected = replace(selected, complete=False)
+        verified, conclusion = unverified(located, selected)
+        diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
+    return diagnosis, () if conclusion.verdict == "unknown" else conclusion.best.model.effects
+
+
+def locate_gap(study: Study, base: Tested, selector: Selector) -> Located:
+    """Test the scenario as it is, and find where it is contradicted."""
     complete = True
-    if base.residual.p > alpha:
+    if base.residual.p > study.config.alpha:
         try:
             base = selector.looked_closer(base)
         except OutOfTime:
             complete = False
-    if base.residual.p > alpha:
-        record = _nothing(study, base, timing, complete)
-    else:
-        record = _search(study, base, selector, timing, reporter)
-    left = [] if record["complete"] else _untried(study, selector.examined)
-    return record | {"untried": left}
+    contradicted = base.residual.p <= study.config.alpha
+    places = disagreements(study, base) if contradicted else ()
+    return Located(base, places, complete, frozenset(selector.examined))
 
 
-def _untried(study: Study, examined: Collection[str]) -> list[str]:
-    """Effects that were not examined; those of the signal log are read off it at once."""
-    return sorted(study.allowed.difference(examined, IN_THE_LOG))
-
-
-def where(study: Study, model: Tested) -> list[Disagreement]:
-    """Where the fitted periods disagree with a model."""
+def disagreements(study: Study, model: Tested) -> tuple[Disagreement, ...]:
+    """Find where the fitted periods disagree with a model."""
     periods = study.measured.of("fit")
     spans = {(period.begin_s, period.end_s) for period in periods}
     span = spans.pop() if len(spans) == 1 else None
@@ -126,247 +152,198 @@ def where(study: Study, model: Tested) -> list[Disagreement]:
     return locate(study.site, model.model.reference, distance, study.config.alpha, span)
 
 
-def corrected(scenario: Scenario, effects: tuple[Effect, ...], directory: Path) -> Path:
-    """Writes the scenario with the effects: a domain like any other."""
-    return apply_effects(scenario, effects).write(directory)
+def _beside_the_log(
+    study: Study, located: Located, conclusion: Conclusion, timing: tuple[Effect, ...]
+) -> Conclusion:
+    """Add to a conclusion without effects those that are read off the signal log."""
+    if not timing:
+        return conclusion
+    alone = unchallenged(located, study.ruled_out, timing)
+    sentence = f"{alone.sentence} {conclusion.sentence}"
+    return replace(conclusion, verdict=alone.verdict, sentence=sentence)
 
 
-def _nothing(
-    study: Study, base: Tested, timing: tuple[Effect, ...], complete: bool
-) -> dict[str, Any]:
-    """The record where the scenario as it is could have made the data."""
-    verification = verify(study, base, base)
-    ruled = f"; {len(study.ruled_out)} effects could not be examined" if study.ruled_out else ""
-    sentence = f"Nothing in the data contradicts the scenario as it is{ruled}."
-    if timing:
-        named = " and ".join(map(str, timing))
-        sentence = f"The signal log has {named}; with that, nothing contradicts the scenario."
-    if not complete:
-        sentence += " The budget ended before single effects were looked for."
-    return {
-        "verdict": "explained" if timing else "no_discrepancy",
-        "sentence": sentence,
-        "effects": [_timing_record(effect) for effect in timing],
-        "where": [],
-        "left": [],
-        "alternatives": [],
-        "heldout": verification.as_dict(),
-        "evidence": {"p_fit": base.residual.p, "p_fit_after": base.residual.p},
-        "best": None,
-        "next_measurement": None,
-        "complete": complete,
-        **_tables(study, base, base),
-        "_effects": timing,
-    }
+# --- the record ---------------------------------------------------------------------------------
 
 
-def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> dict[str, Any]:
-    """The record of a budget that does not suffice for the scenario as it is."""
-    done = study.engine.known
-    return {
-        "verdict": "unknown",
-        "sentence": (
-            f"The budget of {study.config.budget_s:g} s ended after {done} of {study.effort.base} "
-            "simulated days of the scenario as it is, before anything could be compared. Run the "
-            "same command again to go on, or give a larger budget."
-        ),
-        "effects": [_timing_record(effect) for effect in timing],
-        "where": [],
-        "left": [],
-        "alternatives": [],
-        "heldout": None,
-        "evidence": {},
-        "best": None,
-        "next_measurement": None,
-        "complete": False,
-        "untried": _untried(study, ()),
-        "_effects": timing,
-    }
-
-
-def _search(
+def _record(
     study: Study,
-    base: Tested,
-    selector: Selector,
     timing: tuple[Effect, ...],
-    reporter: Reporter,
-) -> dict[str, Any]:
-    """The record where the scenario as it is could not have made the data."""
-    located = where(study, base)
-    selection = selector.select(base)
-    try:
-        verification = verify(study, base, selection.best)
-        conclusion = conclude(
-            base, selection, selector, verification, study.config.alpha, study.site
-        )
-        plain = conclusion.verdict == "no_discrepancy"
-        tables = {} if plain else _tables(study, base, selection.best)
-    except OutOfTime:
-        selection = Selection(selection.best, selection.rivals, complete=False)
-        verification, conclusion = _unverified(base, selection)
-        tables = {}
-    if conclusion.verdict == "no_discrepancy":  # its tables are those of the scenario as it is
-        record = _nothing(study, base, timing, selection.complete)
-        hint = f"{record['sentence']} {conclusion.sentence}" if timing else conclusion.sentence
-        return record | {
-            "sentence": hint,
-            "where": [item.as_dict() for item in located],
-            "alternatives": [_alternative(item) for item in _ranking(conclusion, selection)],
-            "next_measurement": conclusion.next_measurement,
-        }
-    best = conclusion.best
-    named = conclusion.verdict != "unknown"
-    records: list[dict[str, Any]] = []
-    place = 0
-    for hypothesis, values in best.model.members if named else ():
-        errors = tuple(float(e) for e in best.errors[place : place + len(values)])
-        place += len(values)
-        records.append(
-            effect_record(hypothesis, values, errors) | {"evidence": _evidence(best, selection)}
-        )
-    records += [_timing_record(effect) for effect in timing]
-    return {
-        "verdict": conclusion.verdict,
-        "sentence": conclusion.sentence,
-        "effects": records,
-        "where": [item.as_dict() for item in located],
-        "left": [item.as_dict() for item in where(study, best)] if best.model.members else [],
-        "alternatives": [_alternative(item) for item in _ranking(conclusion, selection)],
-        "heldout": verification.as_dict(),
-        "evidence": {"p_fit": base.residual.p, "p_fit_after": best.residual.p},
-        "best": _alternative(best.model) if best.model.members else None,
-        "next_measurement": conclusion.next_measurement,
-        "complete": selection.complete,
-        **tables,
-        "_effects": (*timing, *best.model.effects) if named else timing,
-    }
-
-
-def _unverified(base: Tested, selection: Selection) -> tuple[Verification, Conclusion]:
-    """What can be said when the budget ended before the model was verified."""
-    verification = Verification(base.residual, base.residual, None)
-    members = selection.best.model.members
-    nearest = f" The nearest so far is {describe_members(members)}." if members else ""
-    sentence = (
-        "Simulation and measurement disagree; the budget ended before an explanation was verified."
-        f"{nearest} Run the same command again to go on."
+    located: Located,
+    selected: Selected | None,
+    verified: Verified,
+    conclusion: Conclusion,
+    *,
+    tables: bool = True,
+) -> Diagnosis:
+    """Gather what the stages found."""
+    base, best = located.base, conclusion.best
+    complete = located.complete if selected is None else selected.complete
+    examined = located.examined if selected is None else selected.examined
+    sides = tables_of(study, base, best) if tables else Tables()
+    named = () if selected is None or conclusion.verdict == "unknown" else _named(best, selected)
+    searched = _begun(
+        study, timing, conclusion.verdict, conclusion.sentence, None if complete else examined
     )
-    return verification, Conclusion("unknown", selection.best, (), sentence, None)
+    return replace(
+        searched,
+        effects=(*named, *searched.effects),
+        where=located.disagreements,
+        left=disagreements(study, best) if best.model.members else (),
+        alternatives=() if selected is None else _alternatives(conclusion, selected),
+        best=_explanation(best.model) if best.model.members else None,
+        heldout=HeldOut.of(verified),
+        evidence=FitEvidence(base.residual.p, best.residual.p),
+        statistics=sides.statistics,
+        lanes=sides.lanes,
+        courtesy=sides.courtesy,
+        travel_time=sides.travel_time,
+        next_measurement=conclusion.next_measurement,
+    )
 
 
-def _ranking(conclusion: Conclusion, selection: Selection) -> list[Fitted]:
-    """Models beside the one selected; those that fit as well come first."""
-    chosen = conclusion.best.model
-    others = [
-        item
-        for item in selection.rivals
-        if item.members != chosen.members and item not in conclusion.indistinct
-    ]
-    return [*conclusion.indistinct, *others][:_ALTERNATIVES]
+def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> Diagnosis:
+    """Make the record of a budget that does not suffice for the scenario as it is."""
+    sentence = (
+        f"The budget of {study.config.budget_s:g} s ended after {study.engine.known} of "
+        f"{study.effort.base} simulated days of the scenario as it is, before anything could be "
+        "compared. Run the same command again to go on, or give a larger budget."
+    )
+    return _begun(study, timing, "unknown", sentence, ())
 
 
-def _alternative(model: Fitted) -> dict[str, Any]:
-    effects = [effect_record(h, v, (0.0,) * len(v)) for h, v in model.members]
-    for effect in effects:
-        for parameter in effect["parameters"].values():
-            parameter["low"] = parameter["high"] = None
-    return {"effects": effects, "distance": model.distance.total, "cost": model.cost}
+def _begun(
+    study: Study,
+    timing: tuple[Effect, ...],
+    verdict: Verdict,
+    sentence: str,
+    examined: Collection[str] | None,
+) -> Diagnosis:
+    """Make a record of all that needs no simulation.
+
+    Args:
+        study: The diagnosis.
+        timing: Effects that are read off the signal log.
+        verdict: The verdict.
+        sentence: The same for people.
+        examined: Effects that were examined before the budget ended; None if it did not.
+    """
+    measured = study.measured
+    # Effects of the signal log are read off it at once.
+    left = () if examined is None else study.allowed.difference(examined, IN_THE_LOG)
+    return Diagnosis(
+        schema=SCHEMA,
+        scenario=study.scenario.id,
+        seed=study.config.seed,
+        alpha=study.config.alpha,
+        budget_s=study.config.budget_s,
+        left_out=tuple(sorted(study.config.leave_out)),
+        ruled_out=tuple(sorted(study.ruled_out)),
+        findings=tuple(finding.text for finding in measured.findings),
+        periods=Splits(
+            tuple(period.id for period in measured.of("fit")),
+            tuple(period.id for period in measured.of("heldout")),
+        ),
+        verified_on_fitted_periods=not measured.of("heldout"),
+        hashes={"scenario": study.scenario.hash, "measured": measured.hash},
+        versions=versions_of("ugat-marl", "eclipse-sumo"),
+        verdict=verdict,
+        sentence=sentence,
+        effects=tuple(_from_the_log(effect) for effect in timing),
+        where=(),
+        left=(),
+        alternatives=(),
+        best=None,
+        heldout=None,
+        evidence=None,
+        statistics=(),
+        lanes=(),
+        courtesy=None,
+        travel_time=None,
+        next_measurement=None,
+        complete=examined is None,
+        untried=tuple(sorted(left)),
+        corrected=None,
+    )
 
 
-def _evidence(best: Tested, selection: Selection) -> dict[str, Any]:
-    """How much better the model is than the best one without its effects."""
+def _named(best: Tested, selected: Selected) -> tuple[NamedEffect, ...]:
+    """Write the effects of the model selected, with intervals and grounds.
+
+    The grounds are by how much the model is better than the best one without its effects.
+    """
     names = {hypothesis.name for hypothesis, _ in best.model.members}
     others = [
-        item.cost
-        for item in selection.rivals
-        if {hypothesis.name for hypothesis, _ in item.members} != names
+        rival.cost
+        for rival in selected.rivals
+        if {hypothesis.name for hypothesis, _ in rival.members} != names
     ]
-    return {
-        "distance": best.model.distance.total,
-        "runner_up_is_worse_by": min(others) - best.model.cost if others else None,
+    worse_by = min(others) - best.model.cost if others else None
+    grounds = SearchGrounds(best.model.distance.total, worse_by)
+    effects: list[NamedEffect] = []
+    place = 0
+    for hypothesis, values in best.model.members:
+        errors = tuple(float(error) for error in best.errors[place : place + len(values)])
+        place += len(values)
+        effects.append(_with_grounds(effect_record(hypothesis, values, errors), grounds))
+    return tuple(effects)
+
+
+def _from_the_log(effect: Effect) -> NamedEffect:
+    """Write an effect that is read off the signal log, which is as certain as the log."""
+    values = effect.record()
+    name = str(values.pop("name"))
+    numbers = {key: float(value) for key, value in values.items()}
+    parameters = {
+        key: Parameter(value, value, value, effect.ranges[key].unit)
+        for key, value in numbers.items()
     }
+    return NamedEffect(name, None, None, parameters, LogGrounds("signal log"))
 
 
-def _timing_record(effect: Effect) -> dict[str, Any]:
-    """An effect read off the signal log, which is as certain as the log."""
-    record = effect.record()
-    name = record.pop("name")
-    return {
-        "name": name,
-        "place": None,
-        "window": None,
-        "parameters": {
-            key: {"value": value, "low": value, "high": value, "unit": effect.ranges[key].unit}
-            for key, value in record.items()
-        },
-        "evidence": {"source": "signal log"},
-    }
+def _with_grounds(effect: EffectRecord, grounds: SearchGrounds) -> NamedEffect:
+    return NamedEffect(effect.name, effect.place, effect.window, effect.parameters, grounds)
 
 
-def _tables(study: Study, base: Tested, best: Tested) -> dict[str, Any]:
-    found: dict[str, Any] = {
-        "statistics": statistics_table(study, base, best),
-        "lanes": lanes_table(study, base, best),
-        "courtesy": courtesy(study, base, best),
-    }
-    found["travel_time"] = travel_times(study, best)
-    return found
+def _alternatives(conclusion: Conclusion, selected: Selected) -> tuple[Explanation, ...]:
+    """Write the models beside the one selected; those that fit as well come first."""
+    chosen = conclusion.best.model
+    others = [
+        rival
+        for rival in selected.rivals
+        if rival.members != chosen.members and rival not in conclusion.indistinct
+    ]
+    ranking = [*conclusion.indistinct, *others][:ALTERNATIVES]
+    return tuple(_explanation(model) for model in ranking)
 
 
-def _head(study: Study) -> dict[str, Any]:
-    """What every diagnosis says of itself."""
-    measured = study.measured
-    return {
-        "schema": SCHEMA,
-        "scenario": study.scenario.id,
-        "seed": study.config.seed,
-        "alpha": study.config.alpha,
-        "budget_s": study.config.budget_s,
-        "left_out": sorted(study.config.leave_out),
-        "ruled_out": sorted(study.ruled_out),
-        "findings": [item.text for item in measured.findings],
-        "periods": {split: [p.id for p in measured.of(split)] for split in ("fit", "heldout")},
-        "verified_on_fitted_periods": not measured.of("heldout"),
-        "policy_gap": None,
-        "hashes": {"scenario": study.scenario.hash, "measured": measured.hash},
-        "versions": versions_of("ugat-marl", "eclipse-sumo"),
-    }
+def _explanation(model: Fitted) -> Explanation:
+    effects = tuple(effect_record(hypothesis, values) for hypothesis, values in model.members)
+    return Explanation(effects, model.distance.total, model.cost)
 
 
-def _known_gap(file: Path, record: dict[str, Any]) -> Any:
-    """The policy gap in an earlier record of the same corrected scenario, else None.
+def _known_gap(directory: Path, diagnosis: Diagnosis) -> dict[str, PolicyGap] | None:
+    """Return the policy gap in an earlier record of the same corrected scenario, else None.
 
     It took the simulations of `ugat-marl policy-gap` to measure, and holds as long as scenario,
     data, versions and effects are the same.
     """
     try:
-        earlier: Any = json.loads(file.read_text(encoding="utf-8"))
-        same = all(earlier[key] == record[key] for key in ("schema", "hashes", "versions"))
-        if same and _values(earlier) == _values(record):
-            return _plain(earlier["policy_gap"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        pass  # none, or none that `diagnose` wrote
-    return None
+        earlier = Diagnosis.read(directory)
+    except (OSError, ValueError):
+        return None  # none, or none that `diagnose` wrote
+    same = (earlier.hashes, earlier.versions) == (diagnosis.hashes, diagnosis.versions)
+    return earlier.policy_gap if same and _values(earlier) == _values(diagnosis) else None
 
 
-def _values(record: dict[str, Any]) -> list[Any]:
-    """The effects of a record without intervals and evidence, which change no simulation."""
+def _values(diagnosis: Diagnosis) -> list[object]:
+    """Return the effects without intervals and grounds, which change no simulation."""
     return [
-        [
-            *(effect[key] for key in ("name", "place", "window")),
-            {key: parameter["value"] for key, parameter in effect["parameters"].items()},
-        ]
-        for effect in record["effects"]
+        (
+            effect.name,
+            effect.place,
+            effect.window,
+            {name: parameter.value for name, parameter in effect.parameters.items()},
+        )
+        for effect in diagnosis.effects
     ]
-
-
-def _plain(value: Any) -> Any:
-    """The value with numbers rounded to nine digits, and without what JSON cannot say."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, bool) or value is None or isinstance(value, str | int):
-        return value
-    number = float(value)
-    return float(f"{number:.9g}") if number == number and abs(number) < 1e300 else None

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from ugat_marl.data import Measured
-from ugat_marl.diagnosis import DiagnosisConfig, diagnose
+from ugat_marl.diagnosis import Diagnosis, DiagnosisConfig, diagnose
 from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.diagnosis.select import Effort
 from ugat_marl.effects import load_scenario
@@ -74,7 +74,9 @@ class Street:
             # The answer is tested, not the time: on a busy computer ten minutes may not do.
             **{"cache": self.cache, "budget_s": 3600.0, **options},
         )
-        return diagnose(self.scenario, measured, out, config)
+        diagnosis = diagnose(self.scenario, measured, out, config)
+        assert Diagnosis.read(out) == diagnosis
+        return diagnosis.to_json()
 
 
 @pytest.fixture(scope="session")
