@@ -17,8 +17,8 @@ from ugat_marl.experiments import evaluate, rule_factory
 from ugat_marl.files import xml_bytes
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Network, Scenario, read_scenario
-from ugat_marl.scenarios.importers.cityflow_flow import MOST_VEHICLES
-from ugat_marl.scenarios.importers.reading import objects
+from ugat_marl.scenarios.importers.cityflow import MOST_VEHICLES
+from ugat_marl.scenarios.importers.long_files import objects
 
 
 def point(x: float, y: float) -> dict[str, float]:

@@ -11,7 +11,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import read_scenario
-from ugat_marl.scenarios.importers.counted import read_rows
+from ugat_marl.scenarios.importers.counts import read_rows
 
 
 def made(target: Path, *words: str | Path) -> int:
@@ -113,10 +113,10 @@ def test_long_tables_are_read_row_by_row(tmp_path: Path, monkeypatch: pytest.Mon
     rows = read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
     assert [(row.roads, row.count) for row in rows[:-1]] == [((f"ä {i}",), i) for i in range(40)]
     assert (rows[-1].roads, rows[-1].count, rows[-1].line) == (("z",), 1, 43)
-    monkeypatch.setattr("ugat_marl.scenarios.importers.counted._MOST_ROWS", 9)
+    monkeypatch.setattr("ugat_marl.scenarios.importers.counts._MOST_ROWS", 9)
     with pytest.raises(ScenarioError, match=r"t\.csv, line 11: more than 9 rows"):
         read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
-    monkeypatch.setattr("ugat_marl.scenarios.importers.reading._MOST", 100)
+    monkeypatch.setattr("ugat_marl.scenarios.importers.long_files._MOST", 100)
     (tmp_path / "t.csv").write_bytes(b"edge,count\n" + b"x" * 200)
     with pytest.raises(ScenarioError, match=r"t\.csv, line 2: is longer than a line of a table"):
         read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)

@@ -29,11 +29,10 @@ from ugat_marl.scenarios import (
     rectangle,
     shipped_scenarios,
 )
-from ugat_marl.scenarios.importers.folder import new_folder
-from ugat_marl.scenarios.importers.making import Fleet
-from ugat_marl.scenarios.importers.reading import scan
+from ugat_marl.scenarios.importers.long_files import scan
+from ugat_marl.scenarios.importers.making import Fleet, new_folder
 from ugat_marl.scenarios.importers.streets import Streets
-from ugat_marl.scenarios.importers.walks import Drive, walked, write_drives
+from ugat_marl.scenarios.importers.turning_shares import Drive, walked, write_drives
 
 SINGLE = dict(shipped_scenarios())["single-v1"]
 

@@ -19,11 +19,10 @@ from ugat_marl.experiments import problems
 from ugat_marl.files import parse_xml
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Network, Scenario, read_scenario, shipped_scenarios, survey
-from ugat_marl.scenarios.importers.osm_roads import items, unpack, write_roads
-from ugat_marl.scenarios.importers.osm_walks import utm
-from ugat_marl.scenarios.importers.phasing import suited
+from ugat_marl.scenarios.importers.osm import items, unpack, write_roads
+from ugat_marl.scenarios.importers.osm_crossings import utm
 from ugat_marl.scenarios.junctions import foes_of
-from ugat_marl.scenarios.phases import RightOfWay, are_foes
+from ugat_marl.scenarios.phases import RightOfWay, are_foes, suited
 
 TOWN = Path(__file__).parents[1] / "fixtures" / "town.osm"
 

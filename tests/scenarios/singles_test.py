@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ugat_marl.files import Tag
-from ugat_marl.scenarios.singles import OwnEdges
+from ugat_marl.scenarios.routes import OwnEdges
 
 OWN = ("vehicle", "route")
 

@@ -9,23 +9,18 @@ from __future__ import annotations
 
 import functools
 import re
-import subprocess
-import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import chain
-from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.errors import ScenarioError
-from ugat_marl.files import parse_xml, replacing, xml_bytes
+from ugat_marl.files import parse_xml, xml_bytes
+from ugat_marl.scenarios.routes import explicit
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import seconds_of
-from ugat_marl.scenarios.singles import OwnEdges
 from ugat_marl.seeding import numpy_generator
 
 JITTER_S = 120.0
@@ -47,33 +42,6 @@ class _Vehicles:
     heads: tuple[str, ...]
     tails: tuple[str, ...]
     speeds: NDArray[np.float64]
-
-
-def explicit(scenario: Scenario) -> Scenario:
-    """The same demand as single vehicles with routes: trips and flows are resolved by duarouter.
-
-    Raises:
-        ScenarioError: duarouter refuses; its own words are in the message.
-    """
-    if all(map(_is_explicit, scenario.routes)):
-        return scenario
-    return replace(scenario, routes=(_routed(scenario),))
-
-
-def ways(scenario: Scenario) -> Iterator[tuple[str, ...]]:
-    """The edges of every vehicle that departs in the scenario's time, one after the other.
-
-    Args:
-        scenario: Any scenario; `explicit` is applied if need be.
-    """
-    begin = scenario.settings.begin_s
-    end = begin + scenario.settings.duration_s
-    for document in explicit(scenario).routes:
-        for vehicle in chain.from_iterable(part.iter("vehicle") for part in document.parts()):
-            route = vehicle.find("route")
-            edges = () if route is None else tuple(route.get("edges", "").split())
-            if edges and begin <= seconds_of(vehicle.get("depart", "0")) < end:
-                yield edges
 
 
 def redrawn(scenario: Scenario, seed: int) -> Scenario:
@@ -124,78 +92,6 @@ def redrawn(scenario: Scenario, seed: int) -> Scenario:
         routes=(Document(_VEHICLES, None, text.encode()),),
         additional=(*scenario.additional, vehicles.types),
     )
-
-
-def _is_explicit(document: Document) -> bool:
-    """Whether every vehicle of the file stands there with its own edges, and there is no flow."""
-    if document.path is None or document.content is not None:
-        return _explicit_content(document, 0, 0)
-    state = document.path.stat()
-    return _explicit_content(replace(document, home=None), state.st_size, state.st_mtime_ns)
-
-
-@functools.lru_cache(maxsize=8)
-def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
-    """The same, remembered for a file as long as it does not change."""
-    del size, changed_ns
-    singles = OwnEdges()
-    for tag in document.scan():
-        singles.read(tag)
-        if singles.lost:
-            return False
-    return singles.ended()
-
-
-def _routed(scenario: Scenario) -> Document:
-    """All demand of the scenario through duarouter."""
-    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
-        directory = Path(name)
-        out = directory / "routed.rou.xml"
-
-        def files(documents: tuple[Document, ...]) -> str:
-            return ",".join(str(_for_sumo(item, directory)) for item in documents)
-
-        settings = scenario.settings
-        command = [
-            str(sumo_program("duarouter")),
-            "--net-file", files((scenario.network,)),
-            "--route-files", files(scenario.routes),
-            "--output-file", str(out),
-            "--begin", repr(settings.begin_s),
-            "--end", repr(settings.begin_s + settings.duration_s),
-            "--ignore-errors", "true",
-            "--no-warnings", "true",
-            "--no-step-log", "true",
-            "--seed", "1",
-        ]  # fmt: skip
-        if scenario.additional:
-            command += ["--additional-files", files(scenario.additional)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode or not out.exists():
-            said = " ".join(done.stderr.split()) or "no reason given"
-            raise ScenarioError(
-                f"scenario {scenario.id!r}: its trips or flows cannot be turned into routes: {said}"
-            )
-        return Document("routed.rou.xml", None, out.read_bytes())
-
-
-def _for_sumo(document: Document, directory: Path) -> Path:
-    """Where SUMO finds a document: a plain file where it lies, else a copy in `directory`."""
-    path = document.path
-    plain = path is not None and document.content is None and path.suffix != ".gz"
-    if path is not None and plain and "," not in str(path.resolve()):  # it ends a name for SUMO
-        return path.resolve()
-    copy = directory / document.name.removesuffix(".gz").replace(",", "_")
-    with replacing(copy) as temporary, temporary.open("wb") as file:
-        file.writelines(document.pieces())
-    return copy
-
-
-def sumo_program(name: str) -> Path:
-    """A program of the installed eclipse-sumo wheel itself, not the wrapper written in Python."""
-    import sumo
-
-    return Path(sumo.SUMO_HOME) / "bin" / name
 
 
 @functools.lru_cache(maxsize=8)

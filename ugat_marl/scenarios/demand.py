@@ -9,9 +9,9 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import Tag
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.network import Network
+from ugat_marl.scenarios.routes import OwnEdges
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import seconds_of
-from ugat_marl.scenarios.singles import OwnEdges
 
 _ROUTED = ("from", "to", "via", "edges")
 _NO_TIME = frozenset({"triggered", "containerTriggered", "split", "now", "begin"})

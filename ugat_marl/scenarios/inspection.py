@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.days import explicit
 from ugat_marl.scenarios.demand import Demand, check_demand
 from ugat_marl.scenarios.junctions import Link, foes_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import RightOfWay, are_foes, turn_of
+from ugat_marl.scenarios.routes import drives
 from ugat_marl.scenarios.scenario import Scenario
-from ugat_marl.scenarios.settings import seconds_of
 from ugat_marl.scenarios.signals import GREEN
 
 SHORT_M = 50.0
@@ -352,27 +351,3 @@ class _Traffic:
         lengths_s.sort()
         fill_s = lengths_s[int(0.95 * (len(lengths_s) - 1))] if lengths_s else 0.0
         return cls(Counter({e: n / hours for e, n in passes.items()}), first - begin, fill_s)
-
-
-def drives(
-    scenario: Scenario, *, routed: bool, reporter: Reporter | None = None
-) -> Iterator[tuple[str, float, list[str]]]:
-    """Name, departure and roads of every vehicle that departs before the end of the episode.
-
-    Args:
-        scenario: Whose demand; it has passed `check_demand`.
-        routed: Whether it holds single vehicles with roads only; others are routed before.
-        reporter: Shows progress where a file is long.
-    """
-    begin = scenario.settings.begin_s
-    end = begin + scenario.settings.duration_s
-    for document in scenario.routes if routed else explicit(scenario).routes:
-        name, depart = "", 0.0
-        for tag in document.scan(reporter):
-            if tag.name == "vehicle":
-                name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
-                depart = seconds_of(text) if text[:1].isdigit() else begin
-                if depart >= end:  # they are in the order of their departures
-                    break
-            elif tag.name == "route" and "id" not in tag.attributes:
-                yield name, depart, tag.attributes.get("edges", "").split()

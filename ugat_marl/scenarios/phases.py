@@ -5,12 +5,24 @@ The conflicts are those of the junction's own right-of-way matrix (``<request fo
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.scenarios.junctions import Link, Matrix, has_bit
+from ugat_marl.files import parse_xml, read_bytes
+from ugat_marl.scenarios.junctions import (
+    Link,
+    Matrix,
+    crossings_of,
+    foes_of,
+    has_bit,
+    links_of,
+    yields_of,
+)
 from ugat_marl.scenarios.signals import GREEN, YELLOW
 
 MOST_PHASES = 64
@@ -288,3 +300,67 @@ def _maximal_cliques(
             stack.append((clique | {name}, candidates & near, excluded & near))
             candidates = candidates - {name}
             excluded = excluded | {name}
+
+
+def suited(network: Path) -> tuple[dict[str, str], list[str]]:
+    """The lights that conflict-free phases do not suit, and what suits them.
+
+    Where a lane serves straight on and left turns, a phase for one of them alone lets whoever waits
+    for the other block the lane: there left turns are permitted. A light with too many conflicts to
+    derive phases, or with one phase only by them, keeps its programme's.
+
+    Args:
+        network: The ``.net.xml``.
+
+    Returns:
+        Source of the phases by light, and notes.
+    """
+    root = parse_xml(read_bytes(network), str(network))
+    rules = RightOfWay(foes_of(root), yields_of(root))
+    crossings = crossings_of(root)
+    programmes = _programmes_of(root)
+    found: dict[str, str] = {}
+    for tls, links in sorted(links_of(root).items()):
+        walks = crossings.get(tls, [])
+        usual = "permitted" if _shared(links) else "conflict-free"
+        if len(_derived(tls, links, rules, walks, usual)) < 2 <= len(programmes.get(tls, ())):
+            found[tls] = "programme"
+        elif usual != "conflict-free":
+            found[tls] = usual
+    notes: list[str] = []
+    for source, why in (
+        ("permitted", "lanes for straight on and left turns: their left turns are permitted"),
+        ("programme", "no phases that can be derived: they keep their programme's"),
+    ):
+        if count := sum(kind == source for kind in found.values()):
+            notes.append(f"{count} lights have {why}")
+    return found, notes
+
+
+def _derived(
+    tls: str, links: Sequence[Link], rules: RightOfWay, walks: Sequence[Link], source: str
+) -> tuple[str, ...]:
+    width = max(link.index for link in (*links, *walks)) + 1
+    permitted = source == "permitted"
+    try:
+        return conflict_free_phases(links, rules, width, tls, crossings=walks, permitted=permitted)
+    except ScenarioError:
+        return ()
+
+
+def _shared(links: Sequence[Link]) -> bool:
+    """Whether a lane leads both straight on and to the left."""
+    turns: dict[str, set[str]] = defaultdict(set)
+    for link in links:
+        if link.direction not in "tT":
+            turns[link.from_lane].add(turn_of(link))
+    return any({"s", "l"} <= own for own in turns.values())
+
+
+def _programmes_of(root: ET.Element) -> dict[str, tuple[str, ...]]:
+    return {
+        logic.get("id", ""): programme_phases(
+            [(0.0, phase.get("state", "")) for phase in logic.iter("phase")]
+        )
+        for logic in root.iter("tlLogic")
+    }

@@ -1,249 +1,491 @@
-"""CityFlow's road networks: what stands in a ``roadnet.json``, checked value by value."""
+"""CityFlow's two files as a SUMO network with vehicles.
+
+Geometry, lanes, light phases, routes, departures, sizes and speeds are CityFlow's. CityFlow counts
+lanes from the middle of the road, SUMO from the kerb. Both draw lanes to the right of the road's
+line and stop vehicles at a distance from the centre, which is kept.
+"""
 
 from __future__ import annotations
 
+import heapq
+import json
 import math
-from collections.abc import Mapping, Sequence
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.scenarios.importers.reading import read_json
+from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.importers.cityflow_roadnet import (
+    Crossing,
+    Point,
+    Road,
+    Roadnet,
+    read_roadnet,
+)
+from ugat_marl.scenarios.importers.long_files import objects
+from ugat_marl.scenarios.importers.making import NETWORK, ROUTES, Draft, Roads
+from ugat_marl.scenarios.importers.turning_shares import MOST_VEHICLES, Drive, write_drives
+from ugat_marl.scenarios.junctions import foes_of, links_of, yields_of
+from ugat_marl.scenarios.phases import RightOfWay, state_of
+from ugat_marl.scenarios.programs import netconvert
 
-Point = tuple[float, float]
+YELLOW_S, ALL_RED_S = 3.0, 2.0
+LONGEST_CLEARANCE_S = 10.0
+
+_VEHICLE = ("length", "width", "maxPosAcc", "maxNegAcc", "usualPosAcc", "usualNegAcc", "minGap",
+            "maxSpeed", "headwayTime")  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Road:
-    """A carriageway; lane 0 is the one at the middle of the road.
+def from_cityflow(
+    roadnet: Path, flow: Path, duration_s: float | None, *, own_vehicles: bool, exact: bool
+) -> Roads:
+    """A ``roadnet.json`` with its ``flow.json``.
 
-    Attributes:
-        id: Its name.
-        points: Its left border, from one intersection's centre to the other's, m.
-        lanes: Width (m) and speed limit (m/s) of every lane.
-        start: Intersection it begins at.
-        end: Intersection it ends at.
+    Args:
+        roadnet: The roads.
+        flow: The vehicles.
+        duration_s: Length of an episode; None for whole ten minutes that hold all departures, at
+            least an hour.
+        own_vehicles: Whether the vehicles are wanted.
+        exact: Whether headways are CityFlow's too, and nothing is left to chance.
     """
 
-    id: str
-    points: tuple[Point, ...]
-    lanes: tuple[tuple[float, float], ...]
-    start: str
-    end: str
+    def roads(folder: Path, reporter: Reporter) -> Draft:
+        net = read_roadnet(roadnet)
+        notes = write_network(net, folder / NETWORK)
+        length_s, routes = duration_s or 3600.0, ()
+        if own_vehicles:
+            found = write_routes(flow, net, folder / ROUTES, duration_s, reporter, exact=exact)
+            routes = (ROUTES,)
+            length_s = duration_s or max(3600.0, 600.0 * (math.floor(found.last_s / 600) + 1))
+        return Draft(
+            f"CityFlow network {roadnet.name}",
+            f"Turned from CityFlow's `{roadnet.name}` and `{flow.name}`: lanes, stop lines, turns "
+            "and light phases are theirs, phase n being the n-th green one of the file. Who made "
+            "them decides what may be done with them; keep their licence beside them.",
+            routes=routes,
+            settings={"duration_s": length_s, "control": {"phases": "programme"}},
+            notes=tuple(notes),
+        )
+
+    return roads
 
 
-@dataclass(frozen=True)
-class RoadLink:
-    """A movement: from a road to another over some lanes.
+def write_network(net: Roadnet, out: Path) -> list[str]:
+    """Makes the SUMO network.
 
-    Attributes:
-        start: Road it comes from.
-        end: Road it leads to.
-        lanes: Lane of the first and of the second road, for each way across.
-    """
+    Args:
+        net: The roads.
+        out: The ``.net.xml`` to write.
 
-    start: str
-    end: str
-    lanes: tuple[tuple[int, int], ...]
-
-
-@dataclass(frozen=True)
-class Crossing:
-    """An intersection.
-
-    Attributes:
-        id: Its name.
-        point: Its centre, m.
-        width_m: Distance of the stop lines from the centre.
-        virtual: Whether it is an end of the network.
-        links: Its movements.
-        phases: Seconds of every light phase, and the movements that may go then.
-    """
-
-    id: str
-    point: Point
-    width_m: float
-    virtual: bool
-    links: tuple[RoadLink, ...]
-    phases: tuple[tuple[float, tuple[int, ...]], ...]
-
-
-@dataclass(frozen=True)
-class Roadnet:
-    """All roads and intersections, by their names."""
-
-    roads: Mapping[str, Road]
-    crossings: Mapping[str, Crossing]
-
-
-def read_roadnet(path: Path) -> Roadnet:
-    """Reads and checks a ``roadnet.json``.
+    Returns:
+        What was noticed on the way.
 
     Raises:
-        ScenarioError: Not one, or something in it names what does not exist; with the line.
+        ScenarioError: netconvert refused.
     """
-    raw, text = read_json(path)
-    reader = _Reader(path, text)
-    table = reader.table(raw, "the file")
-    roads = [reader.road(item) for item in reader.items(table, "roads", "the file")]
-    net = Roadnet(
-        reader.by_name(roads, "road"),
-        reader.by_name(
-            [reader.crossing(item) for item in reader.items(table, "intersections", "the file")],
-            "intersection",
-        ),
-    )
-    for road in net.roads.values():
-        for end, name in (("startIntersection", road.start), ("endIntersection", road.end)):
-            if name not in net.crossings:
-                raise reader.error(
-                    road.id, f"road {road.id!r}: its {end} {name!r} does not exist; a road leads "
-                    "from one intersection to another (ends of the network are virtual ones)"
-                )  # fmt: skip
+    documents = {
+        "--node-files": _nodes(net),
+        "--edge-files": _edges(net),
+        "--connection-files": _connections(net),
+        "--tllogic-files": _lights(net),
+    }
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+        arguments: list[str] = []
+        for option, root in documents.items():
+            file = Path(name) / f"{option.strip('-')}.xml"
+            write_whole(file, xml_bytes(root))
+            arguments += [option, str(file)]
+        arguments += ["--no-turnarounds", "true", "--offset.disable-normalization", "true"]
+        arguments += ["--junctions.limit-turn-speed", "-1", "--tls.yellow.time", "3"]
+        netconvert(arguments, Path(name) / "out.net.xml")
+        root = parse_xml(read_bytes(Path(name) / "out.net.xml"), str(out))
+    notes = _set_programmes(root, net)
+    write_whole(out, xml_bytes(root))
+    return notes
+
+
+def has_light(crossing: Crossing) -> bool:
+    """Whether an intersection has a traffic light: two phases that differ."""
+    return not crossing.virtual and len({frozenset(links) for _, links in crossing.phases}) > 1
+
+
+def _nodes(net: Roadnet) -> ET.Element:
+    root = ET.Element("nodes")
     for crossing in net.crossings.values():
-        _check_links(crossing, net, reader)
-    return net
+        kind = "dead_end" if crossing.virtual else "priority"
+        attributes = {
+            "id": crossing.id,
+            "x": f"{crossing.point[0]:g}",
+            "y": f"{crossing.point[1]:g}",
+        }
+        if has_light(crossing):
+            kind = "traffic_light"
+            attributes["tl"] = crossing.id
+        if not crossing.virtual and (shape := _stop_lines(crossing, net)):
+            attributes["shape"] = shape
+        # No road is the main one: straight on goes before turns, as in CityFlow.
+        ET.SubElement(root, "node", attributes, type=kind, rightOfWay="edgePriority")
+    return root
 
 
-def _check_links(crossing: Crossing, net: Roadnet, reader: _Reader) -> None:
-    where = f"intersection {crossing.id!r}"
+def _edges(net: Roadnet) -> ET.Element:
+    root = ET.Element("edges")
+    for road in net.roads.values():
+        edge = ET.SubElement(
+            root,
+            "edge",
+            {"id": road.id, "from": road.start, "to": road.end},
+            numLanes=str(len(road.lanes)),
+            priority="1",
+            spreadType="right",
+            speed=f"{max(speed for _, speed in road.lanes):g}",
+            shape=_shape(road.points),
+        )
+        for index, (width, speed) in enumerate(reversed(road.lanes)):
+            ET.SubElement(edge, "lane", index=str(index), width=f"{width:g}", speed=f"{speed:g}")
+    return root
+
+
+def _connections(net: Roadnet) -> ET.Element:
+    root = ET.Element("connections")
+    leads = {link.start for crossing in net.crossings.values() for link in crossing.links}
+    for road in net.roads.values():
+        if road.id not in leads and not net.crossings[road.end].virtual:
+            ET.SubElement(root, "connection", {"from": road.id})  # nothing leads on
+    for crossing in net.crossings.values():
+        for _, attributes in _ways(crossing, net):
+            ET.SubElement(root, "connection", attributes)
+    return root
+
+
+def _lights(net: Roadnet) -> ET.Element:
+    """Which letter belongs to which way; the states come later, when the conflicts are known."""
+    root = ET.Element("tlLogics")
+    for crossing in filter(has_light, net.crossings.values()):
+        ways = list(_ways(crossing, net))
+        logic = ET.SubElement(
+            root, "tlLogic", id=crossing.id, type="static", programID="0", offset="0"
+        )
+        ET.SubElement(logic, "phase", duration="30", state="G" * len(ways))
+        for index, (_, attributes) in enumerate(ways):
+            ET.SubElement(root, "connection", attributes, tl=crossing.id, linkIndex=str(index))
+    return root
+
+
+def _ways(crossing: Crossing, net: Roadnet) -> Iterator[tuple[int, dict[str, str]]]:
+    """Every way across with the number of its road link, in the order of the file."""
     for number, link in enumerate(crossing.links):
-        for name, end in ((link.start, "startRoad"), (link.end, "endRoad")):
-            if name not in net.roads:
-                raise reader.error(
-                    crossing.id, f"{where}: roadLink {number}: {end} {name!r} does not exist"
-                )
-        start, end = net.roads[link.start], net.roads[link.end]
-        if start.end != crossing.id or end.start != crossing.id:
-            raise reader.error(
-                crossing.id, f"{where}: roadLink {number} leads from {link.start!r} to "
-                f"{link.end!r}, which do not meet there"
-            )  # fmt: skip
+        before, behind = net.roads[link.start], net.roads[link.end]
         for a, b in link.lanes:
-            if a >= len(start.lanes) or b >= len(end.lanes):
-                raise reader.error(
-                    crossing.id, f"{where}: roadLink {number} names lane {a} of {link.start!r} "
-                    f"({len(start.lanes)} lanes) and lane {b} of {link.end!r} "
-                    f"({len(end.lanes)} lanes), counted from 0"
-                )  # fmt: skip
-    for number, (_, available) in enumerate(crossing.phases):
-        for index in available:
-            if index >= len(crossing.links):
-                raise reader.error(
-                    crossing.id, f"{where}: light phase {number} names road link {index}, but "
-                    f"there are {len(crossing.links)}, counted from 0"
-                )  # fmt: skip
-
-
-class _Reader:
-    """Takes values out of a parsed file; what is missing or of another kind is an error."""
-
-    def __init__(self, path: Path, text: str) -> None:
-        self._path = path
-        self._text = text
-
-    def error(self, name: str, complaint: str) -> ScenarioError:
-        """An error at the line where an object of this name is defined."""
-        place = max(self._text.find(f'"id": "{name}"'), self._text.find(f'"id":"{name}"'))
-        line = f", line {self._text.count(chr(10), 0, place) + 1}" if place >= 0 else ""
-        return ScenarioError(f"{self._path}{line}: {complaint}")
-
-    def by_name(self, items: Sequence[Any], what: str) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for item in items:
-            if item.id in found:
-                raise self.error(item.id, f"two {what}s are called {item.id!r}")
-            found[item.id] = item
-        return found
-
-    def road(self, raw: Any) -> Road:
-        item = self.table(raw, "a road")
-        name = self._name(item, "id", "a road")
-        where = f"road {name!r}"
-        points = tuple(
-            self._point(point, name, where) for point in self.items(item, "points", where)
-        )
-        lanes = tuple(
-            (
-                self._number(lane, "width", name, where, least=0.1),
-                self._number(lane, "maxSpeed", name, where, least=0.1),
+            yield (
+                number,
+                {
+                    "from": link.start,
+                    "to": link.end,
+                    "fromLane": str(len(before.lanes) - 1 - a),
+                    "toLane": str(len(behind.lanes) - 1 - b),
+                },
             )
-            for lane in self.items(item, "lanes", where)
-        )
-        if len(points) < 2 or not lanes:
-            raise self.error(name, f"{where}: needs at least two points and one lane")
-        start, end = (
-            self._name(item, key, where) for key in ("startIntersection", "endIntersection")
-        )
-        return Road(name, points, lanes, start, end)
 
-    def crossing(self, raw: Any) -> Crossing:
-        item = self.table(raw, "an intersection")
-        name = self._name(item, "id", "an intersection")
-        where = f"intersection {name!r}"
-        light = item.get("trafficLight") or {}
-        phases = self.items(light, "lightphases", where) if "lightphases" in light else []
-        return Crossing(
-            name,
-            self._point(item.get("point"), name, where),
-            self._number(item, "width", name, where) if "width" in item else 0.0,
-            bool(item.get("virtual", False)),
-            tuple(self._link(link, name, where) for link in self.items(item, "roadLinks", where)),
-            tuple(
-                (
-                    self._number(phase, "time", name, where),
-                    tuple(
-                        self._index(index, name, f"{where}: availableRoadLinks")
-                        for index in self.items(phase, "availableRoadLinks", where)
-                    ),
-                )
-                for phase in phases
-            ),
-        )
 
-    def _link(self, raw: Any, name: str, where: str) -> RoadLink:
-        item = self.table(raw, f"{where}: a roadLink")
-        lanes: list[tuple[int, int]] = []
-        for lane in self.items(item, "laneLinks", f"{where}: a roadLink"):
-            table = self.table(lane, f"{where}: a laneLink")
-            ends = (table.get("startLaneIndex"), table.get("endLaneIndex"))
-            a, b = (self._index(end, name, f"{where}: a laneLink") for end in ends)
-            lanes.append((a, b))
-        start, end = (self._name(item, key, where) for key in ("startRoad", "endRoad"))
-        return RoadLink(start, end, tuple(dict.fromkeys(lanes)))
+def _stop_lines(crossing: Crossing, net: Roadnet) -> str:
+    """A polygon through the ends of all stop lines; empty if roads begin at the centre."""
+    if crossing.width_m <= 0:
+        return ""
+    corners: list[Point] = []
+    for road in net.roads.values():
+        if road.end == crossing.id:
+            corners += _corners(road, road.points[::-1], crossing.width_m, backwards=True)
+        if road.start == crossing.id:
+            corners += _corners(road, road.points, crossing.width_m, backwards=False)
+    x, y = crossing.point
+    around = sorted(set(corners), key=lambda p: math.atan2(p[1] - y, p[0] - x))
+    return _shape(around) if len(around) > 2 else ""
 
-    def table(self, raw: Any, where: str) -> dict[str, Any]:
-        if not isinstance(raw, dict):
-            raise ScenarioError(f"{self._path}: {where} is {raw!r:.60}, not an object in braces")
-        return raw
 
-    def items(self, raw: Any, key: str, where: str) -> list[Any]:
-        found = self.table(raw, where).get(key)
-        if not isinstance(found, list):
-            raise ScenarioError(f"{self._path}: {where}: {key!r} is missing or not a list")
+def _corners(
+    road: Road, points: tuple[Point, ...], distance_m: float, *, backwards: bool
+) -> list[Point]:
+    """Both ends of the line across a road at a distance from the intersection's centre."""
+    left = distance_m
+    for (ax, ay), (bx, by) in pairwise(points):
+        length = math.hypot(bx - ax, by - ay)
+        if length > left or (bx, by) == points[-1]:
+            dx, dy = (bx - ax) / max(length, 1e-9), (by - ay) / max(length, 1e-9)
+            left = min(left, 0.45 * length)
+            x, y = ax + left * dx, ay + left * dy
+            width = sum(width for width, _ in road.lanes) * (-1 if backwards else 1)
+            return [_rounded(x, y), _rounded(x + width * dy, y - width * dx)]
+        left -= length
+    return []
+
+
+def _rounded(x: float, y: float) -> Point:
+    return round(x, 2), round(y, 2)
+
+
+def _shape(points: tuple[Point, ...] | list[Point]) -> str:
+    return " ".join(f"{x:.2f},{y:.2f}" for x, y in points)
+
+
+def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
+    """Writes the light phases into the network, now that it is known who has to wait for whom."""
+    links = links_of(root)
+    rules = RightOfWay(foes_of(root), yields_of(root))
+    without: list[str] = []
+    for logic in root.iter("tlLogic"):
+        crossing = net.crossings[logic.get("id", "")]
+        own = links.get(crossing.id, [])
+        number_of = dict(enumerate(number for number, _ in _ways(crossing, net)))
+        width = len(number_of)
+        for phase in list(logic):
+            logic.remove(phase)
+        greens, clearance_s, always = _split(crossing)
+        if not clearance_s:
+            without.append(crossing.id)
+        states = [
+            state_of([k for k in own if number_of[k.index] in green], own, rules, width)
+            for _, green in greens
+        ]
+        for place, (seconds, _) in enumerate(greens):
+            following = states[(place + 1) % len(states)]
+            ET.SubElement(logic, "phase", duration=f"{seconds:g}", state=states[place])
+            for duration, state in _clearing(
+                states[place], following, clearance_s, _letters(number_of, always)
+            ):
+                ET.SubElement(logic, "phase", duration=f"{duration:g}", state=state)
+    if without:
+        return [
+            f"{len(without)} lights have no phase between two greens (the first: {without[0]!r}); "
+            f"{YELLOW_S:g} s of yellow and {ALL_RED_S:g} s of red were put in"
+        ]
+    return []
+
+
+def _split(
+    crossing: Crossing,
+) -> tuple[list[tuple[float, frozenset[int]]], float, frozenset[int]]:
+    """The green phases, the seconds between two of them, and what goes all the time.
+
+    CityFlow's files hold the time between two greens as a phase of its own, usually the first, in
+    which only those may go who may always go.
+    """
+    phases = [(seconds, frozenset(links)) for seconds, links in crossing.phases if seconds > 0]
+    greens = [
+        phase
+        for phase in phases
+        if phase[0] > LONGEST_CLEARANCE_S or not all(phase[1] <= other for _, other in phases)
+    ]
+    greens = greens or phases
+    between = [phase for phase in phases if phase not in greens]
+    always = frozenset.intersection(*(links for _, links in greens))
+    return greens, between[0][0] if between else 0.0, always
+
+
+def _letters(number_of: dict[int, int], numbers: frozenset[int]) -> set[int]:
+    return {index for index, number in number_of.items() if number in numbers}
+
+
+def _clearing(
+    state: str, following: str, clearance_s: float, always: set[int]
+) -> Iterator[tuple[float, str]]:
+    """Yellow and red between two greens; who may always go stops first, while all is red."""
+    if not any(a in "Gg" and b not in "Gg" for a, b in zip(state, following, strict=True)):
+        return
+    length_s = clearance_s or YELLOW_S + ALL_RED_S
+    yellow_s = min(YELLOW_S, length_s)
+    pairs = list(zip(state, following, strict=True))
+    yield yellow_s, "".join("y" if a in "Gg" and b not in "Gg" else a for a, b in pairs)
+    if length_s > yellow_s:
+        kept = ("s" if index in always else "r" for index in range(len(state)))
+        yield length_s - yellow_s, "".join(kept)
+
+
+@dataclass(frozen=True)
+class Flows:
+    """What was written.
+
+    Attributes:
+        vehicles: How many.
+        last_s: When the last one departs.
+    """
+
+    vehicles: int
+    last_s: float
+
+
+def write_routes(
+    path: Path,
+    net: Roadnet,
+    out: Path,
+    duration_s: float | None,
+    reporter: Reporter,
+    *,
+    exact: bool,
+) -> Flows:
+    """Turns a ``flow.json`` into a route file.
+
+    Vehicles keep their size, gap, accelerations and speed. How they follow each other is SUMO's
+    unless `exact` is set: the headway of 1 s and the chance in driving that its models are tuned
+    for, as in the SUMO forms that CityFlow's data sets come with.
+
+    Args:
+        path: The flows.
+        net: The roads they use.
+        out: The file to write.
+        duration_s: End of the episode, for flows without an end; None for an hour.
+        reporter: Shows progress in a long file.
+        exact: Whether headways are CityFlow's too, and nothing is left to chance.
+
+    Raises:
+        ScenarioError: Not a list of flows, or one that cannot be driven; with the line.
+    """
+    routes = _Routes(net)
+    types: dict[str, dict[str, str]] = {}
+    drives: list[Drive] = []
+    for number, (flow, line) in enumerate(objects(path, reporter)):
+        where = f"{path}, line {line}: flow {number}"
+        kind = types.setdefault(json.dumps(flow.get("vehicle"), sort_keys=True), {})
+        if not kind:
+            kind |= _vehicle_type(flow.get("vehicle"), f"car{len(types)}", where, exact=exact)
+        route = routes.through(flow.get("route"), where)
+        for i, depart_s in enumerate(_departures(flow, duration_s or 3600.0, where)):
+            drives.append(Drive(f"{number}.{i}", depart_s, route, kind["id"], "0"))
+        if len(drives) > MOST_VEHICLES:
+            raise ScenarioError(f"{where}: more than {MOST_VEHICLES} vehicles")
+    if not drives:
+        raise ScenarioError(f"{path}: no vehicle in it")
+    drives.sort(key=lambda drive: drive.depart_s)  # stable: as in the file within a second
+    write_drives(out, drives, types.values())
+    return Flows(len(drives), drives[-1].depart_s)
+
+
+def _departures(flow: Mapping[str, Any], end_s: float, where: str) -> Iterator[float]:
+    """From ``startTime`` to ``endTime``, both included, every ``interval``; -1 is the end."""
+    start, end, interval = (
+        _number(flow, key, where, least=least)
+        for key, least in (("startTime", 0.0), ("endTime", -1.0), ("interval", 0.0))
+    )
+    last = end_s if end < 0 else end
+    if end >= 0 and last < start:
+        raise ScenarioError(f"{where}: endTime ({end:g}) is before startTime ({start:g})")
+    if last > start and interval <= 0:
+        raise ScenarioError(f"{where}: interval = {interval:g} must be above 0")
+    steps = (last - start) / interval if last > start else 0.0
+    count = max(1, math.ceil(steps - 1e-9)) if end < 0 else 1 + int(steps + 1e-9)
+    if count > MOST_VEHICLES:
+        raise ScenarioError(f"{where}: more than {MOST_VEHICLES} vehicles")
+    for i in range(count):
+        yield start + i * interval
+
+
+def _vehicle_type(raw: Any, name: str, where: str, *, exact: bool) -> dict[str, str]:
+    """Attributes of a SUMO vehicle type for CityFlow's vehicle."""
+    if not isinstance(raw, dict):
+        raise ScenarioError(f"{where}: 'vehicle' is missing or not an object in braces")
+    value = {key: _number(raw, key, where, least=0.0) for key in _VEHICLE}
+    for key in ("length", "maxPosAcc", "maxNegAcc", "usualPosAcc", "usualNegAcc", "maxSpeed"):
+        if value[key] <= 0:
+            raise ScenarioError(f"{where}: vehicle: {key} = {value[key]:g} must be above 0")
+    kind = {
+        "id": name,
+        "vClass": "passenger",
+        "length": f"{value['length']:g}",
+        "width": f"{value['width'] or 1.8:g}",
+        "minGap": f"{value['minGap']:g}",
+        "accel": f"{value['usualPosAcc']:g}",
+        "decel": f"{value['usualNegAcc']:g}",
+        "maxSpeed": f"{value['maxSpeed']:g}",
+    }
+    if exact:
+        kind |= {
+            "emergencyDecel": f"{max(value['maxNegAcc'], value['usualNegAcc']):g}",
+            # CityFlow's gap to the bumper ahead is headway times speed; Krauss adds minGap to it.
+            "tau": f"{max(value['headwayTime'] - value['minGap'] / value['maxSpeed'], 0.1):.3g}",
+            "sigma": "0",
+            "speedFactor": "1",
+            "speedDev": "0",
+        }
+    return kind
+
+
+def _number(raw: Mapping[str, Any], key: str, where: str, *, least: float) -> float:
+    found = raw.get(key)
+    if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
+        raise ScenarioError(f"{where}: {key!r} is missing or not a number")
+    if found < least:
+        raise ScenarioError(f"{where}: {key} = {found:g} must be at least {least:g}")
+    return float(found)
+
+
+class _Routes:
+    """The roads from anchor to anchor; where they do not touch, the shortest way between them."""
+
+    def __init__(self, net: Roadnet) -> None:
+        self._net = net
+        self._known: dict[tuple[str, ...], tuple[str, ...]] = {}
+
+    def through(self, raw: Any, where: str) -> tuple[str, ...]:
+        """The whole route."""
+        if not isinstance(raw, list) or not raw or not all(isinstance(name, str) for name in raw):
+            raise ScenarioError(f"{where}: 'route' is missing or not a list of roads")
+        anchors = tuple(raw)
+        if anchors not in self._known:
+            for name in anchors:
+                if name not in self._net.roads:
+                    raise ScenarioError(f"{where}: road {name!r} does not exist")
+            route = [anchors[0]]
+            for a, b in pairwise(anchors):
+                route += self._between(a, b, where)
+            self._known[anchors] = tuple(route)
+        return self._known[anchors]
+
+    @cached_property
+    def _ahead(self) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = {name: [] for name in self._net.roads}
+        for crossing in self._net.crossings.values():
+            for link in crossing.links:
+                if link.lanes:
+                    found[link.start].append(link.end)
         return found
 
-    def _name(self, item: Mapping[str, Any], key: str, where: str) -> str:
-        found = item.get(key)
-        if not isinstance(found, str) or not found:
-            raise ScenarioError(f"{self._path}: {where}: {key!r} is missing or not a name")
-        return found
+    @cached_property
+    def _length_m(self) -> dict[str, float]:
+        return {name: _length(road.points) for name, road in self._net.roads.items()}
 
-    def _point(self, raw: Any, name: str, where: str) -> Point:
-        item = self.table(raw, f"{where}: a point")
-        x, y = (self._number(item, key, name, where, least=-math.inf) for key in ("x", "y"))
-        return x, y
+    def _between(self, start: str, goal: str, where: str) -> list[str]:
+        """The roads after `start` up to and with `goal` (Dijkstra)."""
+        best = {start: 0.0}
+        came: dict[str, str] = {}
+        heap = [(0.0, start)]
+        while heap:
+            length, road = heapq.heappop(heap)
+            if length > best[road]:
+                continue
+            for other in self._ahead[road]:
+                total = length + self._length_m[other]
+                if total < best.get(other, math.inf):
+                    best[other], came[other] = total, road
+                    if other == goal:
+                        return _back(came, start, goal)
+                    heapq.heappush(heap, (total, other))
+        raise ScenarioError(f"{where}: no road link leads from {start!r} on to {goal!r}")
 
-    def _number(self, raw: Any, key: str, name: str, where: str, *, least: float = 0.0) -> float:
-        found = self.table(raw, where).get(key)
-        if isinstance(found, bool) or not isinstance(found, int | float):
-            raise self.error(name, f"{where}: {key!r} is missing or not a number")
-        if not math.isfinite(found) or found < least:
-            raise self.error(name, f"{where}: {key} = {found} must be at least {least:g}")
-        return float(found)
 
-    def _index(self, raw: Any, name: str, where: str) -> int:
-        if isinstance(raw, bool) or not isinstance(raw, int) or raw < 0:
-            raise self.error(name, f"{where}: {raw!r} is not a number counted from 0")
-        return raw
+def _back(came: Mapping[str, str], start: str, goal: str) -> list[str]:
+    route = [goal]
+    while came[route[-1]] != start:
+        route.append(came[route[-1]])
+    return route[::-1]
+
+
+def _length(points: Sequence[tuple[float, float]]) -> float:
+    return sum(math.dist(a, b) for a, b in pairwise(points))

@@ -12,8 +12,8 @@ from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import Tag, parse_xml, read_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.demand import edges_used
+from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import Draft, Fleet, Roads, Vehicles
-from ugat_marl.scenarios.importers.reading import scan
 from ugat_marl.scenarios.scenario import Document, read_scenario
 
 _CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")

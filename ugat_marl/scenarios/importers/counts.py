@@ -20,12 +20,17 @@ import numpy as np
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.days import sumo_program
+from ugat_marl.scenarios.importers.long_files import lines
 from ugat_marl.scenarios.importers.making import ROUTES, Fleet, Vehicles
-from ugat_marl.scenarios.importers.programs import run, tool
-from ugat_marl.scenarios.importers.reading import lines
 from ugat_marl.scenarios.importers.streets import Streets
-from ugat_marl.scenarios.importers.walks import CAR, MOST_VEHICLES, Drive, walked, write_drives
+from ugat_marl.scenarios.importers.turning_shares import (
+    CAR,
+    MOST_VEHICLES,
+    Drive,
+    walked,
+    write_drives,
+)
+from ugat_marl.scenarios.programs import run, sumo_program, tool
 from ugat_marl.seeding import numpy_generator
 
 _CANDIDATES_VPH = 400.0

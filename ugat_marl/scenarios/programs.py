@@ -10,10 +10,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.scenarios.days import sumo_program
 
 _MOST_WORDS = 60
 """Of what a program says in an error; netconvert can complain for pages."""
+
+
+def sumo_program(name: str) -> Path:
+    """A program of the installed eclipse-sumo wheel itself, not the wrapper written in Python."""
+    import sumo
+
+    return Path(sumo.SUMO_HOME) / "bin" / name
 
 
 def netconvert(arguments: Sequence[str], output: Path) -> str:

@@ -1,0 +1,158 @@
+"""Vehicles of a demand with their routes: read from route files, or routed by duarouter."""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+from ugat_marl.errors import ScenarioError
+from ugat_marl.files import Tag, replacing
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.programs import sumo_program
+from ugat_marl.scenarios.scenario import Document, Scenario
+from ugat_marl.scenarios.settings import seconds_of
+
+
+class OwnEdges:
+    """Whether a route file holds single vehicles with their own edges only, tag after tag."""
+
+    def __init__(self) -> None:
+        self._holds = True
+        self._waiting = False  # for the route of the vehicle before
+
+    @property
+    def lost(self) -> bool:
+        """Whether something else came: nothing behind it changes that."""
+        return not self._holds
+
+    def read(self, item: Tag) -> None:
+        """Takes the next opening tag."""
+        if item.name in ("vehicle", "trip", "flow", "route", "routeDistribution"):
+            single = item.name == "vehicle" and "route" not in item.attributes
+            self._holds &= item.name == "route" or (single and not self._waiting)
+            self._waiting = single
+
+    def ended(self) -> bool:
+        """The answer for the whole file."""
+        return self._holds and not self._waiting
+
+
+def explicit(scenario: Scenario) -> Scenario:
+    """The same demand as single vehicles with routes: trips and flows are resolved by duarouter.
+
+    Raises:
+        ScenarioError: duarouter refuses; its own words are in the message.
+    """
+    if all(map(_is_explicit, scenario.routes)):
+        return scenario
+    return replace(scenario, routes=(_routed(scenario),))
+
+
+def ways(scenario: Scenario) -> Iterator[tuple[str, ...]]:
+    """The edges of every vehicle that departs in the scenario's time, one after the other.
+
+    Args:
+        scenario: Any scenario; `explicit` is applied if need be.
+    """
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    for document in explicit(scenario).routes:
+        for vehicle in chain.from_iterable(part.iter("vehicle") for part in document.parts()):
+            route = vehicle.find("route")
+            edges = () if route is None else tuple(route.get("edges", "").split())
+            if edges and begin <= seconds_of(vehicle.get("depart", "0")) < end:
+                yield edges
+
+
+def drives(
+    scenario: Scenario, *, routed: bool, reporter: Reporter | None = None
+) -> Iterator[tuple[str, float, list[str]]]:
+    """Name, departure and roads of every vehicle that departs before the end of the episode.
+
+    Args:
+        scenario: Whose demand; it has passed `check_demand`.
+        routed: Whether it holds single vehicles with roads only; others are routed before.
+        reporter: Shows progress where a file is long.
+    """
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    for document in scenario.routes if routed else explicit(scenario).routes:
+        name, depart = "", 0.0
+        for tag in document.scan(reporter):
+            if tag.name == "vehicle":
+                name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
+                depart = seconds_of(text) if text[:1].isdigit() else begin
+                if depart >= end:  # they are in the order of their departures
+                    break
+            elif tag.name == "route" and "id" not in tag.attributes:
+                yield name, depart, tag.attributes.get("edges", "").split()
+
+
+def _is_explicit(document: Document) -> bool:
+    """Whether every vehicle of the file stands there with its own edges, and there is no flow."""
+    if document.path is None or document.content is not None:
+        return _explicit_content(document, 0, 0)
+    state = document.path.stat()
+    return _explicit_content(replace(document, home=None), state.st_size, state.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=8)
+def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
+    """The same, remembered for a file as long as it does not change."""
+    del size, changed_ns
+    singles = OwnEdges()
+    for tag in document.scan():
+        singles.read(tag)
+        if singles.lost:
+            return False
+    return singles.ended()
+
+
+def _routed(scenario: Scenario) -> Document:
+    """All demand of the scenario through duarouter."""
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+        directory = Path(name)
+        out = directory / "routed.rou.xml"
+
+        def files(documents: tuple[Document, ...]) -> str:
+            return ",".join(str(_for_sumo(item, directory)) for item in documents)
+
+        settings = scenario.settings
+        command = [
+            str(sumo_program("duarouter")),
+            "--net-file", files((scenario.network,)),
+            "--route-files", files(scenario.routes),
+            "--output-file", str(out),
+            "--begin", repr(settings.begin_s),
+            "--end", repr(settings.begin_s + settings.duration_s),
+            "--ignore-errors", "true",
+            "--no-warnings", "true",
+            "--no-step-log", "true",
+            "--seed", "1",
+        ]  # fmt: skip
+        if scenario.additional:
+            command += ["--additional-files", files(scenario.additional)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode or not out.exists():
+            said = " ".join(done.stderr.split()) or "no reason given"
+            raise ScenarioError(
+                f"scenario {scenario.id!r}: its trips or flows cannot be turned into routes: {said}"
+            )
+        return Document("routed.rou.xml", None, out.read_bytes())
+
+
+def _for_sumo(document: Document, directory: Path) -> Path:
+    """Where SUMO finds a document: a plain file where it lies, else a copy in `directory`."""
+    path = document.path
+    plain = path is not None and document.content is None and path.suffix != ".gz"
+    if path is not None and plain and "," not in str(path.resolve()):  # it ends a name for SUMO
+        return path.resolve()
+    copy = directory / document.name.removesuffix(".gz").replace(",", "_")
+    with replacing(copy) as temporary, temporary.open("wb") as file:
+        file.writelines(document.pieces())
+    return copy
