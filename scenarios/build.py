@@ -17,7 +17,7 @@ from demand import draw_demand
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
-from ugat_marl.scenarios import convert, plain_xml, read_plan
+from ugat_marl.scenarios import build_network, plain_xml, read_plan
 
 HERE = Path(__file__).resolve().parent
 BEGIN, END = "<!-- headroom: begin -->\n", "<!-- headroom: end -->\n"
@@ -30,7 +30,9 @@ def build(name: str, into: Path) -> list[Path]:
     vehicles = _read(HERE / "vehicles.toml")
     plan = read_plan(source)
     files = {
-        settings["network"]: convert(plain_xml(plan, source["speed_mps"]), source["netconvert"]),
+        settings["network"]: build_network(
+            plain_xml(plan, source["speed_mps"]), source["netconvert"]
+        ),
         settings["routes"][0]: draw_demand(
             plan, source["demand"], vehicles, settings["duration_s"]
         ),

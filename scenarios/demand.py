@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Plan, Road, arrivals, pick
+from ugat_marl.scenarios import Plan, Road, poisson_arrivals, weighted_choice
 from ugat_marl.seeding import numpy_generator
 
 
@@ -41,9 +41,9 @@ def draw_demand(
         first = next(road for road in plan.roads.values() if road.start == entry)
         number = 0
         for part, factor in enumerate(profile):
-            for moment in arrivals(random, flow["vph"] * factor / 3600, bin_s):
+            for moment in poisson_arrivals(random, flow["vph"] * factor / 3600, bin_s):
                 route = _walk(plan, first, demand["turns"], random)
-                kind = pick(demand["types"], random)
+                kind = weighted_choice(demand["types"], random)
                 trips.append((part * bin_s + moment, f"{entry}_{number}", route, kind))
                 number += 1
     root = ET.Element("routes")
@@ -69,7 +69,7 @@ def _walk(
             served = {turn for lane in road.lanes for turn in lane}
             shares = turns.get(road.id, turns["default"])
             exits = plan.exits(road)
-            turn = pick({t: shares[t] for t in ("l", "s", "r") if t in served}, random)
+            turn = weighted_choice({t: shares[t] for t in ("l", "s", "r") if t in served}, random)
             road = exits[turn]
             route.append(road.id)
         if road.end not in passed:

@@ -20,7 +20,7 @@ from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.effects import Effect, load_scenario, parse_domain
 from ugat_marl.experiments import policy_factory, record
-from ugat_marl.scenarios import Network, Passages, Period, Scenario, redrawn
+from ugat_marl.scenarios import Network, Passages, Period, Scenario, another_day
 from ugat_marl.simulation import standard_detectors
 
 LIMIT = 10.0
@@ -118,7 +118,7 @@ def test_vehicles_depart_so_that_they_come_when_others_came(
     crossing: tuple[Scenario, Network, Site],
 ) -> None:
     scenario, network, site = crossing
-    day = redrawn(scenario, 3)
+    day = another_day(scenario, 3)
     came = {"advance:S_C_0": [60.0, 75.0, 99.0], "stop:S_C_0": [65.0, 80.0, 105.0]}
     period = a_period(passages(came))
     found, due = Arrivals(site, network).given(day, day, period)
@@ -134,7 +134,7 @@ def test_vehicles_depart_so_that_they_come_when_others_came(
 
 def test_more_came_than_the_model_has(crossing: tuple[Scenario, Network, Site]) -> None:
     scenario, network, site = crossing
-    day = redrawn(scenario, 3)
+    day = another_day(scenario, 3)
     times = np.linspace(20.0, 180.0, 60).tolist()
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
     found, _ = Arrivals(site, network).given(day, day, period)
@@ -189,7 +189,7 @@ def test_detectors_that_missed_vehicles_do_not_keep_them_away(
     crossing: tuple[Scenario, Network, Site],
 ) -> None:
     scenario, network, site = crossing
-    day = redrawn(scenario, 3)
+    day = another_day(scenario, 3)
     times = np.linspace(5.0, 195.0, 40)
     few = {"advance:S_C_0": times[::2].tolist(), "stop:S_C_0": (times + 3).tolist()}
     found, due = Arrivals(site, network).given(day, day, a_period(passages(few)))

@@ -38,7 +38,7 @@ from ugat_marl.grounding.off_data import OffData
 from ugat_marl.grounding.timed_fitting import fit_timed
 from ugat_marl.grounding.view import Moment, View
 from ugat_marl.policies import observer_of, roll_out
-from ugat_marl.scenarios import within
+from ugat_marl.scenarios import within_hops
 from ugat_marl.seeding import torch_generator
 
 LAYOUTS = {"a_0": AgentLayout(2, 3, 1), "b_0": AgentLayout(1, 2), "c_0": AgentLayout(3, 2)}
@@ -213,10 +213,10 @@ def test_an_episode_in_sumo_shows_the_models_what_its_log_will_show_them() -> No
 
 def test_neighbours_are_those_within_some_roads_nearest_first() -> None:
     ring = {"a": ("b", "e"), "b": ("a", "c"), "c": ("b", "d"), "d": ("c", "e"), "e": ("d", "a")}
-    assert within(ring, 0)["a"] == ()
-    assert within(ring, 1)["a"] == ("b", "e")
-    assert within(ring, 2)["a"] == ("b", "e", "c", "d") == within(ring, 9)["a"]
-    assert within({"a": (), "b": ()}, 3) == {"a": (), "b": ()}
+    assert within_hops(ring, 0)["a"] == ()
+    assert within_hops(ring, 1)["a"] == ("b", "e")
+    assert within_hops(ring, 2)["a"] == ("b", "e", "c", "d") == within_hops(ring, 9)["a"]
+    assert within_hops({"a": (), "b": ()}, 3) == {"a": (), "b": ()}
 
 
 def test_an_environment_knows_its_neighbours_by_the_names_of_its_agents() -> None:
@@ -227,7 +227,9 @@ def test_an_environment_knows_its_neighbours_by_the_names_of_its_agents() -> Non
     for agent, near in found.items():
         assert all(agent in found[other] for other in near)
     ends = [agent for agent, near in found.items() if len(near) == 1]
-    assert ends[1] not in within(found, 3)[ends[0]] and ends[1] in within(found, 4)[ends[0]]
+    assert (
+        ends[1] not in within_hops(found, 3)[ends[0]] and ends[1] in within_hops(found, 4)[ends[0]]
+    )
 
 
 @pytest.mark.parametrize(

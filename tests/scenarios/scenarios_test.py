@@ -21,7 +21,7 @@ from ugat_marl.experiments import Row, headroom, markdown
 from ugat_marl.scenarios import (
     Network,
     Plan,
-    convert,
+    build_network,
     plain_xml,
     read_plan,
     read_scenario,
@@ -336,4 +336,4 @@ def test_builder_refuses_impossible_lanes(
 def test_builder_passes_on_what_netconvert_says() -> None:
     found = plan(["sr"], [""])
     with pytest.raises(ScenarioError, match="no-such-option"):
-        convert(plain_xml(found, 13.9), {"no-such-option": 1})
+        build_network(plain_xml(found, 13.9), {"no-such-option": 1})

@@ -21,11 +21,11 @@ from ugat_marl.scenarios import (
     from_counts,
     from_od,
     from_osm,
+    from_routes,
     from_sumo,
-    given_routes,
+    from_turns,
     make_scenario,
     rectangle,
-    turning,
 )
 
 ROADS = ("grid", "arterial", "osm", "sumo", "cityflow")
@@ -160,10 +160,10 @@ class ScenarioNew:
                 f"give one of {_listed(DEMANDS)}"
             )
         if self.routes:
-            return given_routes(self.routes, link=self.link)
+            return from_routes(self.routes, link=self.link)
         begin_s, length_s = self.begin_s or 0.0, self.duration_s or 3600.0
         if self.vph is not None:
-            return turning(self.vph, self.turns, begin_s, length_s, self.seed)
+            return from_turns(self.vph, self.turns, begin_s, length_s, self.seed)
         if self.counts is not None:
             return from_counts(self.counts, begin_s, length_s, self.seed)
         if self.od is not None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ugat_marl.data import Finding, Measured
 from ugat_marl.errors import MeasuredDataError
-from ugat_marl.scenarios import Detector, Scenario, edge_of, ways
+from ugat_marl.scenarios import Detector, Scenario, driven_routes, edge_of
 
 _NAMED = 6
 
@@ -35,7 +35,7 @@ def unreached(
             if name in edges and count:
                 counted[edges[name]] = counted.get(edges[name], 0) + int(count)
     left = set(edges.values())
-    for way in ways(scenario):
+    for way in driven_routes(scenario):
         left.difference_update(way)
         if not left:
             return ()

@@ -38,9 +38,9 @@ from ugat_marl.scenarios import (
     Period,
     Scenario,
     SignalLog,
+    another_day,
+    as_vehicles,
     delayed_log,
-    explicit,
-    redrawn,
     sumo_program,
 )
 from ugat_marl.seeding import derive_seed
@@ -91,7 +91,7 @@ class Replay:
     ) -> None:
         self._given = scenario, network, detectors, owner
         self.answering = answering
-        self._scenario = explicit(scenario)
+        self._scenario = as_vehicles(scenario)
         self._network = network
         self._detectors = tuple(detectors)
         self._owner = dict(owner)
@@ -150,7 +150,7 @@ class Replay:
         with self._lock:
             found = self._days.get(seed)
             if found is None:
-                found = self._days[seed] = redrawn(self._scenario, seed)
+                found = self._days[seed] = another_day(self._scenario, seed)
                 if len(self._days) > _DAYS:
                     self._days.popitem(last=False)
             return found

@@ -19,8 +19,8 @@ from ugat_marl.scenarios import (
     Network,
     Period,
     SignalLog,
+    deciding_letter,
     edge_of,
-    letter,
 )
 
 
@@ -169,7 +169,7 @@ def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
     for time, state in log:
         shown = seen.get(state)
         if shown is None:
-            shown = seen[state] = letter([state[index] for index in links])
+            shown = seen[state] = deciding_letter([state[index] for index in links])
         kind = "G" if shown in GREEN else "y" if shown in YELLOW else "r"
         if not changes or _kind(changes[-1][1]) != kind:
             changes.append((time, shown))

@@ -18,7 +18,7 @@ from ugat_marl.diagnosis.features import INDEX
 from ugat_marl.diagnosis.hypotheses import Hypothesis
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Distance
-from ugat_marl.scenarios import Scenario, ways
+from ugat_marl.scenarios import Scenario, driven_routes
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class Routes:
         turns: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         joint: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         rate = 3600.0 / scenario.settings.duration_s
-        for edges in ways(scenario):
+        for edges in driven_routes(scenario):
             origins[edges[0]] += rate
             passed = dict.fromkeys(edges)
             for edge in passed:

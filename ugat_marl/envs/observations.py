@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.scenarios import Network, group_names, member_names, within
+from ugat_marl.scenarios import Network, group_names, member_names, within_hops
 from ugat_marl.simulation import Snapshot
 
 ObservationName = Literal["count", "queue", "pressure", "waiting", "density", "movements"]
@@ -206,7 +206,7 @@ def _downstream_matrix(network: Network) -> NDArray[np.float64]:
 def _within(network: Network, hops: int) -> list[list[int]]:
     """For each intersection the others at most `hops` roads away, nearest first."""
     position = {item.id: index for index, item in enumerate(network.intersections)}
-    near = within({item.id: item.neighbours for item in network.intersections}, hops)
+    near = within_hops({item.id: item.neighbours for item in network.intersections}, hops)
     return [[position[name] for name in others] for others in near.values()]
 
 

@@ -12,7 +12,7 @@ from ugat_marl.experiments.evaluation import evaluate, rule_factory
 from ugat_marl.experiments.headroom import DOMAINS, HOLDS_S, Row, headroom
 from ugat_marl.files import chunks_of, scan_xml
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios import Scenario, Survey, drives, run, sumo_program
+from ugat_marl.scenarios import Scenario, Survey, departures, run_program, sumo_program
 from ugat_marl.simulation import launch_of
 
 TRIPS = "trips.xml"
@@ -96,13 +96,13 @@ def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
         launch = launch_of(scenario, seed, directory, ())
         launch.write()
         end_s = scenario.settings.begin_s + scenario.settings.duration_s
-        run("sumo", [str(sumo_program("sumo")), *launch.arguments, "--end", repr(end_s)])
+        run_program("sumo", [str(sumo_program("sumo")), *launch.arguments, "--end", repr(end_s)])
         waiting = {
             item.attributes.get("id", "")
             for item in scan_xml(chunks_of(directory / TRIPS), "SUMO's report")
             if item.name == "tripinfo" and float(item.attributes.get("depart", "-1")) < 0
         }
-    all_drives = drives(scenario, routed=False)
+    all_drives = departures(scenario, routed=False)
     return Counter(edges[0] for who, _, edges in all_drives if who in waiting and edges)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ugat_marl.envs import Observer
 from ugat_marl.errors import OptionError
 from ugat_marl.field.street import LaneCount
-from ugat_marl.scenarios import Network, Scenario, SignalTiming, within
+from ugat_marl.scenarios import Network, Scenario, SignalTiming, within_hops
 from ugat_marl.simulation import Snapshot
 
 _INCOMING_ONLY = ("count", "queue", "density")
@@ -74,7 +74,7 @@ class Site:
             else (*item.incoming_lanes, *item.outgoing_lanes)
             for item in items
         }
-        near = within({item.id: item.neighbours for item in items}, hops)
+        near = within_hops({item.id: item.neighbours for item in items}, hops)
         return cls(
             network,
             Observer(network, name, hops),

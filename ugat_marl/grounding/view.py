@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import LogError, OptionError
 from ugat_marl.grounding.stacked import Stack, StackedTransitions
-from ugat_marl.scenarios import within
+from ugat_marl.scenarios import within_hops
 
 Neighbours = Mapping[str, Sequence[str]]
 """Agent to the agents around it."""
@@ -66,7 +66,7 @@ class InputsConfig:
                 f"neighbours and agents differ in {sorted(foreign)[:4]}; name the neighbours of "
                 f"every agent: {', '.join(agents[:4])}{', ...' * (len(agents) > 4)}"
             )
-        return within(neighbours, self.hops)
+        return within_hops(neighbours, self.hops)
 
 
 def neighbours_of(env: AnyParallelEnv) -> dict[str, tuple[str, ...]]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.files import parse_xml, xml_bytes
-from ugat_marl.scenarios.routes import explicit
+from ugat_marl.scenarios.routes import as_vehicles
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import seconds_of
 from ugat_marl.seeding import numpy_generator
@@ -44,17 +44,17 @@ class _Vehicles:
     speeds: NDArray[np.float64]
 
 
-def redrawn(scenario: Scenario, seed: int) -> Scenario:
+def another_day(scenario: Scenario, seed: int) -> Scenario:
     """Another day: a Poisson number of copies of every vehicle, departures jittered.
 
     The same seed gives the same vehicles, names and speedFactors, whatever effects are applied
     afterwards, so that two models can be compared on the same day.
 
     Args:
-        scenario: Any scenario; `explicit` is applied if need be.
+        scenario: Any scenario; `as_vehicles` is applied if need be.
         seed: Which day; any non-negative integer.
     """
-    scenario = explicit(scenario)
+    scenario = as_vehicles(scenario)
     vehicles = _vehicles(tuple(document.read() for document in scenario.routes))
     generator = numpy_generator(seed, "another day")
     begin = scenario.settings.begin_s

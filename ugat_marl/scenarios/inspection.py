@@ -13,7 +13,7 @@ from ugat_marl.scenarios.demand import Demand, check_demand
 from ugat_marl.scenarios.junctions import Link, foes_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import RightOfWay, are_foes, turn_of
-from ugat_marl.scenarios.routes import drives
+from ugat_marl.scenarios.routes import departures
 from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import GREEN
 
@@ -342,7 +342,7 @@ class _Traffic:
         passes: Counter[str] = Counter()
         lengths_s: list[float] = []
         first = end
-        for _, depart, edges in drives(scenario, routed=demand.routed, reporter=reporter):
+        for _, depart, edges in departures(scenario, routed=demand.routed, reporter=reporter):
             if begin <= depart < end:
                 passes.update(edges)
                 lengths_s.append(sum(seconds.get(edge, 0.0) for edge in edges))

@@ -26,7 +26,7 @@ class Behind(NamedTuple):
     roads: Shares = ()
 
 
-NOBODY = Behind()
+NOTHING_BEHIND = Behind()
 """Nobody is counted with any lane."""
 
 
@@ -44,7 +44,7 @@ class LaneTable:
     ids: tuple[str, ...]
     capacity: NDArray[np.float64]
     speed_mps: NDArray[np.float64]
-    behind: Behind = NOBODY
+    behind: Behind = NOTHING_BEHIND
 
     def indices(self, lanes: Sequence[str]) -> NDArray[np.int64]:
         """Positions of `lanes` in the arrays, int64."""

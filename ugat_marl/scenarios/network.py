@@ -22,7 +22,7 @@ from ugat_marl.scenarios.junctions import (
     right_on_red_of,
     yields_of,
 )
-from ugat_marl.scenarios.lanes import NOBODY, Behind, LaneTable
+from ugat_marl.scenarios.lanes import NOTHING_BEHIND, Behind, LaneTable
 from ugat_marl.scenarios.phases import (
     RightOfWay,
     conflict_free_phases,
@@ -202,11 +202,11 @@ class Network:
                 tuple(tuple(item.roads.items()) for item in behind),
             )
             if any(item.lanes or item.roads for item in behind)
-            else NOBODY,
+            else NOTHING_BEHIND,
         )
 
 
-def within(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str, tuple[str, ...]]:
+def within_hops(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str, tuple[str, ...]]:
     """For each name the others at most `hops` roads away, nearest first."""
     found: dict[str, tuple[str, ...]] = {}
     for name in neighbours:

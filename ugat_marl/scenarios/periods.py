@@ -91,6 +91,6 @@ class Period:
     passages: Mapping[str, Passages]
 
 
-def letter(states: Sequence[str]) -> str:
+def deciding_letter(states: Sequence[str]) -> str:
     """The letter that decides what vehicles on several links do: green before yellow before red."""
     return next((x for x in "GgYyur" if x in states), "r")

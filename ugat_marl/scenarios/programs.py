@@ -35,7 +35,9 @@ def netconvert(arguments: Sequence[str], output: Path) -> str:
     Raises:
         ScenarioError: It refused; holds its words.
     """
-    said = run("netconvert", [str(sumo_program("netconvert")), *arguments, "-o", str(output)])
+    said = run_program(
+        "netconvert", [str(sumo_program("netconvert")), *arguments, "-o", str(output)]
+    )
     if not output.exists():
         raise ScenarioError(f"netconvert: wrote no network: {_short(said)}")
     text = output.read_text(encoding="utf-8")
@@ -55,10 +57,10 @@ def tool(script: str, arguments: Sequence[str]) -> None:
         ScenarioError: It failed; holds its last words.
     """
     path = sumo_program("netconvert").parent.parent / "tools" / script
-    run(script, [sys.executable, str(path), *arguments])
+    run_program(script, [sys.executable, str(path), *arguments])
 
 
-def run(name: str, command: Sequence[str]) -> str:
+def run_program(name: str, command: Sequence[str]) -> str:
     """What a program says on standard error.
 
     Raises:

@@ -42,7 +42,7 @@ class OwnEdges:
         return self._holds and not self._waiting
 
 
-def explicit(scenario: Scenario) -> Scenario:
+def as_vehicles(scenario: Scenario) -> Scenario:
     """The same demand as single vehicles with routes: trips and flows are resolved by duarouter.
 
     Raises:
@@ -53,15 +53,15 @@ def explicit(scenario: Scenario) -> Scenario:
     return replace(scenario, routes=(_routed(scenario),))
 
 
-def ways(scenario: Scenario) -> Iterator[tuple[str, ...]]:
+def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
     """The edges of every vehicle that departs in the scenario's time, one after the other.
 
     Args:
-        scenario: Any scenario; `explicit` is applied if need be.
+        scenario: Any scenario; `as_vehicles` is applied if need be.
     """
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
-    for document in explicit(scenario).routes:
+    for document in as_vehicles(scenario).routes:
         for vehicle in chain.from_iterable(part.iter("vehicle") for part in document.parts()):
             route = vehicle.find("route")
             edges = () if route is None else tuple(route.get("edges", "").split())
@@ -69,7 +69,7 @@ def ways(scenario: Scenario) -> Iterator[tuple[str, ...]]:
                 yield edges
 
 
-def drives(
+def departures(
     scenario: Scenario, *, routed: bool, reporter: Reporter | None = None
 ) -> Iterator[tuple[str, float, list[str]]]:
     """Name, departure and roads of every vehicle that departs before the end of the episode.
@@ -81,7 +81,7 @@ def drives(
     """
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
-    for document in scenario.routes if routed else explicit(scenario).routes:
+    for document in scenario.routes if routed else as_vehicles(scenario).routes:
         name, depart = "", 0.0
         for tag in document.scan(reporter):
             if tag.name == "vehicle":

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.files import write_whole
-from ugat_marl.scenarios import NOBODY, Behind, Document, Scenario, Segment, edge_of
+from ugat_marl.scenarios import NOTHING_BEHIND, Behind, Document, Scenario, Segment, edge_of
 from ugat_marl.simulation.mesoscopic import (
     QueueLook,
     add_those_behind,
@@ -64,7 +64,7 @@ class Launch:
     files: tuple[tuple[str, bytes], ...] = ()
     zone_m: float = 0.0
     persons: tuple[tuple[str, float], ...] = ()
-    behind: Behind = NOBODY
+    behind: Behind = NOTHING_BEHIND
 
     @property
     def segment_m(self) -> float:
@@ -140,7 +140,7 @@ def launch_of(
     gui: bool = False,
     zone_m: float = 0.0,
     persons: Mapping[str, float] | None = None,
-    behind: Behind = NOBODY,
+    behind: Behind = NOTHING_BEHIND,
 ) -> Launch:
     """Lists SUMO's options, and the files that have to be written for it; writes nothing.
 

@@ -38,7 +38,7 @@ from ugat_marl.data.measured.rows import in_order, refuse_set_back, with_period
 from ugat_marl.data.measured.signal_logs import signals_of
 from ugat_marl.data.measured.tables import DETECTORS, PERIODS, ROW, frame_of
 from ugat_marl.errors import MeasuredDataError
-from ugat_marl.scenarios import Network, Period, Scenario, SignalLog, letter, signal_widths
+from ugat_marl.scenarios import Network, Period, Scenario, SignalLog, deciding_letter, signal_widths
 
 LOOK_BACK_S = 3600.0
 """Events so long before a period tell what the signals showed at its begin."""
@@ -357,7 +357,7 @@ def _states(
     def state() -> str:
         letters = [
             device.constant.get(link)
-            or letter([green if colours[s] == GREEN else colours[s] for s, green in own])
+            or deciding_letter([green if colours[s] == GREEN else colours[s] for s, green in own])
             for link, own in enumerate(links)
         ]
         return "".join(letters)

@@ -19,8 +19,8 @@ from ugat_marl.scenarios import (
     Network,
     Period,
     Scenario,
+    deciding_letter,
     edge_of,
-    letter,
 )
 
 SHORT_S = 300.0
@@ -271,7 +271,7 @@ def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
                 if not log:
                     continue
                 since = np.array([since for since, _ in log])
-                is_red = np.array([letter([s[i] for i in links]) == "r" for _, s in log])
+                is_red = np.array([deciding_letter([s[i] for i in links]) == "r" for _, s in log])
                 for name in stops.get(lane, ()):
                     if name in period.passages:
                         off = period.passages[name].off_s

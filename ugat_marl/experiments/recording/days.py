@@ -52,8 +52,8 @@ from ugat_marl.scenarios import (
     Scenario,
     SignalLog,
     Split,
-    explicit,
-    redrawn,
+    another_day,
+    as_vehicles,
 )
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import loops_document, read_loops, standard_detectors
@@ -140,7 +140,7 @@ def record(
         )
     if duration_s is not None:
         scenario = scenario.with_duration(duration_s)
-    base, effects = _world(explicit(scenario), domain)
+    base, effects = _world(as_vehicles(scenario), domain)
     if duration_s is not None:  # the domain may be another scenario
         base = base.with_duration(duration_s)
     network = Network.read(base)
@@ -149,7 +149,7 @@ def record(
     observed(empty, effects, detectors, owners(base, detectors))  # a wrong detector is an error now
     fixed, watched = own_programmes(base, network, policy)
     street = _Street(
-        explicit(base),
+        as_vehicles(base),
         effects,
         detectors,
         fixed,
@@ -215,7 +215,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
     """One day, from its vehicles to what was seen of them."""
     scenario = street.base
     if not street.same_demand:
-        scenario = redrawn(scenario, derive_seed(street.seed, "record", index, "demand"))
+        scenario = another_day(scenario, derive_seed(street.seed, "record", index, "demand"))
         scenario = _renamed(scenario, derive_seed(street.seed, "record", index, "names"))
     scenario = apply_effects(scenario, street.effects)
     if not street.same_demand:

@@ -30,7 +30,7 @@ from ugat_marl.scenarios.importers.turning_shares import (
     walked,
     write_drives,
 )
-from ugat_marl.scenarios.programs import run, sumo_program, tool
+from ugat_marl.scenarios.programs import run_program, sumo_program, tool
 from ugat_marl.seeding import numpy_generator
 
 _CANDIDATES_VPH = 400.0
@@ -284,7 +284,7 @@ def _route(trips: bytes, network: Path, out: Path, seed: int) -> None:
         work = Path(name)
         write_whole(work / "trips.xml", trips)
         (work / "network.net.xml").write_bytes(read_bytes(network))
-        run(
+        run_program(
             "duarouter",
             [str(sumo_program("duarouter")), "--net-file", str(work / "network.net.xml"),
              "--route-files", str(work / "trips.xml"), "--output-file", str(work / "out.rou.xml"),

@@ -206,7 +206,7 @@ def plain_xml(plan: Plan, speed_mps: float) -> dict[str, bytes]:
     }
 
 
-def convert(documents: Mapping[str, bytes], options: Mapping[str, Any]) -> bytes:
+def build_network(documents: Mapping[str, bytes], options: Mapping[str, Any]) -> bytes:
     """The .net.xml that netconvert makes, without the comment that holds date and paths.
 
     Args:
@@ -286,7 +286,7 @@ def _check(spacing_m: float, speed_mps: float) -> None:
 def _drawn(plan: Plan, speed_mps: float, description: str) -> Roads:
     def roads(folder: Path, reporter: Reporter) -> Draft:
         del reporter
-        write_whole(folder / NETWORK, convert(plain_xml(plan, speed_mps), _NETCONVERT))
+        write_whole(folder / NETWORK, build_network(plain_xml(plan, speed_mps), _NETCONVERT))
         return Draft(
             description,
             "Drawn by the suite and built by SUMO's netconvert: every approach has a lane for left "

@@ -49,7 +49,7 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
     return roads
 
 
-def given_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
+def from_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
     """Route files the user has."""
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:

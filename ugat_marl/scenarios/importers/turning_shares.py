@@ -96,7 +96,7 @@ def walked(
     due = 0
     for entry in streets.entries:
         random = numpy_generator(seed, "entry", entry)
-        for number, moment in enumerate(arrivals(random, vph / 3600, length_s)):
+        for number, moment in enumerate(poisson_arrivals(random, vph / 3600, length_s)):
             due += 1
             if route := _walk(streets, entry, table, random):
                 found.append(Drive(f"{entry}_{number}", round(moment, 2), route))
@@ -126,15 +126,17 @@ def _walk(
             possible = possible or {turn: 1.0 for turn in turns if turn != "t"}
             if not possible:
                 break
-            roads = turns[pick(possible, random)]
-            road = pick(dict.fromkeys(roads, 1.0), random)
+            roads = turns[weighted_choice(possible, random)]
+            road = weighted_choice(dict.fromkeys(roads, 1.0), random)
             route.append(road)
         if road in streets.exits and streets.end[road] not in passed:
             return tuple(route)
     return ()
 
 
-def arrivals(random: np.random.Generator, rate_per_s: float, length_s: float) -> list[float]:
+def poisson_arrivals(
+    random: np.random.Generator, rate_per_s: float, length_s: float
+) -> list[float]:
     """Poisson arrivals in [0, length_s)."""
     found: list[float] = []
     moment = 0.0
@@ -146,7 +148,7 @@ def arrivals(random: np.random.Generator, rate_per_s: float, length_s: float) ->
     return found
 
 
-def pick(shares: Mapping[str, float], random: np.random.Generator) -> str:
+def weighted_choice(shares: Mapping[str, float], random: np.random.Generator) -> str:
     """A key of `shares`, with probability proportional to its value."""
     mark = float(random.random()) * sum(shares.values())
     for name, share in shares.items():
@@ -189,7 +191,7 @@ def _attributes(values: Mapping[str, str]) -> str:
     return "".join(f" {key}={quoteattr(value)}" for key, value in values.items())
 
 
-def turning(
+def from_turns(
     vph: float, shares: tuple[float, float, float], begin_s: float, length_s: float, seed: int
 ) -> Vehicles:
     """Vehicles by turning shares, as `walked` draws them, from `begin_s` on."""
