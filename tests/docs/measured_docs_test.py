@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ugat_marl.data import read_measured
-from ugat_marl.data.measured import atspm_log, coverage
+from ugat_marl.data.measured import atspm, coverage
 from ugat_marl.data.measured.atspm_mapping import AtspmMapping, read_mapping
 from ugat_marl.data.measured.tables import TABLES
 from ugat_marl.scenarios import Network, read_scenario, signal_widths
@@ -70,13 +70,13 @@ def test_the_events_are_those_of_the_importer() -> None:
         for code in row.split(",")
     }
     assert listed == {
-        *atspm_log.PHASE_EVENTS,
-        *atspm_log.OVERLAP_EVENTS,
-        *atspm_log.ARROW_EVENTS,
-        *atspm_log.DETECTOR_FAULTS,
-        atspm_log.DETECTOR_OFF,
-        atspm_log.DETECTOR_ON,
-        atspm_log.CLOCK_UPDATED,
+        *atspm.PHASE_EVENTS,
+        *atspm.OVERLAP_EVENTS,
+        *atspm.ARROW_EVENTS,
+        *atspm.DETECTOR_FAULTS,
+        atspm.DETECTOR_OFF,
+        atspm.DETECTOR_ON,
+        atspm.CLOCK_UPDATED,
     }
 
 

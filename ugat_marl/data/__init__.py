@@ -1,7 +1,9 @@
-"""Data: what is recorded, read and kept in files.
+"""Data: what is recorded, read and kept in files. Nothing here computes statistics.
 
-`TransitionLog` holds transitions of roll-outs, `measured` the measured data of a street and its
-readers, `runs` the folder of a training run. Nothing here computes statistics.
+- `transitions`: the log of transitions of roll-outs, one row per episode, step and agent.
+- `measured`: measured data of a street, their readers (CSV, Parquet, ATSPM) and their writer.
+- `runs`: the folder of a training run; `checkpoints`: dictionaries of tensors.
+- `scores`: the measures of an episode.
 """
 
 import lazy_loader

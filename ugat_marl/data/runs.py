@@ -7,6 +7,7 @@ stage it repeats and ends with the same file as an unbroken one.
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import json
 import math
@@ -18,7 +19,6 @@ from typing import IO, Any
 
 import polars as pl
 
-from ugat_marl.data.versions import versions_of
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.files import replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
@@ -247,3 +247,16 @@ def remove_temporaries(directory: Path) -> None:
     """
     for remains in directory.glob(".*.tmp"):
         remains.unlink(missing_ok=True)
+
+
+def version_of(distribution: str) -> str | None:
+    """Installed version of a package, or None."""
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def versions_of(*distributions: str) -> dict[str, str | None]:
+    """That of each package, by name."""
+    return {name: version_of(name) for name in distributions}

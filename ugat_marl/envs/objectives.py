@@ -23,7 +23,7 @@ HIDDEN: dict[str, str] = {
     "hard_brakings": "hard brakings [1/1000 veh]",
     "collisions": "collisions [1/1000 veh]",
 }
-"""Measures of a domain with an objective beside `ugat_marl.data.metrics.MEASURES`, with their
+"""Measures of a domain with an objective beside `ugat_marl.data.MEASURES`, with their
 headings."""
 
 PERSONS: dict[str, float] = {

@@ -1,1 +1,7 @@
-"""Measured data of the street: detectors, signals and detections in periods, read and written."""
+"""Measured data of a street.
+
+- `values`: the data in memory; `tables`: the files and their columns, read without trust.
+- `reading`: a directory becomes `values.Measured`; `passages`: on and off become vehicles.
+- `coverage`: findings on what is missing; `writing`: the way back.
+- `atspm`, `atspm_mapping`: logs of signal controllers.
+"""

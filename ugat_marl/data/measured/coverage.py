@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data.measured.data import Finding, Measured
+from ugat_marl.data.measured.values import Finding, Measured
 from ugat_marl.effects import known_effects
 from ugat_marl.scenarios import (
     GREEN,

@@ -2,29 +2,51 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
+import numpy as np
 import polars as pl
 
 from ugat_marl.data.measured import tables
-from ugat_marl.data.measured.checks import detectors_of, periods_of
 from ugat_marl.data.measured.coverage import coverage
-from ugat_marl.data.measured.data import Finding, Measured
-from ugat_marl.data.measured.detections import passages_of
-from ugat_marl.data.measured.rows import with_period
-from ugat_marl.data.measured.signal_logs import signals_of
-from ugat_marl.data.measured.tables import Table, read_table, refuse
-from ugat_marl.errors import MeasuredDataError
+from ugat_marl.data.measured.passages import passages_of
+from ugat_marl.data.measured.tables import (
+    PERIOD,
+    ROW,
+    Table,
+    in_order,
+    place,
+    read_table,
+    refuse,
+    refuse_set_back,
+    with_period,
+)
+from ugat_marl.data.measured.values import Finding, Measured, split_periods
+from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import (
+    STATES,
     Detector,
+    DetectorKind,
     Network,
     Passages,
     Period,
     Scenario,
     SignalLog,
+    Split,
     signal_widths,
 )
+
+TOLERANCE_M = 0.1
+"""How far a zone may reach beyond its lane: networks give lengths to the centimetre."""
+
+SIGNAL_GAP_S = 600.0
+"""A traffic light that shows the same for longer was probably not recorded."""
+LATE_S = 120.0
+"""A log that begins later than this in its period, about a cycle, cannot be replayed."""
 
 
 def read_measured(directory: Path, scenario: Scenario, network: Network) -> Measured:
@@ -202,3 +224,256 @@ def _refuse_empty(path: Path, what: str, periods: list[str]) -> None:
             f"{path}: no {what} in period {', '.join(map(repr, periods[:6]))}; was the file cut "
             "short? Add them, or leave the period out of periods.csv"
         )
+
+
+def periods_of(path: Path, frame: pl.DataFrame, scenario: Scenario) -> tuple[Period, ...]:
+    """The periods, still without signals and detections.
+
+    Raises:
+        MeasuredDataError: None, one twice, one that ends before it begins or that the scenario's
+            demand does not cover, or a split that is not ``fit`` or ``heldout``.
+    """
+    if frame.is_empty():
+        raise MeasuredDataError(f"{path}: no periods; write one row per period of measurement")
+    refuse(
+        path,
+        frame.filter(pl.col("period_id").is_duplicated()),
+        "period_id",
+        "occurs twice",
+        "give each period a name of its own",
+    )
+    refuse(
+        path,
+        frame.filter(~(pl.col("end_s") > pl.col("begin_s"))),
+        "end_s",
+        "is not after begin_s",
+        "write times in seconds of the scenario's clock",
+    )
+    _check_times(path, frame, scenario)
+    splits = _splits(path, frame)
+    return tuple(
+        Period(name, begin, end, split, {}, {})
+        for name, begin, end, split in zip(
+            frame["period_id"].to_list(),
+            frame["begin_s"].to_list(),
+            frame["end_s"].to_list(),
+            splits,
+            strict=True,
+        )
+    )
+
+
+def _check_times(path: Path, frame: pl.DataFrame, scenario: Scenario) -> None:
+    settings = scenario.settings
+    first, last = settings.begin_s, settings.begin_s + settings.duration_s
+    for column, bad in (
+        ("begin_s", pl.col("begin_s") < first),
+        ("end_s", pl.col("end_s") > last + 1e-6),
+    ):
+        refuse(
+            path,
+            frame.filter(bad),
+            column,
+            f"lies outside the scenario {scenario.id!r}, which has demand from {first:g} s to "
+            f"{last:g} s",
+            "shorten the period, or use a scenario whose duration_s covers it",
+        )
+
+
+def _splits(path: Path, frame: pl.DataFrame) -> tuple[Split, ...]:
+    refuse(
+        path,
+        frame.filter(pl.col("split").is_not_null() & ~pl.col("split").is_in(list(get_args(Split)))),
+        "split",
+        "is unknown",
+        "write fit or heldout",
+    )
+    given = frame["split"]
+    if 0 < given.null_count() < len(given):
+        refuse(
+            path,
+            frame.filter(pl.col("split").is_null()),
+            "period_id",
+            "has no split, though others have",
+            "write fit or heldout for every period, or leave the column out",
+        )
+    splits = split_periods(len(given)) if given.null_count() else tuple(given.to_list())
+    if "fit" not in splits:
+        raise MeasuredDataError(
+            f"{path}: every period is held out, none is left to fit; write split = fit for some"
+        )
+    return splits
+
+
+def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Detector, ...]:
+    """The detectors.
+
+    Raises:
+        MeasuredDataError: None, one twice, on a lane the network does not have, reaching beyond
+            its lane, or of an unknown kind.
+    """
+    if frame.is_empty():
+        raise MeasuredDataError(f"{path}: no detectors; write one row per detection zone")
+    refuse(
+        path,
+        frame.filter(pl.col("detector_id").is_duplicated()),
+        "detector_id",
+        "occurs twice",
+        "give each detector a name of its own",
+    )
+    kinds = get_args(DetectorKind)
+    refuse(
+        path,
+        frame.filter(~pl.col("kind").is_in(list(kinds))),
+        "kind",
+        "is unknown",
+        f"write one of {', '.join(kinds)}",
+    )
+    found: list[Detector] = []
+    for row in frame.iter_rows(named=True):
+        lane = network.lanes.get(row["lane_id"])
+        where = f"{place(path, row[ROW])}: detector {row['detector_id']!r}"
+        if lane is None:
+            near = nearest(row["lane_id"], network.lanes)
+            raise MeasuredDataError(
+                f"{where} lies on lane {row['lane_id']!r}, which the network does not have"
+                + (f"; did you mean {near!r}?" if near else "; lanes are called <edge>_<number>")
+            )
+        begin, length = row["position_m"], row["length_m"]
+        if not (0 <= begin <= lane.length_m + TOLERANCE_M and length >= 0):
+            raise MeasuredDataError(
+                f"{where} has position_m {begin:g} and length_m {length:g}; lane {lane.id!r} "
+                f"goes from 0 to {lane.length_m:g} m, measured from its upstream end"
+            )
+        if begin + length > lane.length_m + TOLERANCE_M:
+            raise MeasuredDataError(
+                f"{where} ends {begin + length:g} m along lane {lane.id!r}, which ends at "
+                f"{lane.length_m:g} m; its length_m is at most {lane.length_m - begin:g}"
+            )
+        found.append(Detector(row["detector_id"], lane.id, begin, length, row["kind"]))
+    return tuple(found)
+
+
+def signals_of(
+    path: Path,
+    frame: pl.DataFrame,
+    periods: Sequence[Period],
+    widths: Mapping[str, int],
+    found: list[Finding],
+) -> tuple[dict[str, SignalLog], ...]:
+    """What every traffic light showed, one mapping per period.
+
+    Args:
+        path: The file.
+        frame: Its rows, with `PERIOD`.
+        periods: The periods.
+        widths: Letters in the state of each traffic light of the network.
+        found: Findings; logs that begin late, gaps and the like are added.
+
+    Raises:
+        MeasuredDataError: An unknown traffic light, a state of another length than the network's
+            or with letters SUMO does not know, a clock set back, or a log that begins too late.
+    """
+    _check_states(path, frame, widths)
+    names = sorted(widths)
+    index = {tls: i for i, tls in enumerate(names)}
+    code = frame["tls_id"].replace_strict(index, return_dtype=pl.Int64).to_numpy()
+    key = frame[PERIOD].to_numpy().astype(np.int64) * len(names) + code
+
+    def name(stream: int) -> str:
+        return (
+            f"traffic light {names[stream % len(names)]!r} in period "
+            f"{periods[stream // len(names)].id!r}"
+        )
+
+    time = frame["time_s"].to_numpy()
+    refuse_set_back(path, key, time, frame[ROW].to_numpy(), name)
+    order = in_order(path, key, time, found)
+    key, time = key[order], time[order]
+    states = frame["state"].gather(order).to_list()
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    logs: tuple[dict[str, SignalLog], ...] = tuple({} for _ in periods)
+    for begin, end in zip(starts, np.append(starts[1:], len(key)), strict=True):
+        stream = int(key[begin])
+        period = periods[stream // len(names)]
+        log = _log(
+            list(zip(time[begin:end].tolist(), states[begin:end], strict=True)),
+            period,
+            f"{path.name}: {name(stream)}",
+            found,
+        )
+        logs[stream // len(names)][names[stream % len(names)]] = log
+    return logs
+
+
+def _check_states(path: Path, frame: pl.DataFrame, widths: Mapping[str, int]) -> None:
+    known = pl.col("tls_id").is_in(list(widths))
+    unknown = frame.filter(~known)
+    if unknown.height:
+        near = nearest(unknown["tls_id"][0], widths)
+        refuse(
+            path,
+            unknown,
+            "tls_id",
+            "is no traffic light of the network" + (f"; did you mean {near!r}?" if near else ""),
+            f"it has: {', '.join(sorted(widths)[:12]) or 'none'}",
+        )
+    for tls, state in frame.select("tls_id", "state").unique(maintain_order=True).iter_rows():
+        rows = (pl.col("tls_id") == tls) & (pl.col("state") == state)
+        if len(state) != widths[tls]:
+            refuse(
+                path,
+                frame.filter(rows),
+                "state",
+                f"has {len(state)} letters, but traffic light {tls!r} has {widths[tls]} links",
+                "write one letter per link, in the order of the network's linkIndex",
+            )
+        if strange := sorted(set(state) - STATES):
+            refuse(
+                path,
+                frame.filter(rows),
+                "state",
+                f"of traffic light {tls!r} has letters SUMO does not know ({''.join(strange)})",
+                f"allowed: {' '.join(sorted(STATES))}",
+            )
+
+
+def _log(
+    entries: list[tuple[float, str]], period: Period, where: str, found: list[Finding]
+) -> SignalLog:
+    """One log: of entries at the same time the last one counts; the first is at the begin."""
+    kept: list[tuple[float, str]] = []
+    clashes = 0
+    for entry in entries:
+        if kept and kept[-1][0] == entry[0]:
+            clashes += kept[-1][1] != entry[1]
+            kept.pop()
+        kept.append(entry)
+    if clashes:
+        found.append(Finding(f"{where}: {clashes} moments with two states; the last one is taken"))
+    first = kept[0][0]
+    if first > period.begin_s:
+        if first > period.begin_s + LATE_S:
+            raise MeasuredDataError(
+                f"{where} begins at {first:g} s, {first - period.begin_s:g} s late; write the "
+                "state at or before the begin of the period, or begin the period later"
+            )
+        found.append(
+            Finding(
+                f"{where} begins {first - period.begin_s:g} s late; its first state is taken for "
+                "the time before"
+            )
+        )
+        kept[0] = (period.begin_s, kept[0][1])
+    changes = [since for i, (since, s) in enumerate(kept) if i == 0 or s != kept[i - 1][1]]
+    changes = [max(since, period.begin_s) for since in changes] + [period.end_s]
+    gaps = np.diff(changes)
+    if len(gaps) and gaps.max() > SIGNAL_GAP_S:
+        at = float(changes[int(gaps.argmax())])
+        found.append(
+            Finding(
+                f"{where} shows one state for {math.floor(gaps.max() / 60)} min from {at:g} s on; "
+                "was it recorded?"
+            )
+        )
+    return tuple(kept)

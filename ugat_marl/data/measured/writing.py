@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from ugat_marl.data.measured.data import Measured
-from ugat_marl.data.measured.pairing import as_logged
+from ugat_marl.data.measured.passages import as_logged
 from ugat_marl.data.measured.tables import (
     COUNTS,
     DETECTIONS,
@@ -25,6 +24,7 @@ from ugat_marl.data.measured.tables import (
     Table,
     frame_of,
 )
+from ugat_marl.data.measured.values import Measured
 from ugat_marl.errors import OutputError
 from ugat_marl.scenarios import Passages, Period
 

@@ -16,7 +16,7 @@ import pytest
 
 from ugat_marl import parallel_env
 from ugat_marl.data import MEASURES, EpisodeRecorder, Scores
-from ugat_marl.data.metrics import relative_slowness
+from ugat_marl.data.scores import relative_slowness
 from ugat_marl.scenarios import LaneTable
 from ugat_marl.simulation import HALTING_MPS, Snapshot, Trips
 
