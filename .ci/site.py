@@ -1,7 +1,7 @@
 """Build the documentation site from the pages of the repository, strictly.
 
-Run by `make docs`: ``python .ci/site.py``. The pages are staged in ``.cache/site/pages`` in the same
-tree as in the repository, so that a link that works on a code host works in the site too. A page of
+Run by `make docs`: ``python .ci/site.py``. The pages are staged in ``.cache/site/pages`` in the
+same tree as in the repository, so that a link that works on a code host works in the site too. A page of
 reference is written for each room, with all that its ``__init__.pyi`` exports. Broken links and
 names that cannot be resolved fail the build.
 """
@@ -91,9 +91,12 @@ def home(module: str, name: str) -> str:
     folder = ROOT.joinpath(*module.split("."))
     file = folder / "__init__.pyi" if folder.is_dir() else folder.with_suffix(".py")
     for node in ast.parse(file.read_text()).body:
-        if isinstance(node, ast.ImportFrom) and node.module:
-            if name in {alias.asname or alias.name for alias in node.names}:
-                return home(f"{module}.{node.module}" if node.level else node.module, name)
+        if (
+            isinstance(node, ast.ImportFrom)
+            and node.module
+            and name in {alias.asname or alias.name for alias in node.names}
+        ):
+            return home(f"{module}.{node.module}" if node.level else node.module, name)
     return module
 
 
