@@ -1,0 +1,615 @@
+"""Digests of behaviour, to be held to the bit while the package is rearranged.
+
+    python -m studies.held write studies/held.json                 # plays every part twice
+    python -m studies.held check studies/held.json                 # one line per part
+    python -m studies.held check FILE --only episodes/single-v1 train/phase
+
+Parts play episodes in process, in worker processes and in vectors, visit every named domain, and
+let the command line train, record and diagnose. Nothing of the package is used but its public names
+and its command line, so that modules may move and names may change.
+
+A part is *values*, a table of label to list of numbers and short texts, and *names*, what is said
+beside them. The digest of a part is the SHA-256 over its values in an order of their own, without
+labels and names: where only these have changed, `check` says so and goes on. Wall times, paths,
+versions and dates are no values. Each part runs in an interpreter of its own, on one thread, and
+without those instructions of a processor in which mathematical libraries differ most; the numbers
+still belong to the versions in `made_with`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import importlib.metadata
+import importlib.util
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ugat_marl
+
+Values = dict[str, list[Any]]
+"""Label to numbers and short texts."""
+
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "ATEN_CPU_CAPABILITY": "default",
+    "MKL_CBWR": "COMPATIBLE",
+    "ONEDNN_MAX_CPU_ISA": "SSE41",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
+    "COLUMNS": "100",
+}
+PACKAGES = ("eclipse-sumo", "gymnasium", "numpy", "pettingzoo", "polars", "torch")
+EPISODES = ("single-v1", "mixed-v1", "resco:cologne1")
+"""Scenarios of which whole episodes are played."""
+IN_A_VECTOR_S = 900.0
+"""Length of an episode in a vector."""
+SEED = 11
+MEASURES = ("att_s", "throughput", "queue", "delay", "reward", "delay_s", "due", "departed")
+
+DOMAINS = """
+sim noise-3 noise-20 zone-10 zone-50 failure-20 combined-1 combined-4 noise-10-percent
+late-counts-10 late-counts-30 lost-readings-20 coarse-counts-5 delay-20 delay-60 flexible cyclic
+barrier-leading barrier-lagging barrier-both lost-commands-30 long-greens V1 V2 V3 V4 trucks-30
+headway-2 lost-time-2 demand-80 demand-120 late-demand careless idm eidm w99 incident fog downpour
+blizzard meso want-efficiency want-emissions want-fairness want-safety want-person-delay reach=100
+reaction_step=2 gap_acceptance=2+min_gap=4 yellow_running=3+red_running=2 blocker_patience=60
+V4+combined-2 V1+late_green=*,1.5
+"""
+"""Named domains and effects."""
+BEGINNING_LATE = ("late-demand", "incident")
+"""Domains in which nothing happens in the first minutes."""
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    **{f"observation {name}": {"observation": name} for name in ("queue", "pressure", "waiting")},
+    "observation density": {"observation": "density", "reward": "pressure"},
+    "observation movements": {"observation": "movements", "reward": "waiting"},
+    "neighbours": {"neighbours": 1},
+    "programme": {"signals": "programme"},
+    "crossings": {"crossings": True},
+    "spawn": {"simulator": "spawn"},
+}
+"""Options of an environment beside the usual ones."""
+
+RULES = """
+fixed-time:30 webster actuated:40 delay-actuated sotl largest-queue:20 longest-waiting
+max-pressure:10 max-pressure-loss:20 green-wave programme random
+"""
+
+TRAINING = """
+--real V4 --seed 3 --duration-s 900 --pretrain-episodes 4 --iterations 2 --grounded-episodes 2
+--sim-rollouts 2 --real-rollouts 2 --evaluation-seeds 2 --tuning-seeds 1 --fit.epochs 20
+--least-accuracy None
+"""
+
+UNEXAMINED = """
+emergency_deceleration min_gap imperfection reaction_step desired_speed speed_spread yellow_running
+red_running gap_acceptance lane_discipline heavy_share driver_model demand_surge demand_timing
+turning lane_closure parking local_speed clock_drift stuck dropout swapped
+"""
+"""Effects that are left out of a diagnosis, which would take minutes with them."""
+
+WORDS = frozenset({"sentence", "findings", "next_measurement", "ruled_out", "untried", "left_out"})
+"""Keys of a diagnosis under which there are words."""
+OF_THE_RUN = frozenset(
+    {"hashes", "versions", "budget_s", "policy_gap", "schema", "scenario", "corrected"}
+)
+"""Keys of a diagnosis that say how it was made."""
+
+
+class NotInstalled(Exception):
+    """What a part needs is not there."""
+
+
+# --- episodes -----------------------------------------------------------------------------------
+
+
+class Watched:
+    """What is seen of an episode: bytes into digests, sums into lists.
+
+    Args:
+        label: What its values are called.
+    """
+
+    def __init__(self, label: str) -> None:
+        self._label = label
+        self._digests: defaultdict[str, Any] = defaultdict(hashlib.sha256)
+        self._sums: defaultdict[str, list[float]] = defaultdict(list)
+        self._scores: dict[str, Any] = {}
+
+    def see(self, what: str, value: Any) -> None:
+        """Add a value to the digest of its kind, and its sum to the list of sums."""
+        self._digests[what].update(json.dumps(canonical(value)).encode())
+        if what in ("observations", "rewards"):
+            arrays = value.values() if isinstance(value, Mapping) else [value]
+            self._sums[what].append(math.fsum(float(x) for a in arrays for x in np.ravel(a)))
+
+    def score(self, scores: Any) -> None:
+        """Keep the measures of the episode that has ended."""
+        self._scores = dataclasses.asdict(scores)
+
+    def values(self) -> Values:
+        """Return measures, sums per decision, and digests."""
+        found: Values = {f"{self._label}: scores": list(flat_numbers(self._scores))}
+        for what, sums in self._sums.items():
+            found[f"{self._label}: sum of {what}"] = list(sums)
+        for what, digest in self._digests.items():
+            found[f"{self._label}: bytes of {what}"] = [digest.hexdigest()]
+        return found
+
+
+def canonical(value: Any) -> Any:
+    """Return a value as JSON that differs wherever a bit does."""
+    if isinstance(value, Mapping):
+        return {str(key): canonical(value[key]) for key in sorted(value, key=str)}
+    if isinstance(value, np.ndarray):
+        return [value.dtype.str, list(value.shape), np.ascontiguousarray(value).tobytes().hex()]
+    if isinstance(value, np.generic):
+        return canonical(value.item())
+    if isinstance(value, list | tuple):
+        return [canonical(item) for item in value]
+    if isinstance(value, float):
+        return value.hex()
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return [str(type(value).__name__), str(value)]
+
+
+def flat_numbers(value: Any) -> Iterator[Any]:
+    """Yield the numbers of nested tables, in the order in which they stand."""
+    if isinstance(value, Mapping):
+        for item in value.values():
+            yield from flat_numbers(item)
+    else:
+        yield value
+
+
+def drawn(mask: NDArray[Any], rng: np.random.Generator) -> int:
+    """Return a random action that the mask allows."""
+    allowed = np.flatnonzero(mask)
+    return int(allowed[int(rng.integers(len(allowed)))])
+
+
+def play(label: str, env: Any, seed: int = SEED, *, late: bool = False) -> Values:
+    """Return what a whole episode shows under random allowed actions.
+
+    Args:
+        label: What it is called.
+        env: A parallel environment; it is closed.
+        seed: Of the episode and of the actions.
+        late: Whether greens are held back by random times.
+    """
+    rng, watched = np.random.default_rng(seed), Watched(label)
+    watched.see("spaces", [[a, str(env.observation_space(a))] for a in env.possible_agents])
+    watched.see("scenario", [env.scenario.id, env.scenario.hash, env.domain])
+    observations, infos = env.reset(seed=seed)
+    watched.see("observations", observations)
+    watched.see("infos", infos)
+    while env.agents:
+        if late:
+            env.delay_greens({agent: float(rng.random() * 3.0) for agent in env.agents})
+        actions = {agent: drawn(infos[agent]["action_mask"], rng) for agent in env.agents}
+        observations, rewards, ended, truncated, infos = env.step(actions)
+        watched.see("observations", observations)
+        watched.see("rewards", rewards)
+        watched.see("ends", [ended, truncated])
+        watched.see("infos", infos)
+        watched.see("state", env.state())
+    watched.score(env.scores())
+    env.close()
+    return watched.values()
+
+
+def take_turns(label: str, env: Any) -> Values:
+    """Return what an episode of an AEC environment shows."""
+    rng, watched = np.random.default_rng(SEED), Watched(label)
+    env.reset(seed=SEED)
+    for agent in env.agent_iter():
+        observation, reward, ended, truncated, info = env.last()
+        watched.see("observations", observation)
+        watched.see("rewards", float(reward))
+        watched.see("infos", [agent, bool(ended), bool(truncated), info])
+        env.step(None if ended or truncated else drawn(info["action_mask"], rng))
+    watched.score(env.unwrapped.scores())
+    env.close()
+    return watched.values()
+
+
+def step_together(scenario: str) -> Values:
+    """Return what two environments in a vector show: an episode, and the beginning of the next."""
+    domains, found = ["sim", "V4"], {}
+    with ugat_marl.vector_env(scenario, 2, domains, duration_s=IN_A_VECTOR_S) as env:
+        batch = env.reset(seed=SEED)
+        rngs = [np.random.default_rng(SEED + i) for i in range(2)]
+        watched = [Watched(domain) for domain in domains]
+        after = 0
+        while after < 5:
+            actions = [[drawn(mask, rngs[i]) for mask in batch.masks[i]] for i in range(2)]
+            batch = env.step(np.array(actions))
+            after += bool(batch.ended) or after > 0
+            for i, one in enumerate(watched):
+                one.see("agents", list(env.agents))
+                one.see("observations", batch.observations[i])
+                one.see("rewards", batch.rewards[i])
+                one.see("infos", [batch.masks[i], batch.executed[i], bool(batch.truncated[i])])
+                one.see("seeds", [env.episodes[i].seed, env.episodes[i].domain])
+            for end in batch.ended:
+                watched[end.environment].see("last", [end.observations, end.masks])
+                watched[end.environment].score(end.scores)
+        for one in watched:
+            found |= one.values()
+    return found
+
+
+def episodes(scenario: str) -> tuple[Values, Values]:
+    """Return a scenario's episodes in a process of their own."""
+    found = play("V4", ugat_marl.parallel_env(scenario, "V4"), SEED + 1)
+    found |= play("sim", ugat_marl.parallel_env(scenario))
+    if scenario == "single-v1":
+        found |= take_turns("in turns", ugat_marl.env(scenario, duration_s=300.0))
+    return found, {}
+
+
+def episodes_in_process(scenario: str) -> tuple[Values, Values]:
+    """Return a scenario's episode in this process."""
+    return play("sim", ugat_marl.parallel_env(scenario, simulator="inprocess")), {}
+
+
+def episodes_in_a_vector(scenario: str) -> tuple[Values, Values]:
+    """Return a scenario's episodes in a vector of two."""
+    return step_together(scenario), {}
+
+
+def domains() -> tuple[Values, Values]:
+    """Return short episodes in many domains, and the hashes of their scenarios."""
+    found: Values = {}
+    for domain in DOMAINS.split():
+        duration_s = 700.0 if domain in BEGINNING_LATE else 200.0
+        found |= play(domain, ugat_marl.parallel_env("mixed-v1", domain, duration_s=duration_s))
+    return found, {}
+
+
+def variants() -> tuple[Values, Values]:
+    """Return short episodes under other options, and with greens held back."""
+    found: Values = {}
+    for name, options in VARIANTS.items():
+        found |= play(name, ugat_marl.parallel_env("mixed-v1", duration_s=300.0, **options))
+    late = ugat_marl.parallel_env("mixed-v1", "V2", duration_s=300.0)
+    return found | play("late greens", late, late=True), {}
+
+
+def scenarios() -> tuple[Values, Values]:
+    """Return what scenarios hold, by their own hash."""
+    names = ("single-v1", "grid2x2-v1", "grid4x4-v1", "arterial1x5-v1", "mixed-v1")
+    loaded = {name: ugat_marl.load_scenario(name) for name in names}
+    return {name: [one.id, one.hash, one.decisions] for name, one in loaded.items()}, {}
+
+
+# --- the command line ---------------------------------------------------------------------------
+
+
+def command(*arguments: str | Path) -> None:
+    """Run ``ugat-marl`` with the arguments.
+
+    Raises:
+        RuntimeError: It failed; the end of what it said is in the message.
+    """
+    line = [sys.executable, "-m", "ugat_marl", *map(str, arguments)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(line)}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
+
+
+def table_of(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a ``.parquet`` or ``.csv``."""
+    import polars as pl
+
+    read = pl.read_parquet if path.suffix == ".parquet" else pl.read_csv
+    return read(path).to_dicts()
+
+
+def training(grounding: str, *more: str) -> tuple[Values, Values]:
+    """Return scores per policy, domain and seed, and all that was logged on the way."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        command(
+            "train", "single-v1", "--grounding", grounding, *TRAINING.split(), *more, "--out", out
+        )
+        table = json.loads((out / "table.json").read_text(encoding="utf-8"))
+        logged, queues = table_of(out / "metrics.parquet"), table_of(out / "queues.parquet")
+    found: Values = {}
+    for row in table["episodes"]:
+        scores = {**row, **row.get("scores", {})}
+        label = f"{row['policy']}, {row['domain']}, seed {row['seed']}"
+        found[label] = [scores[measure] for measure in MEASURES]
+    for row in sorted(logged, key=lambda row: (row["stage"], row["name"], row["step"])):
+        found.setdefault(f"{row['stage']}: {row['name']}", []).append(row["value"])
+    for row in queues:
+        label = f"queue, {row['policy']}, {row['domain']}, {row['intersection']}"
+        found.setdefault(label, []).append(row["queue"])
+    return found, {key: [text] for key, text in table["notes"].items()}
+
+
+def measured_values(folder: Path, label: str) -> Values:
+    """Return the number of rows, the sums of columns and a digest of measured data."""
+    found: Values = {}
+    for path in sorted(folder.iterdir()):
+        rows = table_of(path)
+        found[f"{label}{path.stem}: rows"] = [len(rows)]
+        for name in rows[0] if rows else ():
+            column = [row[name] for row in rows]
+            digest = hashlib.sha256(json.dumps(canonical(column)).encode()).hexdigest()
+            numbers = [x for x in column if isinstance(x, int | float) and math.isfinite(x)]
+            found[f"{label}{path.stem}: {name}"] = [math.fsum(numbers), digest]
+    return found
+
+
+def recorded_rules() -> tuple[Values, Values]:
+    """Return what is measured under each rule."""
+    found: Values = {}
+    for rule in RULES.split():
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "measured"
+            options = ["--policy", rule, "--periods", "1", "--duration-s", "600", "--workers", "1"]
+            command("record", "mixed-v1", *options, "--seed", "5", "--out", out)
+            found |= measured_values(out, f"{rule}, ")
+    return found, {}
+
+
+def diagnosis(domain: str) -> tuple[Values, Values]:
+    """Return measured data of a domain, and everything a diagnosis finds in them.
+
+    The budget is a day, so that none is ever used up.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        data, out = Path(folder) / "measured", Path(folder) / "found"
+        days = ["--periods", "2", "--duration-s", "600", "--workers", "1", "--seed", "0"]
+        command("record", "single-v1", "--domain", domain, *days, "--out", data)
+        options = ["--cache", Path(folder) / "cache", "--budget-s", "86400", "--workers", "1"]
+        options += ["--seed", "0", "--no-report", "--leave-out", *UNEXAMINED.split()]
+        command("diagnose", "single-v1", data, "--out", out, *options)
+        record = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+        found = measured_values(data, "measured ")
+    if not record["complete"]:
+        raise RuntimeError(f"the diagnosis of {domain} is not complete")
+    names: Values = {}
+    first = ("verdict", "effects", "heldout", "evidence")
+    for key in sorted(record.keys() - OF_THE_RUN, key=lambda key: (key not in first, key)):
+        for path, value in leaves(key, record[key]):
+            words = isinstance(value, str) and key not in ("verdict", "effects")
+            (names if words or key in WORDS else found).setdefault(path, []).append(value)
+    return found, names
+
+
+def leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the leaves of nested JSON with their paths; ``[]`` stands for each entry of a list."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from leaves(f"{path}.{key}", item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from leaves(f"{path}[]", item)
+    else:
+        yield path, value
+
+
+# --- parts --------------------------------------------------------------------------------------
+
+
+def needing(scenario: str, part: Callable[[str], tuple[Values, Values]]) -> tuple[Values, Values]:
+    """Return a part of a scenario, if its network is there."""
+    if scenario.startswith("resco:") and importlib.util.find_spec("sumo_rl") is None:
+        raise NotInstalled(f"{scenario}: the networks of sumo-rl are not installed")
+    return part(scenario)
+
+
+def parts() -> dict[str, Callable[[], tuple[Values, Values]]]:
+    """Return all parts by their names."""
+    found: dict[str, Callable[[], tuple[Values, Values]]] = {"scenarios": scenarios}
+    ways = {"worker": episodes, "in-process": episodes_in_process, "vector": episodes_in_a_vector}
+    for scenario in EPISODES:
+        for way, part in ways.items():
+            found[f"episodes/{scenario}/{way}"] = lambda s=scenario, p=part: needing(s, p)
+    return found | {
+        "variants": variants,
+        "domains": domains,
+        "rules": recorded_rules,
+        "train/phase": lambda: training("phase"),
+        "train/timed": lambda: training("timed", "--timed.match"),
+        "diagnose/nothing": lambda: diagnosis("sim"),
+        "diagnose/V4": lambda: diagnosis("V4"),
+    }
+
+
+def played(name: str) -> dict[str, Any]:
+    """Return a part as another interpreter plays it: its digest, values and names.
+
+    Raises:
+        NotInstalled: It needs what is not there.
+        RuntimeError: It failed.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "studies.held", "play", name],
+        env={**os.environ, **ENVIRONMENT},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise RuntimeError(f"{name} failed:\n{done.stderr[-4000:]}")
+    answer = json.loads(done.stdout.splitlines()[-1])
+    if "missing" in answer:
+        raise NotInstalled(answer["missing"])
+    return answer
+
+
+def plain(values: Values) -> Values:
+    """Return values as JSON can hold them: numbers that are none as texts."""
+    return {
+        label: [str(x) if isinstance(x, float) and not math.isfinite(x) else x for x in found]
+        for label, found in values.items()
+    }
+
+
+def digest_of(values: Values) -> str:
+    """Return the SHA-256 of the values, whatever their labels and the order of these."""
+    lines = sorted(json.dumps(found) for found in values.values())
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def answer(name: str) -> int:
+    """Print a part as one line of JSON."""
+    try:
+        values, names = parts()[name]()
+    except NotInstalled as error:
+        print(json.dumps({"missing": str(error)}))
+        return 0
+    values = plain(values)
+    print(json.dumps({"sha256": digest_of(values), "values": values, "names": plain(names)}))
+    return 0
+
+
+# --- write and check ----------------------------------------------------------------------------
+
+
+def write(path: Path, chosen: Sequence[str]) -> int:
+    """Play every part twice and write down those that are equal; 1 if some are not."""
+    held: dict[str, Any] = {}
+    if path.exists():
+        held = json.loads(path.read_text(encoding="utf-8"))["parts"]
+    bad = 0
+    for name in chosen:
+        held.pop(name, None)
+        began = time.monotonic()
+        try:
+            first, second = played(name), played(name)
+        except NotInstalled as error:
+            say("skipped", name, f"{error}")
+            continue
+        except RuntimeError as error:
+            bad += 1
+            say("left out", name, f"{error}")
+            continue
+        took = f"twice in {time.monotonic() - began:.0f} s"
+        if first != second:
+            bad += 1
+            say("left out", name, f"{took}; the second time: {difference(first, second)}")
+            continue
+        held[name] = first
+        say("written", name, took)
+        save(path, {key: held[key] for key in parts() if key in held})
+    return int(bad > 0)
+
+
+def save(path: Path, held: Mapping[str, Any]) -> None:
+    """Write the parts, one line per label."""
+    versions = {"python": ".".join(map(str, sys.version_info[:3]))}
+    versions |= {name: importlib.metadata.version(name) for name in PACKAGES}
+    lines = ["{", f' "made_with": {json.dumps(versions)},', ' "parts": {']
+    for name, part in held.items():
+        lines += [f"  {json.dumps(name)}: {{", f'   "sha256": "{part["sha256"]}",']
+        for kind in ("values", "names"):
+            rows = [f"    {json.dumps(k)}: {json.dumps(v)}" for k, v in part[kind].items()]
+            lines += [f'   "{kind}": {{', ",\n".join(rows), "   }" + "," * (kind == "values")]
+        lines.append("  }" + "," * (name != list(held)[-1]))
+    lines += [" }", "}", ""]
+    path.write_text("\n".join(line for line in lines if line) + "\n", encoding="utf-8")
+
+
+def check(path: Path, chosen: Sequence[str]) -> int:
+    """Play the parts again and print one line for each; 1 if one is different."""
+    held = json.loads(path.read_text(encoding="utf-8"))["parts"]
+    different = 0
+    for name in chosen:
+        began = time.monotonic()
+        try:
+            now = played(name)
+        except NotInstalled as error:
+            say("skipped", name, f"{error}")
+            continue
+        except RuntimeError as error:
+            different += 1
+            say("DIFFERENT", name, f"it fails: {error}")
+            continue
+        took = f"{time.monotonic() - began:.0f} s"
+        if name not in held:
+            say("not held", name, took)
+        elif now["sha256"] == held[name]["sha256"] and not moved(held[name], now):
+            said = "" if now == held[name] else f"; other words: {difference(held[name], now)}"
+            say("same", name, took + said)
+        else:
+            different += 1
+            say("DIFFERENT", name, f"{took}; {difference(held[name], now)}")
+    return int(different > 0)
+
+
+def moved(before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
+    """Return whether the same labels have exchanged their values."""
+    was, now = before["values"], after["values"]
+    return was.keys() == now.keys() and was != now
+
+
+def difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
+    """Return the first difference of two parts in words, that of a number if there is one."""
+    for kind in ("values", "names"):
+        was, now = before[kind], after[kind]
+        for label in [key for key in was if key in now]:
+            for place, (old, new) in enumerate(zip(was[label], now[label], strict=False)):
+                if old != new:
+                    return f"{label} [{place}] was {old!r} and is {new!r}"
+            if len(was[label]) != len(now[label]):
+                return f"{label} had {len(was[label])} values and has {len(now[label])}"
+        if gone := list(was.keys() - now.keys()) or list(now.keys() - was.keys()):
+            return f"{min(gone)!r} is {'gone' if min(gone) in was else 'new'}"
+    return "none"
+
+
+def say(verdict: str, name: str, text: str) -> None:
+    """Print a line."""
+    print(f"{verdict:10} {name:32} {text}", flush=True)
+
+
+def selected(wanted: Iterable[str], names: Iterable[str]) -> list[str]:
+    """Return the names that begin with one of those wanted; all if none is.
+
+    Raises:
+        SystemExit: Nothing begins so.
+    """
+    wanted, names = list(wanted), list(names)
+    for begin in wanted:
+        if not any(name.startswith(begin) for name in names):
+            raise SystemExit(f"no part begins with {begin!r}; there are: {', '.join(names)}")
+    return [name for name in names if not wanted or name.startswith(tuple(wanted))]
+
+
+def main() -> int:
+    """Run the script; see its docstring."""
+    parser = argparse.ArgumentParser(prog="python -m studies.held", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("verb", choices=("write", "check", "play"))
+    parser.add_argument("file", help="the file of digests; for play, the name of a part")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="how names begin")
+    given = parser.parse_args()
+    if given.verb == "play":
+        return answer(given.file)
+    print(f"package: {Path(ugat_marl.__file__).parent}", flush=True)
+    chosen = selected(given.only, parts())
+    return (write if given.verb == "write" else check)(Path(given.file), chosen)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
