@@ -1,1 +1,1 @@
-"""Studies of the suite itself, run in a checkout: `studies.bench` and `studies.blind`."""
+"""Studies of the suite itself, run in a checkout: `bench`, `blind`, and `held` digests."""
