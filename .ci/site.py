@@ -2,8 +2,8 @@
 
 Run by `make docs`: ``python .ci/site.py``. The pages are staged in ``.cache/site/pages``, in the
 tree they have in the repository, so that a link that works on a code host works in the site too.
-A page of reference is written for each room, with all that its ``__init__.pyi`` exports. Broken links and
-names that cannot be resolved fail the build.
+A page of reference is written for each room, with all that its ``__init__.pyi`` exports. Broken
+links and names that cannot be resolved fail the build.
 """
 
 from __future__ import annotations
