@@ -32,8 +32,8 @@ WHEELS = VENV / "wheel"
 LOCK = ROOT / ".cache" / "environment.lock"
 OLDEST = (3, 11)
 PROBE = """
-import gymnasium, lazy_loader, libsumo, matplotlib, numpy, pettingzoo, polars, pydantic, rich
-import scipy, sumo, supersuit, tensorboard, torch, tyro
+import gymnasium, jinja2, lazy_loader, libsumo, matplotlib, numpy, pettingzoo, polars, pydantic
+import rich, scipy, sumo, supersuit, tensorboard, torch, tyro
 import ugat_marl
 """
 PROBE_DEV = "import hatchling, hypothesis, osmium, pytest, pytest_timeout, xdist"

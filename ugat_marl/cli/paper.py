@@ -26,9 +26,9 @@ from ugat_marl.policies import device_of
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import (
     as_csv,
+    comparison_radar,
     gap_picture,
     markdown,
-    radar_picture,
     seeds_csv,
     terminal_tables,
 )
@@ -149,5 +149,5 @@ def _write(found: Comparison, folder: Path) -> None:
     write_whole(folder / "seeds.csv", seeds_csv(found))
     grounded = [*GROUNDED_NAME.values(), matched_name("timed")]
     drawn = [DIRECT, *(name for name in grounded if name in found.settings)]
-    radar_picture(found, drawn, folder / "radar.png")
+    comparison_radar(found, drawn, folder / "radar.png")
     gap_picture(found, folder / "gaps.png")

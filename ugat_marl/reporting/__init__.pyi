@@ -1,5 +1,7 @@
-from .comparison_pictures import gap_picture as gap_picture
-from .comparison_pictures import radar_picture as radar_picture
+from .charts import calibration_picture as calibration_picture
+from .charts import comparison_radar as comparison_radar
+from .charts import gap_picture as gap_picture
+from .charts import transfer_picture as transfer_picture
 from .comparison_tables import as_csv as as_csv
 from .comparison_tables import markdown as markdown
 from .comparison_tables import number as number
@@ -15,10 +17,6 @@ from .gap_tables import matrix_table as matrix_table
 from .learning_curves import curves_as_csv as curves_as_csv
 from .learning_curves import curves_page as curves_page
 from .network_drawing import draw as draw
-from .pictures import calibration_picture as calibration_picture
-from .pictures import transfer_picture as transfer_picture
-from .run_page import runs_page as runs_page
-from .run_page import write_pictures as write_pictures
 from .run_records import RunRecord as RunRecord
 from .run_records import TableRecord as TableRecord
 from .run_records import read_records as read_records
@@ -26,6 +24,8 @@ from .tables import measures_table as measures_table
 from .tables import policy_gap_table as policy_gap_table
 from .tables import transfer_table as transfer_table
 from .tables import tuning_table as tuning_table
+from .training_page import runs_page as runs_page
+from .training_page import write_pictures as write_pictures
 from .video import Film as Film
 from .video import Frame as Frame
 from .video import film as film

@@ -13,6 +13,7 @@ from pathlib import Path
 from ugat_marl.files import write_whole
 from ugat_marl.reporting import diagnosis_words as words
 from ugat_marl.reporting.diagnosis_charts import speaking, strips
+from ugat_marl.reporting.diagnosis_document import document
 from ugat_marl.reporting.diagnosis_map import disagreement_map
 from ugat_marl.reporting.diagnosis_sections import (
     courtesy,
@@ -26,7 +27,6 @@ from ugat_marl.reporting.diagnosis_sections import (
 )
 from ugat_marl.reporting.diagnosis_style import ABOVE, LEVELS
 from ugat_marl.reporting.diagnosis_words import Record
-from ugat_marl.reporting.page import document
 from ugat_marl.scenarios import Network
 
 _LOUD, _QUIET = 16, 6

@@ -7,6 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from ugat_marl.diagnosis import clock
+from ugat_marl.reporting.formats import chance, number, share, signed
+
+__all__ = ["chance", "number", "share", "signed"]
 
 Record = Mapping[str, Any]
 """The content of ``diagnosis.json``, or a part of it."""
@@ -83,44 +86,6 @@ def _rounded(value: float, width: float) -> str:
     """A number with as many decimals as an interval of this width deserves."""
     decimals = min(max(1 - math.floor(math.log10(max(width, 1e-9))), 0), 4)
     return f"{value:.{decimals}f}".replace("-", "−")
-
-
-def number(value: Any, digits: int = 3) -> str:
-    """A number with three digits, in groups of thousands; a dash where there is none."""
-    if value is None or isinstance(value, bool) or not isinstance(value, int | float):
-        return "–" if value is None else str(value)
-    if not math.isfinite(value):
-        return "–"
-    if abs(value) >= 10**digits:
-        return f"{value:,.0f}".replace(",", "\u00a0").replace("-", "−")
-    return f"{value:.{digits}g}".replace("-", "−")
-
-
-def signed(value: Any) -> str:
-    """A number with its sign."""
-    text = number(value)
-    return text if text[:1] in ("−", "–") or text == "0" else f"+{text}"
-
-
-def share(value: Any) -> str:
-    """A share in per cent; never 100 % where something is missing."""
-    if value is None:
-        return "–"
-    percent = 100 * float(value)
-    if percent < 0:
-        return f"−{share(-value)}"
-    for digits in (0, 1, 2):
-        text = f"{percent:.{digits}f}"
-        if text.partition(".")[0] != "100" or value >= 1:
-            return f"{text} %"
-    return "99.99 %"
-
-
-def chance(value: Any) -> str:
-    """A probability."""
-    if value is None:
-        return "–"
-    return "< 0.001" if value < 0.001 else f"{value:.2g}"
 
 
 def disagreement_place(item: Record) -> str:

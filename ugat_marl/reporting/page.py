@@ -1,62 +1,103 @@
-"""What the pages have in common: one file of HTML that needs nothing else and runs nothing."""
+"""Pages from templates: one file of HTML that loads nothing and runs nothing.
+
+Names come from files of other people. Every text is escaped by the templates, and the page forbids
+itself scripts.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from html import escape
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
-from ugat_marl.reporting.diagnosis_style import STYLE
-
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"
-"""Content security policy: nothing is loaded, nothing is run, whatever a name smuggles in."""
+from ugat_marl.reporting.figures import Picture
+from ugat_marl.reporting.style import DARK, LIGHT, css_variables
 
 _MANY = 7
 """Columns beyond which a table is set narrower."""
 
 
-def document(title: str, body: str, style: str = "") -> str:
-    """A whole page.
-
-    Args:
-        title: Plain text.
-        body: HTML of what stands in the body.
-        style: Rules that this page has beside those of all pages.
-    """
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}{style}</style>\n</head>\n<body>\n"
-        f"{body}\n</body>\n</html>\n"
-    )
-
-
-def grid(
-    headings: Sequence[str], rows: Sequence[Sequence[str]], numbers: Collection[str] = ()
-) -> str:
+@dataclass(frozen=True)
+class Grid:
     """A table that becomes a list of cards where it does not fit.
 
-    Args:
-        headings: Plain text.
-        rows: Plain text, as many cells as there are headings.
+    Attributes:
+        headings: Headings of the columns.
+        rows: As many texts as there are headings.
         numbers: Headings of columns that are set flush right.
     """
-    classes = [' class="n"' if name in numbers else "" for name in headings]
-    named = list(zip(headings, classes, strict=True))
-    head = "".join(f"<th{c}>{escape(name)}</th>" for name, c in named)
-    body = "".join(
-        "<tr>"
-        + "".join(
-            f'<td{c} data-label="{escape(name, quote=True)}">{escape(cell)}</td>'
-            for (name, c), cell in zip(named, row, strict=True)
-        )
-        + "</tr>"
-        for row in rows
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    numbers: Sequence[str] = ()
+
+    @property
+    def many(self) -> bool:
+        """Whether the table has many columns."""
+        return len(self.headings) > _MANY
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture and its caption."""
+
+    picture: Picture
+    caption: str
+
+    @property
+    def svg(self) -> Any:
+        """The picture as HTML; an XML writer has escaped the texts in it."""
+        from markupsafe import Markup
+
+        return Markup(self.picture.for_page())
+
+
+@dataclass
+class Page:
+    """A page under construction.
+
+    Attributes:
+        text: The page, once it is made.
+        pictures: All pictures on it, each with a name of its own.
+    """
+
+    text: str = ""
+    pictures: list[Picture] = field(default_factory=list)
+
+    def figures(self, *pairs: tuple[Picture | None, str]) -> list[Figure]:
+        """Return pictures with their captions, without those that are not there."""
+        made: list[Figure] = []
+        for picture, caption in pairs:
+            if picture is None:
+                continue
+            names = {other.name for other in self.pictures}
+            base, again = picture.name, 1
+            while picture.name in names:
+                again += 1
+                picture.name = f"{base}-{again}"
+            self.pictures.append(picture)
+            made.append(Figure(picture, caption))
+        return made
+
+
+def render(template: str, **context: Any) -> str:
+    """Return a page made from one of the ``templates/``."""
+    text = _environment().get_template(template).render(context)
+    return text.encode("utf-8", "replace").decode()  # names of files may hold half characters
+
+
+@functools.cache
+def _environment() -> Any:
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("ugat_marl.reporting"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    many = " many" * (len(headings) > _MANY)
-    return f'<table class="stack{many}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
-
-
-def folded(summary: str, body: str, *, opened: bool = False) -> str:
-    """Something that is shown on request; `summary` is plain text."""
-    return f"<details{' open' * opened}><summary>{escape(summary)}</summary>{body}</details>"
+    colours: dict[str, Any] = {"light": css_variables(LIGHT), "dark": css_variables(DARK)}
+    environment.globals.update(colours)
+    return environment

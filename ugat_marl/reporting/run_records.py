@@ -185,8 +185,8 @@ def read_records(paths: Sequence[Path]) -> list[RunRecord | TableRecord]:
     ]
 
 
-def number(value: Any) -> float:
-    """A number of a record, nan where there is none."""
+def as_number(value: Any) -> float:
+    """Return a number of a record, nan where there is none."""
     if isinstance(value, bool) or not isinstance(value, int | float | str) or value == "":
         return math.nan
     try:
@@ -339,4 +339,4 @@ def _csv(path: Path) -> list[dict[str, Any]]:
     if not rows:
         raise ValueError("no rows with a setting and a domain in it")
     texts = ("scenario", "setting", "domain")
-    return [{k: str(v) if k in texts else number(v) for k, v in row.items()} for row in rows]
+    return [{k: str(v) if k in texts else as_number(v) for k, v in row.items()} for row in rows]

@@ -1,0 +1,560 @@
+"""Charts of trainings, evaluations and comparisons: curves, means with intervals, radar charts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.data import Metrics
+from ugat_marl.experiments import Comparison, Evaluation, Interval
+from ugat_marl.reporting.figures import (
+    TOP,
+    WIDTH,
+    Picture,
+    add_axes,
+    add_legend,
+    add_tip,
+    legend_height,
+    new_picture,
+    printable,
+    shortened,
+    tick_text,
+    write_png,
+)
+from ugat_marl.reporting.job_names import grounding_of
+from ugat_marl.reporting.run_records import RunRecord
+from ugat_marl.reporting.style import LIGHT, curve_style, styled
+
+MEASURES: dict[str, tuple[str, str]] = {
+    "att_s": ("travel time", "s"),
+    "throughput": ("throughput", "veh"),
+    "reward": ("reward", "per step"),
+    "queue": ("queue", "veh"),
+    "delay": ("delay, 1 − v/vmax", ""),
+}
+"""The paper's five measures on a radar, with their units."""
+_BINS = 20
+_LEAST = 4
+_ROW = 30.0
+
+Row = tuple[float, float, float, float]
+"""x, mean, low, high."""
+
+Estimated = tuple[float, float, float]
+"""Mean, low, high."""
+
+
+# --- curves of trainings --------------------------------------------------------------------------
+
+
+@styled()
+def learning_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
+    """Draw the return per training episode, with 95 % intervals.
+
+    Args:
+        records: Trainings that differ in their seed alone; one of them has intervals over the
+            episodes of a stretch, several have intervals over the seeds.
+        name: Name of the picture.
+    """
+    series = [rows for record in records if (rows := record.series("episode", "return"))]
+    rows = binned(series)
+    if not rows:
+        return None
+    picture, axes = _plot(
+        name, f"Learning: {_several(records)}", "training episode",
+        "return (sum of the reward, mean over agents)",
+    )  # fmt: skip
+    _draw_curve(picture, axes, 0, rows, markers=len(rows) < 3)
+    plain = records[0].ugat.get("pretrain_episodes")
+    first, last = series[0][0][0], max(row[0] for row in rows)
+    if isinstance(plain, int) and first < plain < last:
+        late = plain > (first + last) / 2
+        axes.axvline(plain, color=LIGHT["soft"], linewidth=1, linestyle=(0, (4, 3)))
+        axes.annotate(
+            "grounded from here", (plain, 1), xycoords=("data", "axes fraction"),
+            xytext=(-4 if late else 4, -10), textcoords="offset points", color=LIGHT["soft"],
+            ha="right" if late else "left",
+        )  # fmt: skip
+    return picture
+
+
+@styled()
+def travel_time_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
+    """Draw ATT after each iteration by domain; with several seeds, 95 % intervals over them."""
+    domains: dict[str, list[Row]] = {}
+    for domain in _domains(records):
+        series = [record.series("iteration", f"att_s/{domain}") for record in records]
+        if rows := joined([one for one in series if one]):
+            domains[domain] = rows
+    if not domains:
+        return None
+    picture, axes = _plot(
+        name, f"Travel time: {_several(records)}", "iteration (0: direct transfer)",
+        "average travel time, s", [f"in {domain}" for domain in domains],
+    )  # fmt: skip
+    for number, rows in enumerate(domains.values()):
+        _draw_curve(picture, axes, number, rows)
+    return picture
+
+
+@styled()
+def gate_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
+    """Draw acceptance, α and u over the iterations, means over the intersections."""
+    labels = {
+        "gate/acceptance": "acceptance (share of decisions)",
+        "gate/mean_u": "mean u",
+        "gate/alpha": "threshold α (none: ∞)",
+    }
+    curves = {
+        key: joined([rows for record in records if (rows := record.series("iteration", key))])
+        for key in labels
+    }
+    if not curves["gate/acceptance"]:
+        return None
+    picture, axes = _plot(
+        name, f"The gate: {_several(records)}", "iteration", "share, or uncertainty",
+        list(labels.values()),
+    )  # fmt: skip
+    axes.set_ylim(-0.02, 1.02)
+    for number, rows in enumerate(curves.values()):
+        _draw_curve(picture, axes, number, rows)
+    return picture
+
+
+def binned(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
+    """Return stretches of episodes: middle, mean, and Student's 95 % interval.
+
+    The interval is over the episodes of a stretch for one series, over the series for several.
+    """
+    if not series:
+        return []
+    last = max(one[-1][0] for one in series) + 1
+    size = max(_LEAST, math.ceil(last / _BINS))
+    rows: list[Row] = []
+    for start in range(0, last, size):
+        parts = [[v for x, v in one if start <= x < start + size] for one in series]
+        parts = [part for part in parts if part]
+        values = parts[0] if len(series) == 1 and parts else [float(np.mean(p)) for p in parts]
+        if values and (len(values) > 1 or len(series) > 1 or last < 2 * size):
+            rows.append((start + min(size, last - start) / 2, *_interval(values)))
+    return rows
+
+
+def joined(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
+    """Return mean and Student's 95 % interval over the series at each step (nan for one)."""
+    steps: dict[int, list[float]] = {}
+    for one in series:
+        for step, value in one:
+            steps.setdefault(step, []).append(value)
+    return [(step, *_interval(values)) for step, values in sorted(steps.items())]
+
+
+def _interval(values: Sequence[float]) -> Estimated:
+    finite = np.array([value for value in values if math.isfinite(value)])
+    if not finite.size or finite.size < len(values):
+        return math.nan, math.nan, math.nan
+    interval = Interval.of(finite)
+    return interval.mean, interval.low, interval.high
+
+
+def _plot(
+    name: str, title: str, x_label: str, y_label: str, legend: Sequence[str] = ()
+) -> tuple[Picture, Any]:
+    """A picture with one pair of axes and whole numbers on the horizontal one."""
+    below = legend_height(legend)
+    picture = new_picture(name, title, 300 + below)
+    axes = add_axes(picture, 58, 54, 14, 46 + below)
+    _label(axes, x_label, y_label)
+    if legend:
+        add_legend(picture, legend)
+    return picture, axes
+
+
+def _label(axes: Any, x_label: str, y_label: str) -> None:
+    """Labels at the ends of both axes, the vertical one read without turning one's head."""
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+    axes.set_xlabel(x_label, loc="right")
+    axes.set_title(y_label, color=LIGHT["soft"], x=-50 / _points_wide(axes))
+    axes.grid(visible=False, axis="x")
+    axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
+    axes.yaxis.set_major_locator(MaxNLocator(6))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(FuncFormatter(tick_text))
+
+
+def _points_wide(axes: Any) -> float:
+    return float(axes.get_position().width * axes.figure.get_size_inches()[0] * 72)
+
+
+def _draw_curve(
+    picture: Picture, axes: Any, number: int, rows: Sequence[Row], *, markers: bool = True
+) -> None:
+    """Draw a curve with its interval; it is interrupted where there is no value."""
+    x, mean, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
+    style = curve_style(number)
+    marker = style.pop("marker")
+    axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
+    axes.plot(x, mean, **style)
+    alone = np.isfinite(mean) & ~np.isfinite(np.r_[mean[1:], np.nan] + np.r_[np.nan, mean[:-1]])
+    for place, value, single in zip(x, mean, alone, strict=True):
+        if np.isfinite(value) and (markers or (single and len(x) == 1)):
+            (dot,) = axes.plot(place, value, marker=marker, color=style["color"], zorder=3)
+            add_tip(dot, f"{place:g}: {tick_text(value)}")
+
+
+def _several(records: Sequence[RunRecord]) -> str:
+    if len(records) == 1:
+        return shortened(records[0].name, 34)
+    first = records[0]
+    name = first.scenario + (f" → {first.real}" if first.real else "")
+    kind = grounding_of(first.settings)
+    return f"{shortened(name, 26)}{f', {kind}' if kind else ''}, {len(records)} seeds"
+
+
+def _domains(records: Sequence[RunRecord]) -> list[str]:
+    names = [
+        name.removeprefix("att_s/")
+        for record in records
+        for stage, _, name, _ in (record.metrics.rows if record.metrics is not None else [])
+        if stage == "iteration" and name.startswith("att_s/")
+    ]
+    return list(dict.fromkeys(names))
+
+
+# --- means with intervals -------------------------------------------------------------------------
+
+
+@styled()
+def scores_picture(
+    title: str, labels: Sequence[str], series: Mapping[str, Sequence[Estimated]], name: str
+) -> Picture | None:
+    """Draw travel times as dots with their 95 % intervals.
+
+    Args:
+        title: What they are of.
+        labels: Labels of the rows.
+        series: Domain to the mean and interval of every row; nan where there is none.
+        name: Name of the picture.
+    """
+    if not any(math.isfinite(v) for rows in series.values() for row in rows for v in row):
+        return None
+    below = legend_height(list(series))
+    picture = new_picture(name, title, TOP + _ROW * len(labels) + 48 + below)
+    axes = add_axes(picture, 186, TOP, 16, 48 + below)
+    _draw_estimates(axes, labels, series, "s")
+    axes.set_xlabel("travel time, s", loc="right")
+    add_legend(picture, list(series), lines=False)
+    return picture
+
+
+def _draw_estimates(
+    axes: Any, labels: Sequence[str], series: Mapping[str, Sequence[Estimated]], unit: str,
+    *, named: bool = True,
+) -> None:  # fmt: skip
+    """Draw a row for every label, in it a dot with an interval for every series."""
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+    for number, (group, estimates) in enumerate(series.items()):
+        style = {**curve_style(number), "linestyle": "none"}
+        shift = min(0.23, 0.73 / len(series)) * (number - (len(series) - 1) / 2)
+        for place, (label, (mean, *ends)) in enumerate(zip(labels, estimates, strict=True)):
+            if not math.isfinite(mean):
+                continue
+            if all(map(math.isfinite, ends)):
+                axes.plot(ends, [place + shift] * 2, color=style["color"])
+            (dot,) = axes.plot(mean, place + shift, **style, markersize=8, zorder=3)
+            add_tip(dot, f"{label}, {group}: {tick_text(mean)} {unit}")
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    texts = [printable(shortened(label, 26)) for label in labels] if named else [""] * len(labels)
+    axes.set_yticks(range(len(labels)), texts, color=LIGHT["ink"])
+    axes.grid(visible=False, axis="y")
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_formatter(FuncFormatter(tick_text))
+
+
+@styled()
+def transfer_picture(found: Evaluation, metrics: Metrics, path: Path) -> None:
+    """Draw ATT by policy and domain, and ATT over the iterations, as PNG.
+
+    Args:
+        found: The final evaluation.
+        metrics: The run's metrics; its iterations are drawn.
+        path: Where to write.
+    """
+    labels = [f"in {domain}" for domain in found.domains]
+    height = max(270.0, TOP + 22 + _ROW * len(found.policies) + 66)
+    picture = new_picture("gap", f"{found.scenario}: average travel time", height, 2 * WIDTH)
+    left = add_axes(picture, 186, TOP + 22, WIDTH + 10, 66)
+    _draw_policies(left, found)
+    right = add_axes(picture, WIDTH + 68, TOP + 22, 14, 66)
+    _label(right, "iteration (0: direct transfer)", "after each iteration, one seed, s")
+    for number, domain in enumerate(found.domains):
+        rows = [
+            (step, value, math.nan, math.nan)
+            for stage, step, name, value in sorted(metrics.rows)
+            if stage == "iteration" and name == f"att_s/{domain}"
+        ]
+        if rows:
+            _draw_curve(picture, right, number, rows)
+        rule = f"rule {found.notes.get(f'best rule in {domain}')}"
+        if rule in found.policies:
+            colour, level = (
+                curve_style(number)["color"],
+                found.estimate(rule, domain, "att_s").mean,
+            )
+            right.axhline(level, color=colour, linestyle=(0, (1, 2)), linewidth=1)
+            right.annotate(
+                printable(f"best rule in {domain}"), (1, level), (0, 3), color=colour,
+                xycoords=("axes fraction", "data"), textcoords="offset points", ha="right",
+                fontsize=10,
+            )  # fmt: skip
+    add_legend(picture, labels)
+    write_png(picture, path)
+
+
+def travel_times(found: Evaluation) -> dict[str, list[Estimated]]:
+    """Return travel times in every domain, with intervals, by policy."""
+    return {
+        f"in {domain}": [_of(found.estimate(p, domain, "att_s")) for p in found.policies]
+        for domain in found.domains
+    }
+
+
+def _draw_policies(axes: Any, found: Evaluation) -> None:
+    _draw_estimates(axes, found.policies, travel_times(found), "s")
+    seeds = len({result.seed for result in found.results})
+    title = f"final policies, {seeds} seeds, 95 % intervals, s"
+    axes.set_title(title, color=LIGHT["soft"], x=-178 / _points_wide(axes))
+
+
+@styled()
+def gap_picture(found: Comparison, path: Path) -> None:
+    """Draw the gaps of ATT and throughput with intervals over training seeds, as PNG.
+
+    Args:
+        found: The comparison.
+        path: Where to write.
+    """
+    below = legend_height(found.targets, 2 * WIDTH)
+    row = max(24.0, 11.0 * len(found.targets) + 6)
+    height = TOP + 8 + row * len(found.settings) + 48 + below
+    title = f"{found.scenario}: real domain minus simulation"
+    picture = new_picture("gaps", title, height, 2 * WIDTH)
+    for place, (measure, label, unit) in enumerate(
+        (
+            ("att_s", "Δ of ATT, s; shorter is better", "s"),
+            ("throughput", "Δ of throughput, veh; more is better", "veh"),
+        )
+    ):
+        side = (190.0, 375.0) if place == 0 else (2 * WIDTH - 355, 16.0)
+        axes = add_axes(picture, side[0], TOP + 8, side[1], 48 + below)
+        series = {
+            target: [
+                _of(Interval.of(found.gaps(s, target, measure)))
+                if found.has(s, target)
+                else (math.nan, math.nan, math.nan)
+                for s in found.settings
+            ]
+            for target in found.targets
+        }
+        _draw_estimates(axes, found.settings, series, unit, named=place == 0)
+        axes.axvline(0, color=LIGHT["soft"], linewidth=1)
+        axes.set_xlabel(label, loc="right")
+    add_legend(picture, found.targets, lines=False)
+    write_png(picture, path)
+
+
+def _of(interval: Any) -> Estimated:
+    return interval.mean, interval.low, interval.high
+
+
+# --- radar charts ---------------------------------------------------------------------------------
+
+
+@styled()
+def radar_picture(title: str, lines: Mapping[str, Sequence[float]], name: str) -> Picture | None:
+    """Draw the five measures on axes of their own; the rim is the best value on each.
+
+    Args:
+        title: What is compared.
+        lines: Label to a value for each of `MEASURES`; one without all of them is left out.
+        name: Name of the picture.
+    """
+    known = {label: row for label, row in lines.items() if all(map(math.isfinite, row))}
+    if not known:
+        return None
+    below = legend_height(list(known))
+    picture = new_picture(name, title, 334 + below)
+    axes = add_axes(picture, 100, 78, 100, 36 + below, projection="polar")
+    _draw_radar(axes, list(known.values()))
+    add_legend(picture, list(known))
+    return picture
+
+
+@styled()
+def comparison_radar(found: Comparison, settings: Sequence[str], path: Path) -> None:
+    """Draw the paper's five measures in sim and in each real domain, as PNG.
+
+    Args:
+        found: The comparison.
+        settings: Rows to draw; the first is drawn in the simulation, too.
+        path: Where to write.
+    """
+    columns = min(len(found.targets), 2)
+    rows = math.ceil(len(found.targets) / columns)
+    legend = [f"{settings[0]} in {found.sim}", *(f"{s} in the real domain" for s in settings)]
+    wide, high = 440.0, 310.0
+    width = max(wide * columns, 560.0)
+    below = legend_height(legend, width) + 12
+    title = "simulation against real domain; the rim is the best"
+    picture = new_picture("radar", f"{found.scenario}: {title}", TOP + high * rows + below, width)
+    for place, target in enumerate(found.targets):
+        left, top = wide * (place % columns), TOP + high * (place // columns)
+        axes = add_axes(
+            picture, left + 125, top + 70, width - left - wide + 125,
+            below + high * (rows - 1 - place // columns) + 50, projection="polar",
+        )  # fmt: skip
+        lines = [(settings[0], found.sim), *((s, target) for s in settings)]
+        table = [
+            [float(found.values(s, target, m, domain).mean()) for m in MEASURES]
+            if found.has(s, target)
+            else [math.nan] * len(MEASURES)
+            for s, domain in lines
+        ]
+        _draw_radar(axes, table)
+        axes.set_title(printable(target), x=-0.6, y=1.24, fontweight="bold")
+    add_legend(picture, legend)
+    write_png(picture, path)
+
+
+def radar_lines(found: Evaluation, real: str) -> dict[str, list[float]]:
+    """Return direct transfer in the simulation, then its rivals in `real`."""
+    sim, policies = found.domains[0], found.policies
+    rule = f"rule {found.notes.get(f'best rule in {real}')}"
+    shown = [policies[0], *(p for p in policies if p.startswith("UGAT") and p != policies[0])]
+    shown += [p for p in policies if p == rule and p not in shown]
+
+    def means(policy: str, domain: str) -> list[float]:
+        return [float(found.values(policy, domain, measure).mean()) for measure in MEASURES]
+
+    lines = {f"{policies[0]} in {sim}": means(policies[0], sim)}
+    return lines | {f"{policy} in {real}": means(policy, real) for policy in shown[:5]}
+
+
+def goodness(values: NDArray[np.float64], more_is_better: bool) -> NDArray[np.float64]:
+    """Return values in (0, 1] with 1 for the best: ratios to it, by size where negative.
+
+    Args:
+        values: ``(n,)``, all of one sign.
+        more_is_better: Whether the largest size is the best.
+    """
+    sizes = np.abs(values)
+    best = np.nanmax(sizes) if more_is_better else np.nanmin(sizes)
+    if best == 0.0:
+        return np.where(sizes == 0.0, 1.0, 0.0)
+    return sizes / best if more_is_better else best / sizes
+
+
+def _draw_radar(axes: Any, rows: Sequence[Sequence[float]]) -> None:
+    """Draw lines on polar axes, one axis for each of `MEASURES`; rows of nan are left out."""
+    table = np.array(rows, dtype=float)
+    scaled = np.stack([goodness(table[:, i], m == "throughput") for i, m in enumerate(MEASURES)])
+    angles = np.linspace(0, 2 * np.pi, len(MEASURES), endpoint=False)
+    axes.set_theta_zero_location("N")
+    axes.set_theta_direction(-1)
+    for number, row in enumerate(scaled.T):
+        if not np.isfinite(row).all():
+            continue
+        closed = np.r_[angles, angles[0]], np.r_[row, row[0]]
+        style = curve_style(number)
+        axes.fill(*closed, color=style["color"], alpha=0.07, linewidth=0)
+        axes.plot(*closed, **style, markersize=5.5, clip_on=False)
+    axes.set_ylim(0, 1)
+    axes.set_yticks([0.25, 0.5, 0.75, 1.0], ["", "0.5", "", ""], fontsize=11)
+    axes.set_rlabel_position(36)
+    axes.set_xticks(angles, [])
+    axes.spines["polar"].set_visible(False)
+    best = [_best(table[:, i], m) for i, m in enumerate(MEASURES)]
+    for angle, (measure, unit), text in zip(angles, MEASURES.values(), best, strict=True):
+        side = round(math.sin(angle), 3)
+        anchor = "center" if side == 0 else ("left" if side > 0 else "right")
+        up = 10 if side == 0 else 2 if math.cos(angle) > 0 else -28
+        for words, colour, y in (
+            (measure, "ink", up + 14),
+            (f"best: {text} {unit}".rstrip(), "soft", up),
+        ):
+            axes.annotate(
+                words, (angle, 1.0), (9 * np.sign(side), y), textcoords="offset points",
+                ha=anchor, color=LIGHT[colour], annotation_clip=False,
+            )  # fmt: skip
+
+
+def _best(column: NDArray[np.float64], measure: str) -> str:
+    sizes = np.abs(column)
+    place = np.nanargmax(sizes) if measure == "throughput" else np.nanargmin(sizes)
+    return tick_text(float(f"{column[place]:.3g}"))
+
+
+# --- calibration ----------------------------------------------------------------------------------
+
+
+@styled()
+def calibration_picture(metrics: Metrics, path: Path) -> bool:
+    """Draw the worth of u: risk against coverage, and u on and off the data, as PNG.
+
+    Args:
+        metrics: The metrics of a run.
+        path: Where to write.
+
+    Returns:
+        Whether there was an iteration to draw; if not, nothing is written.
+    """
+    steps: dict[int, dict[str, float]] = {}
+    for stage, step, name, value in metrics.rows:
+        if stage == "iteration" and name.startswith("calibration/"):
+            steps.setdefault(step, {})[name.removeprefix("calibration/")] = value
+    if not steps:
+        return False
+    picture = new_picture("calibration", "Uncertainty u of the inverse models", 330, 2 * WIDTH)
+    left = add_axes(picture, 58, TOP + 22, WIDTH + 10, 90)
+    right = add_axes(picture, WIDTH + 58, TOP + 22, 14, 90)
+    _draw_risks(left, steps)
+    _draw_levels(right, steps)
+    for axes in (left, right):
+        axes.legend(loc="upper left", bbox_to_anchor=(-50 / _points_wide(axes), -0.24))
+    write_png(picture, path)
+    return True
+
+
+def _draw_risks(axes: Any, steps: Mapping[int, Mapping[str, float]]) -> None:
+    from matplotlib.ticker import AutoLocator
+
+    title = "wrong among the answers taken; dotted: a u that says nothing"
+    _label(axes, "share of answers taken, lowest u first", title)
+    axes.xaxis.set_major_locator(AutoLocator())
+    ends: Iterable[int] = (min(steps), max(steps)) if len(steps) > 1 else steps
+    for number, step in enumerate(ends):
+        values = steps[step]
+        risks = [v for name, v in sorted(values.items()) if name.startswith("risk_by_cov")]
+        shares = [(i + 1) / len(risks) for i in range(len(risks))]
+        label = f"iteration {step} (AUROC {values['auroc']:.2f}, ECE {values['ece']:.2f})"
+        axes.plot(shares, risks, **curve_style(number), label=label)
+        axes.axhline(risks[-1], color=curve_style(number)["color"], linestyle=":", linewidth=1)
+    axes.set_ylim(0, 1.08 * axes.dataLim.ymax or 1)
+
+
+def _draw_levels(axes: Any, steps: Mapping[int, Mapping[str, float]]) -> None:
+    _label(axes, "iteration", "mean u: does it rise where the simulation never was?")
+    order = sorted(steps)
+    for number, (name, label) in enumerate(
+        (("mean_u", "on held-out data"), ("mean_u_off_data", "off the data"))
+    ):
+        axes.plot(order, [steps[s][name] for s in order], **curve_style(number), label=label)
+    axes.set_xlim(order[0] - 0.5, order[-1] + 0.5)  # one alone has no width of its own
+    axes.set_ylim(0, 1.03)

@@ -1,0 +1,221 @@
+"""Pictures: matplotlib figures that are written as SVG for a page, as an SVG file and as PNG.
+
+On a page every colour is a custom property of CSS, so that a picture is dark on a dark page. Text
+stays text. Names of other people are escaped and never read as formulas.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.files import write_whole
+from ugat_marl.reporting.style import LIGHT, curve_style, styled
+
+WIDTH = 480.0
+"""Width of a picture in points, which are also the units of its SVG."""
+TOP = 34.0
+"""Height of a picture's title."""
+LEGEND = 19.0
+"""Height of a line of a legend."""
+_DPI = 144
+_TIP = "tip: "
+_FONTS = 'system-ui, "Segoe UI", Roboto, Arial, sans-serif'
+_NAMES = {colour: name for name, colour in LIGHT.items()}
+_SVG = "{http://www.w3.org/2000/svg}"
+_HREF = "{http://www.w3.org/1999/xlink}href"
+_USED = re.compile(r"url\(#([^)]+)\)")
+
+
+@dataclass
+class Picture:
+    """One picture.
+
+    Attributes:
+        name: Name of its files, without an ending.
+        title: Text for those who cannot see it.
+        figure: A `matplotlib.figure.Figure` that is not known to pyplot.
+    """
+
+    name: str
+    title: str
+    figure: Any
+
+    def for_page(self) -> str:
+        """Return an ``<svg>`` for a page whose style defines the palette as custom properties."""
+        root = self._parsed()
+        width, height = root.attrib.pop("width"), root.attrib.pop("height")
+        assert width and height
+        for element in root.iter():
+            element.tag = element.tag.removeprefix(_SVG)
+            if _HREF in element.attrib:
+                element.set("href", element.attrib.pop(_HREF))
+            if "style" in element.attrib:
+                element.set("style", re.sub(r"#[0-9a-f]{6}", _variable, element.attrib["style"]))
+        return ET.tostring(root, encoding="unicode")
+
+    def svg(self) -> str:
+        """Return an SVG document of its own, in the light colours."""
+        root = self._parsed()
+        root.set("font-family", _FONTS)
+        background = ET.Element("rect", width="100%", height="100%", fill=LIGHT["paper"])
+        root.insert(1, background)
+        for element in root.iter():
+            element.tag = element.tag.removeprefix(_SVG)
+            if _HREF in element.attrib:
+                element.set("xlink:href", element.attrib.pop(_HREF))
+        root.set("xmlns", "http://www.w3.org/2000/svg")
+        root.set("xmlns:xlink", "http://www.w3.org/1999/xlink")
+        body = ET.tostring(root, encoding="unicode")
+        return f'<?xml version="1.0" encoding="utf-8"?>\n{body}\n'
+
+    def png(self) -> bytes:
+        """Return the picture in pixels, two per point, in the light colours."""
+        content = io.BytesIO()
+        with styled():
+            self.figure.savefig(
+                content, format="png", dpi=_DPI, facecolor=LIGHT["paper"],
+                metadata={"Software": None},
+            )  # fmt: skip
+        return content.getvalue()
+
+    def write(self, directory: Path) -> list[Path]:
+        """Write the picture as SVG and as PNG, and return the two files."""
+        files = directory / f"{self.name}.svg", directory / f"{self.name}.png"
+        write_whole(files[0], self.svg())
+        write_whole(files[1], self.png())
+        return list(files)
+
+    def _parsed(self) -> ET.Element:
+        """The SVG of matplotlib with words, without what a page must not have twice."""
+        content = io.BytesIO()
+        with styled(self.name):
+            self.figure.savefig(content, format="svg", metadata={"Date": None})
+        root = ET.fromstring(content.getvalue())
+        for parent in (root, *root.findall(f"{_SVG}defs")):
+            for child in [*parent.findall(f"{_SVG}metadata"), *parent.findall(f"{_SVG}style")]:
+                parent.remove(child)  # the style would hold for all of a page
+        root.set("style", "stroke-linejoin: round; stroke-linecap: butt")
+        root.set("role", "img")
+        root.set("aria-label", printable(self.title))
+        title = ET.Element(f"{_SVG}title")
+        title.text = printable(self.title)
+        root.insert(0, title)
+        _clean(root)
+        return root
+
+
+def _clean(root: ET.Element) -> None:
+    """Turn ids into tool tips where they are meant so, and drop those that nothing refers to."""
+    used = {element.attrib[_HREF][1:] for element in root.iter() if _HREF in element.attrib}
+    used |= {m for element in root.iter() for m in _USED.findall(element.get("clip-path", ""))}
+    for element in root.iter():
+        name = element.get("id", "")
+        if name not in used:
+            element.attrib.pop("id", None)
+        if name.startswith(_TIP):
+            tip = ET.Element(f"{_SVG}title")
+            tip.text = name.removeprefix(_TIP)
+            element.insert(0, tip)
+        if element.tag == f"{_SVG}text":
+            style = re.sub(r"font-family: [^;]*;? ?", "", element.get("style", ""))
+            element.set("style", re.sub(r"font: ([\d.]+px) [^;]*", r"font-size: \1", style))
+        if "d" in element.attrib:
+            element.set("d", _shortened_path(element.attrib["d"]))
+        if element.text is not None and not element.text.strip():
+            element.text = None
+        if element.tail is not None and not element.tail.strip():
+            element.tail = None
+
+
+def _shortened_path(path: str) -> str:
+    """A path with two decimals, which is a hundredth of a point."""
+    text = re.sub(r"-?\d+\.\d+", lambda m: f"{float(m[0]):.2f}".rstrip("0").rstrip("."), path)
+    return re.sub(r"\s*\n\s*", "", text)
+
+
+def _variable(match: re.Match[str]) -> str:
+    name = _NAMES.get(match[0])
+    return f"var(--{name})" if name else match[0]
+
+
+def write_png(picture: Picture, path: Path) -> None:
+    """Write a picture as PNG under a path of its own."""
+    write_whole(path, picture.png())
+
+
+def new_picture(name: str, title: str, height: float, width: float = WIDTH) -> Picture:
+    """Return an empty picture with its title at the top; sizes are in points."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width / 72, height / 72))
+    picture = Picture(name, title, figure)
+    text = printable(shortened(title, int((width - 16) / 9.3)))
+    figure.text(8 / width, 1 - 20 / height, text, fontsize=14, fontweight="bold")
+    return picture
+
+
+def add_axes(
+    picture: Picture, left: float, top: float, right: float, bottom: float, **more: Any
+) -> Any:
+    """Return axes whose sides keep these distances, in points, from those of the picture."""
+    width, height = picture.figure.get_size_inches() * 72
+    box = left / width, bottom / height, 1 - (left + right) / width, 1 - (top + bottom) / height
+    return picture.figure.add_axes(box, **more)
+
+
+def legend_columns(labels: Sequence[str], width: float = WIDTH) -> int:
+    """Return how many labels stand side by side."""
+    longest = max(map(len, labels), default=1)
+    return max(1, min(len(labels), int((width - 16) / (46 + 6.9 * longest))))
+
+
+def legend_height(labels: Sequence[str], width: float = WIDTH) -> float:
+    """Return the height in points of the legend of these labels."""
+    return LEGEND * -(-len(labels) // legend_columns(labels, width)) if labels else 0.0
+
+
+def add_legend(picture: Picture, labels: Sequence[str], *, lines: bool = True) -> None:
+    """Add a legend of curves, in the order of their numbers, at the bottom."""
+    from matplotlib.lines import Line2D
+
+    width, height = picture.figure.get_size_inches() * 72
+    handles: list[Any] = []
+    for number in range(len(labels)):
+        style: dict[str, Any] = curve_style(number)
+        if not lines:
+            style["linestyle"] = "none"
+        handles.append(Line2D([], [], **style))
+    picture.figure.legend(
+        handles, [printable(label) for label in labels], loc="lower left", fontsize=12,
+        bbox_to_anchor=(12 / width, 5 / height), ncols=legend_columns(labels, width),
+        labelspacing=0.35, columnspacing=1.4,
+    )  # fmt: skip
+
+
+def add_tip(artist: Any, text: str) -> None:
+    """Give a shape a text that is shown when one points at it."""
+    artist.set_gid(f"{_TIP}{printable(text)}")
+
+
+def printable(text: str) -> str:
+    """Return a text without what no XML or font can hold: control characters, half characters."""
+    whole = text.encode("utf-8", "replace").decode()
+    return "".join(c if c.isprintable() else " " for c in whole)
+
+
+def shortened(text: str, most: int) -> str:
+    """Return a text with an ellipsis in place of what is too much."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def tick_text(value: float, _: Any = None) -> str:
+    """Return a number for a scale; takes a place as well, as matplotlib's formatters do."""
+    if abs(value) >= 10_000:
+        return f"{value:,.0f}".replace(",", "\u2009").replace("-", "−")
+    return f"{round(value, 6):.4g}".replace("-", "−")

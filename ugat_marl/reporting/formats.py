@@ -1,0 +1,44 @@
+"""Numbers as texts for pages and for the terminal."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """Return a number with three digits, in groups of thousands; a dash where there is none."""
+    if value is None or isinstance(value, bool) or not isinstance(value, int | float):
+        return "–" if value is None else str(value)
+    if not math.isfinite(value):
+        return "–"
+    if abs(value) >= 10**digits:
+        return f"{value:,.0f}".replace(",", "\u00a0").replace("-", "−")
+    return f"{value:.{digits}g}".replace("-", "−")
+
+
+def signed(value: Any) -> str:
+    """Return a number with its sign."""
+    text = number(value)
+    return text if text[:1] in ("−", "–") or text == "0" else f"+{text}"
+
+
+def share(value: Any) -> str:
+    """Return a share in per cent; never 100 % where something is missing."""
+    if value is None:
+        return "–"
+    percent = 100 * float(value)
+    if percent < 0:
+        return f"−{share(-value)}"
+    for digits in (0, 1, 2):
+        text = f"{percent:.{digits}f}"
+        if text.partition(".")[0] != "100" or value >= 1:
+            return f"{text} %"
+    return "99.99 %"
+
+
+def chance(value: Any) -> str:
+    """Return a probability."""
+    if value is None:
+        return "–"
+    return "< 0.001" if value < 0.001 else f"{value:.2g}"

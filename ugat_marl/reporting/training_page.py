@@ -1,0 +1,612 @@
+"""Trainings as one page of HTML that needs nothing else, and its pictures as files.
+
+The page is made of whatever is there: a training under way, one that was broken off, files cut
+short. Missing parts are named in their place.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.data import MEASURES
+from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.envs import HIDDEN, Observer
+from ugat_marl.errors import UgatMarlError
+from ugat_marl.experiments import Estimate, Evaluation
+from ugat_marl.reporting import charts
+from ugat_marl.reporting.figures import Picture, printable
+from ugat_marl.reporting.formats import number, share, signed
+from ugat_marl.reporting.job_names import grounding_of, job_name
+from ugat_marl.reporting.network_maps import minutes_picture, node_map
+from ugat_marl.reporting.page import Figure, Grid, Page, render
+from ugat_marl.reporting.run_groups import groups, seeds_of_one
+from ugat_marl.reporting.run_records import RunRecord, TableRecord, as_number
+from ugat_marl.scenarios import Network
+
+Commands = Mapping[Path, Sequence[str]]
+"""Folder to the commands that run it again."""
+Queues = Mapping[str, Sequence[float]]
+"""Intersection to its mean queue in each minute."""
+Cells = Mapping[tuple[str, str], Mapping[str, Any]]
+"""Setting and domain to a row of a table."""
+
+_ARTICLES = 12
+"""With more trainings than this only those with a gate have a part of their own."""
+_OPEN = 4
+"""With more, those parts are folded."""
+_WORST = 10
+_RADARS = ("direct transfer", "UGAT", "trained in real", "best rule")
+_RADAR = "Every axis is scaled by its best value, at the rim; the middle is worst."
+_STRETCH = "Mean of a stretch of episodes, with its 95 % interval over "
+
+
+def runs_page(records: Sequence[RunRecord | TableRecord], commands: Commands) -> Page:
+    """Return the page of some trainings.
+
+    Args:
+        records: Records of their folders.
+        commands: How to run them again.
+    """
+    page = Page()
+    runs = [record for record in records if isinstance(record, RunRecord)]
+    tables = [record for record in records if isinstance(record, TableRecord)]
+    alone = len(records) == 1
+    few = len(runs) <= _ARTICLES
+    shown = [r for r in runs if few or r.series("iteration", "gate/acceptance")]
+    heading, note = _heading(runs, tables)
+    page.text = render(
+        "training.html.j2",
+        title=_title(records),
+        heading=_title(records) if alone else heading,
+        note="" if alone else note,
+        single=alone,
+        overview=_overview(runs) if len(runs) > 1 else None,
+        overview_folded=not few,
+        groups=[
+            {
+                "title": group.title,
+                "note": group.note + _left_out(group.left_out),
+                "settings": _settings(page, group.title, group.rows),
+            }
+            for group in groups(runs)
+        ],
+        tables=[_table(page, record, commands) for record in tables],
+        seeds=_seeds(page, runs),
+        trainings=[_training(page, record, commands) for record in shown],
+        trainings_folded=not alone and len(shown) > _OPEN,
+        left_out=len(runs) - len(shown),
+    )
+    return page
+
+
+def write_pictures(pictures: Sequence[Picture], directory: Path) -> None:
+    """Write every picture as SVG and as PNG."""
+    for picture in pictures:
+        picture.write(directory)
+
+
+def _file_name(*parts: str) -> str:
+    """Texts as the name of a file, without an ending."""
+    text = re.sub(r"[^A-Za-z0-9_=+.]+", "-", "-".join(filter(None, parts)))
+    return text.strip("-.")[-80:].strip("-.") or "picture"
+
+
+# --- the head -------------------------------------------------------------------------------------
+
+
+def _title(records: Sequence[RunRecord | TableRecord]) -> str:
+    if len(records) == 1 and isinstance(records[0], RunRecord):
+        return printable(f"Training {records[0].name}")
+    return printable(records[0].name if len(records) == 1 else f"{len(records)} trainings")
+
+
+def _heading(runs: Sequence[RunRecord], tables: Sequence[TableRecord]) -> tuple[str, str]:
+    """Heading and note of a page of several."""
+    counted = [f"{len(runs)} trainings" * bool(runs), f"{len(tables)} tables" * bool(tables)]
+    scenarios = list(dict.fromkeys(r.scenario for r in runs if r.scenario))
+    text = " and ".join(filter(None, counted))
+    text += f" on {', '.join(scenarios)}" if scenarios else ""
+    unfinished = sum(not record.finished for record in runs)
+    return text, f"{unfinished} of them are not finished." if unfinished else ""
+
+
+def _left_out(names: Sequence[str]) -> str:
+    return f" Left out, since not judged in both domains: {', '.join(names)}." if names else ""
+
+
+def _status(record: RunRecord) -> tuple[str, str]:
+    """The class of a training's badge, and the text on it."""
+    if record.finished:
+        return ("mixed", "incomplete") if record.missing else ("good", "whole")
+    if record.metrics is not None or record.state is not None or record.settings:
+        return "mixed", "not finished"
+    return "bad", "unreadable"
+
+
+def _progress(record: RunRecord) -> str:
+    """How far an unfinished training is; "" for a finished one."""
+    if record.finished:
+        return ""
+    state, parts = record.state or {}, list[str]()
+    for key, whole, unit in (
+        ("pretrained", "pretrain_episodes", "episodes of plain training"),
+        ("iteration", "iterations", "iterations"),
+    ):
+        if key in state and whole in record.ugat:
+            parts.append(f"{state[key]} of {record.ugat[whole]} {unit}")
+    if not parts and (episodes := record.series("episode", "return")):
+        parts.append(f"{episodes[-1][0] + 1} training episodes")
+    text = f"So far: {', '.join(parts)}. " if parts else ""
+    if math.isfinite(record.written):
+        last = datetime.fromtimestamp(record.written, UTC)
+        text += f"Last written {last:%Y-%m-%d %H:%M} UTC."
+    return text
+
+
+def _headline(record: RunRecord) -> str:
+    """The outcome in one sentence."""
+    evaluation = record.evaluation
+    title = f"{record.scenario or record.name}: {record.sim}"
+    title += f" → {record.real}" if record.real else ""
+    if evaluation is None or not evaluation.policies:
+        return f"{title}, no result yet"
+    if record.job:
+        return f"{title}, {job_name(record.settings)}"
+    last = evaluation.domains[-1]
+    parts = [
+        f"{policy} {number(evaluation.estimate(policy, last, 'att_s').mean)} s"
+        for policy in _main_policies(evaluation)
+    ]
+    return f"{title}. Travel time in {last}: {', '.join(parts)}."
+
+
+# --- several trainings ----------------------------------------------------------------------------
+
+
+def _overview(records: Sequence[RunRecord]) -> Grid:
+    """All trainings side by side."""
+    headings = (
+        "training", "scenario", "domains", "policy", "seed", "state", "in sim, s",
+        "direct transfer, s", "in real, s", "best rule, s", "accepted",
+    )  # fmt: skip
+    return Grid(headings, [_overview_row(record) for record in records], headings[6:])
+
+
+def _overview_row(record: RunRecord) -> list[str]:
+    evaluation = record.evaluation
+    accepted = record.series("iteration", "gate/acceptance")
+    cells = dict.fromkeys(("sim", "direct", "real", "rule"), "–")
+    policy = job_name(record.settings) if record.job else grounding_of(record.settings)
+    if evaluation is not None and evaluation.policies:
+        shown = _main_policies(evaluation)
+        policy = next((name for name in shown if name.startswith("UGAT")), shown[0])
+        sim, real = evaluation.domains[0], evaluation.domains[-1]
+        cells["sim"] = _with_interval(evaluation.estimate(policy, sim, "att_s"))
+        if real != sim:
+            cells["real"] = _with_interval(evaluation.estimate(policy, real, "att_s"))
+        if not record.job:
+            direct = evaluation.policies[0]
+            cells["direct"] = _with_interval(evaluation.estimate(direct, real, "att_s"))
+        rule = f"rule {evaluation.notes.get(f'best rule in {real}')}"
+        if rule in evaluation.policies:
+            cells["rule"] = _with_interval(evaluation.estimate(rule, real, "att_s"))
+    return [
+        record.name, record.scenario or "–", f"{record.sim} → {record.real or '–'}",
+        policy or "–", record.seed or "–", _status(record)[1], *cells.values(),
+        share(accepted[-1][1]) if accepted else "–",
+    ]  # fmt: skip
+
+
+def _table(page: Page, record: TableRecord, commands: Commands) -> dict[str, Any]:
+    given = commands.get(record.directory) or ([record.command] if record.command else [])
+    return {
+        "name": record.name,
+        "missing": record.missing,
+        "settings": _settings(page, record.name, record.rows) if record.rows else None,
+        "commands": given,
+    }
+
+
+def _settings(page: Page, title: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Tables and pictures of settings in several real domains."""
+    labels = list(dict.fromkeys(str(row["setting"]) for row in rows))
+    domains = list(dict.fromkeys(str(row["domain"]) for row in rows))
+    cells = {(str(row["setting"]), str(row["domain"])): row for row in rows}
+    headings = [f"{domain}, s" for domain in domains]
+
+    def grid(key: str, *, sign: bool = False) -> Grid:
+        lines = [
+            [s, *(_cell(cells.get((s, d), {}), key, sign=sign) for d in domains)] for s in labels
+        ]
+        return Grid(["policy", *headings], lines, headings)
+
+    def estimates(domain: str) -> list[charts.Estimated]:
+        own = [cells.get((label, domain), {}) for label in labels]
+        return [
+            (as_number(r.get("att_s")), as_number(r.get("att_s_low")),
+             as_number(r.get("att_s_high")))
+            for r in own
+        ]  # fmt: skip
+
+    scores = charts.scores_picture(
+        title, labels, {d: estimates(d) for d in domains}, _file_name(title, "travel-times")
+    )
+    radars = [
+        charts.radar_picture(
+            f"sim against {domain}",
+            _radar_lines(labels, cells, domain),
+            _file_name(title, "radar", domain),
+        )
+        for domain in domains
+    ]
+    caption = "Mean over training seeds with its 95 % interval."
+    return {
+        "att": grid("att_s"),
+        "gap": grid("att_s_gap", sign=True),
+        "sim": grid("att_s_sim"),
+        "figures": page.figures((scores, caption), *((radar, _RADAR) for radar in radars)),
+    }
+
+
+def _cell(row: Mapping[str, Any], key: str, *, sign: bool) -> str:
+    mean, low, high = (as_number(row.get(name)) for name in (key, f"{key}_low", f"{key}_high"))
+    if not math.isfinite(mean):
+        return "–"
+    text = signed(mean) if sign else number(mean)
+    return f"{text} {_ends(low, high)}" if low < high else text
+
+
+def _radar_lines(labels: Sequence[str], cells: Cells, domain: str) -> dict[str, list[float]]:
+    shown = [label for label in labels if label.startswith(_RADARS) and (label, domain) in cells]
+    lines: dict[str, list[float]] = {}
+    for place, label in enumerate(shown[:5]):
+        row = cells[label, domain]
+        if place == 0:
+            lines[f"{label} in sim"] = [as_number(row.get(f"{m}_sim")) for m in charts.MEASURES]
+        lines[f"{label} in {domain}"] = [as_number(row.get(m)) for m in charts.MEASURES]
+    return lines
+
+
+def _seeds(page: Page, runs: Sequence[RunRecord]) -> list[Figure]:
+    """Curves of trainings that differ in their seed alone."""
+    figures: list[Figure] = []
+    over = "Mean over the seeds, with its 95 % interval."
+    for own in seeds_of_one(runs):
+        if len(own) < 2:
+            continue
+        name = _file_name(own[0].scenario, own[0].real, grounding_of(own[0].settings), "seeds")
+        figures += page.figures(
+            (charts.learning_picture(own, f"{name}-learning"), f"{_STRETCH}the seeds."),
+            (charts.travel_time_picture(own, f"{name}-att"), over),
+            (charts.gate_picture(own, f"{name}-gate"), over),
+        )
+    return figures
+
+
+# --- one training ---------------------------------------------------------------------------------
+
+
+def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, Any]:
+    places = places_of(record)
+    evaluation = record.evaluation
+    judged = evaluation is not None and evaluation.policies
+    learning = charts.learning_picture([record], _file_name(record.name, "learning"))
+    travel = charts.travel_time_picture([record], _file_name(record.name, "att"))
+    once = "One episode after each iteration, on a seed that decides nothing: no interval."
+    hashes = [(f"hash of {name}", text) for name, text in record.hashes.items()]
+    versions = [(f"version of {name}", text) for name, text in record.versions.items()]
+    notes = list(evaluation.notes.items()) if evaluation is not None else []
+    return {
+        "name": record.name,
+        "status": _status(record),
+        "headline": _headline(record),
+        "progress": _progress(record),
+        "missing": record.missing,
+        "boxes": _boxes(record),
+        "scores": _scores(page, record, evaluation) if evaluation is not None and judged else None,
+        "curves": page.figures((learning, f"{_STRETCH}its episodes."), (travel, once)),
+        "gate": _gate(page, record, places),
+        "queues": _worst(page, record, places if isinstance(places, Places) else None),
+        "commands": commands.get(record.directory, ()),
+        "provenance": [("folder", str(record.directory)), *versions, *hashes, *notes],
+        "settings": _flat(record.settings),
+    }
+
+
+def _boxes(record: RunRecord) -> list[tuple[str, str]]:
+    """The numbers one asks for first."""
+    evaluation = record.evaluation
+    if evaluation is None or record.job or len(evaluation.domains) < 2 or not evaluation.policies:
+        return []
+    real, direct = evaluation.domains[1], evaluation.policies[0]
+    boxes: list[tuple[str, str]] = []
+    for name in _main_policies(evaluation):
+        text = number(evaluation.estimate(name, real, "att_s").mean)
+        boxes.append((f"{text} s", f"{name} in {real}"))
+    ugat = next((name for name in evaluation.policies if name.startswith("UGAT")), None)
+    if ugat is not None:
+        start, now = (evaluation.gap(p, real, "att_s").mean for p in (direct, ugat))
+        if start > 0 and math.isfinite(now):
+            boxes.append((share(1 - now / start), "of the gap Δ is gone with UGAT"))
+        boxes.append((f"{number(evaluation.regret(ugat, real).mean)} s", "regret of UGAT"))
+    return boxes
+
+
+def _main_policies(evaluation: Evaluation) -> list[str]:
+    """Direct transfer, UGAT and the best rule, of those there are."""
+    rule = f"rule {evaluation.notes.get(f'best rule in {evaluation.domains[-1]}')}"
+    return [
+        name
+        for place, name in enumerate(evaluation.policies)
+        if place == 0 or name.startswith("UGAT") or name == rule
+    ]
+
+
+def _scores(page: Page, record: RunRecord, evaluation: Evaluation) -> dict[str, Any]:
+    """Travel times with gap and regret, and all measures."""
+    first, *others = evaluation.domains
+    headings = ["policy", f"in {first}, s"]
+    for domain in others:
+        headings += [f"in {domain}, s", f"Δ {domain}, s", f"regret {domain}, s"]
+    rows: list[list[str]] = []
+    for policy in evaluation.policies:
+        cells = [policy, _with_interval(evaluation.estimate(policy, first, "att_s"))]
+        for domain in others:
+            cells += [
+                _with_interval(evaluation.estimate(policy, domain, "att_s")),
+                signed(evaluation.gap(policy, domain, "att_s").mean),
+                number(evaluation.regret(policy, domain).mean),
+            ]
+        rows.append(cells)
+    radars = [
+        charts.radar_picture(
+            f"{first} against {real}",
+            charts.radar_lines(evaluation, real),
+            _file_name(record.name, "radar", real),
+        )
+        for real in others
+    ]
+    scores = charts.scores_picture(
+        f"{record.name}: travel time",
+        evaluation.policies,
+        charts.travel_times(evaluation),
+        _file_name(record.name, "travel-times"),
+    )
+    caption = "Mean over the episodes with its 95 % interval."
+    return {
+        "sim": first,
+        "episodes": len({result.seed for result in evaluation.results}),
+        "table": Grid(headings, rows, headings[1:]),
+        "measures": _measures(evaluation),
+        "figures": page.figures((scores, caption), *((radar, _RADAR) for radar in radars)),
+    }
+
+
+def _measures(evaluation: Evaluation) -> Grid:
+    hidden = list(dict.fromkeys(name for r in evaluation.results for name in r.scores.hidden))
+    headings = ["policy", "domain", *MEASURES.values(), "never entered [veh]"]
+    headings += [HIDDEN.get(name, name) for name in hidden]
+    rows = [
+        [
+            policy,
+            domain,
+            *(_with_half(evaluation.estimate(policy, domain, measure)) for measure in MEASURES),
+            number(evaluation.estimate(policy, domain, "backlog").mean),
+            *(number(evaluation.estimate(policy, domain, name).mean) for name in hidden),
+        ]
+        for policy in evaluation.policies
+        for domain in evaluation.domains
+    ]
+    return Grid(headings, rows, headings[2:])
+
+
+def _gate(page: Page, record: RunRecord, places: Places | str) -> dict[str, Any] | None:
+    """The gate over the iterations and, in the last one, by intersection."""
+    curve = charts.gate_picture([record], _file_name(record.name, "gate"))
+    if curve is None:
+        return None
+    caption = "Means over the intersections. A grounded action is taken where u is below α."
+    figures = [(curve, caption)]
+    if isinstance(places, Places):
+        figures += [
+            _gate_map(record, places, *row)
+            for row in (
+                ("gate/acceptance", "accepted grounded actions", "% of decisions"),
+                ("gate/mean_u", "mean uncertainty u", "from 0 to 1"),
+                ("gate/alpha", "threshold α", "as u; ∞ takes everything"),
+            )
+        ]
+    return {
+        "figures": page.figures(*figures),
+        "note": places.note if isinstance(places, Places) else places,
+        "table": _gate_grid(record, places if isinstance(places, Places) else None),
+    }
+
+
+def _gate_map(
+    record: RunRecord, places: Places, key: str, quantity: str, unit: str
+) -> tuple[Picture | None, str]:
+    series = record.agents(key)
+    last = max((rows[-1][0] for rows in series.values() if rows), default=0)
+    scale = 100.0 if unit.startswith("%") else 1.0
+    values: dict[str, tuple[float, str]] = {}
+    for agent, tls in places.intersection_of.items():
+        value = dict(series.get(agent, [])).get(last, math.nan) * scale
+        text = "∞" if math.isinf(value) else f"{value:.0f}" if scale > 1 else f"{value:.2f}"
+        values[tls] = (value, "" if math.isnan(value) else text)
+    if len(values) < 2 or not any(text for _, text in values.values()):
+        return None, ""  # a single intersection needs no map
+    title = f"{quantity}, iteration {last}"
+    name = _file_name(record.name, "map", key.rpartition("/")[2])
+    picture = node_map(name, title, places.network, values, (0.0, scale), unit)
+    return picture, f"{quantity[0].upper()}{quantity[1:]} at each intersection ({unit})."
+
+
+def _gate_grid(record: RunRecord, places: Places | None) -> Grid:
+    columns = {
+        "gate/acceptance": "accepted", "gate/mean_u": "mean u", "gate/alpha": "α",
+        "gate/change_rate": "changed", "gate/trusted": "f and h are proven",
+        "lost_time/best_s": "lost time, s",
+    }  # fmt: skip
+    last = {
+        key: {agent: rows[-1][1] for agent, rows in record.agents(key).items()} for key in columns
+    }
+    shown = {key: text for key, text in columns.items() if last[key]}
+    rows: list[list[str]] = []
+    for agent in last["gate/acceptance"]:
+        tls = places.intersection_of.get(agent) if places is not None else None
+        cells = [_of_gate(key, last[key].get(agent, math.nan)) for key in shown]
+        rows.append([agent, tls or "–", *cells])
+    headings = ["agent", "traffic light", *shown.values()]
+    return Grid(headings, rows, headings[2:])
+
+
+def _of_gate(key: str, value: float) -> str:
+    if key == "gate/trusted":
+        return "yes" if value else "no"
+    if math.isinf(value):
+        return "∞"
+    is_share = key in ("gate/acceptance", "gate/change_rate")
+    return share(value) if is_share and math.isfinite(value) else number(value)
+
+
+def _worst(page: Page, record: RunRecord, places: Places | None) -> dict[str, Any] | None:
+    """Where and when vehicles stood, in the real domain."""
+    if record.queues is None or record.evaluation is None:
+        return None
+    domain, known = record.evaluation.domains[-1], record.evaluation.policies
+    policies = [p for p in known if p.startswith("UGAT")]
+    policies = [*policies, *(p for p in known[:1] if p not in policies)]
+    by_policy: dict[str, dict[str, list[float]]] = {}
+    for policy, where, _, tls, queue, _ in record.queues.sort("minute").rows():
+        if where == domain and policy in policies:
+            by_policy.setdefault(policy, {}).setdefault(tls, []).append(queue)
+    by_policy = {policy: by_policy[policy] for policy in policies if policy in by_policy}
+    if not by_policy:
+        return None
+    most = max(max(row) for queues in by_policy.values() for row in queues.values())
+    caption = "Longest queues first; the same colours for all policies."
+    figures: list[tuple[Picture | None, str]] = []
+    for policy, queues in by_policy.items():
+        name = _file_name(record.name, "minutes", policy)
+        figures.append((minutes_picture(name, f"{policy} in {domain}", queues, most), caption))
+    first, queues = next(iter(by_policy.items()))
+    means = {tls: sum(row) / len(row) for tls, row in queues.items()}
+    if places is not None and len(means.keys() & set(places.intersection_of.values())) > 1:
+        picture = node_map(
+            _file_name(record.name, "map-queue"), f"mean queue, {first} in {domain}",
+            places.network, {tls: (mean, f"{mean:.1f}") for tls, mean in means.items()},
+            (0.0, max(means.values()) or 1.0), "vehicles standing",
+        )  # fmt: skip
+        figures.append((picture, "Halting vehicles before each intersection."))
+    table = _worst_grid(by_policy)
+    return {"domain": domain, "table": table, "figures": page.figures(*figures)}
+
+
+def _worst_grid(by_policy: Mapping[str, Queues]) -> Grid:
+    """The intersections with the longest queues; the first policy decides the order."""
+    policies = list(by_policy)
+    means = {p: {tls: sum(q) / len(q) for tls, q in by_policy[p].items() if q} for p in policies}
+    order = sorted(means[policies[0]], key=lambda tls: -means[policies[0]][tls])[:_WORST]
+    headings, numbers = ["intersection"], list[str]()
+    for policy in policies:
+        numbers += [f"{policy}: queue, veh", f"{policy}: longest, veh"]
+        headings += [*numbers[-2:], f"{policy}: when"]
+    rows: list[list[str]] = []
+    for tls in order:
+        cells = [tls]
+        for policy in policies:
+            row = by_policy[policy].get(tls, ())
+            if not row:
+                cells += ["–", "–", "–"]
+                continue
+            worst = max(range(len(row)), key=lambda k: row[k])
+            cells += [number(means[policy][tls]), number(row[worst]), f"minute {worst}"]
+        rows.append(cells)
+    return Grid(headings, rows, numbers)
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Settings by their paths, such as ``ugat.gate.mode``."""
+    rows: list[tuple[str, str]] = []
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            rows += _flat(value, f"{prefix}{key}.")
+        else:
+            shown = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            rows.append((f"{prefix}{key}", shown))
+    return rows
+
+
+def _with_interval(estimate: Estimate) -> str:
+    """A mean with its interval, if it has one."""
+    if not math.isfinite(estimate.low) or estimate.low == estimate.high:
+        return number(estimate.mean)
+    return f"{number(estimate.mean)} {_ends(estimate.low, estimate.high)}"
+
+
+def _with_half(estimate: Estimate) -> str:
+    """A mean with half of its interval, if it has one, where there is little room."""
+    if not math.isfinite(estimate.low) or estimate.low == estimate.high:
+        return number(estimate.mean)
+    return f"{number(estimate.mean)} ±{number((estimate.high - estimate.low) / 2, 2)}"
+
+
+def _ends(low: float, high: float) -> str:
+    """An interval that stays on one line."""
+    return f"({number(low)}\u00a0to\u00a0{number(high)})"
+
+
+# --- where the agents are -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Places:
+    """A network and its agents.
+
+    Attributes:
+        network: The network.
+        intersection_of: Agent to SUMO's id of its traffic light.
+        note: What a reader must know of it; "" for nothing.
+    """
+
+    network: Network
+    intersection_of: Mapping[str, str]
+    note: str
+
+
+def places_of(record: RunRecord) -> Places | str:
+    """Return the places of a training's agents, or why they are not known."""
+    if not record.scenario:
+        return "no map: the scenario is not on record"
+    options: Any = record.settings.get("options") if record.job else record.settings
+    options = options if isinstance(options, Mapping) else {}
+    try:
+        # A job notes the scenario itself, a training the one it drove, with its own duration.
+        duration_s = None if record.job else options.get("duration_s")
+        network, own_hash = _network(record.scenario, record.sim, duration_s)
+        neighbours = int(options.get("neighbours") or 0)
+        agents = Observer(network, str(options.get("observation") or "count"), neighbours).agents
+    except (UgatMarlError, OSError, ValueError, TypeError) as error:
+        reason = " ".join(str(error).split())
+        return f"no map: scenario {record.scenario!r} cannot be read here ({reason[:200]})"
+    tls = [item.id for item in network.intersections]
+    recorded = record.hashes.get("sim") or record.hashes.get(record.sim)
+    changed = recorded not in (None, own_hash)
+    note = "The scenario has changed since; the map shows it as it is now." if changed else ""
+    return Places(network, dict(zip(agents, tls, strict=True)), note)
+
+
+@functools.lru_cache(maxsize=8)
+def _network(scenario: str, sim: str, duration_s: float | None) -> tuple[Network, str]:
+    derived = in_domain(load_scenario(scenario), sim)
+    if duration_s is not None:
+        derived = derived.with_duration(duration_s)
+    return Network.read(derived), derived.hash
