@@ -25,7 +25,7 @@ from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import AgentSet, VectorEnv, agent_indicator, pad
 from ugat_marl.envs.vector.arrays import Arrays, Shape, shared_memory
 from ugat_marl.envs.vector.gymnasium_env import GymnasiumVectorEnv
-from ugat_marl.envs.vector.nursery import Nursery
+from ugat_marl.envs.vector.remote import SERVICE
 from ugat_marl.envs.vector.spec import in_turn
 from ugat_marl.errors import (
     ActionError,
@@ -37,6 +37,7 @@ from ugat_marl.errors import (
     UnknownNameError,
     WorkerError,
 )
+from ugat_marl.simulation import Host
 
 Crossing = Callable[..., Path]
 
@@ -49,9 +50,10 @@ DECISIONS = 10
 @pytest.fixture(scope="module", autouse=True)
 def warm() -> Iterator[None]:
     """Keeps the parent between tests, so that each does not wait for SUMO to load."""
-    parent = Nursery.acquire()
+    host = Host(SERVICE)
+    host.warm()
     yield
-    parent.release()
+    host.close()
 
 
 @pytest.fixture
@@ -131,7 +133,7 @@ def together(
 
 
 def pids(env: VectorEnv) -> list[int]:
-    return [lane._worker._pid for lane in env._lanes if lane._worker is not None]
+    return [lane._worker._pid for lane in env._environments if lane._worker is not None]
 
 
 def gone(pid: int) -> bool:
@@ -176,7 +178,7 @@ def test_an_episode_depends_on_its_seed_and_domain_alone() -> None:
     # Every one can be played again: the third of the last environment was in V4.
     env = vector_env("grid2x2-v1", 3, domains, **options)
     env.reset(7)
-    lane = env._lanes[2]
+    lane = env._environments[2]
     lane.begin(None, domains)
     lane.answer()
     lane.begin(None, domains)
@@ -248,20 +250,20 @@ def test_a_killed_simulation_is_taken_up_again(moment: str, temporary: Path) -> 
                 if moment == "under way":
                     subprocess.Popen(["/bin/sh", "-c", f"sleep 0.2; kill -9 {victim}"])
                 if moment == "with the parent":
-                    parent = env._home._parent  # type: ignore[union-attr]
+                    parent = env._shared.host._parent  # type: ignore[union-attr]
                     parent._process.kill()  # type: ignore[union-attr]
                     parent._process.wait()  # type: ignore[union-attr]
 
         if moment == "at the reset":
-            begin = env._lanes[1]._start
+            begin = env._environments[1]._start
 
             def start() -> None:
                 begin()
                 if len(killed) < 2:
-                    killed.append(env._lanes[1]._worker._pid)  # type: ignore[union-attr]
+                    killed.append(env._environments[1]._worker._pid)  # type: ignore[union-attr]
                     os.kill(killed[-1], signal.SIGKILL)
 
-            env._lanes[1]._start = start  # type: ignore[method-assign]
+            env._environments[1]._start = start  # type: ignore[method-assign]
             assert together(env, 4, episodes=2) == unharmed
         else:
             assert together(env, 4, episodes=2, at=kill) == unharmed
@@ -319,7 +321,7 @@ def test_a_domain_with_other_phases_is_refused(crossing: Crossing) -> None:
     env = vector_env(scenario, 1, lambda environment, episode: ["sim", "V1"][episode])
     env.close()
     env = vector_env(scenario, 1)
-    env._home.agents = AgentSet.of(parallel_env("single-v1"))  # type: ignore[union-attr]
+    env._shared.agents = AgentSet.of(parallel_env("single-v1"))  # type: ignore[union-attr]
     with pytest.raises(ScenarioError, match="has other agents, observations or phases"):
         env.reset(1)
     env.close()
@@ -407,7 +409,7 @@ def test_nothing_is_left_when_the_user_s_process_ends(
         os.killpg(process.pid, getattr(signal, how))
     _, said = process.communicate(timeout=30)
     assert eventually(lambda: not relatives() and not list(temporary.iterdir()), 10)
-    assert "vector.worker" not in said
+    assert "simulation.worker" not in said
     assert how != "end" or (said == "" and process.returncode == 0)
 
 

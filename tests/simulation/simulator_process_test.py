@@ -27,13 +27,14 @@ from ugat_marl.errors import EpisodeError, OptionError, SimulatorCrashed, Simula
 from ugat_marl.simulation import (
     Channel,
     ChannelClosed,
+    Host,
     LibsumoSimulator,
     Message,
     ProcessSimulator,
     Simulator,
     launch_of,
 )
-from ugat_marl.simulation.process import WarmParent
+from ugat_marl.simulation.process import SERVICE
 
 Crossing = Callable[..., Path]
 
@@ -44,9 +45,10 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason=
 @pytest.fixture(scope="module", autouse=True)
 def warm() -> Iterator[None]:
     """Keeps the warm parent between tests, so that each does not wait for SUMO to load."""
-    parent = WarmParent.acquire()
+    host = Host(SERVICE)
+    host.warm()
     yield
-    parent.release()
+    host.close()
 
 
 def pid_of(env: Any) -> int:
@@ -300,14 +302,14 @@ def test_a_killed_warm_parent_is_replaced(crossing: Crossing) -> None:
     env, other = parallel_env(crossing()), parallel_env(crossing())
     env.reset(seed=0)
     other.reset(seed=0)
-    assert env._simulator._parent is other._simulator._parent
-    env._simulator._parent._process.kill()
-    env._simulator._parent._process.wait()
+    assert env._simulator._host._parent is other._simulator._host._parent
+    env._simulator._host._parent._process.kill()
+    env._simulator._host._parent._process.wait()
     env.step({"signal_0": 0})  # its worker lives on
     env.reset(seed=0)
     other.reset(seed=0)
     env.step({"signal_0": 0})
-    assert env._simulator._parent is other._simulator._parent
+    assert env._simulator._host._parent is other._simulator._host._parent
     env.close()
     other.close()
 
@@ -467,7 +469,7 @@ def test_nothing_is_left_when_the_user_s_process_ends(
     os.killpg(script.process.pid, getattr(signal, how))
     _, said = script.process.communicate(timeout=20)
     assert script.leaves_nothing()
-    assert "simulator_worker" not in said  # no traceback but the user's own
+    assert "simulation.worker" not in said  # no traceback but the user's own
 
 
 BUSY = """
@@ -675,7 +677,7 @@ def test_hanging_up_waits_for_the_other_end_but_not_for_ever() -> None:
 
 
 def test_workers_import_what_their_user_imports() -> None:
-    from ugat_marl.simulation.process import _environment
+    from ugat_marl.simulation.host import _environment
 
     environment = _environment()
     assert environment["PYTHONPATH"].split(os.pathsep) == [p or str(Path.cwd()) for p in sys.path]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.files import write_whole
 from ugat_marl.scenarios import NOTHING_BEHIND, Behind, Document, Scenario, Segment, edge_of
+from ugat_marl.simulation.host import one_line
 from ugat_marl.simulation.mesoscopic import (
     QueueLook,
     add_those_behind,
@@ -390,12 +391,6 @@ def _errors_of(directory: Path) -> str:
     """SUMO's error log in one line."""
     path = directory / _ERRORS
     return one_line(path.read_text(errors="replace")) if path.exists() else ""
-
-
-def one_line(text: str) -> str:
-    """What SUMO printed as one line, without its formulas."""
-    lines = [line.strip().removeprefix("Error: ") for line in text.splitlines()]
-    return " ".join(line for line in lines if line and line != "Quitting (on error).")
 
 
 def simulates_here() -> bool:

@@ -1,143 +1,197 @@
-"""The other end of `ugat_marl.simulation.process`: what runs in the processes it starts.
+"""The program of a host's processes: the warm parent, its workers, and how they end.
 
-``parent`` is warm: SUMO is loaded, and it forks a worker for every pair of file descriptors that
-arrives. ``spawned`` is a worker in an interpreter of its own. All of them end when their line
-closes, or when the user's process is gone though a child it forked still holds the line open.
+``parent`` has its service loaded and forks a worker for every order that arrives. ``spawned`` is a
+worker in an interpreter of its own. All of them end when their line closes, or when the user's
+process is gone though a child it forked still holds the line open.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
+import json
 import os
+import shutil
 import signal
 import socket
 import sys
-from typing import Any, NoReturn
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NoReturn
 
-import numpy as np
-
-from ugat_marl.errors import SimulatorError
+from ugat_marl.errors import UgatMarlError
 from ugat_marl.simulation.channel import Channel, ChannelClosed, Message
-from ugat_marl.simulation.lifeline import LOOK_EVERY_S, Lifeline, abandoned
-from ugat_marl.simulation.simulator import Launch, LibsumoSimulator, Simulator
-from ugat_marl.simulation.snapshots import Snapshot
+from ugat_marl.simulation.host import LENGTH
+
+if TYPE_CHECKING:
+    from ugat_marl.simulation.host import Service
+
+LOOK_EVERY_S = 1.0
+"""Seconds between two looks whether the user's process is still there."""
+
+_MOST_DESCRIPTORS = 8
+"""Open files that come with an order at most."""
 
 
-def _answer(simulator: Simulator, header: dict[str, Any]) -> Message:
-    what = header["what"]
-    if what == "start":
-        fields: dict[str, Any] = dict(header["launch"])
-        for name in ("arguments", "lanes"):
-            fields[name] = tuple(fields[name])
-        return _message(simulator.start(Launch(**fields)))
-    if what == "advance":
-        return _message(simulator.advance(header["seconds"], header["plans"]))
-    if what == "vehicles":
-        seen = simulator.vehicles()
-        rows = [*seen.position.T, seen.angle_deg, seen.length_m, seen.speed_mps]
-        return Message({}, [np.array(rows)])
-    if what == "signals":
-        return Message({"states": simulator.signals()}, [])
-    assert what == "finish", what
-    trips = simulator.finish()
-    rows = [trips.travel_time_s, trips.delay_s, trips.finished, trips.entered]
-    told = [np.array(rows, dtype=np.float64)]
-    hidden = [trips.co2_g, trips.persons, trips.dangers] if len(trips.dangers) else []
-    return Message({}, told + hidden)
+def end_with_input() -> None:
+    """End this process, with exit code 1, once standard input ends: its starter is gone.
 
-
-def _message(snapshot: Snapshot) -> Message:
-    header = {
-        "time_s": snapshot.time_s,
-        "departed": snapshot.departed,
-        "backlog": snapshot.backlog,
-    }
-    lanes = np.array([snapshot.vehicles, snapshot.halting, snapshot.mean_speed_mps])
-    measured = [lanes, snapshot.waiting_s, snapshot.mean_left]
-    return Message(header, [*measured, snapshot.near] if len(snapshot.near) else measured)
-
-
-class _Worker:
-    """Serves one simulation until the channel closes.
-
-    Args:
-        channel: The line to the user's process.
-        parent: Number of the process that started this one.
-        user: Number of the user's process.
+    Standard input is read past `sys.stdin`, whose lock would be in the way of an orderly end.
     """
 
-    def __init__(self, channel: Channel, parent: int, user: int) -> None:
-        self._channel = channel
-        self._life = Lifeline(parent, user)
+    def watch() -> None:
+        while os.read(0, 1024):
+            pass
+        os._exit(1)
 
-    def run(self) -> NoReturn:
-        """Answers questions, then removes SUMO's files and exits."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        self._life.watch()
-        simulator = LibsumoSimulator()
-        with contextlib.suppress(ChannelClosed):
-            while (question := self._hear()).header["what"] != "close":
-                if question.header["what"] == "own":
-                    self._life.directory = question.header["directory"]
-                    continue
-                try:
-                    answer = _answer(simulator, question.header)
-                except SimulatorError as error:
-                    answer = Message({"error": str(error)}, [])
-                self._tell(answer)
-        self._life.leave()
-
-    def _hear(self) -> Message:
-        try:
-            return self._channel.receive()
-        except OSError:
-            raise ChannelClosed from None
-
-    def _tell(self, answer: Message) -> None:
-        try:
-            self._channel.send(answer)
-        except OSError:
-            raise ChannelClosed from None
+    threading.Thread(target=watch, daemon=True).start()
 
 
-def _serve(descriptor: int, user: int) -> None:
-    """The warm parent: forks a worker for every pair of file descriptors that arrives."""
+def _abandoned(parent: int, user: int) -> bool:
+    """Return True if this process lost its parent because the user's process ended.
+
+    A warm parent may be killed alone; then its workers go on.
+    """
+    if os.getppid() == parent:
+        return False
+    try:
+        os.kill(user, 0)
+    except (ProcessLookupError, PermissionError):  # gone, or its number is somebody else's by now
+        return True
+    return False
+
+
+class _Life:
+    """Ends a worker with the user's process, and leaves no files behind.
+
+    Args:
+        parent: Number of the process that started this one.
+        user: Number of the user's process.
+        directory: Folder to remove at the end.
+    """
+
+    def __init__(self, parent: int, user: int, directory: str | None) -> None:
+        self._parent = parent
+        self._user = user
+        self._directory = directory
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def leave(self) -> NoReturn:
+        """Remove the folder and exit."""
+        if self._directory is not None:
+            shutil.rmtree(self._directory, ignore_errors=True)
+        os._exit(0)  # no destructors: libsumo's may take long on a large network
+
+    def _watch(self) -> None:
+        while not _abandoned(self._parent, self._user):
+            time.sleep(LOOK_EVERY_S)
+        self.leave()
+
+
+def _work(
+    service: Service,
+    channel: Channel,
+    order: dict[str, Any],
+    descriptors: list[int],
+    parent: int,
+    user: int,
+) -> NoReturn:
+    """Answer questions until the line closes, then exit."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    life = _Life(parent, user, order.get("directory"))
+    answer = service.open(order, descriptors)
+    with contextlib.suppress(ChannelClosed, OSError):
+        while (question := channel.receive()).header["what"] != "close":
+            channel.send(_answered(answer, question))
+    life.leave()
+
+
+def _answered(answer: Callable[[Message], Message], question: Message) -> Message:
+    try:
+        return answer(question)
+    except UgatMarlError as error:
+        kinds = [kind.__name__ for kind in type(error).__mro__]
+        return Message({"error": str(error), "kinds": kinds}, [])
+    except Exception:  # noqa: BLE001 - of the user's reward or wrapper; the user is told all
+        return Message({"error": traceback.format_exc(limit=-5), "kinds": []}, [])
+
+
+def _serve(service: Service, user: int, descriptor: int) -> None:
+    """Fork a worker for every order that arrives."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # workers leave no zombies
     here = os.getpid()
     with socket.socket(fileno=descriptor) as control, contextlib.suppress(ConnectionError):
-        control.settimeout(LOOK_EVERY_S)
-        while True:
-            try:
-                request, descriptors, _, _ = socket.recv_fds(control, 1, 2)
-            except TimeoutError:
-                if abandoned(user, user):
-                    return
-                continue
-            if not request:
+        while (request := _next(control, user)) is not None:
+            message, descriptors = request
+            if message["what"] == "bye":
                 return
+            if message["what"] == "tell":
+                service.told(message["order"])
+                continue
+            order = message["order"]
+            service.prepare(order)
             pid = os.fork()
             if pid == 0:
                 control.close()
-                os.dup2(descriptors[1], 1)
-                os.dup2(descriptors[1], 2)
-                line = socket.socket(fileno=descriptors[0])
+                signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+                number, said, *others = descriptors
+                os.dup2(said, 1)
+                os.dup2(said, 2)
+                line = socket.socket(fileno=number)
                 channel = Channel(line.makefile("rb"), line.makefile("wb"), line.close)
-                _Worker(channel, here, user).run()
-            for descriptor in descriptors:
-                os.close(descriptor)
+                _work(service, channel, order, others, here, user)
+            for number in descriptors:
+                os.close(number)
             control.sendall(pid.to_bytes(8, "little"))
+    service.abandoned()
 
 
-def _spawned(user: int) -> None:
-    """A worker of its own interpreter: SUMO may print, so the channel leaves standard output."""
+def _next(control: socket.socket, user: int) -> tuple[dict[str, Any], list[int]] | None:
+    """Return the next message and the open files with it; None if the user's process is gone."""
+    control.settimeout(LOOK_EVERY_S)
+    while True:
+        try:
+            first, descriptors, _, _ = socket.recv_fds(control, 1, _MOST_DESCRIPTORS)
+            break
+        except TimeoutError:
+            if _abandoned(user, user):
+                return None
+    control.settimeout(None)
+    if not first:
+        return None
+    (length,) = LENGTH.unpack(_exactly(control, LENGTH.size))
+    return json.loads(_exactly(control, length)), descriptors
+
+
+def _exactly(control: socket.socket, count: int) -> bytes:
+    data = b""
+    while len(data) < count:
+        more = control.recv(count - len(data))
+        if not more:
+            raise ConnectionError
+        data += more
+    return data
+
+
+def _spawned(service: Service, user: int, order: dict[str, Any]) -> None:
+    """Work in an interpreter of its own: SUMO may print, so the line leaves standard output."""
     reader, writer = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    _Worker(Channel(reader, writer, writer.close), user, user).run()
+    service.prepare(order)
+    _work(service, Channel(reader, writer, writer.close), order, [], user, user)
+
+
+def _main(kind: str, name: str, user: str, argument: str) -> None:
+    module, _, member = name.partition(":")
+    service: Service = getattr(importlib.import_module(module), member)()
+    if kind == "parent":
+        _serve(service, int(user), int(argument))
+    else:
+        _spawned(service, int(user), json.loads(argument))
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "parent":
-        _serve(int(sys.argv[2]), int(sys.argv[3]))
-    else:
-        _spawned(int(sys.argv[2]))
+    _main(*sys.argv[1:])

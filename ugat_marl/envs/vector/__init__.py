@@ -2,7 +2,7 @@
 
 from ugat_marl.envs.vector.arrays import Arrays
 from ugat_marl.envs.vector.environment import Autoreset, Batch, Ended, VectorEnv, vector_env
-from ugat_marl.envs.vector.lane import Episode
+from ugat_marl.envs.vector.remote import Episode
 from ugat_marl.envs.vector.spec import in_turn
 
 __all__ = [

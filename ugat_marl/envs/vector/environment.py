@@ -19,8 +19,7 @@ from ugat_marl.envs.agents import AgentSet
 from ugat_marl.envs.traffic_env import parallel_env
 from ugat_marl.envs.types import AnyParallelEnv
 from ugat_marl.envs.vector.arrays import Arrays
-from ugat_marl.envs.vector.lane import Answer, Episode, Lane
-from ugat_marl.envs.vector.nursery import Home
+from ugat_marl.envs.vector.remote import Answer, Episode, RemoteEnv, Shared
 from ugat_marl.envs.vector.spec import (
     DomainOf,
     Wraps,
@@ -86,12 +85,13 @@ class VectorEnv:
     """Environments in processes of their own, stepped together; see `vector_env`.
 
     Args:
-        lanes: The environments.
+        environments: The environments.
         arrays: Their memory.
         plain: An environment with the same spaces, which is never started.
         domains: The domain of an episode.
         autoreset: What happens when one ends.
-        home: What is closed with them; or what they are a half of, which is kept alive.
+        shared: Their memory and host, closed with them; None for a half of another vector.
+        whole: The vector they are a half of, which is kept alive.
 
     Attributes:
         n: Number of environments.
@@ -105,25 +105,26 @@ class VectorEnv:
 
     def __init__(
         self,
-        lanes: Sequence[Lane],
+        environments: Sequence[RemoteEnv],
         arrays: Arrays,
         plain: AnyParallelEnv,
         domains: DomainOf,
         autoreset: Autoreset,
-        home: Home | VectorEnv,
+        shared: Shared | None,
+        whole: VectorEnv | None = None,
     ) -> None:
-        self.n = len(lanes)
+        self.n = len(environments)
         self.agent_set = AgentSet.of(plain)
         self.agents = self.agent_set.names
         self.observation_spaces = {a: plain.observation_space(a) for a in self.agents}
         self.action_spaces = {a: plain.action_space(a) for a in self.agents}
         self.autoreset: Autoreset = autoreset
         self.plain = plain
-        self._lanes = list(lanes)
+        self._environments = list(environments)
         self._arrays: Arrays | None = arrays
         self._domains = domains
-        self._whole = home if isinstance(home, VectorEnv) else None
-        self._home = None if isinstance(home, VectorEnv) else home
+        self._whole = whole
+        self._shared = shared
         self._counts = np.array(self.agent_set.action_counts)
         self._begun: list[int] = []
         self._stepped: list[int] = []
@@ -131,7 +132,7 @@ class VectorEnv:
     @property
     def episodes(self) -> tuple[Episode | None, ...]:
         """The episode each environment is in; None before the first reset."""
-        return tuple(lane.episode for lane in self._lanes)
+        return tuple(env.episode for env in self._environments)
 
     def halves(self) -> tuple[VectorEnv, VectorEnv]:
         """Two vectors of these environments: one is stepped while the other one's answer is used.
@@ -147,12 +148,13 @@ class VectorEnv:
         parts = slice(0, middle), slice(middle, self.n)
         first, second = (
             VectorEnv(
-                self._lanes[part],
+                self._environments[part],
                 arrays.part(part),
                 self.plain,
                 self._domains,
                 self.autoreset,
-                self,
+                None,
+                whole=self,
             )
             for part in parts
         )
@@ -174,7 +176,7 @@ class VectorEnv:
         chosen = self._chosen(where)
         seeds = self._seeds(seed, chosen)
         for index in chosen:
-            self._lanes[index].close()
+            self._environments[index].close()
         self._stepped = []
         self._begin(chosen, seeds)
         self._memory.rewards[chosen] = 0.0
@@ -197,17 +199,17 @@ class VectorEnv:
     def step_async(self, actions: ArrayLike) -> None:
         """Begins a step; `step_wait` ends it, and there is time for something else between."""
         asked = self._checked(actions)
-        idle = [lane.over and not lane.asked for lane in self._lanes]
-        anew = self.autoreset == "next-step" and self._lanes[0].episode is not None
-        for lane, over in zip(self._lanes, idle, strict=True):
+        idle = [env.over and not env.asked for env in self._environments]
+        anew = self.autoreset == "next-step" and self._environments[0].episode is not None
+        for env, over in zip(self._environments, idle, strict=True):
             if not (anew and over):
-                lane.require_running()
+                env.require_running()
         self._begun = [index for index, over in enumerate(idle) if over]
         self._stepped = [index for index, over in enumerate(idle) if not over]
         for index in self._stepped:
-            self._lanes[index].act(asked[index].copy())
+            self._environments[index].act(asked[index].copy())
         for index in self._begun:
-            self._lanes[index].begin(None, self._domains)
+            self._environments[index].begin(None, self._domains)
 
     def step_wait(self) -> Batch:
         """Waits for the step that `step_async` began.
@@ -234,12 +236,12 @@ class VectorEnv:
 
     def close(self) -> None:
         """Ends all simulations and their processes, removes their files; may be called again."""
-        for lane in self._lanes:
-            lane.close()
-        home, self._home = self._home, None
-        if home is not None:
+        for env in self._environments:
+            env.close()
+        shared, self._shared = self._shared, None
+        if shared is not None:
             self._arrays = None
-            home.close()
+            shared.close()
 
     def __enter__(self) -> VectorEnv:
         return self
@@ -248,7 +250,7 @@ class VectorEnv:
         self.close()
 
     def __del__(self) -> None:
-        if getattr(self, "_home", None) is not None:
+        if getattr(self, "_shared", None) is not None:
             with contextlib.suppress(OSError):
                 self.close()
 
@@ -312,7 +314,7 @@ class VectorEnv:
 
     def _begin(self, chosen: list[int], seeds: dict[int, int | None]) -> None:
         for index in chosen:
-            self._lanes[index].begin(seeds[index], self._domains)
+            self._environments[index].begin(seeds[index], self._domains)
         self._answers(chosen)
 
     def _answers(self, chosen: list[int]) -> dict[int, Answer]:
@@ -321,7 +323,7 @@ class VectorEnv:
         failed: list[UgatMarlError] = []
         for index in chosen:
             try:
-                answers[index] = self._lanes[index].answer()
+                answers[index] = self._environments[index].answer()
             except UgatMarlError as error:
                 failed.append(error)
         for text in dict.fromkeys(_said(answers.values())):
@@ -331,7 +333,7 @@ class VectorEnv:
         return answers
 
     def _ended(self, index: int, answer: Answer) -> Ended:
-        memory, episode = self._memory, self._lanes[index].episode
+        memory, episode = self._memory, self._environments[index].episode
         assert episode is not None
         seen, masks = memory.observations[index].copy(), memory.masks[index].copy()
         return Ended(index, episode, seen, masks, answer.scores)
@@ -395,6 +397,6 @@ def vector_env(
     plain: AnyParallelEnv = parallel_env(loaded, domain_of(0, 0), **options)
     for each in listed(wrap):
         plain = imported(spelling("wrap", each))(plain)
-    home = Home(loaded, options, wrap, AgentSet.of(plain), n)
-    lanes = [Lane(home, index, home.arrays.part(index)) for index in range(n)]
-    return VectorEnv(lanes, home.arrays, plain, domain_of, autoreset, home)
+    shared = Shared(loaded, options, wrap, AgentSet.of(plain), n)
+    environments = [RemoteEnv(shared, index, shared.arrays.part(index)) for index in range(n)]
+    return VectorEnv(environments, shared.arrays, plain, domain_of, autoreset, shared)
