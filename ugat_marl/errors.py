@@ -1,4 +1,4 @@
-"""Every exception that crosses a module boundary.
+"""Exceptions of the suite.
 
 Messages name the thing, the value, what is allowed and the way out; the command line prints them
 as one line and leaves with exit code 2.
@@ -76,7 +76,7 @@ class WorkerError(UgatMarlError, RuntimeError):
 
 
 class EpisodeError(UgatMarlError, RuntimeError):
-    """`step`, `state` or `scores` was called at a moment of the episode when it has no meaning."""
+    """`step`, `state` or `scores` was called while it has no meaning."""
 
 
 class OutputError(UgatMarlError, OSError):
@@ -92,7 +92,7 @@ class MeasuredDataError(UgatMarlError):
 
 
 class MeasurementError(UgatMarlError):
-    """A measured process of a bench failed, or did other work than what it is compared with."""
+    """A measured process of a bench failed, or did other work than its counterpart."""
 
 
 class BlindTestError(UgatMarlError):

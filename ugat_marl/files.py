@@ -1,4 +1,4 @@
-"""Files that are whole or absent, and XML that cannot do anything but be read.
+"""Files that are whole or absent, and safe reading of XML.
 
 Everything the suite writes goes through `write_whole`: a killed run leaves the old file or the new
 one, never half of either. Everything it reads as XML goes through one parser, which refuses
@@ -36,7 +36,7 @@ _END = "\0"
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a temporary path beside `path`; it replaces `path` if the block ends normally."""
+    """Yield a temporary path beside `path`; it replaces `path` if the block ends normally."""
     require_writable(path)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
     os.close(handle)
@@ -52,7 +52,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def require_writable(path: Path) -> None:
-    """Refuses a path that cannot become a file; makes the folder it lies in.
+    """Refuse a path that cannot become a file, and make its folder.
 
     Raises:
         OutputError: It is a folder, or its own folder cannot be made or written to.
@@ -70,14 +70,14 @@ def require_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Writes `content` to `path` so that a reader sees the old file or the new one."""
+    """Write `content` to `path` so that a reader sees the old file or the new one."""
     with replacing(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @contextlib.contextmanager
 def scratch() -> Iterator[None]:
-    """What is written here goes to the folder for temporary files.
+    """Context in which files are written to the folder for temporary files.
 
     Raises:
         OutputError: That is full, or missing.
@@ -92,7 +92,7 @@ def scratch() -> Iterator[None]:
 
 
 def user_cache(name: str) -> Path:
-    """Where results of the kind `name` are remembered between runs: the user's cache folder."""
+    """Return the folder that keeps results of the kind `name` between runs, in the user's cache."""
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "ugat_marl" / name
 
@@ -185,7 +185,7 @@ def scan_xml(pieces: Iterable[bytes], name: str) -> Iterator[Tag]:
 
 
 def parse_xml(content: bytes, name: str) -> ET.Element:
-    """Parses XML without document types or entities.
+    """Parse XML without document types or entities.
 
     Args:
         content: The document.
@@ -200,7 +200,7 @@ def parse_xml(content: bytes, name: str) -> ET.Element:
 
 
 def parts_of_xml(pieces: Iterable[bytes], name: str) -> Iterator[ET.Element]:
-    """A document of any length as trees: its root again and again, each time with more children.
+    """Yield a document of any length as trees: copies of its root, each with the next children.
 
     Every child stands whole in one of the parts, of which there is at least one.
 
@@ -266,7 +266,7 @@ def _parse(parser: expat.XMLParserType, content: bytes, last: bool, name: str) -
 
 
 def xml_bytes(root: ET.Element) -> bytes:
-    """Serialises an element tree as an indented UTF-8 document."""
+    """Serialise an element tree as an indented UTF-8 document."""
     ET.indent(root, "    ")
     return ET.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
 
@@ -304,7 +304,7 @@ class Document:
 
     @property
     def source(self) -> str:
-        """What to call the document in errors."""
+        """Name of the document in errors."""
         return self.name if self.path is None or self.home is not None else str(self.path)
 
     def read(self) -> bytes:
@@ -348,7 +348,7 @@ class Document:
         return Document(self.name.removesuffix(".gz"), None, content)
 
     def write(self, path: Path) -> None:
-        """Puts the document at `path`, packed as it was found."""
+        """Put the document at `path`, packed as it was found."""
         with replacing(path) as temporary:
             if self.content is not None:
                 temporary.write_bytes(self.content)
@@ -358,7 +358,7 @@ class Document:
 
 
 class Draft:
-    """An XML document that is being written: in memory, or once it is long, in a file of its own.
+    """An XML document under construction: in memory, or in a file once it is long.
 
     Args:
         name: File name.
@@ -375,7 +375,7 @@ class Draft:
         self._file.write(b"<?xml version='1.0' encoding='UTF-8'?>\n")
 
     def add(self, *children: str) -> None:
-        """Writes children, see `child_texts`."""
+        """Write children, see `child_texts`."""
         if not children:
             return
         start = f"{self._start.removesuffix(' />')}>" if self._empty else ""
@@ -390,7 +390,7 @@ class Draft:
                 self._file.write(begun)
 
     def document(self) -> Document:
-        """What has been written, as a document."""
+        """Return the text written so far as a document."""
         end = self._start if self._empty else f"\n</{self._tag}>"
         with scratch():
             self._file.write(f"{end}\n".encode())
@@ -400,7 +400,7 @@ class Draft:
 
 
 class OwnDirectory:
-    """Names a fresh folder for every simulation, and removes the one before.
+    """A fresh folder for every simulation; the one before is removed.
 
     The last one goes with this object; not when a forked child lets go of its copy, however.
     """
@@ -409,14 +409,14 @@ class OwnDirectory:
         self._remove: weakref.finalize[..., OwnDirectory] | None = None
 
     def fresh(self) -> Path:
-        """The path of another folder; whoever uses it makes it."""
+        """Return the path of another folder, which the caller has to make."""
         self.remove()
         directory = Path(tempfile.gettempdir()) / f"ugat_marl-{secrets.token_hex(8)}"
         self._remove = weakref.finalize(self, _remove_tree, directory, os.getpid())
         return directory
 
     def remove(self) -> None:
-        """Removes the folder, if there is one."""
+        """Remove the folder, if there is one."""
         remove, self._remove = self._remove, None
         if remove is not None:
             remove()

@@ -1,4 +1,4 @@
-"""Who does work that can be done in parts: this machine's cores, or any standard executor.
+"""Work in parts, on this machine's cores or by any standard executor.
 
 Everything that plays many episodes takes ``workers``: a number, None for one per usable core, or a
 `concurrent.futures.Executor` that the caller made and closes. With a number the parts are threads,
@@ -40,7 +40,7 @@ RETRIES = 3
 
 
 def persistently(work: Callable[[], Done], death: type[Exception] = SimulatorCrashed) -> Done:
-    """Does something; again, to the same result, if a process that it needs died meanwhile.
+    """Call a function, and again if a process that it needs died meanwhile.
 
     Args:
         work: What to do; an episode, say.
@@ -54,7 +54,7 @@ def persistently(work: Callable[[], Done], death: type[Exception] = SimulatorCra
 
 
 class Stop(threading.Event):
-    """Set when nobody waits for the work any more; a copy in another process is never set."""
+    """Flag that nobody waits for the work any more; a copy in another process is never set."""
 
     def __reduce__(self) -> tuple[type[Stop], tuple[()]]:
         return Stop, ()
@@ -68,7 +68,7 @@ def usable_cores() -> int:
 
 
 def parts_at_a_time(workers: Workers) -> int:
-    """How many parts are done at once; a guess for executors that do not say."""
+    """Return the number of parts done at once; a guess for executors that do not say."""
     if isinstance(workers, Executor):
         return getattr(workers, "parts_at_a_time", None) or getattr(
             workers, "_max_workers", usable_cores()
@@ -77,7 +77,7 @@ def parts_at_a_time(workers: Workers) -> int:
 
 
 def in_this_process(workers: Workers) -> bool:
-    """Whether the parts can call back what made them."""
+    """Return True if the parts can call functions of the process that made them."""
     return not isinstance(workers, Executor) or isinstance(workers, ThreadPoolExecutor)
 
 
@@ -97,7 +97,7 @@ def as_done(
     parts: Iterable[tuple[Any, ...]],
     stop: Stop,
 ) -> Iterator[tuple[int, Done]]:
-    """Does all parts; yields the number of each with what came of it, in the order they are done.
+    """Do all parts; yield the number and result of each, in the order they are done.
 
     The first failure is raised. What was not begun then is given up, and `stop` is set, as it is
     when the loop is left early or interrupted.
@@ -125,7 +125,7 @@ def as_done(
 
 
 class LocalProcesses(Executor):
-    """Interpreters of their own instead of threads: for many cores, where one would be too slow.
+    """Executor with an interpreter per core, for many cores that one interpreter cannot use.
 
     Each takes seconds to start and as much memory as the suite with torch. A script that makes them
     guards its code by ``if __name__ == "__main__":``. Where a process dies, another begins its part
@@ -142,7 +142,7 @@ class LocalProcesses(Executor):
         self._is_open = True
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Hands a part to a process.
+        """Hand a part to a process.
 
         The part raises `BrokenProcessPool` if its process died each time.
         """
@@ -150,7 +150,7 @@ class LocalProcesses(Executor):
         return self._threads.submit(persistently, lambda: self._done(part), BrokenProcessPool)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Ends the processes once they have done what was submitted, or what they are at."""
+        """End the processes after the submitted parts, or after the current ones."""
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
         self._is_open = False
         while self._idle:
@@ -224,7 +224,7 @@ class RayExecutor(Executor):
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Hands a part to the cluster."""
+        """Hand a part to the cluster."""
         if not self._is_open:
             raise RuntimeError("cannot schedule new futures after shutdown")
         future: Future[Any] = Future()
@@ -236,7 +236,7 @@ class RayExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Waits for what was submitted, unless told not to; ends the Ray that was started here."""
+        """Wait for submitted parts, unless told not to, and end the Ray that was started here."""
         self._is_open = False
         with self._lock:
             running = list(self._running)
@@ -249,7 +249,7 @@ class RayExecutor(Executor):
             self._ray.shutdown()
 
     def _settle(self, future: Future[Any], found: Future[Any]) -> None:
-        """Passes a result on; Ray's error is the part's own with Ray's words around it."""
+        """Pass a result on; Ray's error is the part's own with Ray's words around it."""
         with self._lock:
             self._running.pop(future, None)
         if not future.set_running_or_notify_cancel():

@@ -1,4 +1,4 @@
-"""What long work says while it runs: bars in a terminal, a line now and then elsewhere."""
+"""Progress of long work: bars in a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Reporter(Protocol):
     """Shows tasks of known length."""
 
     def task(self, name: str, total: int) -> contextlib.AbstractContextManager[Advance]:
-        """A task; the value of the context advances it by one."""
+        """Show a task; the value of the context advances it by one."""
         ...
 
     def say(self, text: str) -> None:
@@ -43,16 +43,16 @@ class Reporter(Protocol):
 
 
 class Silent:
-    """Shows nothing."""
+    """Show nothing."""
 
     @contextlib.contextmanager
     def task(self, name: str, total: int) -> Iterator[Advance]:
-        """Does nothing."""
+        """Do nothing."""
         del name, total
         yield lambda note="": None
 
     def say(self, text: str) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
 
 class Bars:
@@ -70,7 +70,7 @@ class Bars:
 
     @contextlib.contextmanager
     def task(self, name: str, total: int) -> Iterator[Advance]:
-        """A bar that leaves one line behind when the task is done."""
+        """Show a bar that leaves one line behind when the task is done."""
         columns = (
             TextColumn("{task.description:<26.26}"),
             BarColumn(bar_width=18),
@@ -96,11 +96,11 @@ class Bars:
             progress.update(bar, completed=total)  # the work may have ended early, by its own rule
 
     def _rest(self) -> Column:
-        """What the other columns leave of a line: a long note must not squeeze them."""
+        """Return the width the other columns leave, so that a note does not squeeze them."""
         return Column(no_wrap=True, overflow="ellipsis", max_width=max(self._console.width - 74, 6))
 
     def say(self, text: str) -> None:
-        """Writes a line."""
+        """Write a line."""
         self._console.print(text, highlight=False, markup=False)
 
 
@@ -108,13 +108,13 @@ _shown: list[Reporter] = [Silent()]
 
 
 def usual() -> Reporter:
-    """What shows long work that nobody passed a reporter to: nothing, but for `showing`."""
+    """Return the reporter of work that was passed none: a silent one, except in `showing`."""
     return _shown[-1]
 
 
 @contextlib.contextmanager
 def showing(reporter: Reporter) -> Iterator[None]:
-    """Makes a reporter the usual one of the whole program for a while."""
+    """Make a reporter the usual one of the whole program for a while."""
     _shown.append(reporter)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Seeds derived from seeds: the same path of numbers always gives the same stream.
+"""Seeds derived from seeds: the same path of numbers gives the same stream.
 
 A run that is resumed asks for the stream of "iteration 3, episode 2" and gets it, without any
 generator state having been saved.

@@ -52,7 +52,7 @@ class Routes:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Routes:
-        """Reads all routes that vehicles of a scenario may refer to."""
+        """Read all routes that vehicles of a scenario may refer to."""
         documents = (*scenario.additional, *scenario.routes)
         found = cls()
         if not any(mentions(document, "route=", "route =") for document in documents):
@@ -106,7 +106,7 @@ class DemandLevel(Effect):
     factor: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Leaves out or doubles vehicles, and changes the rates of flows.
+        """Leave out or double vehicles, and change the rates of flows.
 
         Raises:
             UnknownNameError: No such edge.
@@ -116,7 +116,7 @@ class DemandLevel(Effect):
 
 @dataclass(frozen=True)
 class DemandSurge(Effect):
-    """So many times as many vehicles start on an edge (``"*"``: everywhere) during a while."""
+    """So many times as many vehicles start on an edge (``"*"``: all) between two times."""
 
     name: ClassVar[str] = "demand_surge"
     on_departures: ClassVar[bool] = True
@@ -128,7 +128,7 @@ class DemandSurge(Effect):
     factor: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Leaves out or doubles vehicles that depart then; flows are cut into parts.
+        """Leave out or double vehicles that depart then, and cut flows into parts.
 
         Raises:
             UnknownNameError: No such edge.
@@ -151,7 +151,7 @@ class DemandTiming(Effect):
     seconds: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Shifts departures.
+        """Shift departures.
 
         Raises:
             UnknownNameError: No such edge.
@@ -186,7 +186,7 @@ def replace_departing(
     edge: str,
     becomes: Callable[[ET.Element], list[ET.Element]],
 ) -> Scenario:
-    """Puts others in the place of the vehicles, trips and flows that start on `edge`.
+    """Replace the vehicles, trips and flows that start on `edge`.
 
     Args:
         scenario: It does not change itself.
@@ -219,7 +219,7 @@ def replace_departing(
 
 
 def scaled_flow(item: ET.Element, factor: float, end_s: float) -> ET.Element | None:
-    """The same flow with another rate; None if nothing is left of it.
+    """Return the flow with another rate; None if nothing is left of it.
 
     Args:
         item: A ``<flow>``.
@@ -262,7 +262,7 @@ _RATES = ("vehsPerHour", "perHour", "period", "probability")
 
 
 def _seconds_of_number(flow: ET.Element, number: float) -> float:
-    """How long a flow of so many vehicles lasts at its rate."""
+    """Return the duration of a flow of so many vehicles at its rate, in s."""
     rates: Mapping[str, Callable[[float], float]] = {
         "vehsPerHour": lambda x: 3600 / x,
         "perHour": lambda x: 3600 / x,
@@ -311,7 +311,7 @@ def _scaled(
 
 
 def _mark(scenario: Scenario) -> str:
-    """What stands in the ids of twins, and in none so far: demand may grow more than once."""
+    """Return a mark for the ids of twins that no id has yet: demand may grow more than once."""
     documents = (*scenario.additional, *scenario.routes)
     found = (_TWIN.finditer(window) for document in documents for window in windows(document))
     return "+" * (1 + max((len(match[1]) for matches in found for match in matches), default=0))
@@ -320,7 +320,7 @@ def _mark(scenario: Scenario) -> str:
 def _scaled_window(
     item: ET.Element, window: tuple[float, float], factor: float, over_s: float, mark: str
 ) -> list[ET.Element]:
-    """A flow in up to three parts: before, within and after the window."""
+    """Return a flow in up to three parts: before, within and after the window."""
     begin = depart_s(item)
     if math.isnan(begin):
         return [item]

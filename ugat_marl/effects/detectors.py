@@ -154,7 +154,7 @@ class Stuck(DetectorEffect):
 
 @dataclass(frozen=True)
 class Dropout(DetectorEffect):
-    """A detector reports nothing for a while."""
+    """A detector reports nothing between two times."""
 
     name: ClassVar[str] = "dropout"
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}

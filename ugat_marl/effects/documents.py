@@ -1,4 +1,4 @@
-"""Editing a scenario's files: part by part, and only those that can hold what is looked for."""
+"""Edits of a scenario's files, part by part, in those files alone that an effect may concern."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Change = Callable[[Root], bool]
 
 
 def windows(document: Document) -> Iterator[bytes]:
-    """The bytes piece by piece, each with the end of the one before it."""
+    """Yield the bytes piece by piece, each with the end of the one before it."""
     window = b""
     for piece in document.pieces():
         window = window[-_OVERLAP:] + piece
@@ -49,7 +49,7 @@ def windows(document: Document) -> Iterator[bytes]:
 
 
 def mentions(document: Document, *texts: str) -> bool:
-    """Whether any of the texts occurs; also True where that cannot be told without parsing."""
+    """Return True if any of the texts occurs, or if only parsing could tell."""
     wanted = [text.encode() for text in texts]
     return any(
         window[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -62,7 +62,7 @@ def mentions(document: Document, *texts: str) -> bool:
 def edit(
     documents: Iterable[Document], change: Change, *texts: str, in_order: bool = False
 ) -> tuple[Document, ...]:
-    """Applies `change` to every document that mentions one of `texts`.
+    """Apply `change` to every document that mentions one of `texts`.
 
     Args:
         documents: What may be edited, however long.
@@ -99,7 +99,7 @@ def _edited(document: Document, change: Change, in_order: bool) -> Document:
 def edit_scenario(
     scenario: Scenario, change: Change, *texts: str, applied: str, in_order: bool = False
 ) -> Scenario:
-    """Applies `change` to additional files and routes, as `edit` does.
+    """Apply `change` to additional files and routes, as `edit` does.
 
     Args:
         scenario: It does not change itself.
@@ -117,7 +117,7 @@ def edit_scenario(
 
 
 def with_default_types(scenario: Scenario) -> Scenario:
-    """The same scenario with the default types in use declared, in its first additional file."""
+    """Return the scenario with the default types in use declared, in its first additional file."""
     if scenario.additional and scenario.additional[0].name == DEFAULTS_FILE:
         return scenario
     declared: set[str] = set()
@@ -142,7 +142,7 @@ def with_default_types(scenario: Scenario) -> Scenario:
 
 
 def is_demand(item: Root) -> bool:
-    """Whether an element is a vehicle, trip or flow that wants to get somewhere."""
+    """Return True if an element is a vehicle, trip or flow of the demand."""
     return item.tag in DEPARTING and not item.get("id", "").startswith(BLOCKERS)
 
 
@@ -156,7 +156,7 @@ def depart_s(item: Root) -> float:
 
 
 def sort_departures(root: Root) -> None:
-    """Puts definitions first and then everything that departs, in order of time.
+    """Put definitions first and then everything that departs, in order of time.
 
     One whose departure is triggered stays behind its predecessor.
     """
@@ -164,7 +164,7 @@ def sort_departures(root: Root) -> None:
 
 
 def _clock() -> Callable[[Root], float]:
-    """When each of a document's elements departs, asked one after the other; -inf if it is none."""
+    """Return a function that gives the departure of each element in turn; -inf if it has none."""
     latest = -sys.float_info.max
 
     def departure(item: Root) -> float:
@@ -187,7 +187,7 @@ class _Sorted:
         self._count = self._length = 0
 
     def add(self, rows: Iterable[tuple[float, str]]) -> None:
-        """Takes times and texts; of those of one time, the first stays first."""
+        """Take times and texts; of those of one time, the first stays first."""
         for time, text in rows:
             self._run.append((time, self._count, text))
             self._count += 1
@@ -206,5 +206,5 @@ class _Sorted:
 
 
 def seconds_text(value: float) -> str:
-    """A time as it is written into files, to the millisecond, SUMO's own resolution."""
+    """Return a time as text for a file, to the millisecond, SUMO's own resolution."""
     return f"{value:.3f}".rstrip("0").rstrip(".")

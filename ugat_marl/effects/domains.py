@@ -1,4 +1,4 @@
-"""Domains that have a name, by the gap they open between simulation and street.
+"""Named domains, by the gap they open between simulation and street.
 
 The counterparts are settings of Sim2Signal (Al Rafi et al. 2026, arXiv:2609.01676), by the names of
 its repository, whose files of settings and tables of phases were read for the numbers here. That
@@ -19,7 +19,7 @@ GAPS: tuple[Gap, ...] = get_args(Gap)
 
 @dataclass(frozen=True)
 class NamedDomain:
-    """A domain with a name.
+    """A domain with a name, see `NAMED`.
 
     Attributes:
         name: What it is called; small and capital letters are the same.
@@ -183,7 +183,7 @@ TO_TRAIN_IN = frozenset({"meso"})
 
 
 def spelled_out(names: Sequence[str]) -> list[str]:
-    """Domains with ``"all"`` and names of gaps in place of lists, each domain once.
+    """Return domains with ``"all"`` and names of gaps replaced by lists, each domain once.
 
     Args:
         names: Domains; ``"all"`` is ``sim`` and every named one, the name of a gap all of its own,

@@ -1,4 +1,4 @@
-"""How a simulation goes about it: in queues, with blocked junctions, and how far it counts."""
+"""Effects on the engine: queues in place of car following, blocked junctions, reach of counts."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class QueueModel(Effect):
     metres: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets options of SUMO and the clearance: what queues serve is what car following serves.
+        """Set options of SUMO and the clearance, so that queues serve what car following serves.
 
         A green of g s on a saturated lane serves (g - 0.9) / 1.95 vehicles in car following at
         13.9 m/s, yellow and start included. SUMO's queues would serve as many in a green shorter by
@@ -55,7 +55,7 @@ class QueueModel(Effect):
 
 @dataclass(frozen=True)
 class BlockerPatience(Effect):
-    """Who has stood on a junction for so many seconds is no obstacle to others any more.
+    """A vehicle that has stood on a junction for so many seconds is no obstacle any more.
 
     Vehicles that meet in the middle of a junction, slow ones that started late above all, can hold
     each other up for ever: SUMO solves that by teleporting alone, which the suite switches off, and
@@ -68,7 +68,7 @@ class BlockerPatience(Effect):
     seconds: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets the option of SUMO."""
+        """Set the option of SUMO."""
         return _changed(scenario, self, {"ignore-junction-blocker": f"{self.seconds:g}"})
 
 
@@ -87,14 +87,14 @@ class Reach(Effect):
     metres: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets `control.reach_m`."""
+        """Set `control.reach_m`."""
         return _changed(scenario, self, {}, reach_m=self.metres)
 
 
 def _changed(
     scenario: Scenario, effect: Effect, options: Mapping[str, str], **control: float
 ) -> Scenario:
-    """The scenario with further options of SUMO, and other values in its control."""
+    """Return the scenario with further options of SUMO and other values in its control."""
     settings = scenario.settings.model_dump()
     settings["sumo"] = {**settings["sumo"], **options}
     settings["control"] = {**settings["control"], **control}

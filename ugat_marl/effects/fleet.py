@@ -1,4 +1,4 @@
-"""Effects on what the fleet is made of: desired speeds, their spread, and long vehicles."""
+"""Effects on the fleet: desired speeds, their spread, and trucks."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ class Speeds:
     greatest: float = _GREATEST
 
     def write(self, item: ET.Element) -> None:
-        """Puts the distribution into a type, in SUMO's words."""
+        """Put the distribution into a type, in SUMO's words."""
         values = (self.mean, self.deviation, self.least, self.greatest)
         item.attrib.pop("speedDev", None)
         item.set("speedFactor", f"normc({','.join(f'{value:.8g}' for value in values)})")
 
     @classmethod
     def of(cls, item: ET.Element, general: float | None) -> Speeds:
-        """Reads a type as SUMO does.
+        """Read a type as SUMO does.
 
         Args:
             item: A ``<vType>``.
@@ -70,7 +70,7 @@ class Speeds:
 
 
 def default_deviation(item: ET.Element, general: float | None) -> float:
-    """The deviation of speedFactor of a type that does not say it, by its vehicle class."""
+    """Return the default deviation of speedFactor of a vehicle class."""
     if general is not None and general >= 0:
         return general
     kind = item.get("vClass", "passenger")
@@ -79,14 +79,14 @@ def default_deviation(item: ET.Element, general: float | None) -> float:
 
 @dataclass(frozen=True)
 class DesiredSpeed(Effect):
-    """Drivers want to be so many times as fast: speedFactor of all types and of each vehicle."""
+    """Desired speeds are so many times as high: speedFactor of all types and of each vehicle."""
 
     name: ClassVar[str] = "desired_speed"
     ranges: ClassVar[dict[str, Parameter]] = {"factor": Parameter("", 0.2, 3.0)}
     factor: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Multiplies every speedFactor."""
+        """Multiply every speedFactor."""
 
         def typed(old: Speeds) -> Speeds:
             x = self.factor
@@ -104,7 +104,7 @@ class SpeedSpread(Effect):
     deviation: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets the deviation of all types; single vehicles move away from their type's mean.
+        """Set the deviation of all types; single vehicles move away from their type's mean.
 
         A vehicle of a type without spread is given one by a hash of its id.
         """
@@ -136,7 +136,7 @@ class HeavyShare(Effect):
     share: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Gives vehicles chosen by a hash of their ids, and a part of each flow, truck types."""
+        """Give vehicles chosen by a hash of their ids, and a part of each flow, truck types."""
         scenario = with_default_types(scenario)
         over = scenario.settings.begin_s + scenario.settings.duration_s
         cars = _cars(scenario)
@@ -222,7 +222,7 @@ def _with_speeds(
     typed: Callable[[Speeds], Speeds],
     single: Callable[[str, float, Speeds], float],
 ) -> Scenario:
-    """Changes the speeds of all types, and of the vehicles that have their own."""
+    """Change the speeds of all types, and of the vehicles that have their own."""
     scenario = with_default_types(scenario)
     general = scenario.settings.sumo.get("default.speeddev")
     known = _speeds(scenario, float(general) if general is not None else None)

@@ -1,4 +1,4 @@
-"""The places of a network that effects name: edges, lanes, traffic lights, and where they lead."""
+"""Places of a network that effects name: edges, lanes, traffic lights, and their connections."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class LanePlace:
 
 @dataclass(frozen=True)
 class Places:
-    """What a network consists of, outside of its junctions.
+    """Lanes, edges and traffic lights of a network, without the inside of junctions.
 
     Attributes:
         lanes: Lanes by id.
@@ -47,7 +47,7 @@ class Places:
     begins: Mapping[str, str]
 
     def check(self, effect: str, kind: str, name: str, known: Collection[str]) -> None:
-        """Refuses a place that does not exist.
+        """Refuse a place that does not exist.
 
         Raises:
             UnknownNameError: `name` is not among `known`.
@@ -57,20 +57,20 @@ class Places:
             raise UnknownNameError(kind, name, known, hint)
 
     def seconds(self, edge: str) -> float:
-        """Time to drive along an edge at its limit."""
+        """Return the time to drive along an edge at its limit, in s."""
         lanes = [self.lanes[lane] for lane in self.edges[edge]]
         fastest = max(lane.speed_mps for lane in lanes)
         return lanes[0].length_m / max(fastest, 0.1)
 
     def path(self, start: str, end: str) -> tuple[str, ...] | None:
-        """The fastest way over empty streets, both edges included; None if there is none."""
+        """Return the fastest way over empty streets, both edges included; None if there is none."""
         if start not in self.edges or end not in self.edges:
             return None
         return self.ways(start).get(end)
 
     @functools.lru_cache(maxsize=4096)  # noqa: B019 - instances are few and live long
     def ways(self, start: str) -> dict[str, tuple[str, ...]]:
-        """Every edge that can be reached from `start`, and the fastest way there."""
+        """Return every edge that can be reached from `start`, with the fastest way there."""
         before: dict[str, str] = {}
         best = {start: 0.0}
         done: set[str] = set()

@@ -1,4 +1,4 @@
-"""Effects on roads: lanes closed or blocked for a while, and other speeds along an edge.
+"""Effects on roads: lanes closed or blocked for some time, other speeds along an edge.
 
 A closed lane is a vehicle that stands on it. It has a short type and a file of its own, so that
 departures stay in order; effects on the demand pass it over.
@@ -30,7 +30,7 @@ _TIME = Parameter("s", 0.0, 1e7)
 
 @dataclass(frozen=True)
 class LaneClosure(Effect):
-    """Nobody passes a point near the end of a lane during a while, as after an accident."""
+    """No vehicle passes a point near the end of a lane between two times, as after an accident."""
 
     name: ClassVar[str] = "lane_closure"
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
@@ -40,7 +40,7 @@ class LaneClosure(Effect):
     end_s: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Adds a vehicle that stands in the middle of the lane's last 60 m.
+        """Add a vehicle that stands in the middle of the lane's last 60 m.
 
         Raises:
             UnknownNameError: No such lane.
@@ -55,7 +55,7 @@ class LaneClosure(Effect):
 
 @dataclass(frozen=True)
 class Incident(Effect):
-    """A lane before a signal is closed for a while; a hash of the network's lanes says which.
+    """A lane before a signal, chosen by a hash of the network's lanes, is closed between two times.
 
     A diagnosis looks for the `LaneClosure` it is.
     """
@@ -66,7 +66,7 @@ class Incident(Effect):
     lasts_s: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Closes one of the lanes that lead to a signal, if possible one with another beside it.
+        """Close one of the lanes that lead to a signal, if possible one with another beside it.
 
         Times count from the beginning of the scenario, not from midnight.
 
@@ -105,7 +105,7 @@ class Parking(Effect):
     dwell_s: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Adds one vehicle in each interval of an hour over `per_hour`, at a time set by a hash.
+        """Add one vehicle in each interval of an hour over `per_hour`, at a time set by a hash.
 
         Raises:
             UnknownNameError: No such lane.
@@ -130,7 +130,7 @@ class LocalSpeed(Effect):
     factor: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Adds a sign with a variable speed to the edge's lanes, or changes the one there is.
+        """Add a sign with a variable speed to the edge's lanes, or change the one there is.
 
         Raises:
             UnknownNameError: No such edge.
@@ -160,7 +160,7 @@ class LocalSpeed(Effect):
 
 
 def parked_at_other_times(scenario: Scenario, seed: int) -> Scenario:
-    """The day with the vehicles of `Parking` at other times, which are turned about the day.
+    """Return the day with the vehicles of `Parking` at other times, shifted around the clock.
 
     Nobody parks at the same second every day, and a model that says so expects a pattern in time.
     """
@@ -180,7 +180,7 @@ def parked_at_other_times(scenario: Scenario, seed: int) -> Scenario:
 def _with_blockers(
     scenario: Scenario, effect: Effect, lane: str, departs: Sequence[float], stand: dict[str, str]
 ) -> Scenario:
-    """Adds vehicles that appear in the middle of a lane's last 60 m, stand there and are gone.
+    """Add vehicles that appear in the middle of a lane's last 60 m, stand there and vanish.
 
     Farther away traffic goes round them and is in order again before the signal. Where a queue
     stands at that moment, the vehicle appears as soon as there is room for it.

@@ -100,17 +100,17 @@ _ALL: dict[str, type[Effect]] = {**_EFFECTS, **_ON_CONTROLLERS, **_OTHERS}
 
 
 def known_effects() -> Mapping[str, type[Effect]]:
-    """The effects on traffic, signals and detectors by name: what measured data may show."""
+    """Return the effects that measured data may show, by name: traffic, signals, detectors."""
     return dict(_EFFECTS)
 
 
 def effects_on_controllers() -> Mapping[str, type[Effect]]:
-    """The effects on what controllers see, do and are judged by; no diagnosis looks for them."""
+    """Return the effects on controllers by name; no diagnosis looks for them."""
     return dict(_ON_CONTROLLERS)
 
 
 def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
-    """An effect from its name and parameters, as in ``[[effects]]`` of a scenario file.
+    """Return an effect from its name and parameters, as in ``[[effects]]`` of a scenario file.
 
     Args:
         record: ``{"name": ..., parameter: value, ...}``.
@@ -137,7 +137,7 @@ def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
 
 
 def parse_domain(domain: Domain) -> tuple[Effect, ...]:
-    """The effects that make `domain` out of a scenario; none for ``"sim"``.
+    """Return the effects that make `domain` out of a scenario; none for ``"sim"``.
 
     Raises:
         UnknownNameError: No such setting or effect.
@@ -174,12 +174,12 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
 
 
 def _names() -> dict[str, str]:
-    """Domains by all the names they have, in small letters."""
+    """Return the name of a domain by each of its names in lower case."""
     return {name.lower(): name for name in NAMED} | ALIASES
 
 
 def _parts(domain: str) -> list[str]:
-    """The parts of a domain between plus signs, but for those in the id of an edge or lane."""
+    """Split a domain at its plus signs, except those in the id of an edge or lane."""
     parts: list[str] = []
     for part in domain.split("+"):
         name = parts[-1].partition("=")[0].strip().lower() if parts else ""
@@ -215,21 +215,21 @@ def _effect_from_text(text: str) -> Effect:
 
 
 def describe(domain: Domain) -> str:
-    """A short name for a domain, as tables show it."""
+    """Return a short name for a domain, as tables show it."""
     if isinstance(domain, str):
         return _names().get(domain.strip().lower(), domain)
     return "+".join(map(str, domain)) or "sim"
 
 
 def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
-    """Applies effects one after the other."""
+    """Apply effects one after the other."""
     for apply_all, group in groupby(effects, lambda effect: effect.apply_all):
         scenario = apply_all(scenario, list(group))
     return scenario
 
 
 def load_scenario(name: str | Path | Scenario) -> Scenario:
-    """Loads a scenario and applies the effects its own file lists (see `read_scenario`).
+    """Load a scenario and apply the effects its own file lists (see `read_scenario`).
 
     Those on controllers stay listed in its settings, for the environment to keep.
     """
@@ -259,7 +259,7 @@ def controller_effects(scenario: Scenario) -> tuple[Effect, ...]:
 
 
 def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
-    """The scenario as it is in `domain`.
+    """Return the scenario as it is in `domain`.
 
     Args:
         scenario: What `load_scenario` returned.
@@ -282,7 +282,7 @@ def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
 
 
 def _checked(scenario: Scenario) -> Scenario:
-    """The scenario, unless agents are to look farther than whole lanes and not as far."""
+    """Return the scenario; refuse a detection zone together with a reach."""
     zones = (item for item in scenario.settings.effects if item.get("name") == DetectionZone.name)
     if scenario.control.reach_m and any(zones):
         raise OptionError(
@@ -293,7 +293,7 @@ def _checked(scenario: Scenario) -> Scenario:
 
 
 def scenario_of(domain: Domain) -> Path | None:
-    """The other scenario that a domain names, or None; a file that is merely called V4 is none."""
+    """Return the other scenario that a domain names, or None; a file called V4 is none."""
     if not isinstance(domain, str):
         return None
     path = Path(domain).expanduser()
@@ -301,7 +301,7 @@ def scenario_of(domain: Domain) -> Path | None:
 
 
 def _signals(scenario: Scenario) -> set[tuple[str, ...]]:
-    """What every letter of every signal stands for."""
+    """Return the connection that each letter of each signal belongs to."""
     keys = ("tl", "linkIndex", "from", "fromLane", "to", "toLane")
     return {
         tuple(item.get(key, "") for key in keys)

@@ -32,7 +32,7 @@ class LateGreen(Effect):
     seconds: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets the late green of one traffic light, or of all of them.
+        """Set the late green of one traffic light, or of all of them.
 
         Raises:
             UnknownNameError: No such traffic light.
@@ -64,7 +64,7 @@ class YellowTime(Effect):
     seconds: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets `control.yellow_s`."""
+        """Set `control.yellow_s`."""
         return _with_control(scenario, self, "yellow_s", self.seconds)
 
 
@@ -77,12 +77,12 @@ class AllRedTime(Effect):
     seconds: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets `control.all_red_s`."""
+        """Set `control.all_red_s`."""
         return _with_control(scenario, self, "all_red_s", self.seconds)
 
 
 def late_greens(scenario: Scenario) -> dict[str, float]:
-    """Traffic light to its late green in s, those in time left out."""
+    """Return the late green of traffic lights in s, without those that have none."""
     start_s = QUEUE_START_S if "mesosim" in scenario.settings.sumo else 0.0
     general = scenario.control.late_green_s + start_s
     own = scenario.settings.intersections
@@ -94,7 +94,7 @@ def late_greens(scenario: Scenario) -> dict[str, float]:
 
 
 def with_late_programmes(scenario: Scenario) -> Scenario:
-    """The scenario with late green in the programmes SUMO runs by itself, for the simulator only.
+    """Return the scenario with late green in SUMO's own programmes, for the simulator only.
 
     Phases that agents choose from are read from the scenario as it was. A programme knows only
     whole steps, and the same ones in each cycle: the late green is rounded to them.
@@ -130,7 +130,7 @@ def _with_control(scenario: Scenario, effect: Effect, key: str, seconds: float) 
 
 
 def _delay(logic: ET.Element, late_s: float, step_s: float, scenario: str) -> None:
-    """Splits every phase of a programme in which something turns green."""
+    """Split every phase of a programme in which something turns green."""
     phases = logic.findall("phase")
     if late_s <= 0 or not phases:
         return

@@ -1,4 +1,4 @@
-"""The effect that vehicles turn otherwise at one place."""
+"""Effect on the turns of vehicles at one place."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ENDS = ("arrivalLane", "arrivalPos", "arrivalEdge", "arrivalPosLat", "arrivalSp
 
 @dataclass(frozen=True)
 class Turning(Effect):
-    """This share of the vehicles that leave an edge otherwise now take `to_edge`.
+    """This share of the vehicles that leave an edge by another turn take `to_edge` instead.
 
     From there they go on like vehicles that already do so; where nobody did, along the fastest way
     out of the network. Trips are given the fastest way over empty streets first.
@@ -39,7 +39,7 @@ class Turning(Effect):
     share: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Changes the routes of vehicles, trips and flows.
+        """Change the routes of vehicles, trips and flows.
 
         Raises:
             UnknownNameError: No such edge, or no way from the one to the other.
@@ -76,7 +76,7 @@ class Turning(Effect):
     def _tails(
         self, scenario: Scenario, way: Callable[[ET.Element], Way], places: Places
     ) -> Counter[Way]:
-        """How vehicles that take the turn today go on, and how many do."""
+        """Return the further ways of vehicles that take the turn, and the number on each."""
         found: Counter[Way] = Counter()
         for document in (*scenario.additional, *scenario.routes):
             if not mentions(document, *TAGS):
@@ -96,7 +96,7 @@ class Turning(Effect):
         tails: Counter[Way],
         over_s: float,
     ) -> list[ET.Element]:
-        """What stands for one element of a route file afterwards."""
+        """Return the elements that replace one element of a route file."""
         if not is_demand(item):
             return [item]
         edges = way(item)
@@ -122,14 +122,14 @@ class Turning(Effect):
 
 
 def _drawn(tails: Counter[Way], salt: str, name: str) -> Way:
-    """One of the ways on, as often as vehicles took it."""
+    """Return one of the further ways, drawn as often as vehicles took it."""
     ways = sorted(tails)
     bounds = list(accumulate(tails[way] for way in ways))
     return ways[bisect_right(bounds, draw(salt, "way", name) * bounds[-1])]
 
 
 def _fastest(item: ET.Element, places: Places) -> Way:
-    """The way of a trip over empty streets; none if it does not say where from and to."""
+    """Return the way of a trip over empty streets; none if it names no origin or destination."""
     stations = [item.get("from", ""), *item.get("via", "").split(), item.get("to", "")]
     if not stations[0] or not stations[-1]:
         return ()
@@ -143,13 +143,13 @@ def _fastest(item: ET.Element, places: Places) -> Way:
 
 
 def _way_out(start: str, places: Places) -> Way:
-    """The fastest way to an edge from which no other can be reached."""
+    """Return the fastest way to an edge from which no other can be reached."""
     ways = [way for way in places.ways(start).values() if not places.following.get(way[-1])]
     return min(ways, key=lambda way: sum(map(places.seconds, way)), default=(start,))
 
 
 def _with_route(item: ET.Element, edges: Way) -> ET.Element:
-    """The same vehicle or flow on another route; stops elsewhere are left out."""
+    """Return the vehicle or flow on another route; stops elsewhere are left out."""
     made = copy.deepcopy(item)
     if made.tag == "trip":
         made.tag = "vehicle"

@@ -62,7 +62,7 @@ class VehicleEffect(Effect):
         return replace(edited, applied=(*scenario.applied, *map(str, effects)))
 
     def write(self, item: ET.Element, step_s: float) -> None:
-        """Puts the effect into one type, of a scenario with this step length."""
+        """Put the effect into one type, of a scenario with this step length."""
         self._write(item, getattr(self, fields(self)[0].name), step_s)
 
     def _write(self, item: ET.Element, number: float, step_s: float) -> None:
@@ -158,7 +158,7 @@ class MinGap(VehicleEffect):
 
 @dataclass(frozen=True)
 class Imperfection(VehicleEffect):
-    """How unevenly drivers follow, 0 is perfect (`sigma` of Krauss' model; default 0.5)."""
+    """Unevenness of following, 0 is perfect (`sigma` of Krauss' model; default 0.5)."""
 
     name: ClassVar[str] = "imperfection"
     attribute: ClassVar[str] = "sigma"
@@ -225,7 +225,7 @@ class GapAcceptance(VehicleEffect):
 
 @dataclass(frozen=True)
 class LaneDiscipline(VehicleEffect):
-    """How early drivers change to the lane of their turn (`lcStrategic`; default 1, 0 is late)."""
+    """Eagerness to change early to the lane of a turn (`lcStrategic`; default 1, 0 is late)."""
 
     name: ClassVar[str] = "lane_discipline"
     attribute: ClassVar[str] = "lcStrategic"
@@ -245,7 +245,7 @@ class DriverModel(Effect):
     model: str
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Sets the model in every vehicle type, SUMO's default type included."""
+        """Set the model in every vehicle type, SUMO's default type included."""
 
         def change(root: ET.Element) -> bool:
             types = driven_types(root)

@@ -1,4 +1,4 @@
-"""What agents ask for, checked before anything happens."""
+"""Checks of the actions of agents, before anything happens."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ugat_marl.errors import ActionError
 def checked_phases(
     actions: Mapping[str, Any], agents: Sequence[str], spaces: Mapping[str, Discrete]
 ) -> list[int]:
-    """The green phase asked for by each agent, in their order.
+    """Return the green phase requested by each agent, in their order.
 
     Raises:
         ActionError: An action is missing, of an unknown agent, or outside its space.
@@ -54,5 +54,5 @@ def _refuse_unknown(what: str, given: Mapping[str, Any], agents: Sequence[str]) 
 
 
 def _is_phase(action: Any, space: Discrete) -> bool:
-    """Whether `space` contains `action`; a plain int, the usual case, is quickly told."""
+    """Return True if `space` contains `action`; fast for a plain int, the usual case."""
     return (type(action) is int and 0 <= action < space.n) or space.contains(action)

@@ -1,4 +1,4 @@
-"""Between dictionaries by agent and padded arrays over all agents."""
+"""Conversion between dictionaries by agent and padded arrays over all agents."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Snapshot -> one vector per intersection, with its space.
+"""Observations: from a snapshot to one vector per intersection, with its space.
 
 Every vector is ``features | own phase one-hot | context``: what the intersection measures, what it
 shows, and, if asked for, the same of its neighbours.
@@ -93,7 +93,7 @@ class Observer:
 
     @property
     def needs_waiting(self) -> bool:
-        """Whether snapshots must hold waiting times."""
+        """True if snapshots must hold waiting times."""
         return self.name == "waiting"
 
     def observe(self, snapshot: Snapshot, phases: Sequence[int]) -> list[NDArray[np.float32]]:
@@ -113,7 +113,7 @@ class Observer:
         return [seen[part] for part in self._parts]
 
     def _place(self) -> None:
-        """Lays out ``features | phases`` of all intersections in one row, and who sees what of it.
+        """Lay out ``features | phases`` of all intersections in one row, and who sees what of it.
 
         Every number of a decision is then written by three assignments, however many intersections
         there are.

@@ -1,4 +1,4 @@
-"""Options of an environment, checked as soon as they are given."""
+"""Options of an environment, checked at once."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class Picture:
         self._draw_signals({})
 
     def draw(self, vehicles: VehiclePicture, states: Mapping[str, str]) -> None:
-        """Puts vehicles and signal states into the picture."""
+        """Put vehicles and signal states into the picture."""
         self._canvas.restore_region(self._empty)
         self._draw_signals(states)
         if len(vehicles.length_m):
@@ -147,7 +147,7 @@ class Picture:
             )  # fmt: skip
 
     def _draw_legend(self) -> None:
-        """What the colours are, along the lower rim."""
+        """Draw the legend of colours along the lower rim."""
         self._axes.imshow(self._colours[None], extent=(12, 132, 12, 22), aspect="auto", zorder=6)
         width, height = self._view.size
         self._axes.set_xlim(0, width)

@@ -1,4 +1,4 @@
-"""(before, after) -> one number per intersection."""
+"""Rewards: from the snapshots before and after a decision to one number per intersection."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RewardName = Literal["queue", "pressure", "waiting"]
 
 @dataclass(frozen=True)
 class IntersectionView:
-    """What one intersection sees of a snapshot; lanes in the intersection's own order.
+    """Part of a snapshot that belongs to one intersection, lanes in its own order.
 
     Attributes:
         time_s: Time on the scenario's clock.
@@ -66,7 +66,7 @@ class Rewarder:
 
     @property
     def needs_waiting(self) -> bool:
-        """Whether snapshots must hold waiting times."""
+        """True if snapshots must hold waiting times."""
         return self._reward == "waiting" or callable(self._reward)
 
     def rewards(self, before: Snapshot, after: Snapshot) -> list[float]:
@@ -97,7 +97,7 @@ class Rewarder:
 
 
 class _Sums:
-    """From one value per lane to the sum over each group of lanes; no group is empty."""
+    """Sums over groups of lanes; no group is empty."""
 
     def __init__(self, groups: Sequence[NDArray[np.int64]]) -> None:
         self._members = np.concatenate(groups)

@@ -113,17 +113,17 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     @property
     def env_options(self) -> dict[str, Any]:
-        """What a policy must know to be given the same observations elsewhere."""
+        """Options that a policy needs elsewhere for the same observations."""
         return {"observation": self.options.observation, "neighbours": self.options.neighbours}
 
     @property
     def snapshot(self) -> Snapshot:
-        """What was measured after the last decision (or the reset)."""
+        """Measured lanes after the last decision, or the reset."""
         return self._snapshot
 
     @property
     def seen(self) -> Snapshot:
-        """What controllers see of `snapshot`: all of it, but for effects on observations."""
+        """The `snapshot` as controllers see it, behind the sensors of effects."""
         return self._seen
 
     @property
@@ -136,7 +136,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
-        """Starts an episode in a fresh simulation.
+        """Start an episode in a fresh simulation.
 
         Args:
             seed: Fixes the simulation to the bit; without it the seed is drawn from the one before.
@@ -172,7 +172,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """Shows the chosen phases for one decision interval.
+        """Show the chosen phases for one decision interval.
 
         Args:
             actions: A green phase for every agent; forbidden by its mask, it is not shown.
@@ -212,7 +212,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         return result
 
     def delay_greens(self, seconds: Mapping[str, float]) -> None:
-        """Holds back the greens that begin in the next step; what ends is not touched.
+        """Hold back the greens that begin in the next step; greens that end are not touched.
 
         Observations and infos are blind to it, as they are to a late green of the scenario.
 
@@ -263,7 +263,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         return self._picture.pixels()
 
     def close(self) -> None:
-        """Ends the simulation and its process and removes its files; may be called again."""
+        """End the simulation and its process and remove its files; may be called again."""
         simulator, self._simulator = self._simulator, None
         self.agents = []
         if simulator is not None:
@@ -277,7 +277,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     # --- parts --------------------------------------------------------------------------------
 
     def _name_agents(self) -> None:
-        """Agents are named by their observer; the same group means the same spaces."""
+        """Name the agents as their observer does; the same group means the same spaces."""
         observer, items = self._observer, self.network.intersections
         agents = self.possible_agents = list(observer.agents)
         self.agent_groups = {

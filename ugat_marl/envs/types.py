@@ -1,4 +1,4 @@
-"""Types of what environments take and return, by agent."""
+"""Types of the arguments and results of environments, by agent."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ Infos = dict[str, dict[str, Any]]
 
 
 def pad(env: AnyParallelEnv) -> Wrapper:
-    """Gives all agents equal spaces: zeros behind short observations, further actions.
+    """Give all agents equal spaces: zeros behind short observations, further actions.
 
     All observe one and the same `Box`, of the length of the longest observation, and act in
     `Discrete` of the size of the largest. ``infos[agent]["action_mask"]`` is 0 for the actions an
@@ -41,7 +41,7 @@ def pad(env: AnyParallelEnv) -> Wrapper:
 
 
 def agent_indicator(env: AnyParallelEnv) -> Wrapper:
-    """Appends to each observation a one-hot of its agent, in the order of `possible_agents`.
+    """Append to each observation a one-hot of its agent, in the order of `possible_agents`.
 
     It is 0 or 1 and its bounds are 0 and 1, whatever the bounds of the observation.
     """
@@ -49,7 +49,7 @@ def agent_indicator(env: AnyParallelEnv) -> Wrapper:
 
 
 def shared_observation(env: AnyParallelEnv) -> Wrapper:
-    """Appends to each observation those of all agents, its own again included.
+    """Append to each observation those of all agents, its own again included.
 
     The appended part is the same for all agents, in the order of `possible_agents`. It is made of
     the observations of the environment within, padded or stacked if that is; `state()` stays
@@ -59,7 +59,7 @@ def shared_observation(env: AnyParallelEnv) -> Wrapper:
 
 
 def frame_stack(env: AnyParallelEnv, k: int) -> Wrapper:
-    """Joins the last `k` observations of each agent, the newest last; zeros before the first.
+    """Join the last `k` observations of each agent, the newest last; zeros before the first.
 
     Raises:
         OptionError: `k` is not at least 1.
@@ -76,7 +76,7 @@ def masked_observation(env: AnyParallelEnv) -> Wrapper:
 
 
 def appended_mask(env: AnyParallelEnv) -> Wrapper:
-    """Appends to each observation the agent's action mask, for learners that know no other way.
+    """Append to each observation the agent's action mask, for learners without another way.
 
     Whoever reads it gives the actions with a 0 no probability, or a value below all others. It is
     all ones where the infos have no mask.
@@ -85,7 +85,7 @@ def appended_mask(env: AnyParallelEnv) -> Wrapper:
 
 
 class Wrapper(BaseParallelWrapper[str, Any, Any]):
-    """What the wrappers have in common: spaces of their own, all else of the environment within.
+    """Base of the wrappers: spaces of its own, all else of the environment within.
 
     Attributes:
         observation_spaces: Agent to its space, the same object as `observation_space` returns.
@@ -126,14 +126,14 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
-        """Starts an episode of the environment within."""
+        """Start an episode of the environment within."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._begin()
         told = self._told(infos)
         return self._seen(observations, told), told
 
     def step(self, actions: dict[str, Any]) -> Stepped:
-        """Passes actions on, and observations back.
+        """Pass actions on, and observations back.
 
         Raises:
             ActionError: As the environment within, and `pad`.
@@ -144,17 +144,17 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
         return self._seen(observations, told), rewards, terminations, truncations, told
 
     def _begin(self) -> None:
-        """Forgets the episode before."""
+        """Forget the episode before."""
 
     def _check(self, actions: Mapping[str, Any]) -> None:
-        """Refuses actions before anything happens."""
+        """Refuse actions before anything happens."""
 
     def _told(self, infos: Infos) -> Infos:
-        """The infos as the learner gets them."""
+        """Return the infos for the learner."""
         return infos
 
     def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
-        """The observations as the learner gets them, in fresh arrays."""
+        """Return the observations for the learner, in fresh arrays."""
         raise NotImplementedError
 
 
@@ -278,7 +278,7 @@ class _FrameStack(Wrapper):
 
 
 class _Masking(Wrapper):
-    """What shows masks in observations."""
+    """Base of wrappers that show masks in observations."""
 
     def __init__(self, env: AnyParallelEnv) -> None:
         super().__init__(env)
@@ -363,13 +363,13 @@ def _joined(boxes: list[spaces.Box]) -> spaces.Box:
 
 
 def _each(boxes: Mapping[str, spaces.Box], change: Any) -> dict[str, spaces.Box]:
-    """Each agent's box changed; agents that shared one still do."""
+    """Return each agent's changed box; agents that shared one still do."""
     changed = {id(box): change(box) for box in boxes.values()}
     return {agent: changed[id(box)] for agent, box in boxes.items()}
 
 
 def _common_box(boxes: list[spaces.Box]) -> spaces.Box:
-    """A box for all, of the longest one's length, that holds zeros where some are shorter."""
+    """Return a box for all, of the longest length, that holds zeros behind shorter vectors."""
     width = max(box.shape[0] for box in boxes)
     low, high = (
         np.array([_longer(getattr(box, side), width) for box in boxes]) for side in ("low", "high")

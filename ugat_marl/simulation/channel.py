@@ -1,4 +1,4 @@
-"""Messages between a simulation and its user: JSON with float64 arrays behind it.
+"""Messages between a worker and its user: JSON with float64 arrays behind it.
 
 No pickle: what arrives is data, whoever sent it.
 """
@@ -55,7 +55,7 @@ class Channel:
         self._close_writer = close_writer
 
     def send(self, message: Message) -> None:
-        """Writes one message."""
+        """Write one message."""
         shapes = [array.shape for array in message.arrays]
         header = json.dumps({**message.header, "shapes": shapes}).encode()
         bodies = [np.ascontiguousarray(array, dtype="<f8").tobytes() for array in message.arrays]
@@ -64,7 +64,7 @@ class Channel:
         self._writer.flush()
 
     def receive(self) -> Message:
-        """Waits for one message.
+        """Wait for one message.
 
         Raises:
             ChannelClosed: The other end is gone.
@@ -82,7 +82,7 @@ class Channel:
         return Message(header, arrays)
 
     def hang_up(self, patience_s: float) -> bool:
-        """Closes this end; returns whether the other end closed within `patience_s` seconds.
+        """Close this end; return True if the other end closed within `patience_s` seconds.
 
         There is no thread in it: none can be started while the interpreter shuts down.
         """
@@ -98,7 +98,7 @@ class Channel:
         return gone
 
     def _closes(self, patience_s: float) -> bool:
-        """Reads on, without use for it, until the other end closes."""
+        """Read and discard until the other end closes."""
         deadline = time.monotonic() + patience_s
         with contextlib.suppress(OSError, ValueError):
             descriptor = self._reader.fileno()

@@ -29,7 +29,7 @@ _END = "@end"
 
 
 def standard_detectors(network: Network) -> tuple[Detector, ...]:
-    """An advance and a stop detector on every incoming lane, an exit detector on every outgoing."""
+    """Return advance and stop detectors on incoming lanes, exit detectors on outgoing ones."""
     places: dict[tuple[str, DetectorKind], float] = {}
     for item in network.intersections:
         for name in item.incoming_lanes:
@@ -47,7 +47,7 @@ def standard_detectors(network: Network) -> tuple[Detector, ...]:
 def loops_document(
     detectors: Sequence[Detector], lanes: dict[str, Lane] | None, file: Path
 ) -> Document:
-    """An additional file with the loops of the detectors, all of which write to `file`.
+    """Return an additional file with the loops of the detectors, which write to `file`.
 
     A zone has two loops: its front end tells when a vehicle comes, its rear end when it has gone.
 
@@ -76,7 +76,7 @@ def loops_document(
 def read_loops(
     file: Path, detectors: Sequence[Detector], begin_s: float, end_s: float
 ) -> dict[str, Passages]:
-    """What the detectors saw between two times.
+    """Read the passages that detectors saw between two times.
 
     Raises:
         SimulatorError: SUMO did not write the file.
@@ -102,7 +102,7 @@ def _passages(
     front: list[tuple[float, bool, bytes, float, float]],
     rear: list[tuple[float, bool, bytes, float, float]],
 ) -> Passages:
-    """Pairs the entering of each vehicle at the front end with its leaving at the rear end."""
+    """Pair the entering of each vehicle at the front end with its leaving at the rear end."""
     left: dict[bytes, tuple[float, float]] = {
         vehicle: (time, speed) for time, enters, vehicle, speed, _ in rear if not enters
     }
@@ -120,7 +120,7 @@ def _passages(
 
 
 def _clipped(passages: Passages, begin_s: float, end_s: float) -> Passages:
-    """The part between two times; an end outside of it is unknown."""
+    """Return the part between two times; an end outside of it is unknown."""
     if not len(passages):
         return passages
     inside = (passages.off_s >= begin_s) & (passages.on_s < end_s)

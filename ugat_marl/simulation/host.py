@@ -78,7 +78,7 @@ class Service(Protocol):
 
 
 class Host:
-    """Starts workers of a service.
+    """Start workers of a service.
 
     Args:
         service: ``"module:Class"`` of the `Service`.

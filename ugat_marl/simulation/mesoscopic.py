@@ -160,7 +160,7 @@ class QueueLook:
         return _Stay(self._api.vehicle.getLanePosition(name), entered_s, lanes, -1)
 
     def _lane(self, name: str, road: _Road, stay: _Stay, vehicles: Sequence[float]) -> int:
-        """The lane on which a vehicle counts, when so many have been counted already."""
+        """Return the lane on which a vehicle counts, given the vehicles counted so far."""
         if len(stay.lanes) == 1:
             return stay.lanes[0]
         # Where an edge has but one successor, SUMO has one queue for all its lanes.
@@ -177,7 +177,7 @@ class QueueLook:
 def near_the_end(
     api: Any, lanes: Sequence[str], taken: Sequence[str], zone_m: float
 ) -> NDArray[np.float64]:
-    """Vehicles, halting ones and waiting time in the last metres of each lane, ``(3, lanes)``.
+    """Return vehicles, halting ones and waiting time at the end of each lane, ``(3, lanes)``.
 
     Args:
         api: The module `libsumo`.
@@ -199,7 +199,7 @@ def near_the_end(
 
 
 def refuse_in_queues(scenario: str, **asked: bool) -> None:
-    """Refuses what needs positions on lanes.
+    """Refuse what needs positions on lanes.
 
     Raises:
         OptionError: Crossings, zones or a window are asked for in the mesoscopic model.
@@ -224,7 +224,7 @@ def add_those_behind(
         NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
     ],
 ) -> None:
-    """Counts vehicles behind a lane that is too short for them as if they were on it.
+    """Count vehicles behind a lane that is too short for them as if they were on it.
 
     Those that wait to enter the network halt; their waiting time is that since they were due.
 

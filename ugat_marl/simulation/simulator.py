@@ -1,4 +1,4 @@
-"""The only file that talks to SUMO.
+"""SUMO in this process: the only file that calls libsumo.
 
 libsumo holds one simulation per process, and a second start replaces the first without a word; here
 it is refused. `ugat_marl.simulation.process` gives the same interface in a process of its own.
@@ -39,7 +39,7 @@ _TRIPS, _ERRORS = "trips.xml", "errors.log"
 
 @dataclass(frozen=True)
 class Launch:
-    """All that is needed to start a simulation, in plain values that can be sent to a process.
+    """Start of a simulation, in plain values that can be sent to a process.
 
     Attributes:
         arguments: Options of SUMO, without the name of the program.
@@ -75,7 +75,7 @@ class Launch:
         return float(self.arguments[self.arguments.index("--meso-edgelength") + 1])
 
     def write(self) -> None:
-        """Makes the folder and puts the files into it."""
+        """Make the folder and put the files into it."""
         Path(self.directory).mkdir(mode=0o700, exist_ok=True)
         for name, content in self.files:
             write_whole(Path(self.directory) / name, content)
@@ -87,7 +87,7 @@ class Launch:
 
 @dataclass(frozen=True)
 class VehiclePicture:
-    """Where the vehicles are, for drawing.
+    """Positions of the vehicles, for drawing.
 
     Attributes:
         position: Front bumpers, m, ``(vehicles, 2)``.
@@ -106,11 +106,11 @@ class Simulator(Protocol):
     """One simulation at a time; start, advance repeatedly, finish."""
 
     def start(self, launch: Launch) -> Snapshot:
-        """Starts a simulation; one that is under way is ended first."""
+        """Start a simulation; one that is under way is ended first."""
         ...
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
-        """Simulates `seconds` under the given signals."""
+        """Simulate `seconds` under the given signals."""
         ...
 
     def vehicles(self) -> VehiclePicture:
@@ -122,11 +122,11 @@ class Simulator(Protocol):
         ...
 
     def finish(self) -> Trips:
-        """Ends the simulation and returns what became of every vehicle due."""
+        """End the simulation; return the trips of every vehicle due."""
         ...
 
     def close(self) -> None:
-        """Ends the simulation, if there is one; may be called again."""
+        """End the simulation, if there is one; may be called again."""
         ...
 
 
@@ -143,7 +143,7 @@ def launch_of(
     persons: Mapping[str, float] | None = None,
     behind: Behind = NOTHING_BEHIND,
 ) -> Launch:
-    """Lists SUMO's options, and the files that have to be written for it; writes nothing.
+    """List SUMO's options and the files to be written for it; write nothing.
 
     Args:
         scenario: What to simulate.
@@ -206,7 +206,7 @@ def launch_of(
 
 
 def _on_disk(document: Document, directory: Path, written: dict[str, bytes]) -> str:
-    """A path SUMO can open, of a file to write if need be: a comma ends a name for SUMO."""
+    """Return a path SUMO can open, of a copy if need be: a comma ends a name for SUMO."""
     if document.path is not None and "," not in str(document.path.resolve()):
         return str(document.path.resolve())
     name = document.name.removesuffix(".gz").replace(",", "_")
@@ -233,7 +233,7 @@ class LibsumoSimulator:
         self._owner = 0
 
     def start(self, launch: Launch) -> Snapshot:
-        """Starts a simulation.
+        """Start a simulation.
 
         Raises:
             SimulatorBusy: This process already runs a simulation of somebody else.
@@ -267,7 +267,7 @@ class LibsumoSimulator:
         return self._snapshot()
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
-        """Simulates `seconds`, showing the planned signal states.
+        """Simulate `seconds`, showing the planned signal states.
 
         Raises:
             SimulatorError: SUMO failed; its own words are in the message.
@@ -318,14 +318,14 @@ class LibsumoSimulator:
         return {name: api.getRedYellowGreenState(name) for name in api.getIDList()}
 
     def finish(self) -> Trips:
-        """Ends the simulation; SUMO then writes what became of every vehicle due."""
+        """End the simulation and read the trips of every vehicle due."""
         assert self._launch is not None, "finish before start"
         directory, persons = Path(self._launch.directory), dict(self._launch.persons)
         self.close()
         return read_trips(directory / _TRIPS, persons)
 
     def close(self) -> None:
-        """Ends the simulation of this object, if there is one."""
+        """End the simulation of this object, if there is one."""
         if self._launch is not None:
             self._launch = None
             # A forked child has a copy of the simulation and the parent's open files.
@@ -333,7 +333,7 @@ class LibsumoSimulator:
                 libsumo.simulation.close()
 
     def _count_left(self, left: NDArray[np.float64]) -> None:
-        """Adds to `left`, ``(lanes,)``, who has left a lane's road since the last look."""
+        """Add to `left`, ``(lanes,)``, the vehicles that have left a lane's road since then."""
         assert self._launch is not None
         now: dict[str, tuple[int, str]] = {}
         for index, lane in enumerate(self._launch.lanes):
@@ -359,7 +359,7 @@ class LibsumoSimulator:
         names = [lanes[index] for index in taken.tolist()]
 
         def measure(what: Callable[[str], float], empty: _Floats) -> _Floats:
-            """Asks only lanes with vehicles; most of a network is empty at any instant."""
+            """Ask only lanes with vehicles; most of a network is empty at any instant."""
             values = empty.copy()
             values[taken] = np.fromiter(map(what, names), np.float64, len(names))
             return values
@@ -394,5 +394,5 @@ def _errors_of(directory: Path) -> str:
 
 
 def simulates_here() -> bool:
-    """Whether this very process runs a simulation."""
+    """Return True if this process runs a simulation itself."""
     return bool(libsumo.simulation.isLoaded())

@@ -1,4 +1,4 @@
-"""What is measured: every lane at one instant, and every vehicle at the end of an episode."""
+"""Measurements: every lane at one instant, and every vehicle at the end of an episode."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Snapshot:
     near: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def less(self, left: NDArray[np.float64]) -> Snapshot:
-        """This snapshot without the vehicles that have `left`, ``(lanes,)``; nobody arrives."""
+        """Return this snapshot without the vehicles that have `left`, ``(lanes,)``."""
         halting = np.maximum(self.halting - left, 0.0)
         return replace(self, vehicles=self.vehicles - left, halting=halting)
 

@@ -1,4 +1,4 @@
-"""What became of every vehicle due, as SUMO reports it at the end."""
+"""Trips of every vehicle due, as SUMO reports them at the end."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STATISTICS = "statistics.xml"
 
 
 def measuring_options(directory: Path) -> list[str]:
-    """Options of SUMO that measure what is hidden; the traffic is the same with them."""
+    """Return options of SUMO for emissions and safety; the traffic is the same with them."""
     return [
         "--device.emissions.probability", "1",
         "--statistic-output", str(directory / STATISTICS),
@@ -25,7 +25,7 @@ def measuring_options(directory: Path) -> list[str]:
 
 
 def read_trips(path: Path, persons: Mapping[str, float] | None = None) -> Trips:
-    """Reads SUMO's tripinfo file, unfinished and undeparted vehicles included.
+    """Read SUMO's tripinfo file, unfinished and undeparted vehicles included.
 
     Args:
         path: The file.

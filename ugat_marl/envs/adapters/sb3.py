@@ -65,7 +65,7 @@ class AgentsVecEnv(VecEnv):
         super().__init__(len(self.rows), box, actions)
 
     def reset(self) -> NDArray[np.float32]:
-        """Begins an episode in every environment, with the seeds that `seed` has left."""
+        """Begin an episode in every environment, with the seeds that `seed` has left."""
         seen = [
             self._begin(k, self._seeds[int(self._starts[k])])  # its first agent's
             for k in range(len(self.envs))
@@ -75,7 +75,7 @@ class AgentsVecEnv(VecEnv):
         return np.concatenate(seen)
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Seeds the next reset: ``seed + k`` for environment `k`, whatever its number of agents."""
+        """Seed the next reset: ``seed + k`` for environment `k`, whatever its number of agents."""
         if seed is None:
             return super().seed(None)
         for k in range(len(self.envs)):
@@ -84,11 +84,11 @@ class AgentsVecEnv(VecEnv):
         return self._seeds
 
     def step_async(self, actions: NDArray[np.int64]) -> None:
-        """Keeps the actions; environments in worker processes may begin with them."""
+        """Keep the actions; environments in worker processes may begin with them."""
         self._chosen = np.asarray(actions).reshape(-1)
 
     def step_wait(self) -> Step:
-        """Steps every environment once, and begins anew where an episode is over."""
+        """Step every environment once, and begin the next episode of those that are over."""
         seen, infos = list[NDArray[np.float32]](), list[dict[str, Any]]()
         rewards = np.zeros(len(self.rows), np.float32)
         over = np.zeros(len(self.rows), np.bool_)
@@ -114,11 +114,11 @@ class AgentsVecEnv(VecEnv):
         return np.concatenate(seen), rewards, over, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """What each agent may do now, ``(agents, actions)``; all of it where no info says so."""
+        """Return the allowed actions, ``(agents, actions)``; all where the info has no mask."""
         return self._masks.copy()
 
     def close(self) -> None:
-        """Closes every environment; may be called again."""
+        """Close every environment; may be called again."""
         for env in self.envs:
             env.close()
 
@@ -129,14 +129,14 @@ class AgentsVecEnv(VecEnv):
         return [getattr(self.rows[row][0], attr_name) for row in self._picked(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Sets an attribute of the environments of these agents."""
+        """Set an attribute of the environments of these agents."""
         for env in self._environments(indices):
             setattr(env, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method, once for each environment that these agents are in.
+        """Call a method, once for each environment that these agents are in.
 
         ``action_masks`` is one mask for each agent instead.
         """
@@ -146,7 +146,7 @@ class AgentsVecEnv(VecEnv):
         return [getattr(env, method_name)(*method_args, **method_kwargs) for env in environments]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Whether agents are inside one of Gymnasium's wrappers, which none is."""
+        """Return False for every agent: none is inside one of Gymnasium's wrappers."""
         return [False for _ in self._picked(indices)]
 
     def get_images(self) -> Sequence[Any]:
@@ -161,7 +161,7 @@ class AgentsVecEnv(VecEnv):
         return self._stacked(k, observations, infos)
 
     def _stacked(self, k: int, observations: Any, infos: Any) -> NDArray[np.float32]:
-        """What the agents of environment `k` see, ``(agents, size)``; their masks are kept."""
+        """Return the observations of environment `k`, ``(agents, size)``, and keep the masks."""
         rows = self._agents_of(k)
         agents = self.envs[k].possible_agents
         for row, agent in zip(rows, agents, strict=True):

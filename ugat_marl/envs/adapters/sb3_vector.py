@@ -49,7 +49,7 @@ class SimulationsVecEnv(AgentsVecEnv):
         )
 
     def reset(self) -> NDArray[np.float32]:
-        """Begins an episode in every simulation, with the seeds that `seed` has left."""
+        """Begin an episode in every simulation, with the seeds that `seed` has left."""
         seeds = [self._seeds[int(start)] for start in self._starts[:-1]]
         given = [seed for seed in seeds if seed is not None]
         batch = self.simulations.reset(given if len(given) == len(seeds) else None)
@@ -59,11 +59,11 @@ class SimulationsVecEnv(AgentsVecEnv):
         return self._seen(batch)
 
     def step_async(self, actions: NDArray[np.int64]) -> None:
-        """Begins a step of every simulation."""
+        """Begin a step of every simulation."""
         self.simulations.step_async(np.asarray(actions).reshape(self.simulations.n, -1))
 
     def step_wait(self) -> Step:
-        """Waits for it."""
+        """Wait for it."""
         batch = self.simulations.step_wait()
         infos, agents = self._infos(batch), len(self.simulations.agents)
         for ended in batch.ended:
@@ -74,7 +74,7 @@ class SimulationsVecEnv(AgentsVecEnv):
         return self._seen(batch), rewards, np.repeat(batch.truncated, agents), infos
 
     def close(self) -> None:
-        """Ends the simulations; may be called again."""
+        """End the simulations; may be called again."""
         self.simulations.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
@@ -88,11 +88,11 @@ class SimulationsVecEnv(AgentsVecEnv):
         return super().get_attr(attr_name, indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuses; the environments are in processes of their own."""
+        """Refuse: the environments are in processes of their own."""
         raise OptionError(f"set_attr({attr_name!r}): {_ELSEWHERE}")
 
     def set_options(self, options: Any = None) -> None:
-        """Refuses; a reset of simulations takes seeds only."""
+        """Refuse: a reset of simulations takes seeds only."""
         if options:
             raise OptionError(f"set_options({options!r}): a reset of simulations takes seeds only")
 
@@ -105,7 +105,7 @@ class SimulationsVecEnv(AgentsVecEnv):
         return super().env_method(method_name, indices=indices)
 
     def _seen(self, batch: Batch) -> NDArray[np.float32]:
-        """What all agents see, ``(rows, size)``; their masks are kept."""
+        """Return the observations of all agents, ``(rows, size)``, and keep the masks."""
         masks = batch.masks.reshape(len(self.rows), -1)
         self._masks = masks.astype(np.bool_)
         return self._with_masks(batch.observations.reshape(len(self.rows), -1), masks)

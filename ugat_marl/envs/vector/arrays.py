@@ -1,4 +1,4 @@
-"""The memory that a user's process and its simulations have in common.
+"""Memory that a user's process and its simulations share.
 
 The first axis is the environment, the second the agent, in the order of `possible_agents`. Unequal
 agents are padded at the end: zeros behind short observations, zeros in the masks of phases an agent
@@ -39,7 +39,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Arrays:
-    """What is passed to and fro.
+    """Arrays that the two sides read and write.
 
     Attributes:
         observations: float32 ``(environments, agents, width)``.

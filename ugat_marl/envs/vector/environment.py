@@ -59,7 +59,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class Batch:
-    """What a reset or step of all environments returns; the arrays are the caller's own.
+    """Result of a reset or step of all environments; the arrays are the caller's own.
 
     Agents are in the order of `VectorEnv.agents`, unequal ones padded at the end: observations with
     zeros, and phases an agent does not have are 0 in its mask.
@@ -163,7 +163,7 @@ class VectorEnv:
     def reset(
         self, seed: int | Sequence[int] | None = None, where: ArrayLike | None = None
     ) -> Batch:
-        """Begins episodes; those under way are given up.
+        """Begin episodes; those under way are given up.
 
         Args:
             seed: One for each environment; a single number stands for itself, the next one, .... A
@@ -183,7 +183,7 @@ class VectorEnv:
         return self._batch(np.zeros(self.n, dtype=np.bool_), ())
 
     def step(self, actions: ArrayLike) -> Batch:
-        """Shows the chosen phases for one decision interval, in all environments.
+        """Show the chosen phases for one decision interval, in all environments.
 
         Args:
             actions: Integers ``(environments, agents)``.
@@ -197,7 +197,7 @@ class VectorEnv:
         return self.step_wait()
 
     def step_async(self, actions: ArrayLike) -> None:
-        """Begins a step; `step_wait` ends it, and there is time for something else between."""
+        """Begin a step, which `step_wait` ends; the caller may do other work in between."""
         asked = self._checked(actions)
         idle = [env.over and not env.asked for env in self._environments]
         anew = self.autoreset == "next-step" and self._environments[0].episode is not None
@@ -212,7 +212,7 @@ class VectorEnv:
             self._environments[index].begin(None, self._domains)
 
     def step_wait(self) -> Batch:
-        """Waits for the step that `step_async` began.
+        """Wait for the step that `step_async` began.
 
         Raises:
             EpisodeError: It has begun none.
@@ -235,7 +235,7 @@ class VectorEnv:
         return self._batch(truncated, ended)
 
     def close(self) -> None:
-        """Ends all simulations and their processes, removes their files; may be called again."""
+        """End all simulations and their processes and remove their files; may be called again."""
         for env in self._environments:
             env.close()
         shared, self._shared = self._shared, None
@@ -318,7 +318,7 @@ class VectorEnv:
         self._answers(chosen)
 
     def _answers(self, chosen: list[int]) -> dict[int, Answer]:
-        """All answers; an error is raised when everyone has been heard."""
+        """Return all answers; raise an error when all have arrived."""
         answers: dict[int, Answer] = {}
         failed: list[UgatMarlError] = []
         for index in chosen:

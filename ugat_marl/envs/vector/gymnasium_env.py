@@ -46,7 +46,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begins episodes.
+        """Begin episodes.
 
         Args:
             seed: As for `VectorEnv.reset`: one for each simulation.
@@ -67,12 +67,12 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         NDArray[np.bool_],
         dict[str, Any],
     ]:
-        """Shows the chosen phases; `actions` are ``(num_envs,)``."""
+        """Show the chosen phases; `actions` are ``(num_envs,)``."""
         self.step_async(actions)
         return self.step_wait()
 
     def step_async(self, actions: Any) -> None:
-        """Begins a step; `step_wait` ends it, and learning may go on meanwhile."""
+        """Begin a step; `step_wait` ends it, and learning may go on meanwhile."""
         asked = np.asarray(actions)
         if asked.shape != (self.num_envs,):
             raise ActionError(f"actions have shape {asked.shape}; allowed: ({self.num_envs},)")
@@ -87,7 +87,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         NDArray[np.bool_],
         dict[str, Any],
     ]:
-        """Waits for the step that `step_async` began."""
+        """Wait for the step that `step_async` began."""
         batch = self.env.step_wait()
         truncated = np.repeat(batch.truncated, len(self.env.agents))
         none = np.zeros(self.num_envs, dtype=np.bool_)
@@ -97,7 +97,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         return self._flat(batch.observations), self._flat(batch.rewards), none, truncated, infos
 
     def close_extras(self, **_: Any) -> None:
-        """Ends the simulations."""
+        """End the simulations."""
         self.env.close()
 
     def _flat(self, values: NDArray[Any]) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""What an environment of a vector is made of, in plain values that can be sent to a process."""
+"""Specification of the environments of a vector, in plain values that a process can be sent."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Wraps = Wrap | Sequence[Wrap] | None
 
 @dataclass(frozen=True)
 class Spec:
-    """How to make the environment.
+    """Specification of an environment.
 
     Attributes:
         scenario: Folder of the scenario.
@@ -64,7 +64,7 @@ class Spec:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the fields for JSON."""
         return asdict(self)
 
     def environment(self, domain: Any) -> AnyParallelEnv:
@@ -81,7 +81,7 @@ class Spec:
 
 
 def checked_options(options: Mapping[str, Any]) -> None:
-    """Refuses options that mean nothing here.
+    """Refuse options that have no meaning in a vector.
 
     Raises:
         UnknownNameError: No such option.
@@ -150,7 +150,7 @@ def sent(domain: Domain) -> Any:
 
 
 def received(domain: Any) -> Domain:
-    """What `sent` was given."""
+    """Return the domain that `sent` was given."""
     return domain if isinstance(domain, str) else [effect_from(record) for record in domain]
 
 
@@ -209,7 +209,7 @@ def in_turn(domains: Sequence[Domain]) -> DomainOf:
 
 
 def _is_domain(item: Any) -> bool:
-    """Whether something in a list is a domain of its own, and not an effect of one domain."""
+    """Return True if an entry of a list is a domain of its own, not an effect of one domain."""
     return isinstance(item, str | list | tuple)
 
 

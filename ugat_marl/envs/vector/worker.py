@@ -91,7 +91,7 @@ class Episodes:
 
 
 class _EpisodeServer:
-    """Plays one episode.
+    """Play one episode.
 
     Args:
         memory: Descriptor of the shared memory.
