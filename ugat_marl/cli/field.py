@@ -16,8 +16,8 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory
 from ugat_marl.field import (
+    CountSource,
     DecisionLog,
-    DetectorKind,
     FieldLoop,
     Limits,
     Site,
@@ -65,7 +65,7 @@ class Field:
     domain: str = "sim"
     seed: int = 0
     seconds: LengthS = None
-    detectors: DetectorKind = "lanes"
+    detectors: CountSource = "lanes"
     log: Log = None
     limits: Limits = field(default_factory=Limits)
 

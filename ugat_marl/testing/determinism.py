@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ugat_marl.testing.behaviour import an_episode_runs
+from ugat_marl.testing.environment import an_episode_runs
 from ugat_marl.testing.episodes import (
     EnvironmentCase,
     Episode,

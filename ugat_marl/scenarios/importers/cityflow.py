@@ -30,7 +30,7 @@ from ugat_marl.scenarios.importers.cityflow_roadnet import (
     read_roadnet,
 )
 from ugat_marl.scenarios.importers.long_files import objects
-from ugat_marl.scenarios.importers.making import NETWORK, ROUTES, Draft, Roads
+from ugat_marl.scenarios.importers.making import NETWORK, ROUTES, RoadFiles, RoadSource
 from ugat_marl.scenarios.importers.turning_shares import MOST_VEHICLES, Drive, write_drives
 from ugat_marl.scenarios.junctions import foes_of, links_of, yields_of
 from ugat_marl.scenarios.phases import RightOfWay, state_of
@@ -45,7 +45,7 @@ _VEHICLE = ("length", "width", "maxPosAcc", "maxNegAcc", "usualPosAcc", "usualNe
 
 def from_cityflow(
     roadnet: Path, flow: Path, duration_s: float | None, *, own_vehicles: bool, exact: bool
-) -> Roads:
+) -> RoadSource:
     """A ``roadnet.json`` with its ``flow.json``.
 
     Args:
@@ -57,7 +57,7 @@ def from_cityflow(
         exact: Whether headways are CityFlow's too, and nothing is left to chance.
     """
 
-    def roads(folder: Path, reporter: Reporter) -> Draft:
+    def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         net = read_roadnet(roadnet)
         notes = write_network(net, folder / NETWORK)
         length_s, routes = duration_s or 3600.0, ()
@@ -65,7 +65,7 @@ def from_cityflow(
             found = write_routes(flow, net, folder / ROUTES, duration_s, reporter, exact=exact)
             routes = (ROUTES,)
             length_s = duration_s or max(3600.0, 600.0 * (math.floor(found.last_s / 600) + 1))
-        return Draft(
+        return RoadFiles(
             f"CityFlow network {roadnet.name}",
             f"Turned from CityFlow's `{roadnet.name}` and `{flow.name}`: lanes, stop lines, turns "
             "and light phases are theirs, phase n being the n-th green one of the file. Who made "

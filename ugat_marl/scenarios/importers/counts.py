@@ -21,7 +21,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.long_files import lines
-from ugat_marl.scenarios.importers.making import ROUTES, Fleet, Vehicles
+from ugat_marl.scenarios.importers.making import ROUTES, VehicleFiles, VehicleSource
 from ugat_marl.scenarios.importers.streets import Streets
 from ugat_marl.scenarios.importers.turning_shares import (
     CAR,
@@ -136,13 +136,13 @@ def _number(text: str | None, key: str, where: str) -> float:
     return value
 
 
-def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehicles:
+def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
     """Vehicles that come by as often as was counted, by SUMO's routeSampler.
 
     It chooses among random drives through the network; every counted road has to lie on one.
     """
 
-    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=False)
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         _require_roads(rows, streets, path, network)
@@ -163,7 +163,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         if not sampled:
             raise ScenarioError(f"{path}: SUMO's routeSampler found no vehicle for these counts")
         write_drives(folder / ROUTES, sorted(sampled, key=lambda d: (d.depart_s, d.id)))
-        return Fleet((ROUTES,), (_fit(rows, sampled, path),))
+        return VehicleFiles((ROUTES,), (_fit(rows, sampled, path),))
 
     return vehicles
 
@@ -243,10 +243,10 @@ def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
     return found
 
 
-def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> Vehicles:
+def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
     """Vehicles from origins to destinations, on the fastest ways through the empty network."""
 
-    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=True)
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         _require_roads(rows, streets, path, network)
@@ -258,7 +258,7 @@ def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> Vehicles:
                     f"{row.roads[1]!r}"
                 )
         _route(_trips(rows, seed), network, folder / ROUTES, seed)
-        return Fleet((ROUTES,))
+        return VehicleFiles((ROUTES,))
 
     return vehicles
 

@@ -24,7 +24,7 @@ NETWORK, ROUTES = "network.net.xml", "demand.rou.xml"
 
 
 @dataclass(frozen=True)
-class Draft:
+class RoadFiles:
     """What a source of roads has put into the folder.
 
     Attributes:
@@ -50,12 +50,12 @@ class Draft:
     copied: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
 
-Roads = Callable[[Path, Reporter], Draft]
+RoadSource = Callable[[Path, Reporter], RoadFiles]
 """Puts a network into a folder."""
 
 
 @dataclass(frozen=True)
-class Fleet:
+class VehicleFiles:
     """What a source of vehicles has put into the folder.
 
     Attributes:
@@ -69,7 +69,7 @@ class Fleet:
     copied: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
 
-Vehicles = Callable[[Path, Path, Reporter], Fleet]
+VehicleSource = Callable[[Path, Path, Reporter], VehicleFiles]
 """Puts route files for the network (the second path) into a folder."""
 
 
@@ -92,8 +92,8 @@ class Made:
 
 def make_scenario(
     target: Path,
-    roads: Roads,
-    vehicles: Vehicles | None,
+    roads: RoadSource,
+    vehicles: VehicleSource | None,
     *,
     settings: Mapping[str, Any],
     command: str,
@@ -119,7 +119,7 @@ def make_scenario(
         draft = roads(folder, reporter)
         copied = dict(draft.copied)
         with _errors_about(copied, folder):
-            fleet = Fleet(draft.routes)
+            fleet = VehicleFiles(draft.routes)
             if vehicles:
                 fleet = vehicles(folder, folder / draft.network, reporter)
                 copied |= fleet.copied
@@ -133,7 +133,7 @@ def make_scenario(
 
 
 def _write_settings(
-    folder: Path, draft: Draft, fleet: Fleet, settings: Mapping[str, Any]
+    folder: Path, draft: RoadFiles, fleet: VehicleFiles, settings: Mapping[str, Any]
 ) -> tuple[str, ...]:
     """Writes ``scenario.toml``; returns all that was noticed."""
     own = dict(draft.settings)
@@ -169,7 +169,7 @@ def _errors_about(copied: Mapping[str, Path], folder: Path) -> Iterator[None]:
         raise ScenarioError(text) from None
 
 
-def _readme(made: Made, draft: Draft, command: str) -> str:
+def _readme(made: Made, draft: RoadFiles, command: str) -> str:
     settings = made.scenario.settings
     phases = [len(item.phases) for item in made.network.intersections]
     spread = f"{min(phases)} to {max(phases)}" if len(set(phases)) > 1 else f"{phases[0]}"

@@ -20,7 +20,7 @@ from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import Tag, parse_xml, read_bytes, scratch, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.long_files import scan
-from ugat_marl.scenarios.importers.making import NETWORK, Draft, Roads
+from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
 from ugat_marl.scenarios.importers.osm_crossings import crossings_for, has_light
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, links_of
 from ugat_marl.scenarios.phases import are_foes
@@ -72,7 +72,7 @@ class _Extract:
     nodes: frozenset[str] = frozenset()
 
 
-def from_osm(path: Path, *, guess: bool) -> Roads:
+def from_osm(path: Path, *, guess: bool) -> RoadSource:
     """The streets of an extract.
 
     Args:
@@ -85,7 +85,7 @@ def from_osm(path: Path, *, guess: bool) -> Roads:
     if not path.name.lower().endswith(_ENDINGS):
         raise OptionError(f"--osm {str(path)!r}: give a file that ends in {', '.join(_ENDINGS)}")
 
-    def roads(folder: Path, reporter: Reporter) -> Draft:
+    def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             source = _as_xml(path, Path(name), reporter)
             extract = _look(source, path, reporter)
@@ -109,7 +109,7 @@ def from_osm(path: Path, *, guess: bool) -> Roads:
                     f"{path}: none of its lights is at a road for cars; --guess-signals puts some "
                     "at large junctions"
                 )
-        return Draft(
+        return RoadFiles(
             f"OpenStreetMap extract {path.name}",
             f"Converted from `{path.name}` by SUMO's netconvert. © OpenStreetMap contributors; the "
             "data are available under the Open Database Licence (openstreetmap.org/copyright).",

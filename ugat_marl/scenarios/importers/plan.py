@@ -19,7 +19,7 @@ from typing import Any
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import write_whole, xml_bytes
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.importers.making import NETWORK, Draft, Roads
+from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
 from ugat_marl.scenarios.programs import netconvert
 
 TURNS = {"l": "left", "s": "straight", "r": "right"}
@@ -234,7 +234,7 @@ def build_network(documents: Mapping[str, bytes], options: Mapping[str, Any]) ->
         return output.read_bytes()
 
 
-def rectangle(text: str, spacing_m: float, speed_mps: float) -> Roads:
+def rectangle(text: str, spacing_m: float, speed_mps: float) -> RoadSource:
     """A grid.
 
     Args:
@@ -257,7 +257,7 @@ def rectangle(text: str, spacing_m: float, speed_mps: float) -> Roads:
     return _drawn(plan, speed_mps, f"A grid of {words}")
 
 
-def arterial(count: int, spacing_m: float, speed_mps: float) -> Roads:
+def arterial(count: int, spacing_m: float, speed_mps: float) -> RoadSource:
     """A main road from west to east with side streets.
 
     Args:
@@ -283,11 +283,11 @@ def _check(spacing_m: float, speed_mps: float) -> None:
         raise OptionError(f"--speed-mps {speed_mps:g} is not within 1 to 60 m/s")
 
 
-def _drawn(plan: Plan, speed_mps: float, description: str) -> Roads:
-    def roads(folder: Path, reporter: Reporter) -> Draft:
+def _drawn(plan: Plan, speed_mps: float, description: str) -> RoadSource:
+    def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         del reporter
         write_whole(folder / NETWORK, build_network(plain_xml(plan, speed_mps), _NETCONVERT))
-        return Draft(
+        return RoadFiles(
             description,
             "Drawn by the suite and built by SUMO's netconvert: every approach has a lane for left "
             f"turns beside those straight on and right; the speed limit is {speed_mps:g} m/s, and "

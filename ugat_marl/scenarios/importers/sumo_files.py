@@ -13,13 +13,13 @@ from ugat_marl.files import Tag, parse_xml, read_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.demand import edges_used
 from ugat_marl.scenarios.importers.long_files import scan
-from ugat_marl.scenarios.importers.making import Draft, Fleet, Roads, Vehicles
+from ugat_marl.scenarios.importers.making import RoadFiles, RoadSource, VehicleFiles, VehicleSource
 from ugat_marl.scenarios.scenario import Document, read_scenario
 
 _CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
 
 
-def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
+def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
     """Roads, and perhaps vehicles, of SUMO's own files.
 
     Args:
@@ -34,11 +34,11 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
     if not configuration and not path.name.removesuffix(".gz").endswith(".xml"):
         raise OptionError(f"--sumo {str(path)!r}: give a .sumocfg or a .net.xml")
 
-    def roads(folder: Path, reporter: Reporter) -> Draft:
+    def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         if not configuration:
             _require_root(path, ("net",), "SUMO network", reporter)
             name = _placed(path, folder, link)
-            return Draft(
+            return RoadFiles(
                 f"SUMO network {path.name}",
                 _origin([path], link),
                 network=name,
@@ -49,10 +49,10 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
     return roads
 
 
-def from_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
+def from_routes(paths: Sequence[Path], *, link: bool) -> VehicleSource:
     """Route files the user has."""
 
-    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         leads = _leads(network)
         for path in paths:
             for tag in _rooted(path, ("routes", "additional"), "route file", reporter):
@@ -61,14 +61,14 @@ def from_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
                 if tag.name == "route":
                     _require_connected(tag, leads, path, network)
         placed = tuple(_placed(path, folder, link) for path in paths)
-        return Fleet(placed, copied={path.name: path for path in paths})
+        return VehicleFiles(placed, copied={path.name: path for path in paths})
 
     return vehicles
 
 
 def _configured(
     path: Path, folder: Path, link: bool, own_vehicles: bool, reporter: Reporter
-) -> Draft:
+) -> RoadFiles:
     if own_vehicles:
         scenario = read_scenario(path)
         network, routes, additional = scenario.network, scenario.routes, scenario.additional
@@ -82,7 +82,7 @@ def _configured(
     def placed(documents: Sequence[Document]) -> tuple[str, ...]:
         return tuple(_put(item, folder, link) for item in documents)
 
-    return Draft(
+    return RoadFiles(
         f"SUMO configuration {path.name}",
         _origin([path], link),
         network=placed([network])[0],

@@ -18,7 +18,7 @@ import numpy as np
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, replacing
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.importers.making import ROUTES, Fleet, Vehicles
+from ugat_marl.scenarios.importers.making import ROUTES, VehicleFiles, VehicleSource
 from ugat_marl.scenarios.importers.streets import Streets
 from ugat_marl.seeding import numpy_generator
 
@@ -193,15 +193,15 @@ def _attributes(values: Mapping[str, str]) -> str:
 
 def from_turns(
     vph: float, shares: tuple[float, float, float], begin_s: float, length_s: float, seed: int
-) -> Vehicles:
+) -> VehicleSource:
     """Vehicles by turning shares, as `walked` draws them, from `begin_s` on."""
 
-    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         del reporter
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         drives = walked(streets, vph, shares, length_s, seed)
         later = (replace(drive, depart_s=begin_s + drive.depart_s) for drive in drives)
         write_drives(folder / ROUTES, later)
-        return Fleet((ROUTES,))
+        return VehicleFiles((ROUTES,))
 
     return vehicles
