@@ -70,7 +70,7 @@ class Field:
     limits: Limits = field(default_factory=Limits)
 
     def run(self, console: Console) -> int:
-        """Drives and sums up."""
+        """Drive and sum up."""
         if self.port is None and not self.start:
             raise OptionError("--port is missing: where SUMO listens; or let --start run one")
         if self.start and self.host != "localhost":

@@ -99,7 +99,7 @@ class ScenarioNew:
     force: bool = False
 
     def run(self, console: Console) -> int:
-        """Makes it and says what it is."""
+        """Make the scenario and say what it is."""
         roads, vehicles = self._roads(), self._vehicles()
         made = make_scenario(
             self.name,

@@ -14,7 +14,7 @@ from ugat_marl.simulation import Snapshot, Trips
 
 @dataclass(frozen=True)
 class Scores:
-    """How an episode went.
+    """Measures of one episode.
 
     Attributes:
         att_s: Average travel time in s over all vehicles due, from the scheduled departure to the
@@ -85,7 +85,7 @@ class EpisodeRecorder:
         self._reward = self._queue = self._delay = 0.0
 
     def add(self, snapshot: Snapshot, mean_reward: float) -> None:
-        """Records the state after one decision and the mean reward of the agents."""
+        """Record the state after one decision and the mean reward of the agents."""
         self._decisions += 1
         self._reward += mean_reward
         self._queue += float(snapshot.halting[self._all].sum()) / len(self.incoming)

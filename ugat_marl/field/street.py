@@ -41,7 +41,7 @@ _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of <linux/prctl.h>
 
 
 class LaneCount(NamedTuple):
-    """What is known of one lane.
+    """Count of one lane.
 
     Attributes:
         time_s: When it was counted, on the street's clock.
@@ -55,7 +55,7 @@ class LaneCount(NamedTuple):
 
 
 class Street(Protocol):
-    """What the loop needs of a street. Only `read` may fail without ending the loop."""
+    """Interface of a street. Only `read` may fail without ending the loop."""
 
     def now_s(self) -> float:
         """The street's clock, s."""
@@ -70,11 +70,11 @@ class Street(Protocol):
         ...
 
     def show(self, states: Mapping[str, str]) -> None:
-        """Sets lights, which stay so until the next call; those left out are not touched."""
+        """Set lights, which stay so until the next call; those left out are not touched."""
         ...
 
     def wait(self, until_s: float) -> None:
-        """Returns when the clock shows at least `until_s`."""
+        """Return when the clock shows at least `until_s`."""
         ...
 
 
@@ -145,7 +145,7 @@ class TraciStreet:
             return {name: api.getRedYellowGreenState(name) for name in api.getIDList()}
 
     def read(self) -> dict[str, LaneCount]:
-        """Counts at the end of the last step."""
+        """Count at the end of the last step."""
         sums: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
         for name, values in self._counter.getAllSubscriptionResults().items():
             row = sums[self._lane_of[name]]
@@ -154,20 +154,20 @@ class TraciStreet:
         return {lane: LaneCount(self._time_s, *row) for lane, row in sums.items()}
 
     def show(self, states: Mapping[str, str]) -> None:
-        """Sets the lights of the simulation."""
+        """Set the lights of the simulation."""
         with self._told("SUMO does not set a light"):
             for light, state in states.items():
                 self._connection.trafficlight.setRedYellowGreenState(light, state)
 
     def wait(self, until_s: float) -> None:
-        """Simulates until then."""
+        """Simulate until then."""
         if until_s > self._time_s:
             with self._told(f"the street is gone after {self._time_s:g} s"):
                 self._connection.simulationStep(until_s)
                 self._time_s = float(self._connection.simulation.getTime())
 
     def close(self) -> None:
-        """Hangs up, upon which SUMO ends; may be called again."""
+        """Hang up, upon which SUMO ends; may be called again."""
         with contextlib.suppress(TraCIException, FatalTraCIError, OSError):
             if self._amid and self._connection._socket is not None:
                 self._connection._socket.close()  # goodbye would be answered by what is under way
@@ -252,7 +252,7 @@ class StartedSumo:
         return self
 
     def trips(self) -> Trips:
-        """What became of every vehicle due, once the client has hung up.
+        """Return the trips of every vehicle due, once the client has hung up.
 
         Raises:
             SimulatorError: SUMO has not written it.
@@ -289,7 +289,7 @@ def _free_port() -> int:
 
 
 def _tied_to(parent: int) -> Callable[[], None]:
-    """What the child calls before it becomes SUMO: to be killed when `parent` dies."""
+    """Return a function for the child: it is killed when `parent` dies."""
     prctl: Any = ctypes.CDLL(None).prctl  # loaded before the fork, where little is allowed
 
     def tie() -> None:

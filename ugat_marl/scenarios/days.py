@@ -96,7 +96,7 @@ def another_day(scenario: Scenario, seed: int) -> Scenario:
 
 @functools.lru_cache(maxsize=8)
 def _vehicles(routes: tuple[bytes, ...]) -> _Vehicles:
-    """Takes explicit route files apart; remembered, since days are drawn many times."""
+    """Take explicit route files apart; remembered, since days are drawn many times."""
     types = ET.Element("additional")
     depart: list[float] = []
     names: list[str] = []

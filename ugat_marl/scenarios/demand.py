@@ -1,4 +1,4 @@
-"""What route files ask for: who departs when, over which edges; and whether it can be driven."""
+"""Checks of route files: departure times, edges, and their order."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def check_demand(
     *,
     whole: bool = True,
 ) -> Demand:
-    """Reads all route files and checks that they can be driven.
+    """Read all route files and check that they can be driven.
 
     Args:
         scenario: Whose files.

@@ -1,4 +1,4 @@
-"""What a controller will face in a scenario: its intersections, their phases, and the traffic."""
+"""Facts a controller will face in a scenario: intersections, phases, and traffic."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Survey:
 
 
 def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
-    """Looks at everything that needs no simulation.
+    """Look at everything that needs no simulation.
 
     Args:
         scenario: What to look at.
@@ -324,7 +324,7 @@ def _free_links(root: ET.Element) -> Counter[str]:
 
 @dataclass(frozen=True)
 class _Traffic:
-    """What the routes bring: vehicles an hour by road, and how long they drive."""
+    """Traffic by the routes: vehicles an hour by road, and driving times."""
 
     vph: Counter[str]
     first_s: float

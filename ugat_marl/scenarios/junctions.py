@@ -1,4 +1,4 @@
-"""What a ``.net.xml`` says of the ways across its junctions: links, crossings, who gives way."""
+"""Ways across the junctions of a ``.net.xml``: links, crossings, right of way."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def right_on_red_of(root: ET.Element) -> frozenset[str]:
 
 
 def has_bit(a: Link, b: Link, matrix: Matrix) -> bool:
-    """Whether the matrix marks link `b` in the row of link `a`."""
+    """Return True if the matrix marks link `b` in the row of link `a`."""
     if a.junction != b.junction or a.request < 0 or b.request < 0:
         return False
     return bool(matrix[a.junction][a.request] >> b.request & 1)
@@ -173,7 +173,7 @@ def _request_of(via: str) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class Upstream:
-    """What lies upstream of a lane at a light.
+    """Lanes and roads upstream of a lane at a light.
 
     Attributes:
         lanes: Lanes inside junctions and outside to the share of their vehicles that is counted.
@@ -229,7 +229,7 @@ def behind_of(
 
 @dataclass(frozen=True)
 class _Ways:
-    """How lanes outside of junctions lead to each other.
+    """Connections between lanes outside of junctions.
 
     Attributes:
         feeds: For each lane those that lead to it without a light, with the lanes inside the
@@ -273,7 +273,7 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
 def _begins(
     lane: str, ways: _Ways, lengths_m: Mapping[str, float], reach_m: float
 ) -> dict[str, float]:
-    """How far from the light lanes begin, up to those that begin beyond the reach, by distance."""
+    """Return each lane's distance from its begin to the light, m, nearest first."""
     found: dict[str, float] = {}
     waiting = [(lengths_m.get(lane, reach_m), lane)]
     while waiting:

@@ -14,7 +14,7 @@ Shares = tuple[tuple[tuple[str, float], ...], ...]
 
 
 class Behind(NamedTuple):
-    """Who is counted with lanes that end before an agent's sight does (`junctions.behind_of`).
+    """Lanes and roads counted with lanes shorter than an agent's sight (`junctions.behind_of`).
 
     Attributes:
         lanes: For each measured lane the lanes upstream of it, inside junctions and outside.
@@ -32,7 +32,7 @@ NOTHING_BEHIND = Behind()
 
 @dataclass(frozen=True)
 class LaneTable:
-    """Which lanes are measured, in the order of every array of a `Snapshot`.
+    """Measured lanes, in the order of every array of a `Snapshot`.
 
     Attributes:
         ids: Lane ids of SUMO, ``(lanes,)``.

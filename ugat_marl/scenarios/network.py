@@ -107,7 +107,7 @@ class Network:
 
     @classmethod
     def read(cls, scenario: Scenario) -> Network:
-        """Reads and checks the network of a scenario.
+        """Read and check the network of a scenario.
 
         Raises:
             ScenarioError: Not a network, no traffic light to control, phases that cannot be shown
@@ -220,7 +220,7 @@ def within_hops(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str,
 
 
 def signal_widths(scenario: Scenario) -> dict[str, int]:
-    """How many letters the state of each traffic light has, controlled by an agent or not.
+    """Return the number of letters in the state of each traffic light, an agent's or not.
 
     Raises:
         ScenarioError: The network is not well-formed.
@@ -236,7 +236,7 @@ def signal_widths(scenario: Scenario) -> dict[str, int]:
 
 
 def _source_of(scenario: Scenario, tls: str) -> str | Sequence[str]:
-    """Where the phases of a traffic light come from; states if they are listed."""
+    """Return the source of a traffic light's phases; the states if they are listed."""
     own = scenario.settings.intersections.get(tls)
     return own.phases if own and own.phases is not None else scenario.control.phases
 
@@ -287,7 +287,7 @@ def _check_programme(
     foes: Mapping[str, Sequence[int]],
     where: str,
 ) -> int:
-    """Refuses a programme SUMO or traffic could not live with; returns the letters of its states.
+    """Refuse an impossible programme and return the number of letters of its states.
 
     There may be more letters than links of vehicles: those of pedestrian crossings.
     """

@@ -1,4 +1,4 @@
-"""Which links may be green together: phases from a programme, or derived from the conflicts.
+"""Links that may be green together: phases of a programme, or derived from the conflicts.
 
 The conflicts are those of the junction's own right-of-way matrix (``<request foes=...>``).
 """
@@ -46,7 +46,7 @@ def programme_phases(programme: Sequence[tuple[float, str]]) -> tuple[str, ...]:
 
 
 def are_foes(a: Link, b: Link, foes: Matrix) -> bool:
-    """Whether the paths of two links cross or merge, by their junction's matrix."""
+    """Return True if the paths of two links cross or merge, by their junction's matrix."""
     return has_bit(a, b, foes) or has_bit(b, a, foes)
 
 
@@ -71,7 +71,7 @@ def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple
 
 @dataclass(frozen=True)
 class RightOfWay:
-    """Who is in whose way at the junctions of a network, and who waits.
+    """Right of way at the junctions of a network: conflicts, and who waits.
 
     Attributes:
         foes: Rows that cross or merge.
@@ -84,7 +84,7 @@ class RightOfWay:
     right_on_red: frozenset[str] = frozenset()
 
     def waits(self, a: Link, b: Link) -> bool:
-        """Whether `a` must let `b` go first."""
+        """Return True if `a` must let `b` go first."""
         return bool(self.yields) and has_bit(a, b, self.yields)
 
 
@@ -349,7 +349,7 @@ def _derived(
 
 
 def _shared(links: Sequence[Link]) -> bool:
-    """Whether a lane leads both straight on and to the left."""
+    """Return True if some lane leads both straight on and to the left."""
     turns: dict[str, set[str]] = defaultdict(set)
     for link in links:
         if link.direction not in "tT":

@@ -23,7 +23,7 @@ def sumo_program(name: str) -> Path:
 
 
 def netconvert(arguments: Sequence[str], output: Path) -> str:
-    """Makes a network, without the comment that holds date and paths.
+    """Make a network, without the comment that holds date and paths.
 
     Args:
         arguments: Options without the output.
@@ -47,7 +47,7 @@ def netconvert(arguments: Sequence[str], output: Path) -> str:
 
 
 def tool(script: str, arguments: Sequence[str]) -> None:
-    """Runs one of SUMO's tools written in Python.
+    """Run one of SUMO's tools written in Python.
 
     Args:
         script: Its name, ``routeSampler.py`` say.
@@ -61,7 +61,7 @@ def tool(script: str, arguments: Sequence[str]) -> None:
 
 
 def run_program(name: str, command: Sequence[str]) -> str:
-    """What a program says on standard error.
+    """Run a program and return its standard error.
 
     Raises:
         ScenarioError: It failed.

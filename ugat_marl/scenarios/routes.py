@@ -19,7 +19,7 @@ from ugat_marl.scenarios.settings import seconds_of
 
 
 class OwnEdges:
-    """Whether a route file holds single vehicles with their own edges only, tag after tag."""
+    """Detector of route files that hold nothing but single vehicles with their own edges."""
 
     def __init__(self) -> None:
         self._holds = True
@@ -27,11 +27,11 @@ class OwnEdges:
 
     @property
     def lost(self) -> bool:
-        """Whether something else came: nothing behind it changes that."""
+        """True once something else was read; later tags cannot change that."""
         return not self._holds
 
     def read(self, item: Tag) -> None:
-        """Takes the next opening tag."""
+        """Take the next opening tag."""
         if item.name in ("vehicle", "trip", "flow", "route", "routeDistribution"):
             single = item.name == "vehicle" and "route" not in item.attributes
             self._holds &= item.name == "route" or (single and not self._waiting)
@@ -94,7 +94,7 @@ def departures(
 
 
 def _is_explicit(document: Document) -> bool:
-    """Whether every vehicle of the file stands there with its own edges, and there is no flow."""
+    """Return True if the file holds nothing but single vehicles with their own edges."""
     if document.path is None or document.content is not None:
         return _explicit_content(document, 0, 0)
     state = document.path.stat()
@@ -147,7 +147,7 @@ def _routed(scenario: Scenario) -> Document:
 
 
 def _for_sumo(document: Document, directory: Path) -> Path:
-    """Where SUMO finds a document: a plain file where it lies, else a copy in `directory`."""
+    """Return a path SUMO can read: a plain file where it lies, else a copy in `directory`."""
     path = document.path
     plain = path is not None and document.content is None and path.suffix != ".gz"
     if path is not None and plain and "," not in str(path.resolve()):  # it ends a name for SUMO

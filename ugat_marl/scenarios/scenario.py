@@ -98,7 +98,7 @@ class Scenario:
         return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
 
     def write(self, directory: Path) -> Path:
-        """Writes a scenario directory that any SUMO and `read_scenario` can use.
+        """Write a scenario directory that any SUMO and `read_scenario` can use.
 
         Returns:
             `directory`.
@@ -122,7 +122,7 @@ class Scenario:
 
 
 def read_scenario(name: str | Path) -> Scenario:
-    """Loads a scenario; effects listed in its ``scenario.toml`` are kept in its settings.
+    """Load a scenario; effects listed in its ``scenario.toml`` are kept in its settings.
 
     Args:
         name: Id of a shipped scenario (``"grid4x4-v1"``), a directory with a ``scenario.toml``, a

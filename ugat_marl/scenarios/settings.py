@@ -1,4 +1,4 @@
-"""What stands in a ``scenario.toml``, checked value by value."""
+"""Content of a ``scenario.toml``, checked value by value."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ControlSettings(pydantic.BaseModel):
 
 
 class IntersectionSettings(pydantic.BaseModel):
-    """What one traffic light does differently from `ControlSettings`."""
+    """Settings of one traffic light that differ from `ControlSettings`."""
 
     model_config = _STRICT
 
@@ -73,7 +73,7 @@ class ScenarioFile(pydantic.BaseModel):
 
 
 def validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
-    """Checks the content of a scenario file.
+    """Check the content of a scenario file.
 
     Args:
         raw: Keys and values.
@@ -121,7 +121,7 @@ def validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
 
 
 def may_be_given(option: str) -> bool:
-    """Whether a scenario may set this option of SUMO: not what the suite sets, reads or writes."""
+    """Return True for an option of SUMO that a scenario may set; the suite sets the others."""
     words = set(re.split("[-.]", option))
     return option not in _SET_BY_THE_SUITE and not words & _INPUT_AND_OUTPUT
 

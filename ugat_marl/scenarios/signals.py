@@ -46,7 +46,7 @@ class SignalTiming:
 
 
 class SignalState(NamedTuple):
-    """Where the machine of one intersection stands.
+    """State of the signal machine of one intersection.
 
     Attributes:
         phase: Green phase shown, or cleared towards.
@@ -60,7 +60,7 @@ class SignalState(NamedTuple):
 
     @property
     def clearing(self) -> bool:
-        """Whether yellow or all-red is shown."""
+        """True while yellow or all-red is shown."""
         return self.phase != self.origin
 
     def later(self, seconds: float) -> SignalState:
@@ -74,7 +74,7 @@ def initial_state(timing: SignalTiming) -> SignalState:
 
 
 def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) -> bool:
-    """Whether a request made now is begun within the next `within_s` seconds."""
+    """Return True if a request made now is begun within the next `within_s` seconds."""
     wait = timing.min_green_s - state.elapsed_s
     if state.clearing:
         wait = timing.clearance_s - state.elapsed_s + timing.min_green_s
@@ -82,7 +82,7 @@ def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) ->
 
 
 def begins_when_asked(timing: SignalTiming, interval_s: float) -> bool:
-    """Whether every green begins within the decision that asks for it.
+    """Return True if every green begins within the decision that asks for it.
 
     It does if clearance leaves some of an interval, and the minimum green lasts no longer than
     that: then a light may always change at once, and has done so when the next decision is due.
@@ -98,7 +98,7 @@ def advance(
     seconds: float,
     timing: SignalTiming,
 ) -> tuple[SignalState, list[Segment]]:
-    """Runs the machine of one intersection for `seconds` under one request.
+    """Run the machine of one intersection for `seconds` under one request.
 
     A clearance in progress is completed, the minimum green is held, and then the requested phase
     follows behind yellow and all-red. Links that are green in both phases stay green in between.
@@ -193,7 +193,7 @@ def _ending(before: str, after: str, cleared: str) -> str:
 
 
 class LateGreen(NamedTuple):
-    """What `with_late_green` has to remember about one traffic light.
+    """Memory of `with_late_green` about one traffic light.
 
     Attributes:
         commanded: State commanded last, one letter per link.
@@ -275,7 +275,7 @@ class GreenDelays:
         self._asked = seconds
 
     def hold(self, plans: Mapping[str, list[Segment]]) -> dict[str, list[Segment]]:
-        """What is shown instead of `plans`, which are the same decision of every light."""
+        """Return the segments shown instead of `plans`, which are one decision of every light."""
         shown = dict(plans)
         for tls, plan in plans.items():
             late = self._late_s.get(tls, 0.0) + self._asked.get(tls, 0.0)
@@ -332,7 +332,7 @@ def delayed_log(
 
 
 def check_phases(phases: Sequence[str], links: int, source: str) -> None:
-    """Refuses phase lists a signal cannot show.
+    """Refuse phase lists a signal cannot show.
 
     Args:
         phases: Green states.

@@ -135,7 +135,7 @@ DETERMINISM_CHECKS = (
 
 
 def check_determinism(make_env: MakeEnv, seed: int = 1) -> list[Result]:
-    """Checks that episodes are reproducible to the bit.
+    """Check that episodes are reproducible to the bit.
 
     Plays about a dozen whole episodes; give it short ones.
 

@@ -65,7 +65,7 @@ def observations_lie_in_their_spaces(case: EnvironmentCase) -> None:
 
 
 def _outside(value: Any, space: Any) -> str:
-    """How a vector is outside its space, in words; empty if it is inside."""
+    """Say in words why a vector is outside its space; empty if it is inside."""
     if not isinstance(value, np.ndarray):
         return f"is {type(value).__name__}, not a numpy array"
     if value.dtype != space.dtype or value.shape != space.shape:
@@ -231,7 +231,7 @@ def values_are_plain(case: EnvironmentCase) -> None:
 
 
 def results_are_fresh(case: EnvironmentCase) -> None:
-    """What was returned is neither returned again nor changed later."""
+    """Returned values are neither returned again nor changed later."""
     previous: Moment | None = None
     for moment, when in _moments(case):
         for name, part in moment.given.items():
@@ -677,7 +677,7 @@ ENVIRONMENT_CHECKS = (an_episode_runs, *LIFE, *DECLARED, *BEHAVIOUR)
 
 
 def check_environment(make_env: MakeEnv, seed: int = 1) -> list[Result]:
-    """Checks an environment, the suite's own, a wrapped or a third-party one.
+    """Check an environment, the suite's own, a wrapped or a third-party one.
 
     Plays about three whole episodes; give it short ones.
 

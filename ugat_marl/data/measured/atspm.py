@@ -109,7 +109,7 @@ class _Event:
 
 
 def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Network) -> Measured:
-    """Reads a controllers' log as measured data.
+    """Read a controllers' log as measured data.
 
     Args:
         events: CSV or Parquet with TimeStamp, DeviceId, EventId and Parameter.
@@ -228,7 +228,7 @@ def _in_periods(
 
 
 def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, found: list[Finding]) -> None:
-    """What a log says of itself: clocks that were set, detectors that failed."""
+    """Add findings that the log itself reports: clocks that were set, detectors that failed."""
     updates = rows.filter(pl.col("event") == CLOCK_UPDATED)
     if updates.height:
         names = ", ".join(map(repr, updates["device"].unique().sort().to_list()[:6]))

@@ -121,7 +121,7 @@ class AtspmMapping(pydantic.BaseModel):
 def read_mapping(
     path: Path, widths: Mapping[str, int], driven: Mapping[str, Collection[int]]
 ) -> AtspmMapping:
-    """Reads and checks a mapping file.
+    """Read and check a mapping file.
 
     Args:
         path: TOML.

@@ -1,4 +1,4 @@
-"""What measured data lack, and which hypotheses nobody can examine without it."""
+"""Findings on gaps in measured data, and the effects that these gaps rule out."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Ite
 
 
 def follows_traffic(periods: Sequence[Period], tls: str) -> bool:
-    """Whether some green lasts differently long; twice in one cycle it may in a fixed programme."""
+    """Return True if some green has many lengths, more than a fixed programme can give it."""
     lengths: dict[str, set[float]] = {}
     for period in periods:
         changes = period.signals.get(tls, ())
@@ -167,7 +167,7 @@ def follows_traffic(periods: Sequence[Period], tls: str) -> bool:
 
 
 def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
-    """Whether a log has yellow, or has no green that could end in it."""
+    """Return True if a log has yellow, or no green that could end in it."""
     shown = {state for period in periods for _, state in period.signals.get(tls, ())}
     letters = set("".join(shown))
     return bool(letters & YELLOW) or not letters & GREEN or len(shown) < 2
@@ -331,7 +331,7 @@ def _of_silence(measured: Measured) -> Iterator[Finding]:
 
 
 def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> bool:
-    """Whether a silence is longer than a cycle and as long before and after it was busy."""
+    """Return True for a silence longer than a cycle, with as busy a time before and after it."""
     end_s = begin_s + length_s
     before = int(((times > begin_s - length_s) & (times <= begin_s)).sum()) // 2
     after = int(((times >= end_s) & (times < end_s + length_s)).sum()) // 2
@@ -377,7 +377,7 @@ def _times(period: Period, detector: str) -> NDArray[np.float64]:
 
 
 def _is_on(period: Period, detector: str, time_s: float) -> bool:
-    """Whether a vehicle comes over the detector at this time."""
+    """Return True if a vehicle comes over the detector at this time."""
     return detector in period.passages and bool((period.passages[detector].on_s == time_s).any())
 
 

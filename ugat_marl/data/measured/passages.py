@@ -296,7 +296,7 @@ def _share(some: NDArray[np.int64], many: NDArray[np.int64]) -> float:
 
 
 def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
-    """What is left of passages once they were written to a file and read again.
+    """Return the passages as a file holds them: written and read again.
 
     Simulated detectors know more than those of a street: two vehicles on one zone, or one that
     changed lanes beside it. Measured and simulated passages are compared in this form.

@@ -50,7 +50,7 @@ LATE_S = 120.0
 
 
 def read_measured(directory: Path, scenario: Scenario, network: Network) -> Measured:
-    """Reads measured data; the files are never written to.
+    """Read measured data; the files are never written to.
 
     Args:
         directory: Holds the files described in ``docs/reference/measured-data.md``.
@@ -176,7 +176,7 @@ def _counts(
     detectors: tuple[Detector, ...],
     alone: bool,
 ) -> pl.DataFrame:
-    """Counts per detector and interval, all of known detectors and within their periods."""
+    """Count per detector and interval, all of known detectors and within their periods."""
     names = [detector.id for detector in detectors]
     refuse(
         path,
@@ -361,7 +361,7 @@ def signals_of(
     widths: Mapping[str, int],
     found: list[Finding],
 ) -> tuple[dict[str, SignalLog], ...]:
-    """What every traffic light showed, one mapping per period.
+    """Return the signal log of every traffic light, one mapping per period.
 
     Args:
         path: The file.

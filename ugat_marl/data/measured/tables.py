@@ -195,13 +195,13 @@ def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
 
 
 def place(path: Path, row: int) -> str:
-    """How a row is called in messages."""
+    """Return the name of a row for messages."""
     what = {".csv": "line", ".parquet": "row"}.get(path.suffix, "entry")
     return f"{path}, {what} {row}"
 
 
 def refuse(path: Path, bad: pl.DataFrame, column: str, complaint: str, way_out: str) -> None:
-    """Raises an error for the first of the bad rows, if there are any.
+    """Raise an error for the first of the bad rows, if there are any.
 
     Raises:
         MeasuredDataError: `bad` has rows.
@@ -260,7 +260,7 @@ def _read_parquet(path: Path) -> pl.DataFrame:
 
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
-    """Keeps a block that fails from writing to standard error.
+    """Keep a block that fails from writing to standard error.
 
     Threads of polars print their own stack traces there before Python learns of the error.
     """
@@ -354,7 +354,7 @@ def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
 
 
 def to_texts(path: Path, cells: pl.Series) -> pl.Series:
-    """Names as text; empty cells are null.
+    """Name as text; empty cells are null.
 
     Raises:
         MeasuredDataError: A column that holds no names.
@@ -488,7 +488,7 @@ def refuse_set_back(
     row: NDArray[np.int64],
     name: Callable[[int], str],
 ) -> None:
-    """Refuses streams whose clock was set back.
+    """Refuse streams whose clock was set back.
 
     A file that is merely out of order steps back all the time; one whose pieces were put together
     the wrong way has no time twice.

@@ -1,4 +1,4 @@
-"""What was measured on the street, or by the same detectors in a simulation; plain values."""
+"""Measured data of a street, or of the same detectors in a simulation, as plain values."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ class Measured:
 
     @property
     def has_events(self) -> bool:
-        """Whether single vehicles were detected, and not only counted."""
+        """True if single vehicles were detected, and not only counted."""
         return any(period.passages for period in self.periods)
 
     @property
     def has_speeds(self) -> bool:
-        """Whether speeds of single vehicles were measured."""
+        """True if speeds of single vehicles were measured."""
         return any(
             bool(np.isfinite(passages.speed_mps).any())
             for period in self.periods

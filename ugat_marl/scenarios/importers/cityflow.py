@@ -79,7 +79,7 @@ def from_cityflow(
 
 
 def write_network(net: Roadnet, out: Path) -> list[str]:
-    """Makes the SUMO network.
+    """Make the SUMO network.
 
     Args:
         net: The roads.
@@ -113,7 +113,7 @@ def write_network(net: Roadnet, out: Path) -> list[str]:
 
 
 def has_light(crossing: Crossing) -> bool:
-    """Whether an intersection has a traffic light: two phases that differ."""
+    """Return True for an intersection with a traffic light: two phases that differ."""
     return not crossing.virtual and len({frozenset(links) for _, links in crossing.phases}) > 1
 
 
@@ -167,7 +167,7 @@ def _connections(net: Roadnet) -> ET.Element:
 
 
 def _lights(net: Roadnet) -> ET.Element:
-    """Which letter belongs to which way; the states come later, when the conflicts are known."""
+    """Map letters to ways; states follow later, once the conflicts are known."""
     root = ET.Element("tlLogics")
     for crossing in filter(has_light, net.crossings.values()):
         ways = list(_ways(crossing, net))
@@ -237,7 +237,7 @@ def _shape(points: tuple[Point, ...] | list[Point]) -> str:
 
 
 def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
-    """Writes the light phases into the network, now that it is known who has to wait for whom."""
+    """Write the light phases into the network, now that it is known who has to wait for whom."""
     links = links_of(root)
     rules = RightOfWay(foes_of(root), yields_of(root))
     without: list[str] = []
@@ -311,7 +311,7 @@ def _clearing(
 
 @dataclass(frozen=True)
 class Flows:
-    """What was written.
+    """Vehicles that were written.
 
     Attributes:
         vehicles: How many.
@@ -331,7 +331,7 @@ def write_routes(
     *,
     exact: bool,
 ) -> Flows:
-    """Turns a ``flow.json`` into a route file.
+    """Turn a ``flow.json`` into a route file.
 
     Vehicles keep their size, gap, accelerations and speed. How they follow each other is SUMO's
     unless `exact` is set: the headway of 1 s and the chance in driving that its models are tuned

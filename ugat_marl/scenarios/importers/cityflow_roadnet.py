@@ -78,7 +78,7 @@ class Roadnet:
 
 
 def read_roadnet(path: Path) -> Roadnet:
-    """Reads and checks a ``roadnet.json``.
+    """Read and check a ``roadnet.json``.
 
     Raises:
         ScenarioError: Not one, or something in it names what does not exist; with the line.

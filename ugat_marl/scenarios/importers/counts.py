@@ -190,7 +190,7 @@ def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -
 
 
 def _counts_for_sumo(rows: Sequence[Row], work: Path) -> list[str]:
-    """Writes the counts as routeSampler reads them; returns its options."""
+    """Write the counts as routeSampler reads them and return its options."""
     turns = any(len(row.roads) > 1 for row in rows)
     by_time: dict[tuple[float, float], list[Row]] = defaultdict(list)
     for row in rows:
@@ -221,7 +221,7 @@ def _sampled(path: Path) -> Iterator[Drive]:
 
 
 def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
-    """How well the counts are met, by the traffic engineers' GEH."""
+    """Say in one sentence how many counts are met, by the GEH of traffic engineering."""
     good = 0
     passed = _passages(drives)
     for row in rows:

@@ -111,13 +111,13 @@ def read_json(path: Path) -> tuple[Any, str]:
 
 
 def _strange(where: str, error: Exception) -> ScenarioError:
-    """What Python's reader gives up on although it is JSON."""
+    """Return the error for JSON on which Python's reader gives up."""
     what = "nested too deeply" if isinstance(error, RecursionError) else "a number is far too long"
     return ScenarioError(f"{where}: {what}; no file of CityFlow's is like that")
 
 
 def _texts(pieces: Pieces, path: Path) -> Iterator[str]:
-    """What the pieces say, never nothing."""
+    """Decode the pieces as UTF-8 and yield those that are not empty."""
     decoder = codecs.getincrementaldecoder("utf-8-sig")()
     try:
         for piece in pieces:

@@ -25,7 +25,7 @@ NETWORK, ROUTES = "network.net.xml", "demand.rou.xml"
 
 @dataclass(frozen=True)
 class RoadFiles:
-    """What a source of roads has put into the folder.
+    """Files that a source of roads has put into the folder.
 
     Attributes:
         description: One line.
@@ -56,7 +56,7 @@ RoadSource = Callable[[Path, Reporter], RoadFiles]
 
 @dataclass(frozen=True)
 class VehicleFiles:
-    """What a source of vehicles has put into the folder.
+    """Files that a source of vehicles has put into the folder.
 
     Attributes:
         routes: Its route files: names in the folder, or absolute paths of files left in place.
@@ -100,7 +100,7 @@ def make_scenario(
     force: bool,
     reporter: Reporter,
 ) -> Made:
-    """Makes a scenario directory, whole or not at all.
+    """Make a scenario directory, whole or not at all.
 
     Args:
         target: The directory.
@@ -135,7 +135,7 @@ def make_scenario(
 def _write_settings(
     folder: Path, draft: RoadFiles, fleet: VehicleFiles, settings: Mapping[str, Any]
 ) -> tuple[str, ...]:
-    """Writes ``scenario.toml``; returns all that was noticed."""
+    """Write ``scenario.toml`` and return all notes."""
     own = dict(draft.settings)
     notes = (*draft.notes, *fleet.notes)
     if draft.derive and "phases" not in settings.get("control", {}):
@@ -202,7 +202,7 @@ def _readme(made: Made, draft: RoadFiles, command: str) -> str:
 
 @contextlib.contextmanager
 def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
-    """Yields an empty folder beside `target`, which becomes `target` if the block ends normally.
+    """Yield an empty folder beside `target`, which becomes `target` if the block ends normally.
 
     Args:
         target: The directory to be.
@@ -242,7 +242,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _stopped_in_order() -> Iterator[None]:
-    """Whoever ends the program (``kill``, a system that shuts down) finds nothing left behind."""
+    """Turn SIGTERM into an exception, so that a killed program leaves nothing behind."""
 
     def stop(number: int, _: object) -> None:
         raise SystemExit(128 + number)
@@ -270,7 +270,7 @@ def _put(made: Path, target: Path, before: Path) -> None:
 
 
 def require_free(target: Path, *, force: bool) -> None:
-    """Refuses a place that holds something.
+    """Refuse a place that holds something.
 
     Raises:
         OutputError: As for `new_folder`.

@@ -53,7 +53,7 @@ _KINDS = frozenset({"highway", "railway"})
 
 @dataclass(frozen=True)
 class _Extract:
-    """What an extract holds for us.
+    """Facts about an extract that its conversion needs.
 
     Attributes:
         roads: Ways for cars.
@@ -130,7 +130,7 @@ def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
 
 
 def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
-    """Counts roads and lights; refuses entities before any other program sees the file."""
+    """Count roads and lights; refuse entities before any other program sees the file."""
     roads = signals = unlit = 0
     walks: set[str] = set()
     nodes: set[str] = set()
@@ -311,7 +311,7 @@ def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
 def write_roads(
     source: Path, path: Path, nodes: Collection[str], out: Path, reporter: Reporter
 ) -> None:
-    """Writes what netconvert looks at; it holds all it is given in memory, most of it buildings.
+    """Write what netconvert looks at; it holds all it is given in memory, most of it buildings.
 
     Args:
         source: The extract as XML, packed or not.

@@ -1,4 +1,4 @@
-"""Where an OpenStreetMap extract has people cross at lights, on the roads netconvert made of it.
+"""Crossings at lights of an OpenStreetMap extract, on the roads netconvert made of it.
 
 Crossings are nodes of the roads they cross. netconvert leaves them out unless footways are mapped
 without a gap, so they are found here by their place and handed to it as a list.
@@ -38,7 +38,7 @@ class _Arm:
 
 
 def has_light(tags: Mapping[str, str]) -> bool:
-    """Whether a node is a crossing that may belong to a traffic light.
+    """Return True for a node that is a crossing and may belong to a traffic light.
 
     Args:
         tags: Of the node.
@@ -129,7 +129,7 @@ def _arms_at_lights(root: ET.Element) -> dict[str, list[_Arm]]:
 
 
 def _join(arms: list[_Arm], name: str, line: Point) -> None:
-    """Puts a road, drawn from its junction outwards, to the arm of its direction."""
+    """Put a road, drawn from its junction outwards, to the arm of its direction."""
     away = line[-1] - line[0]
     bearing = math.degrees(math.atan2(away[1], away[0]))
     for arm in arms:

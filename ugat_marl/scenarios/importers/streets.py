@@ -1,4 +1,4 @@
-"""Where cars may drive: entries, exits, and the way on from every road of a network."""
+"""Roads for cars: entries, exits, and the roads ahead of every road of a network."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def _leads(network: Path) -> dict[str, set[str]]:
 
 
 def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
-    """Refuses edges that do not exist, by the file the user has, not the copy to be."""
+    """Refuse edges that do not exist, by the file the user has, not the copy to be."""
     used = edges_used(tag)
     if leads and not leads.keys() >= set(used):  # a network without roads has its own message
         edge = next(edge for edge in used if edge not in leads)
@@ -153,7 +153,7 @@ def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
 
 
 def _require_connected(tag: Tag, leads: Mapping[str, set[str]], path: Path, network: Path) -> None:
-    """Refuses a route that jumps."""
+    """Refuse a route that jumps."""
     for a, b in pairwise(tag.attributes.get("edges", "").split()):
         if a in leads and b in leads and b not in leads[a]:
             raise ScenarioError(

@@ -161,7 +161,7 @@ def weighted_choice(shares: Mapping[str, float], random: np.random.Generator) ->
 def write_drives(
     path: Path, drives: Iterable[Drive], types: Iterable[Mapping[str, str]] = (CAR,)
 ) -> None:
-    """Writes the vehicles as a route file, one after the other.
+    """Write the vehicles as a route file, one after the other.
 
     Args:
         path: The file.
