@@ -27,7 +27,7 @@ class Behind(NamedTuple):
 
 
 NOTHING_BEHIND = Behind()
-"""Nobody is counted with any lane."""
+"""No lane is counted with another."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class LaneTable:
         ids: Lane ids of SUMO, ``(lanes,)``.
         capacity: Vehicles that fit on the lane, ``(lanes,)``, float64.
         speed_mps: Speed limit, ``(lanes,)``, float64.
-        behind: Who is counted with lanes that are too short.
+        behind: Lanes and roads counted with lanes that are too short.
     """
 
     ids: tuple[str, ...]

@@ -38,12 +38,12 @@ class OwnEdges:
             self._waiting = single
 
     def ended(self) -> bool:
-        """The answer for the whole file."""
+        """Return True if the whole file held nothing else."""
         return self._holds and not self._waiting
 
 
 def as_vehicles(scenario: Scenario) -> Scenario:
-    """The same demand as single vehicles with routes: trips and flows are resolved by duarouter.
+    """Return the same demand as single vehicles with routes; duarouter resolves trips and flows.
 
     Raises:
         ScenarioError: duarouter refuses; its own words are in the message.
@@ -54,7 +54,7 @@ def as_vehicles(scenario: Scenario) -> Scenario:
 
 
 def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
-    """The edges of every vehicle that departs in the scenario's time, one after the other.
+    """Yield the edges of every vehicle that departs within the scenario's time.
 
     Args:
         scenario: Any scenario; `as_vehicles` is applied if need be.
@@ -72,7 +72,7 @@ def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
 def departures(
     scenario: Scenario, *, routed: bool, reporter: Reporter | None = None
 ) -> Iterator[tuple[str, float, list[str]]]:
-    """Name, departure and roads of every vehicle that departs before the end of the episode.
+    """Yield name, departure and roads of every vehicle that departs before the end.
 
     Args:
         scenario: Whose demand; it has passed `check_demand`.
@@ -103,7 +103,7 @@ def _is_explicit(document: Document) -> bool:
 
 @functools.lru_cache(maxsize=8)
 def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
-    """The same, remembered for a file as long as it does not change."""
+    """Do the same, cached for a file as long as it does not change."""
     del size, changed_ns
     singles = OwnEdges()
     for tag in document.scan():
@@ -114,7 +114,7 @@ def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
 
 
 def _routed(scenario: Scenario) -> Document:
-    """All demand of the scenario through duarouter."""
+    """Route all demand of the scenario with duarouter."""
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
         out = directory / "routed.rou.xml"

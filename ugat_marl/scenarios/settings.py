@@ -38,9 +38,9 @@ class ControlSettings(pydantic.BaseModel):
     min_green_s: Annotated[float, Field(ge=0, le=600)] = 5.0
     phases: PhaseSource = "programme"
     late_green_s: Annotated[float, Field(ge=0, le=60, exclude_if=lambda value: value == 0)] = 0.0
-    """Traffic on every link starts so much later than its green, to which the agent is blind."""
+    """Delay of traffic behind every green, s; agents do not see it."""
     reach_m: Annotated[float, Field(ge=0, le=2000, exclude_if=lambda value: value == 0)] = 0.0
-    """How far upstream of a stop line vehicles are counted where the lane at it is shorter."""
+    """Distance upstream of a stop line within which vehicles are counted, on shorter lanes too."""
 
 
 class IntersectionSettings(pydantic.BaseModel):
@@ -127,7 +127,7 @@ def may_be_given(option: str) -> bool:
 
 
 def seconds_of(text: str) -> float:
-    """Seconds of a time as SUMO writes it: ``seconds``, ``h:m:s`` or ``days:h:m:s``.
+    """Return the seconds of a time of SUMO's: ``seconds``, ``h:m:s`` or ``days:h:m:s``.
 
     Raises:
         ValueError: Not a time.
@@ -142,7 +142,7 @@ def seconds_of(text: str) -> float:
 
 
 def _explain(item: Any) -> str:
-    """One complaint of pydantic in words of the file."""
+    """Return one complaint of pydantic in words of the file."""
     names = [str(part) for part in item["loc"]]
     if "phases" in names:  # the alternatives of a union stand behind the key
         key = ".".join(names[: names.index("phases") + 1])
@@ -162,7 +162,7 @@ def _explain(item: Any) -> str:
 
 
 def _known_keys(table: list[str]) -> list[str]:
-    """The keys of the table an unknown one stands in, and where it might belong instead."""
+    """Return the keys that are allowed in the table of an unknown key."""
     if not table:
         return [*ScenarioFile.model_fields]
     if table[0] == "intersections":

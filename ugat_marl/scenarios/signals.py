@@ -64,12 +64,12 @@ class SignalState(NamedTuple):
         return self.phase != self.origin
 
     def later(self, seconds: float) -> SignalState:
-        """The same light, `seconds` later."""
+        """Return the state `seconds` later, with no change in between."""
         return SignalState(self.phase, self.origin, self.elapsed_s + seconds)
 
 
 def initial_state(timing: SignalTiming) -> SignalState:
-    """Phase 0, green for long enough that any phase may follow."""
+    """Return phase 0, green for long enough that any phase may follow."""
     return SignalState(0, 0, timing.min_green_s)
 
 
@@ -84,8 +84,8 @@ def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) ->
 def begins_when_asked(timing: SignalTiming, interval_s: float) -> bool:
     """Return True if every green begins within the decision that asks for it.
 
-    It does if clearance leaves some of an interval, and the minimum green lasts no longer than
-    that: then a light may always change at once, and has done so when the next decision is due.
+    That holds if the clearance is shorter than an interval and the minimum green no longer than
+    the rest. Then a light may change at once at every decision.
     """
     left_s = interval_s - timing.clearance_s
     return left_s > _INSTANT_S and timing.min_green_s <= left_s + _INSTANT_S
@@ -105,7 +105,7 @@ def advance(
 
     Args:
         phases: Green states of the intersection, one letter per link.
-        state: Where the machine stands.
+        state: State of the machine.
         requested: Index of the phase asked for.
         seconds: Length of the decision interval.
         timing: Clearance and minimum green.
@@ -130,7 +130,7 @@ def _course(
     seconds: float,
     timing: SignalTiming,
 ) -> tuple[SignalState, tuple[Segment, ...]]:
-    """`advance`, remembered: the machine is in few states, and asked many times in each."""
+    """Do the work of `advance`, cached: the machine has few states and visits each many times."""
     shown: list[Segment] = []
     left = seconds
     while left > _INSTANT_S:
@@ -144,7 +144,7 @@ def _course(
 def _next_segment(
     phases: Sequence[str], state: SignalState, requested: int, left: float, timing: SignalTiming
 ) -> tuple[SignalState, Segment]:
-    """The longest stretch of constant state that starts now, at most `left` seconds."""
+    """Return the longest stretch of constant state from now on, at most `left` seconds."""
     green = phases[state.phase]
     if state.clearing:
         origin = phases[state.origin]
@@ -174,13 +174,13 @@ def _append(shown: list[Segment], segment: Segment) -> None:
 
 @functools.cache
 def yellow_between(origin: str, target: str) -> str:
-    """Yellow where a green ends; green where it goes on, with the weaker of the two rights."""
+    """Return yellow where a green ends; green where it goes on, with the weaker of both rights."""
     return "".join(_ending(a, b, "y") for a, b in zip(origin, target, strict=True))
 
 
 @functools.cache
 def red_between(origin: str, target: str) -> str:
-    """Red where a green ended or is about to begin; green where it goes on."""
+    """Return red where a green ended or is about to begin; green where it goes on."""
     return "".join(_ending(a, b, "r") for a, b in zip(origin, target, strict=True))
 
 
@@ -209,7 +209,7 @@ class LateGreen(NamedTuple):
 
     @classmethod
     def after(cls, state: str) -> LateGreen:
-        """A light that has shown `state` for long."""
+        """Return the memory of a light that has shown `state` for long."""
         nothing = (0.0,) * len(state)
         return cls(state, state, nothing, nothing)
 
@@ -217,21 +217,20 @@ class LateGreen(NamedTuple):
 def with_late_green(
     segments: Sequence[Segment], late_s: float, step_s: float, before: LateGreen
 ) -> tuple[LateGreen, list[Segment]]:
-    """Traffic that starts late: every link that turns green stays red for `late_s` first.
+    """Delay greens: every link that turns green stays red for `late_s` first.
 
     The time is lost at the start of the green, the end stays where it is. Greens are held back by
-    whole steps, since a simulation knows nothing in between; what is left over is added to the
-    link's next green, so that the mean over many greens is `late_s`. A green shorter than its delay
-    is not shown, nor the yellow behind it.
+    whole steps of the simulation. The rest is added to the link's next green, so that the mean over
+    many greens is `late_s`. A green shorter than its delay is not shown, nor is its yellow.
 
     Args:
-        segments: What is commanded.
+        segments: Commanded states.
         late_s: Time lost, in s.
         step_s: Length of a simulation step.
-        before: What is remembered of what was commanded before.
+        before: Memory of earlier commands.
 
     Returns:
-        What to remember, and what is shown: segments of the same total duration.
+        The new memory, and the states shown: segments of the same total duration.
     """
     shown: list[Segment] = []
     state = before
@@ -271,7 +270,7 @@ class GreenDelays:
         self._held: dict[str, LateGreen] = {}  # lights that wait, or owe a fraction of a step
 
     def ask(self, seconds: Mapping[str, float]) -> None:
-        """Traffic light to how much longer greens that begin in the next `hold` stay red, in s."""
+        """Set, per traffic light, the extra delay in s of greens that begin in the next `hold`."""
         self._asked = seconds
 
     def hold(self, plans: Mapping[str, list[Segment]]) -> dict[str, list[Segment]]:
@@ -291,7 +290,7 @@ class GreenDelays:
 
 
 def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -> LateGreen:
-    """The memory at the moment at which `commanded` begins, `shown` holding what waits."""
+    """Return the memory when `commanded` begins; its `shown` holds the letters that wait."""
     if commanded == state.commanded:
         return state
     shown, waiting, owed = list(state.shown), list(state.waiting_s), list(state.owed_s)
@@ -313,7 +312,7 @@ def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -
 def delayed_log(
     log: Sequence[tuple[float, str]], late_s: float, step_s: float
 ) -> tuple[tuple[float, str], ...]:
-    """`with_late_green` for what a traffic light showed: ``(since_s, state)`` at every change."""
+    """Apply `with_late_green` to the log of a light, ``(since_s, state)`` at every change."""
     if len(log) < 2:
         return tuple(log)
     state = LateGreen.after(log[0][1])

@@ -18,11 +18,11 @@ HELD_OUT_SHARE = 0.4
 
 @dataclass(frozen=True)
 class Finding:
-    """Something the data lack, or that looks wrong in them.
+    """Gap in the data, or something that looks wrong in them.
 
     Attributes:
         text: What, where, and how much.
-        rules_out: Hypotheses that cannot be told apart for it, by name of their effects.
+        rules_out: Names of effects that cannot be examined because of it.
     """
 
     text: str
@@ -51,7 +51,7 @@ class Measured:
     findings: tuple[Finding, ...] = field(default=())
 
     def of(self, split: Split) -> tuple[Period, ...]:
-        """The periods of one split."""
+        """Return the periods of one split."""
         return tuple(period for period in self.periods if period.split == split)
 
     @property
@@ -102,11 +102,11 @@ class Measured:
 
 
 def _canonical(numbers: NDArray[np.float64]) -> bytes:
-    """The bytes of numbers, with one way to write NaN and one to write zero."""
+    """Return the bytes of numbers, with one form of NaN and of zero."""
     return np.where(np.isnan(numbers), np.nan, numbers + 0.0).astype("<f8").tobytes()
 
 
 def split_periods(count: int) -> tuple[Split, ...]:
-    """The default split: the last 40 % are held out, and with two periods or more at least one."""
+    """Return the default split: the last 40 % are held out, of two periods or more at least one."""
     held = min(max(round(HELD_OUT_SHARE * count), 1), count - 1) if count > 1 else 0
     return ("fit",) * (count - held) + ("heldout",) * held

@@ -1,4 +1,4 @@
-"""Writes measured data as the directory that `read_measured` reads."""
+"""Writer of measured data, as the directory that `read_measured` reads."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def _events(period: Period, detector: str, passages: Passages) -> pl.DataFrame:
 
 
 def _ordered(frame: pl.DataFrame, table: Table) -> pl.DataFrame:
-    """The frame as the table has it, NaN as an empty cell."""
+    """Return the frame in the columns of the table, NaN as an empty cell."""
     columns = [name for name in (*table.columns, *table.optional) if name in frame.columns]
     kinds = {**table.columns, **table.optional}
     return frame.select(

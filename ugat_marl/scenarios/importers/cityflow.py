@@ -46,7 +46,7 @@ _VEHICLE = ("length", "width", "maxPosAcc", "maxNegAcc", "usualPosAcc", "usualNe
 def from_cityflow(
     roadnet: Path, flow: Path, duration_s: float | None, *, own_vehicles: bool, exact: bool
 ) -> RoadSource:
-    """A ``roadnet.json`` with its ``flow.json``.
+    """Return a source of the roads and vehicles in a ``roadnet.json`` and its ``flow.json``.
 
     Args:
         roadnet: The roads.
@@ -86,7 +86,7 @@ def write_network(net: Roadnet, out: Path) -> list[str]:
         out: The ``.net.xml`` to write.
 
     Returns:
-        What was noticed on the way.
+        Notes for the user.
 
     Raises:
         ScenarioError: netconvert refused.
@@ -181,7 +181,7 @@ def _lights(net: Roadnet) -> ET.Element:
 
 
 def _ways(crossing: Crossing, net: Roadnet) -> Iterator[tuple[int, dict[str, str]]]:
-    """Every way across with the number of its road link, in the order of the file."""
+    """Yield every way across with the number of its road link, in the order of the file."""
     for number, link in enumerate(crossing.links):
         before, behind = net.roads[link.start], net.roads[link.end]
         for a, b in link.lanes:
@@ -197,7 +197,7 @@ def _ways(crossing: Crossing, net: Roadnet) -> Iterator[tuple[int, dict[str, str
 
 
 def _stop_lines(crossing: Crossing, net: Roadnet) -> str:
-    """A polygon through the ends of all stop lines; empty if roads begin at the centre."""
+    """Return a polygon through the ends of all stop lines; empty if roads begin at the centre."""
     if crossing.width_m <= 0:
         return ""
     corners: list[Point] = []
@@ -214,7 +214,7 @@ def _stop_lines(crossing: Crossing, net: Roadnet) -> str:
 def _corners(
     road: Road, points: tuple[Point, ...], distance_m: float, *, backwards: bool
 ) -> list[Point]:
-    """Both ends of the line across a road at a distance from the intersection's centre."""
+    """Return the ends of the line across a road at a distance from the intersection's centre."""
     left = distance_m
     for (ax, ay), (bx, by) in pairwise(points):
         length = math.hypot(bx - ax, by - ay)
@@ -273,7 +273,7 @@ def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
 def _split(
     crossing: Crossing,
 ) -> tuple[list[tuple[float, frozenset[int]]], float, frozenset[int]]:
-    """The green phases, the seconds between two of them, and what goes all the time.
+    """Return the green phases, the seconds between two of them, and the links always green.
 
     CityFlow's files hold the time between two greens as a phase of its own, usually the first, in
     which only those may go who may always go.
@@ -297,7 +297,7 @@ def _letters(number_of: dict[int, int], numbers: frozenset[int]) -> set[int]:
 def _clearing(
     state: str, following: str, clearance_s: float, always: set[int]
 ) -> Iterator[tuple[float, str]]:
-    """Yellow and red between two greens; who may always go stops first, while all is red."""
+    """Yield yellow and red between two greens; always-green links stop while all is red."""
     if not any(a in "Gg" and b not in "Gg" for a, b in zip(state, following, strict=True)):
         return
     length_s = clearance_s or YELLOW_S + ALL_RED_S
@@ -369,7 +369,7 @@ def write_routes(
 
 
 def _departures(flow: Mapping[str, Any], end_s: float, where: str) -> Iterator[float]:
-    """From ``startTime`` to ``endTime``, both included, every ``interval``; -1 is the end."""
+    """Yield a flow's departures, ``startTime`` to ``endTime`` inclusive; -1 is the end."""
     start, end, interval = (
         _number(flow, key, where, least=least)
         for key, least in (("startTime", 0.0), ("endTime", -1.0), ("interval", 0.0))
@@ -427,14 +427,14 @@ def _number(raw: Mapping[str, Any], key: str, where: str, *, least: float) -> fl
 
 
 class _Routes:
-    """The roads from anchor to anchor; where they do not touch, the shortest way between them."""
+    """Routes from anchor to anchor, on the shortest way where anchors do not touch."""
 
     def __init__(self, net: Roadnet) -> None:
         self._net = net
         self._known: dict[tuple[str, ...], tuple[str, ...]] = {}
 
     def through(self, raw: Any, where: str) -> tuple[str, ...]:
-        """The whole route."""
+        """Return the whole route."""
         if not isinstance(raw, list) or not raw or not all(isinstance(name, str) for name in raw):
             raise ScenarioError(f"{where}: 'route' is missing or not a list of roads")
         anchors = tuple(raw)
@@ -462,7 +462,7 @@ class _Routes:
         return {name: _length(road.points) for name, road in self._net.roads.items()}
 
     def _between(self, start: str, goal: str, where: str) -> list[str]:
-        """The roads after `start` up to and with `goal` (Dijkstra)."""
+        """Return the roads after `start` up to and with `goal` (Dijkstra)."""
         best = {start: 0.0}
         came: dict[str, str] = {}
         heap = [(0.0, start)]

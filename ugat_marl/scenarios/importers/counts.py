@@ -1,4 +1,4 @@
-"""Demand from what was counted on roads and turns, or from origins and destinations."""
+"""Demand from counts on roads and turns, or from origins and destinations."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Row:
         count: Vehicles.
         begin_s: Start of the time they belong to.
         end_s: Its end.
-        line: Where it stands.
+        line: Its line in the file.
     """
 
     roads: tuple[str, ...]
@@ -62,7 +62,7 @@ class Row:
 def read_rows(
     path: Path, begin_s: float, end_s: float, reporter: Reporter, *, pairs: bool
 ) -> list[Row]:
-    """A CSV file with the columns ``count`` and ``edge``, or ``from`` and ``to``.
+    """Read a CSV file with the columns ``count`` and ``edge``, or ``from`` and ``to``.
 
     The columns ``begin_s`` and ``end_s`` may be added; without them a row is for the whole episode.
 
@@ -137,7 +137,7 @@ def _number(text: str | None, key: str, where: str) -> float:
 
 
 def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
-    """Vehicles that come by as often as was counted, by SUMO's routeSampler.
+    """Return a source of vehicles that meet counts, by SUMO's routeSampler.
 
     It chooses among random drives through the network; every counted road has to lie on one.
     """
@@ -235,7 +235,7 @@ def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
 
 
 def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
-    """Roads, and turns from one to the next, to the departures of all that come by, in order."""
+    """Map roads, and turns between two, to the departures of the vehicles there, in order."""
     found: dict[tuple[str, ...], list[float]] = defaultdict(list)
     for drive in sorted(drives, key=lambda drive: drive.depart_s):
         for passed in chain(zip(drive.route, strict=True), pairwise(drive.route)):
@@ -244,7 +244,7 @@ def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
 
 
 def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
-    """Vehicles from origins to destinations, on the fastest ways through the empty network."""
+    """Return a source of vehicles from origins to destinations, on the fastest free routes."""
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=True)

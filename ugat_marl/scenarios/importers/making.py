@@ -35,7 +35,7 @@ class RoadFiles:
         additional: Its additional files, likewise.
         settings: Further values of its ``scenario.toml``.
         derive: Whether the phases of each light are derived as its lanes allow.
-        notes: What was noticed on the way, for the README and for whoever waits.
+        notes: Notes for the README and the user.
         copied: Files in the folder that are copies, to where they come from.
     """
 
@@ -60,7 +60,7 @@ class VehicleFiles:
 
     Attributes:
         routes: Its route files: names in the folder, or absolute paths of files left in place.
-        notes: What was noticed on the way.
+        notes: Notes for the user.
         copied: Files in the folder that are copies, to where they come from.
     """
 
@@ -81,7 +81,7 @@ class Made:
         scenario: As it lies in its directory.
         network: Its network.
         demand: Its demand.
-        notes: What was noticed on the way.
+        notes: Notes for the user.
     """
 
     scenario: Scenario
@@ -107,13 +107,13 @@ def make_scenario(
         roads: Where the roads come from.
         vehicles: Where the vehicles come from; None if the roads come with vehicles.
         settings: Values for ``scenario.toml`` that go before those of the source.
-        command: What makes it again, for the README.
+        command: The command that makes it again, for the README.
         force: Whether a scenario of this name is replaced.
         reporter: Shows progress.
 
     Raises:
         OutputError: It exists, or cannot be written.
-        ScenarioError: What was made is no sound scenario.
+        ScenarioError: The result is no sound scenario.
     """
     with new_folder(target, force=force) as folder:
         draft = roads(folder, reporter)
@@ -159,7 +159,7 @@ def _write_settings(
 
 @contextlib.contextmanager
 def _errors_about(copied: Mapping[str, Path], folder: Path) -> Iterator[None]:
-    """Errors name the files the user has, not copies that are gone when they are read."""
+    """Make errors name the user's files, not copies that are gone when the error is read."""
     try:
         yield
     except ScenarioError as error:
@@ -202,7 +202,7 @@ def _readme(made: Made, draft: RoadFiles, command: str) -> str:
 
 @contextlib.contextmanager
 def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
-    """Yield an empty folder beside `target`, which becomes `target` if the block ends normally.
+    """Yield an empty folder beside `target` that becomes `target` if the block ends normally.
 
     Args:
         target: The directory to be.

@@ -73,7 +73,7 @@ class _Extract:
 
 
 def from_osm(path: Path, *, guess: bool) -> RoadSource:
-    """The streets of an extract.
+    """Return a source of the streets of an extract.
 
     Args:
         path: ``.osm``, ``.osm.gz`` or ``.pbf``.
@@ -122,7 +122,7 @@ def from_osm(path: Path, *, guess: bool) -> RoadSource:
 
 
 def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
-    """The extract as XML."""
+    """Return the path of the extract as XML."""
     if not path.name.lower().endswith(".pbf"):
         return path
     unpack(path, work / "unpacked.osm", reporter)
@@ -188,7 +188,7 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
 
 
 def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
-    """Crossings at lights, and programmes that have green for them."""
+    """Add crossings at lights, and programmes that have green for them."""
     root = parse_xml(read_bytes(made), str(made))
     if not (content := crossings_for(root, extract.crossings)):
         return
@@ -200,7 +200,7 @@ def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
 
 
 def _idle_lights(network: Path, walks: Iterable[str]) -> list[str]:
-    """Junctions of lights that no two streams contend for, without those at crossings."""
+    """Return the junctions of lights without conflicting streams, crossings excepted."""
     root = parse_xml(read_bytes(network), str(network))
     foes = foes_of(root)
     kept = set(walks)
@@ -228,13 +228,13 @@ class Item(NamedTuple):
 
     @property
     def tags(self) -> dict[str, str]:
-        """Its keys and values."""
+        """Keys and values of its tags."""
         found = (tag.attributes for tag in self.inside if tag.name == "tag")
         return {tag.get("k", ""): tag.get("v", "") for tag in found}
 
     @property
     def way_nodes(self) -> list[str]:
-        """The nodes of a road or railway; none of anything else."""
+        """Nodes, if it is a road or railway."""
         if self.start.name != "way" or not _KINDS & self.tags.keys():
             return []
         return [tag.attributes.get("ref", "") for tag in self.inside if tag.name == "nd"]
@@ -278,7 +278,7 @@ def unpack(path: Path, out: Path, reporter: Reporter) -> None:
 
 
 def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
-    """All items of an extract of any length.
+    """Yield all items of an extract of any length.
 
     Args:
         source: The extract as XML, packed or not.
@@ -311,7 +311,7 @@ def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
 def write_roads(
     source: Path, path: Path, nodes: Collection[str], out: Path, reporter: Reporter
 ) -> None:
-    """Write what netconvert looks at; it holds all it is given in memory, most of it buildings.
+    """Write roads and railways; netconvert would hold all else, mostly buildings, in memory.
 
     Args:
         source: The extract as XML, packed or not.
@@ -343,7 +343,7 @@ def _open(tag: Tag) -> str:
 
 
 def place_of(node: Tag, path: Path) -> tuple[float, float]:
-    """Longitude and latitude of a node, degrees.
+    """Return longitude and latitude of a node, degrees.
 
     Raises:
         ScenarioError: It has none; names the line.

@@ -31,7 +31,7 @@ class Streets:
 
     @classmethod
     def of(cls, root: ET.Element) -> Streets:
-        """Those of a ``<net>``."""
+        """Return the roads for cars of a ``<net>``."""
         start: dict[str, str] = {}
         end: dict[str, str] = {}
         for edge in root.iter("edge"):

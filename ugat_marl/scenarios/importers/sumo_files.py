@@ -1,4 +1,4 @@
-"""A network, or a whole configuration, that SUMO reads already: copied, or used where it lies."""
+"""Networks and configurations of SUMO, copied or used where they lie."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
 
 
 def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
-    """Roads, and perhaps vehicles, of SUMO's own files.
+    """Return a source of roads, and perhaps vehicles, from SUMO's own files.
 
     Args:
         path: A ``.sumocfg`` or a ``.net.xml``, packed or not.
@@ -50,7 +50,7 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
 
 
 def from_routes(paths: Sequence[Path], *, link: bool) -> VehicleSource:
-    """Route files the user has."""
+    """Return a source of vehicles from the user's route files."""
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         leads = _leads(network)
@@ -117,7 +117,7 @@ def _put(document: Document, folder: Path, link: bool) -> str:
 
 
 def _placed(path: Path, folder: Path, link: bool) -> str:
-    """The name under which the scenario finds the file: in its folder, or where it is."""
+    """Copy the file, unless it is linked; return the name by which the scenario finds it."""
     if link:
         return str(path.resolve())
     _require_new(folder / path.name)
@@ -133,7 +133,7 @@ def _require_new(path: Path) -> None:
 
 
 def _leads(network: Path) -> dict[str, set[str]]:
-    """The edges that every edge of a network leads to."""
+    """Return the edges that every edge of a network leads to."""
     root = parse_xml(read_bytes(network), str(network))
     found: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
     for item in root.iter("connection"):
@@ -168,7 +168,7 @@ def _require_root(path: Path, tags: Sequence[str], what: str, reporter: Reporter
 
 
 def _rooted(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> Iterator[Tag]:
-    """All elements of a file, if its first one is what it should be."""
+    """Yield all elements of a file; refuse another root than `tags`."""
     for number, tag in enumerate(scan(path, reporter)):
         if not number and tag.name not in tags:
             raise ScenarioError(
