@@ -35,14 +35,14 @@ class RecordingSimulator:
         self.launch: Launch | None = None
 
     def start(self, launch: Launch) -> Snapshot:
-        """Starts a simulation and forgets what was noted."""
+        """Start a simulation and forgets what was noted."""
         self.launch, self._now, self._shown, self.switches = launch, launch.begin_s, {}, []
         snapshot = self._simulator.start(launch)
         shutil.copytree(launch.directory, self._folder, dirs_exist_ok=True)
         return snapshot
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
-        """Simulates `seconds` and notes every change of a signal."""
+        """Simulate `seconds` and note every change of a signal."""
         changes: dict[float, list[tuple[str, str]]] = {}
         for light, segments in plans.items():
             when = self._now
@@ -64,15 +64,15 @@ class RecordingSimulator:
         return self._simulator.signals()
 
     def finish(self) -> Trips:
-        """Ends the simulation."""
+        """End the simulation."""
         return self._simulator.finish()
 
     def close(self) -> None:
-        """Ends the simulation."""
+        """End the simulation."""
         self._simulator.close()
 
     def bare_request(self) -> dict[str, Any]:
-        """What `studies.bench.bare` needs to do the same, without any output."""
+        """Return the request with which `studies.bench.env_libsumo_program` does the same."""
         assert self.launch is not None
         pairs = zip(self.launch.arguments[::2], self.launch.arguments[1::2], strict=True)
         kept = [
@@ -103,7 +103,7 @@ def random_actions(env: TrafficEnv, seed: int) -> list[dict[str, int]]:
 
 
 def episode(request: dict[str, Any]) -> dict[str, Any]:
-    """Runs one episode.
+    """Run one episode.
 
     Args:
         request: ``scenario``, ``control`` (changes to its timing), ``duration_s``, ``seed``,

@@ -32,7 +32,7 @@ _OWN_VERSIONS = (
 
 
 @dataclass(frozen=True)
-class Rival:
+class SumoRl:
     """An environment with sumo-rl.
 
     Attributes:
@@ -46,13 +46,13 @@ class Rival:
     versions: dict[str, str]
 
     def variables(self) -> dict[str, str]:
-        """Environment variables sumo-rl asks for; nothing of the suite shines through."""
+        """Return the environment variables for sumo-rl, without the path of the suite."""
         import sumo
 
         return {"SUMO_HOME": str(sumo.SUMO_HOME), "LIBSUMO_AS_TRACI": "1", "PYTHONPATH": ""}
 
 
-def rival(cache: Path, say: Callable[[str], None]) -> Rival:
+def install_sumo_rl(cache: Path, say: Callable[[str], None]) -> SumoRl:
     """The environment below `cache`, installed if it is not there yet.
 
     Args:
@@ -73,7 +73,7 @@ def rival(cache: Path, say: Callable[[str], None]) -> Rival:
         _install(folder, python, wanted)
         write_whole(record, json.dumps(_found(python)))
     found = json.loads(record.read_text())
-    return Rival(python, Path(found["networks"]), found["versions"])
+    return SumoRl(python, Path(found["networks"]), found["versions"])
 
 
 def _install(folder: Path, python: Path, wanted: list[str]) -> None:
@@ -92,7 +92,7 @@ def _install(folder: Path, python: Path, wanted: list[str]) -> None:
 
 
 def _found(python: Path) -> dict[str, Any]:
-    """Asks the environment what it holds, without importing sumo-rl."""
+    """Ask the environment what it holds, without importing sumo-rl."""
     program = (
         "import importlib.metadata as m, importlib.util as u, json; "
         "print(json.dumps({'networks': u.find_spec('sumo_rl').submodule_search_locations[0] "

@@ -15,7 +15,7 @@ from studies.blind import visible
 from studies.blind.cases import DIAGNOSIS, Case, Hidden, Label, write_label, write_plan
 from studies.blind.grade import SEEN, grade_cases
 from studies.blind.table import rows_of
-from studies.blind.visible import effect_of, judge_visibility, separation
+from studies.blind.visibility import effect_of, judge_visibility, separation
 from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, EVENT_FEATURES, FEATURES
 from ugat_marl.diagnosis.statistics import Pools

@@ -1,4 +1,4 @@
-"""Runs one measured program in a fresh process, so that no measurement warms up another.
+"""Run one measured program in a fresh process, so that no measurement warms up another.
 
 A program is called as ``python program request.json result.json``. It has a temporary folder of its
 own, and everything it prints is kept for the case that it fails.
@@ -28,7 +28,7 @@ def in_fresh_process(
     variables: Mapping[str, str] | None = None,
     timeout_s: float = 3600.0,
 ) -> dict[str, Any]:
-    """Runs a program and returns its result.
+    """Run a program and returns its result.
 
     Args:
         program: Arguments of Python: ``["-m", module]`` or ``[path]``.

@@ -24,7 +24,7 @@ Vector = NDArray[np.float32]
 
 
 class Tape(BaseParallelWrapper[str, Vector, int]):
-    """Notes seed and actions of an episode, and plays them again without a learner."""
+    """Note seed and actions of an episode, and play them again without a learner."""
 
     def __init__(self, env: TrafficEnv) -> None:
         super().__init__(env)
@@ -34,17 +34,17 @@ class Tape(BaseParallelWrapper[str, Vector, int]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Vector], dict[str, dict[str, Any]]]:
-        """Starts an episode and forgets the actions of the one before."""
+        """Start an episode and forgets the actions of the one before."""
         self.seed, self.actions = seed, []
         return self.env.reset(seed=seed, options=options)
 
     def step(self, actions: Mapping[str, int]) -> Any:
-        """One decision."""
+        """Note and make one decision."""
         self.actions.append(dict(actions))
         return self.env.step(dict(actions))
 
     def play(self) -> None:
-        """The noted episode once more."""
+        """Play the noted episode again."""
         self.env.reset(seed=self.seed)
         for actions in self.actions:
             self.env.step(actions)
@@ -77,24 +77,24 @@ class Noise(ParallelEnv[str, Any, Any]):
         self.agents: list[str] = []
 
     def observation_space(self, agent: str) -> Box:
-        """A vector in [0, 1]."""
+        """Return the space of vectors in [0, 1]."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Discrete:
-        """Some actions."""
+        """Return the discrete space of an agent."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Vector], dict[str, dict[str, Any]]]:
-        """Begins anew."""
+        """Begin an episode."""
         self._generator = np.random.default_rng(seed)
         self._left = self._decisions
         self.agents = self.possible_agents[:]
         return self._draw(), {agent: {} for agent in self.agents}
 
     def step(self, actions: Mapping[str, int]) -> Any:
-        """Draws observations and rewards."""
+        """Draw observations and rewards."""
         self._left -= 1
         agents, over = self.agents, self._left == 0
         rewards = dict(zip(agents, self._generator.normal(size=len(agents)).tolist(), strict=True))
@@ -180,7 +180,7 @@ def update_costs(request: Mapping[str, Any], spaces: list[tuple[int, int]]) -> d
 
 
 def measure(request: Mapping[str, Any]) -> dict[str, Any]:
-    """Both comparisons."""
+    """Measure both comparisons."""
     episodes = paired_episodes(request)
     return {**episodes, **update_costs(request, episodes["spaces"])}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import json
 import os
 import signal
@@ -12,13 +13,13 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.bench.cpu_shares import CpuShares, folder_of
-from studies.bench.memory_resets import family, look, processes
+from studies.bench.memory_program import family, look, processes
 from ugat_marl.envs import AnyParallelEnv, Batch, VectorEnv, parallel_env, vector_env
 from ugat_marl.seeding import numpy_generator
 
@@ -28,7 +29,7 @@ _HELD = 3
 
 
 def cycle(masks: NDArray[np.int8], decision: int) -> NDArray[np.int64]:
-    """Green after green, each held for the same time; what the mask forbids gives way."""
+    """Choose green after green, each held for the same time, among those the mask allows."""
     counts = masks.sum(axis=-1)
     wanted = np.full(masks.shape[:-1], decision // _HELD) % np.maximum(counts, 1)
     order = np.cumsum(masks, axis=-1) - 1
@@ -62,7 +63,7 @@ def steps(request: Request) -> dict[str, Any]:
 
 
 def _by_halves(env: VectorEnv, batch: Batch, first: int, last: int) -> None:
-    """One half decides while the other one is simulated."""
+    """Step two halves in turn: one decides while the other one is simulated."""
     halves = env.halves()
     masks = [batch.masks[: halves[0].n], batch.masks[halves[0].n :]]
     for half, own in zip(halves, masks, strict=True):
@@ -115,7 +116,7 @@ def split(request: Request) -> dict[str, Any]:
 
 
 def grounded(request: Request) -> dict[str, Any]:
-    """An episode, plain or with models that are asked and never obeyed: the same traffic."""
+    """Time an episode, plain or with models whose answers are not used: the same traffic."""
     from ugat_marl.grounding import GateConfig, GroundedActionTransform, GroundedEnv, TimedTransform
 
     inner = parallel_env(request["scenario"], duration_s=request["duration_s"])
@@ -149,7 +150,7 @@ def grounded(request: Request) -> dict[str, Any]:
 
 
 def leaks(request: Request) -> dict[str, Any]:
-    """Environments opened, reset, stepped and closed, again and again."""
+    """Open, reset, step and close environments, again and again."""
     seen: list[dict[str, float]] = []
     resets = 0
     for turn in range(request["turns"]):
@@ -165,7 +166,7 @@ def leaks(request: Request) -> dict[str, Any]:
 
 
 def kills(request: Request) -> dict[str, Any]:
-    """A digest of all episodes, and how many processes were killed on the way."""
+    """Kill processes at random; return a digest of all episodes and the number of kills."""
     generator = numpy_generator(request["seed"], "bench", "kills")
     n, per_lane = request["n"], request["episodes"] // request["n"]
     with vector_env(request["scenario"], n, duration_s=request["duration_s"]) as env:
@@ -192,7 +193,7 @@ def kills(request: Request) -> dict[str, Any]:
 
 
 def decide(request: Request) -> dict[str, Any]:
-    """How long policies take to decide for all intersections, on one core."""
+    """Measure the time of a decision for all intersections, on one core."""
     import torch
 
     from ugat_marl.policies import DQN, DQNConfig
@@ -215,7 +216,7 @@ def decide(request: Request) -> dict[str, Any]:
 
 
 def ray(request: Request) -> dict[str, Any]:
-    """The same evaluation on a cluster of this machine, of one node and of two with a core each."""
+    """Time the same evaluation on a local cluster of one or two nodes with a core each."""
     from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
     from ugat_marl.effects import load_scenario
@@ -248,7 +249,7 @@ def ray(request: Request) -> dict[str, Any]:
 
 
 def learner(request: Request) -> dict[str, Any]:
-    """Where the time of a training goes: SUMO, torch, or all else, in one process."""
+    """Measure the CPU time of a training in SUMO, in torch and in all else, in one process."""
     from ugat_marl.policies import learner_factory
 
     env = parallel_env(request["scenario"], duration_s=request["duration_s"], simulator="inprocess")
@@ -273,7 +274,7 @@ def _cpu_s(env: VectorEnv) -> float:
 
 
 def _memory_mib() -> float:
-    """Memory of this process and those below it; what n of them share counts 1/n in each."""
+    """Return the memory of this process and its descendants; shared pages count by share."""
     total = 0.0
     for pid, resident in family(processes(), os.getpid()).items():
         try:
@@ -295,6 +296,63 @@ def _kill(env: VectorEnv, number: int) -> None:
     if worker is not None:
         with contextlib.suppress(ProcessLookupError):
             os.kill(worker._pid, signal.SIGKILL)
+
+
+INTERVAL_S = 0.001
+"""CPU time from one sample of `CpuShares` to the next."""
+
+
+class CpuShares:
+    """Seconds of CPU of the main thread, by the package of the innermost Python function.
+
+    A timer of the process's own time interrupts it; what has been used since the last sample is
+    charged to the function that is on top then. A long call into C is interrupted when it returns,
+    and charged whole to the function that made it: a package's compiled code counts as its own
+    where one of its Python functions calls it, and as the caller's where it is called directly.
+
+    Args:
+        packages: Name of a share to the folder of the package it is of; the rest is "rest".
+
+    Attributes:
+        seconds: Of each share, so far.
+    """
+
+    def __init__(self, packages: Mapping[str, Path]) -> None:
+        self._folders = {str(folder) + "/": name for name, folder in packages.items()}
+        self._known: dict[str, str] = {}
+        self._last = 0.0
+        self._before: Any = None
+        self.seconds = dict.fromkeys([*packages, "rest"], 0.0)
+
+    def __enter__(self) -> CpuShares:
+        self._before = signal.signal(signal.SIGPROF, self._sample)
+        self._last = time.process_time()
+        signal.setitimer(signal.ITIMER_PROF, INTERVAL_S, INTERVAL_S)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        self._sample(signal.SIGPROF, sys._getframe())
+        signal.signal(signal.SIGPROF, self._before)
+
+    def _sample(self, _: int, frame: FrameType | None) -> None:
+        now = time.process_time()
+        file = frame.f_code.co_filename if frame is not None else ""
+        self.seconds[self._share(file)] += now - self._last
+        self._last = now
+
+    def _share(self, file: str) -> str:
+        if file not in self._known:
+            owners = (name for folder, name in self._folders.items() if file.startswith(folder))
+            self._known[file] = next(owners, "rest")
+        return self._known[file]
+
+
+def folder_of(package: str) -> Path:
+    """Return the folder of an importable package."""
+    module = importlib.import_module(package)
+    assert module.__file__ is not None
+    return Path(module.__file__).parent
 
 
 WORK: Mapping[str, Callable[[Request], dict[str, Any]]] = {

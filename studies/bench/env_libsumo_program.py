@@ -1,6 +1,6 @@
 """Measured program: SUMO alone shows given signal states at given seconds, and nothing else.
 
-The yardstick of `studies.bench.speed`: libsumo without the suite, so that this and the simulator
+The yardstick of `studies.bench.env`: libsumo without the suite, so that this and the simulator
 are the only files that import it.
 """
 
@@ -16,7 +16,7 @@ import libsumo
 
 
 def replay(request: dict[str, Any]) -> dict[str, Any]:
-    """Replays signal states.
+    """Replay signal states.
 
     Args:
         request: ``arguments`` (of SUMO), ``end_s``, and ``switches``: a list of

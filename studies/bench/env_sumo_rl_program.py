@@ -1,6 +1,6 @@
 """Measured program: an episode of sumo-rl.
 
-Runs in an environment of its own (see `studies.bench.rival`), without this suite.
+Runs in an environment of its own (see `studies.bench.sumo_rl`), without this suite.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 
 def episode(request: dict[str, Any]) -> dict[str, Any]:
-    """Runs one episode of sumo-rl's parallel environment.
+    """Run one episode of sumo-rl's parallel environment.
 
     Args:
         request: ``network``, ``routes``, ``begin_s``, ``duration_s``, ``decision_interval_s``,

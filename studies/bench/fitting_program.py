@@ -51,7 +51,7 @@ def recorded(request: Mapping[str, Any], domain: str) -> TransitionLog:
 def measured(
     config: FitConfig, simulated: TransitionLog, real: TransitionLog, seed: int
 ) -> dict[str, float]:
-    """One fit and what it is worth; seconds are CPU time."""
+    """Fit once and score the fit; seconds are CPU time."""
     stack = Stack(simulated.provenance.layouts)
     model = InverseModel(stack, InverseConfig(), torch_generator(seed))
     began = time.process_time()
@@ -87,7 +87,7 @@ def answer_ms(model: InverseModel) -> float:
 
 
 def measure(request: Mapping[str, Any]) -> dict[str, Any]:
-    """All methods in turn, each round with another seed."""
+    """Measure all methods in turn, each round with another seed."""
     torch.set_num_threads(1)
     simulated, real = recorded(request, "sim"), recorded(request, request["domain"])
     options = {name: request[name] for name in ("epochs", "off_data_weight")}

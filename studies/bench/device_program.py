@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from studies.bench.learning_episodes import Noise
+from studies.bench.learning_program import Noise
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.grounding import FitConfig, GroundedActionTransform, fit
 from ugat_marl.policies import CPU, DQN, DQNConfig, device_of
@@ -26,7 +26,7 @@ EPISODES = 4
 
 
 def random_log(agents: int, steps: int, seed: int) -> TransitionLog:
-    """Transitions that hold nothing but have the form of recorded ones."""
+    """Draw random transitions in the form of recorded ones."""
     layouts = {f"agent_{index}": LAYOUT for index in range(agents)}
     seeds = tuple(range(EPISODES))
     told = Provenance("random", "", "sim", seeds, 10.0, "count", layouts)
@@ -46,7 +46,7 @@ def random_log(agents: int, steps: int, seed: int) -> TransitionLog:
 
 
 class Updates:
-    """A learner with something to learn from, on a device."""
+    """A learner with a filled replay memory, on a device."""
 
     def __init__(self, request: Mapping[str, Any], agents: int, device: torch.device) -> None:
         config = DQNConfig(batch_size=request["batch_size"], warmup_decisions=50)
@@ -57,7 +57,7 @@ class Updates:
         self._updates: int = request["updates"]
 
     def time(self) -> float:
-        """Wall ms of one update and of handing its weights to who acts, which waits for it."""
+        """Return wall ms of one update, with its weights handed to the acting networks."""
         began = time.perf_counter()
         for _ in range(self._updates):
             self._learner._update(self._generator)
@@ -66,7 +66,7 @@ class Updates:
 
 
 class Fits:
-    """Models and what they are fitted to, on a device."""
+    """Models and the log they are fitted to, on a device."""
 
     def __init__(
         self, request: Mapping[str, Any], log: TransitionLog, device: torch.device
@@ -77,7 +77,7 @@ class Fits:
         self._transform = GroundedActionTransform(log.provenance.layouts, self._seed)
 
     def time(self) -> float:
-        """Wall s of a whole fit, with reading the log and measuring what the models are worth."""
+        """Return wall s of a whole fit, with reading the log and scoring the models."""
         models = self._transform.forward, self._transform.inverse
         began = time.perf_counter()
         fit(*models, self._log, self._log, self._config, self._seed, device=self._device)
@@ -85,7 +85,7 @@ class Fits:
 
 
 def measure(request: Mapping[str, Any]) -> dict[str, Any]:
-    """All sizes on both devices, round by round; what is loaded on first use is nobody's cost."""
+    """Measure all sizes on both devices, round by round, after a first use that is not counted."""
     torch.set_num_threads(1)
     there = device_of(request["device"])
     devices = {"cpu": CPU, "device": there}

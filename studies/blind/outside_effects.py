@@ -1,4 +1,4 @@
-"""What streets do and the library of effects does not know: a diagnosis must not explain these."""
+"""Effects outside the library: a diagnosis must not call their data explained."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class BusStops(Effect):
     dwell_s: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Adds a bus type and its buses.
+        """Add a bus type and its buses.
 
         Raises:
             BlindTestError: Nobody drives over the edge and on.
@@ -72,7 +72,7 @@ class Driveway(Effect):
     share: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Cuts the routes of vehicles chosen by a hash of their ids."""
+        """Cut the routes of vehicles chosen by a hash of their ids."""
         places = places_of(scenario)
         position = _before_line(scenario, places.edges[self.edge][0])
 

@@ -59,7 +59,7 @@ def entries(folder: Path) -> int:
 
 
 def look() -> dict[str, float]:
-    """All that must not grow."""
+    """Return memory, processes and files, which must not grow."""
     members = family(processes(), os.getpid())
     return {
         "own memory [MiB]": members[os.getpid()],
@@ -71,7 +71,7 @@ def look() -> dict[str, float]:
 
 
 def resets(request: Mapping[str, Any]) -> dict[str, Any]:
-    """Resets and steps; what was seen early and late."""
+    """Reset and step; return what was seen early and late."""
     env = parallel_env(request["scenario"], simulator=request["simulator"])
     generator = numpy_generator(request["seed"], "bench", "memory")
     found: dict[str, dict[str, float]] = {}

@@ -1,4 +1,4 @@
-"""Draws what is hidden in a case: class, strength, place and time."""
+"""Draw what is hidden in a case: class, strength, place and time."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from studies.blind.busy import Busy
-from studies.blind.outside import BusStops, Driveway
+from studies.blind.outside_effects import BusStops, Driveway
+from studies.blind.places import Busy
 from studies.blind.strengths import KINDS, MODELS, SCALE, STRENGTHS, nominal_of
 from ugat_marl.diagnosis import IN_THE_LOG
 from ugat_marl.effects import EVERYWHERE, SETTINGS, Effect, effect_from, known_effects
@@ -44,7 +44,7 @@ _OWN = OUTSIDE[: 4 + len(MODELS)]
 
 @dataclass(frozen=True)
 class Task:
-    """What is asked for before anything is drawn: group, member of it, strength."""
+    """Request for one case before the draw: group, member of the group, strength."""
 
     group: str
     member: str = ""
@@ -52,8 +52,8 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """What is hidden.
+class Sample:
+    """Hidden effects of one case.
 
     Attributes:
         group: The group.
@@ -70,7 +70,7 @@ class Drawn:
     leave_out: tuple[str, ...] = ()
 
 
-def deck(
+def draw_tasks(
     classes: Sequence[str],
     strengths: Sequence[str],
     cases: int,
@@ -123,29 +123,29 @@ def _members(name: str, strengths: Sequence[str]) -> list[Task]:
     return found or [Task("single", effect, KINDS[effect].strengths[0]) for effect in effects]
 
 
-def draw_hidden(
+def draw_sample(
     task: Task, scenario: Scenario, busy: Busy, generator: np.random.Generator
-) -> Drawn | None:
-    """What is hidden in one case; None if the scenario has no place for it."""
+) -> Sample | None:
+    """Draw the hidden effects of one case; return None if the scenario has no place for them."""
     if task.group == "none":
-        return _with_decoy(Drawn("none", "none", "", ()), generator)
+        return _with_decoy(Sample("none", "none", "", ()), generator)
     if task.group == "setting":
-        drawn = Drawn("setting", task.member, "", SETTINGS[task.member])
-        return _with_decoy(drawn, generator)
+        sample = Sample("setting", task.member, "", SETTINGS[task.member])
+        return _with_decoy(sample, generator)
     if task.group == "outside":
         return _outside(task.member, scenario, busy, generator)
     if task.group == "pair":
         return _pair(scenario, busy, generator)
-    effect = hidden_effect(task.member, task.strength, scenario, busy, generator)
+    effect = draw_effect(task.member, task.strength, scenario, busy, generator)
     if effect is None:
         return None
-    return _with_decoy(Drawn("single", task.member, task.strength, (effect,)), generator)
+    return _with_decoy(Sample("single", task.member, task.strength, (effect,)), generator)
 
 
-def hidden_effect(
+def draw_effect(
     name: str, strength: str, scenario: Scenario, busy: Busy, generator: np.random.Generator
 ) -> Effect | None:
-    """An effect at a strength, somewhere, at some time; None if there is no place for it."""
+    """Draw the place and time of an effect; return None if there is no place for it."""
     kind = KINDS[name]
     if (name == "gap_acceptance" and not busy.permitted) or (
         name == "lane_discipline" and not busy.several_lanes
@@ -169,7 +169,7 @@ def hidden_effect(
 
 
 def _places(where: str, busy: Busy) -> list[tuple[str, ...]]:
-    """What the text fields of an effect may hold."""
+    """Return the possible values of the text fields of an effect."""
     if where == "everywhere":
         return [()]
     if where == "light":
@@ -201,26 +201,26 @@ def _window(
     return float(begin), float(begin + round(length))
 
 
-def _pair(scenario: Scenario, busy: Busy, generator: np.random.Generator) -> Drawn | None:
-    """Two effects of two families, neither of them small."""
+def _pair(scenario: Scenario, busy: Busy, generator: np.random.Generator) -> Sample | None:
+    """Draw two effects of two families, neither of them small."""
     names = [x for x in KINDS if x in known_effects() and x not in IN_THE_LOG]
     for _ in range(100):
         one, two = (names[i] for i in generator.choice(len(names), 2, replace=False))
         strength = ("medium", "large")[int(generator.integers(2))]
         if KINDS[one].family == KINDS[two].family:
             continue
-        found = [hidden_effect(x, strength, scenario, busy, generator) for x in (one, two)]
+        found = [draw_effect(x, strength, scenario, busy, generator) for x in (one, two)]
         effects = [effect for effect in found if effect is not None]
         if len(effects) == 2:
             hidden = "+".join(sorted((one, two)))
-            return _with_decoy(Drawn("pair", hidden, strength, tuple(effects)), generator)
+            return _with_decoy(Sample("pair", hidden, strength, tuple(effects)), generator)
     return None
 
 
 def _outside(
     member: str, scenario: Scenario, busy: Busy, generator: np.random.Generator
-) -> Drawn | None:
-    """What the library does not know, or is not allowed to."""
+) -> Sample | None:
+    """Draw an effect that the library does not have, or that the diagnosis may not use."""
     strength = ("medium", "large")[int(generator.integers(2))]
     scale = SCALE[strength]
     effects: tuple[Effect | None, ...]
@@ -229,12 +229,12 @@ def _outside(
             return None
         edge = busy.edges[int(generator.integers(len(busy.edges)))]
         if member == "bus_stops":
-            return Drawn(
+            return Sample(
                 "outside", member, strength, (BusStops(edge, 10.0 * scale, 25.0),), ("parking",)
             )
-        return Drawn("outside", member, strength, (Driveway(edge, 0.1 * scale),))
+        return Sample("outside", member, strength, (Driveway(edge, 0.1 * scale),))
     if member == "double_parking":
-        parked = hidden_effect("parking", strength, scenario, busy, generator)
+        parked = draw_effect("parking", strength, scenario, busy, generator)
         edge = "" if parked is None else edge_of(str(parked.record()["lane"]))
         ways = [turn for turn in busy.turns if turn[0] == edge]
         if parked is None or not ways:
@@ -243,23 +243,23 @@ def _outside(
         turn = effect_from(
             {"name": "turning", "from_edge": start, "to_edge": end, "share": 0.1 * scale}
         )
-        return Drawn("outside", member, strength, (parked, turn), ("parking",))
+        return Sample("outside", member, strength, (parked, turn), ("parking",))
     if member in MODELS:
         model = effect_from({"name": "driver_model", "model": member})
-        return Drawn("outside", member, "", (model,), ("driver_model",))
+        return Sample("outside", member, "", (model,), ("driver_model",))
     name = member.removeprefix("without ")
     strength = strength if strength in KINDS[name].strengths else KINDS[name].strengths[0]
-    effects = (hidden_effect(name, strength, scenario, busy, generator),)
+    effects = (draw_effect(name, strength, scenario, busy, generator),)
     if effects[0] is None:
         return None
     leave_out = (name, *ALSO_OUT.get(name, ()))
-    return Drawn("outside", member, strength, (effects[0],), leave_out)
+    return Sample("outside", member, strength, (effects[0],), leave_out)
 
 
-def _with_decoy(drawn: Drawn, generator: np.random.Generator) -> Drawn:
-    hidden = {effect.name for effect in drawn.effects}
+def _with_decoy(sample: Sample, generator: np.random.Generator) -> Sample:
+    hidden = {effect.name for effect in sample.effects}
     if generator.random() >= DECOYS:
-        return drawn
+        return sample
     others = [x for x in KINDS if x in known_effects() and x not in hidden]
     name = others[int(generator.integers(len(others)))]
-    return Drawn(drawn.group, drawn.hidden, drawn.strength, drawn.effects, (name,))
+    return Sample(sample.group, sample.hidden, sample.strength, sample.effects, (name,))

@@ -1,4 +1,4 @@
-"""Whether a hidden effect can be seen at all: a test that is told what to look for.
+"""Visibility of hidden effects, by a test that is told the effect.
 
 A diagnosis has to find the effect, its place and its strength. This test knows them, and asks only
 by how many standard deviations of noise they move what the fitted periods show: what it cannot see
@@ -39,7 +39,7 @@ DAYS = 24
 def judge_visibility(
     directory: Path, *, only: Sequence[str] = (), seed: int = 0, reporter: Reporter | None = None
 ) -> dict[str, float | None]:
-    """Judges every diagnosed case with a single effect, and writes what it finds.
+    """Judge every diagnosed case with a single effect, and writes what it finds.
 
     Args:
         directory: A blind test.
@@ -79,7 +79,7 @@ def judge_visibility(
 
 
 def effect_of(hidden: Hidden) -> Effect:
-    """The effect itself, from the form in which it is named."""
+    """Make the effect from the form in which it is named."""
     texts = known_effects()[hidden.name].texts
     values: dict[str, float | str] = dict(hidden.parameters)
     values |= dict(zip(texts, (hidden.place or "").split(">"), strict=True)) if texts else {}

@@ -1,4 +1,4 @@
-"""Where enough happens in a scenario that a hidden effect can be seen at all."""
+"""Places of a scenario with enough traffic to show a hidden effect."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Busy:
 
 
 def busy_places(scenario: Scenario, seed: int) -> Busy:
-    """Counts the demand, and plays one day to see which lanes it takes.
+    """Count the demand, and plays one day to see which lanes it takes.
 
     Args:
         scenario: The simulation.
