@@ -264,8 +264,8 @@ def learner(request: Request) -> dict[str, Any]:
 def _cpu_s(env: VectorEnv) -> float:
     """Seconds of CPU the simulations have used; nan where the system does not say."""
     total = 0.0
-    for lane in env._lanes:
-        stat = Path(f"/proc/{lane._worker._pid if lane._worker else 0}/stat")
+    for remote in env._environments:
+        stat = Path(f"/proc/{remote._worker._pid if remote._worker else 0}/stat")
         if not stat.exists():
             return float("nan")
         user, system = stat.read_text().rpartition(")")[2].split()[11:13]
@@ -292,7 +292,7 @@ def _vehicles(counts: NDArray[np.float32]) -> float:
 
 
 def _kill(env: VectorEnv, number: int) -> None:
-    worker = env._lanes[number]._worker
+    worker = env._environments[number]._worker
     if worker is not None:
         with contextlib.suppress(ProcessLookupError):
             os.kill(worker._pid, signal.SIGKILL)
