@@ -9,12 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
-from ugat_marl.diagnosis.engine import Engine, Replicate
+from ugat_marl.diagnosis.engine import Engine, Replicate, Usual
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.fit import FAR, NEARBY, SETTLING_DAYS, SHORTEST_S, Fitter
+from ugat_marl.diagnosis.fit import FAR, NEARBY, SETTLING_DAYS, SHORTEST_S, Fitter, uncertainty
 from ugat_marl.diagnosis.hypotheses import Members
-from ugat_marl.diagnosis.intervals import uncertainty
-from ugat_marl.diagnosis.standstill import Usual
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.effects import Effect
 

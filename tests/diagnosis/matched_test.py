@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, EVENT_FEATURES, FEATURES
-from ugat_marl.diagnosis.matched import LEAST_APART, Directions, Matched
-from ugat_marl.diagnosis.residual import Directed, Null
-from ugat_marl.diagnosis.search import Ray
+from ugat_marl.diagnosis.propose import Ray
+from ugat_marl.diagnosis.residual import LEAST_APART, Directed, Directions, Matched, Null
 from ugat_marl.diagnosis.statistics import Pools
 
 Array = NDArray[np.float64]

@@ -13,8 +13,8 @@ import pytest
 from ugat_marl.diagnosis import Hypothesis, records
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Members
-from ugat_marl.diagnosis.pruning import NEGLIGIBLE, pruned
 from ugat_marl.diagnosis.records import Fitted
+from ugat_marl.diagnosis.select import NEGLIGIBLE, pruned
 from ugat_marl.progress import Advance, Silent
 
 HEADWAY = (Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05), (1.5,))

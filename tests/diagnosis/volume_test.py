@@ -10,9 +10,9 @@ import pytest
 
 from ugat_marl.diagnosis import Hypothesis, Routes
 from ugat_marl.diagnosis.features import FEATURES, INDEX
+from ugat_marl.diagnosis.places import _ALONE, Volume
 from ugat_marl.diagnosis.site import Site, SiteLane
 from ugat_marl.diagnosis.statistics import Distance
-from ugat_marl.diagnosis.volume import _ALONE, Volume
 from ugat_marl.effects import load_scenario
 from ugat_marl.scenarios import Scenario
 

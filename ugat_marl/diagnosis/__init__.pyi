@@ -4,6 +4,7 @@ from .hypotheses import Hypothesis as Hypothesis
 from .hypotheses import free_values as free_values
 from .hypotheses import global_hypotheses as global_hypotheses
 from .hypotheses import ordered as ordered
+from .places import Routes as Routes
 from .records import CORRECTED as CORRECTED
 from .records import FILE as FILE
 from .records import Conclusion as Conclusion
@@ -34,15 +35,14 @@ from .records import Verified as Verified
 from .signal_timing import IN_THE_LOG as IN_THE_LOG
 from .statistics import Reference as Reference
 from .statistics import added as added
+from .statistics import groups_of as groups_of
+from .statistics import independent as independent
 from .statistics import shift as shift
 from .study import DiagnosisConfig as DiagnosisConfig
 from .study import Study as Study
+from .verdict import clock as clock
 from .verdict import conclude as conclude
+from .verdict import statistic as statistic
 from .verify import verify_model as verify_model
-from .volume import Routes as Routes
-from .whitening import groups_of as groups_of
-from .whitening import independent as independent
-from .wording import clock as clock
-from .wording import statistic as statistic
 from .workflow import diagnose as diagnose
 from .workflow import locate_gap as locate_gap

@@ -10,27 +10,23 @@ from pathlib import Path
 
 import numpy as np
 
-from ugat_marl.data import Measured, follows_traffic
-from ugat_marl.diagnosis.counted import bins_together, counts_tally, without_gaps
+from ugat_marl.data import Finding, Measured, follows_traffic
 from ugat_marl.diagnosis.engine import Engine, default_cache
-from ugat_marl.diagnosis.features import Tally
+from ugat_marl.diagnosis.features import Tally, bins_together, counts_tally, without_gaps
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, library
-from ugat_marl.diagnosis.local import Proposer
-from ugat_marl.diagnosis.matched import Directions
-from ugat_marl.diagnosis.reach import unreached
+from ugat_marl.diagnosis.places import Proposer, Routes
 from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
-from ugat_marl.diagnosis.residual import Directed, Null
+from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import Effort, Selector
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, added, shift
-from ugat_marl.diagnosis.volume import Routes
 from ugat_marl.effects import Effect
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios import Detector, Network, Period, Scenario
+from ugat_marl.scenarios import Detector, Network, Period, Scenario, edge_of, driven_routes
 
 PRICE = 14.0
 """What an effect must take off the distance to be worth naming."""
@@ -331,3 +327,59 @@ def _tallies(
         return tuple(engine.measured(periods))
     whole = without_gaps(measured.counts, measured.periods)
     return tuple(counts_tally(site, period, measured.counts, whole) for period in periods)
+
+
+# --- demand that does not come where vehicles were measured ---------------------------------------
+
+_NAMED = 6
+
+
+def unreached(
+    scenario: Scenario, measured: Measured, detectors: Sequence[Detector]
+) -> tuple[Finding, ...]:
+    """A finding on edges where detectors counted vehicles, and which no route leads over.
+
+    Args:
+        scenario: The scenario as it is.
+        measured: The data.
+        detectors: Those that are compared.
+
+    Raises:
+        MeasuredDataError: No route leads over any of the measured edges.
+    """
+    edges = {item.id: edge_of(item.lane) for item in detectors}
+    counted: dict[str, int] = {}
+    for period in measured.periods:
+        for name, passages in period.passages.items():
+            if name in edges and len(passages):
+                counted[edges[name]] = counted.get(edges[name], 0) + len(passages)
+    if not measured.has_events and measured.counts is not None:
+        for name, count in measured.counts.select("detector_id", "count").iter_rows():
+            if name in edges and count:
+                counted[edges[name]] = counted.get(edges[name], 0) + int(count)
+    left = set(edges.values())
+    for way in driven_routes(scenario):
+        left.difference_update(way)
+        if not left:
+            return ()
+    if left == set(edges.values()):
+        raise MeasuredDataError(
+            f"scenario {scenario.id!r}: no vehicle of its demand comes over a measured edge "
+            f"({_few(left)}); check lane_id in detectors.csv, and the demand of the scenario"
+        )
+    missed = {edge for edge in left if counted.get(edge)}
+    if not missed:
+        return ()
+    vehicles = sum(counted[edge] for edge in missed)
+    return (
+        Finding(
+            f"scenario {scenario.id!r}: no vehicle of its demand comes over {_few(missed)}, where "
+            f"detectors counted {vehicles}; demand that is not there is no effect of the library, "
+            "so add it to the scenario first"
+        ),
+    )
+
+
+def _few(edges: set[str]) -> str:
+    named = sorted(edges)
+    return ", ".join(named[:_NAMED]) + (" ..." if len(named) > _NAMED else "")

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.hypotheses import Hypothesis
 from ugat_marl.diagnosis.records import Proposed
-from ugat_marl.diagnosis.statistics import Distance, Reference, softened, without_noise
-from ugat_marl.diagnosis.whitening import Whitener
+from ugat_marl.diagnosis.statistics import Distance, Reference, Whitener, softened, without_noise
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
+from ugat_marl.diagnosis.propose import FARTHEST, Ray, between, propose
 from ugat_marl.diagnosis.records import Proposed
-from ugat_marl.diagnosis.search import FARTHEST, Ray, between, propose
-from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.whitening import Whitener
+from ugat_marl.diagnosis.statistics import Pools, Whitener
 
 Array = NDArray[np.float64]
 
