@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.propose import FARTHEST, Ray, between, propose
+from ugat_marl.diagnosis.propose import Ray, between, propose
 from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Pools, Whitener
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
 
@@ -148,7 +149,7 @@ def test_no_effect_works_backwards(reference: Reference) -> None:
 def test_rays_are_followed_only_so_far(reference: Reference) -> None:
     among = rays()[:1]
     best = propose(among, whitener(reference, {"headway": 5.0}, among), PRICE)[0]
-    assert values(best)["headway"] == pytest.approx(1.0 + FARTHEST * 0.5)
+    assert values(best)["headway"] == pytest.approx(1.0 + THRESHOLDS.farthest * 0.5)
 
 
 def test_two_strengths_of_one_hypothesis_never_stand_in_one_model(reference: Reference) -> None:

@@ -40,6 +40,9 @@ from .statistics import independent as independent
 from .statistics import shift as shift
 from .study import DiagnosisConfig as DiagnosisConfig
 from .study import Study as Study
+from .thresholds import THRESHOLDS as THRESHOLDS
+from .thresholds import Effort as Effort
+from .thresholds import Thresholds as Thresholds
 from .verdict import clock as clock
 from .verdict import conclude as conclude
 from .verdict import statistic as statistic

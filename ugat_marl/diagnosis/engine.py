@@ -24,6 +24,7 @@ from ugat_marl.data import version_of
 from ugat_marl.diagnosis.features import FEATURES, Tally, tally
 from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
 from ugat_marl.diagnosis.site import Greens, Site
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
 from ugat_marl.files import user_cache, write_whole
@@ -32,12 +33,6 @@ from ugat_marl.scenarios import Period, Scenario
 from ugat_marl.seeding import derive_seed
 
 # --- days on which traffic stood still ------------------------------------------------------------
-
-LOCKED_UP = 5.0
-"""Robust standard deviations by which a day's counts are those of no ordinary day."""
-RARE = 0.1
-"""Share of days up to which such days are not part of a model: five measured days rather have none.
-The test of what is left does not hang on one of them."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +75,8 @@ def locked_up(tallies: Sequence[Tally], usual: float = 0.0) -> list[int]:
     """
     counts = _counts(tallies)
     spread = max(day_to_day(tallies), usual)
-    found = np.flatnonzero(np.abs(counts - np.median(counts)) > LOCKED_UP * spread)
-    return found.tolist() if len(found) <= max(1.0, RARE * len(tallies)) else []
+    found = np.flatnonzero(np.abs(counts - np.median(counts)) > THRESHOLDS.locked_up * spread)
+    return found.tolist() if len(found) <= max(1.0, THRESHOLDS.rare * len(tallies)) else []
 
 
 def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:

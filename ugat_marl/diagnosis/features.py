@@ -17,6 +17,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.site import Greens, Site, SiteLane
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.scenarios import Passages, Period
 
 Array = NDArray[np.float64]
@@ -88,12 +89,6 @@ EVENT_FEATURES = frozenset(
 COUNT_FEATURES = ("count_advance", "count_stop", "count_exit")
 PLATOON_FEATURES = ("platoon_gap", "platoon_short", "platoon_middle", "platoon_time")
 BIN_FEATURES = (*COUNT_FEATURES, "occupied")
-BIN_S = 300.0
-
-_BREAK_S = 5.0
-_FIRST_S = 12.0
-_MOVING_MPS = 6.0
-_AFTER_RED_S = 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +143,7 @@ class Tally:
 
 def bins_of(period: Period) -> int:
     """Number of bins of time in a period."""
-    return max(1, round((period.end_s - period.begin_s) / BIN_S))
+    return max(1, round((period.end_s - period.begin_s) / THRESHOLDS.bin_s))
 
 
 def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
@@ -247,8 +242,10 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     queue = came[first] < start
     before = np.where(number == 0, start, np.roll(crossed, 1))
     gap = crossed - before
-    broken = np.cumsum(gap > np.where(number == 0, _FIRST_S, _BREAK_S))
-    alive = queue & (broken - broken[first] + (gap[first] > _FIRST_S) == 0)
+    broken = np.cumsum(
+        gap > np.where(number == 0, THRESHOLDS.first_gap_s, THRESHOLDS.queue_break_s)
+    )
+    alive = queue & (broken - broken[first] + (gap[first] > THRESHOLDS.first_gap_s) == 0)
     protected = alive & greens.protected[cycle]
     counter.add("gap_permitted", gap[alive & ~greens.protected[cycle] & (number >= 1)])
     lost = gap[protected & (number == 0)]
@@ -290,7 +287,9 @@ def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
     counter.ratio("yellow_crossings", float((counted & (red <= 0)).sum()), cycles)
     counter.ratio("late_crossings", float((counted & (red > 0) & (red <= 2.0)).sum()), cycles)
     counter.ratio(
-        "red_crossings", float((counted & (red > 2.0) & (red <= _AFTER_RED_S)).sum()), cycles
+        "red_crossings",
+        float((counted & (red > 2.0) & (red <= THRESHOLDS.after_red_s)).sum()),
+        cycles,
     )
     counter.add("last_crossing", after[counted & (red <= 3.0)])
 
@@ -313,7 +312,7 @@ def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: f
     on, speed = advance.on_s, advance.speed_mps
     over = advance.off_s - on
     gap = np.append(np.inf, np.diff(on))
-    moving = np.where(np.isfinite(speed), speed > _MOVING_MPS, over < 1.2)
+    moving = np.where(np.isfinite(speed), speed > THRESHOLDS.moving_mps, over < 1.2)
     platoon = moving & np.append(False, moving[:-1]) & (gap < 6.0)
     counter.add("platoon_gap", gap[platoon])
     counter.add("platoon_short", (gap[platoon] < 1.6).astype(np.float64))
@@ -390,9 +389,6 @@ def _conserved(counter: _Counter, site: Site, advances: Array, stops: Array, exi
 
 # --- counts alone ---------------------------------------------------------------------------------
 
-_WHOLE = 0.99
-"""Share of a bin, or a period, that must have been counted."""
-
 
 def bins_together(counts: pl.DataFrame | None) -> int:
     """How many bins a count covers: within it nobody knows when vehicles came.
@@ -403,7 +399,7 @@ def bins_together(counts: pl.DataFrame | None) -> int:
     if counts is None or counts.is_empty():
         return 1
     longest = float((counts["end_s"] - counts["begin_s"]).cast(pl.Float64).to_numpy().max())
-    return max(1, math.ceil(longest / BIN_S - 1e-6))
+    return max(1, math.ceil(longest / THRESHOLDS.bin_s - 1e-6))
 
 
 def without_gaps(counts: pl.DataFrame, periods: Sequence[Period]) -> frozenset[str]:
@@ -413,7 +409,7 @@ def without_gaps(counts: pl.DataFrame, periods: Sequence[Period]) -> frozenset[s
     for period in periods:
         own = counts.filter(pl.col("period_id") == period.id)
         times = dict(own.group_by("detector_id").agg(length.sum()).iter_rows())
-        least = _WHOLE * (period.end_s - period.begin_s)
+        least = THRESHOLDS.whole * (period.end_s - period.begin_s)
         found = {name for name in found if times.get(name, 0.0) >= least}
     return frozenset(found)
 
@@ -444,5 +440,5 @@ def counts_tally(site: Site, period: Period, counts: pl.DataFrame, whole: Collec
             line = BIN_FEATURES.index(name), place
             bins[line] += count * inside / max(end - begin, 1e-9)
             covered[line] += inside
-    known = (covered > _WHOLE * np.diff(edges)).astype(np.float64)
+    known = (covered > THRESHOLDS.whole * np.diff(edges)).astype(np.float64)
     return Tally(sums, bins * known, known=known)

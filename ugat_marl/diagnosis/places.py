@@ -15,26 +15,20 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.features import BIN_FEATURES, BIN_S, INDEX
+from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX
 from ugat_marl.diagnosis.hypotheses import CLOCK_S, DRIFT, LATE_STEP_S, Hypothesis, Members
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Distance, Reference
-from ugat_marl.scenarios import Passages, Period, Scenario, edge_of, driven_routes
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.scenarios import Passages, Period, Scenario, driven_routes, edge_of
 
 Array = NDArray[np.float64]
 
-_DWELL_S = 40.0
-_MOST_LANES = 24
-"""With more incoming lanes not every one of them is tried."""
 _FLOW = (
     "gap_long", "occupied_in_green", "gap9+", "free_speed", "queue_over", "platoon_gap",
     "count_advance", "count_stop",
 )  # fmt: skip
 _AVOIDED = ("count_advance", "count_stop")
-_SHIFTS_S = (-900.0, -600.0, -300.0, -150.0, 150.0, 300.0, 600.0, 900.0)
-_SUSPECT = 16.0
-_MOSTLY = 0.7
-"""Share of the vehicles on an edge from which its counts are those of one origin."""
 
 
 class Proposer:
@@ -78,7 +72,7 @@ class Proposer:
         neither pools nor single statistics show it, and no other effect leads there.
         """
         lanes = self._site.lanes
-        if len(lanes) > _MOST_LANES or "parking" not in self.allowed:
+        if len(lanes) > THRESHOLDS.most_lanes or "parking" not in self.allowed:
             return []
         return [_parking(lane.id) for lane in lanes]
 
@@ -94,23 +88,23 @@ class Proposer:
         block = reference.blocks["time"]
         found: list[tuple[float, str, float]] = []
         first = BIN_FEATURES.index("count_advance") * len(self._edges)
-        width = BIN_S * reference.pools.together
+        width = THRESHOLDS.bin_s * reference.pools.together
         for origin in self._routes.passing:
             rows = [
                 first + index
                 for index, lane in enumerate(self._site.lanes)
-                if self._routes.share(origin, lane.edge) > _MOSTLY
+                if self._routes.share(origin, lane.edge) > THRESHOLDS.mostly
             ]
             known = z[rows] != 0
             if not known.any():
                 continue
             mean = np.where(np.isfinite(block.mean[rows]), block.mean[rows], 0.0)
             noise = np.where(known, difference[rows] / np.where(known, z[rows], 1.0), np.inf)
-            for shift in _SHIFTS_S:
+            for shift in THRESHOLDS.shifts_s:
                 ray = (_later(mean, shift / width) - mean) / np.abs(noise)
                 size = float((ray**2).sum())
                 strength = float((ray * z[rows]).sum()) / max(size, 1e-9)
-                if 0.5 < strength < 2.0 and strength**2 * size > _SUSPECT:
+                if 0.5 < strength < 2.0 and strength**2 * size > THRESHOLDS.suspect_timing:
                     found.append((strength**2 * size, origin, shift))
         chosen: dict[str, float] = {}
         for _, origin, shift in sorted(found, reverse=True):
@@ -180,7 +174,7 @@ class Proposer:
         if not rows:
             return None
         begin, end = periods[0].begin_s, periods[0].end_s
-        minutes = max(int((end - begin) / SCAN_S), 1)
+        minutes = max(int((end - begin) / THRESHOLDS.scan_s), 1)
         bins = block.mean.shape[1]
         which = np.minimum((np.arange(minutes) * bins) // minutes, bins - 1)
         per_bin = np.bincount(which, minlength=bins)
@@ -307,7 +301,7 @@ class Proposer:
 
 
 def _parking(lane: str) -> Hypothesis:
-    fixed = (("lane", lane), ("dwell_s", _DWELL_S))
+    fixed = (("lane", lane), ("dwell_s", THRESHOLDS.dwell_s))
     return Hypothesis("parking", fixed, ("per_hour",), ((20.0,),), (0.0,), 3.0)
 
 
@@ -324,12 +318,6 @@ def _later(counts: Array, bins: float) -> Array:
 
 
 # --- counts: demand and turning -------------------------------------------------------------------
-
-_ALONE = 0.1
-"""Share of the noise of a count that it has to itself: vehicles still under way, detectors' own."""
-_SUSPECT_CHANGE = 9.0
-"""Squared standardised change from which a place is examined."""
-_PLACES = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -430,20 +418,22 @@ class Volume:
         counts = self._counts(distance)
         found: list[Hypothesis] = []
         if len(self._routes.passing) > 1:
-            for gain, origin, factor in sorted(self._origins(counts), reverse=True)[:_PLACES]:
+            for gain, origin, factor in sorted(self._origins(counts), reverse=True)[
+                : THRESHOLDS.places_of_a_kind
+            ]:
                 level = float(np.clip(factor, 0.3, 3.0))
                 fixed = (("edge", origin),)
-                if gain > _SUSPECT_CHANGE:
+                if gain > THRESHOLDS.suspect_change:
                     found.append(
                         Hypothesis(
                             "demand_level", fixed, ("factor",), ((level,),), (1.0,), 0.03, both=True
                         )
                     )
         for gain, origin, target, share in sorted(self._turns(counts, distance), reverse=True)[
-            :_PLACES
+            : THRESHOLDS.places_of_a_kind
         ]:
             fixed = (("from_edge", origin), ("to_edge", target))
-            if gain > _SUSPECT_CHANGE:
+            if gain > THRESHOLDS.suspect_change:
                 found.append(Hypothesis("turning", fixed, ("share",), ((share,),), (0.0,), 0.03))
         return found
 
@@ -477,15 +467,15 @@ class Volume:
         shared = np.array([[joint.get(a, {}).get(b, 0.0) for b in edges] for a in edges])
         shared = shared.reshape(len(edges), len(edges))
         size = np.sqrt(np.maximum(np.diag(shared), 1e-9))
-        alone = np.where(np.diag(shared) > 0, _ALONE, 1.0)
-        return (1 - _ALONE) * shared / np.outer(size, size) + np.diag(alone)
+        alone = np.where(np.diag(shared) > 0, THRESHOLDS.alone, 1.0)
+        return (1 - THRESHOLDS.alone) * shared / np.outer(size, size) + np.diag(alone)
 
     def _origins(self, counts: _Counts) -> list[tuple[float, str, float]]:
         """Squared z, origin and factor of every origin that can be told."""
         found: list[tuple[float, str, float]] = []
         for origin, reached in self._routes.passing.items():
             strength, gain, size = counts.weighed(reached)
-            if size > _SUSPECT_CHANGE:
+            if size > THRESHOLDS.suspect_change:
                 found.append((gain, origin, 1.0 + strength))
         return found
 
@@ -539,8 +529,6 @@ class Volume:
 
 # --- stretches of time ----------------------------------------------------------------------------
 
-SCAN_S = 60.0
-SHORTEST_STRETCH_S = 240.0
 _COUNTS = 3
 """Kinds of counts in time that are counts of vehicles; they come first."""
 
@@ -592,12 +580,12 @@ def most_unusual(
         side: -1 or 1 for departures to that side only.
     """
     minutes = len(measured)
-    if expected.sum() <= 0 or minutes * SCAN_S <= SHORTEST_STRETCH_S:
+    if expected.sum() <= 0 or minutes * THRESHOLDS.scan_s <= THRESHOLDS.shortest_stretch_s:
         return None
     sums = [np.concatenate(([0.0], np.cumsum(row))) for row in (measured, expected, variance)]
-    shortest = int(SHORTEST_STRETCH_S / SCAN_S)
+    shortest = int(THRESHOLDS.shortest_stretch_s / THRESHOLDS.scan_s)
     best: tuple[float, int, int, float] | None = None
-    for length in range(shortest, max(int(0.7 * minutes), shortest) + 1):
+    for length in range(shortest, max(int(THRESHOLDS.longest_stretch * minutes), shortest) + 1):
         inside = [row[length:] - row[:-length] for row in sums]
         rest = (sums[0][-1] - inside[0]) / np.maximum(sums[1][-1] - inside[1], 1e-9)
         excess = inside[0] - rest * inside[1]
@@ -609,10 +597,10 @@ def most_unusual(
         if best is None or size[place] > best[0]:
             ratio = float(inside[0][place] / max(rest[place] * inside[1][place], 1e-9))
             best = (float(size[place]), place, place + length, ratio)
-    if best is None or best[0] < 4.0:
+    if best is None or best[0] < THRESHOLDS.unusual_stretch:
         return None
     z, first, last, ratio = best
-    return z, begin_s + SCAN_S * first, begin_s + SCAN_S * last, ratio
+    return z, begin_s + THRESHOLDS.scan_s * first, begin_s + THRESHOLDS.scan_s * last, ratio
 
 
 def occupied_between(on: Array, off: Array, edges: Array) -> Array:
@@ -624,10 +612,6 @@ def occupied_between(on: Array, off: Array, edges: Array) -> Array:
 
 
 # --- faults of detectors --------------------------------------------------------------------------
-
-_SILENT = 15.0
-"""Vehicles that must be missing before silence is a fault."""
-_STUCK_S = 240.0
 
 
 def fault_hypotheses(
@@ -665,7 +649,7 @@ def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:
                 item.on_s, nan=period.begin_s
             )
             longest = int(np.argmax(time))
-            if time[longest] < _STUCK_S:
+            if time[longest] < THRESHOLDS.stuck_s:
                 break
             on, off = float(item.on_s[longest]), float(item.off_s[longest])
             on = period.begin_s if np.isnan(on) else on
@@ -692,7 +676,7 @@ def _silent(periods: Sequence[Period], rate: Mapping[str, float]) -> list[Hypoth
             longest = int(np.argmax(np.diff(times)))
             begin, end = max(begin, float(times[longest])), min(end, float(times[longest + 1]))
         missing = expected * (end - begin) / 60.0 * len(periods)
-        if end > begin and missing > _SILENT:
+        if end > begin and missing > THRESHOLDS.silent:
             fixed = (("detector", name), ("begin_s", round(begin, 1)), ("end_s", round(end, 1)))
             found.append((missing, Hypothesis("dropout", fixed, (), ((),), None)))
     found.sort(key=lambda item: -item[0])

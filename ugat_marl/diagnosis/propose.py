@@ -18,14 +18,9 @@ from numpy.typing import NDArray
 from ugat_marl.diagnosis.hypotheses import Hypothesis
 from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Distance, Reference, Whitener, softened, without_noise
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
-
-FARTHEST = 1.6
-"""A ray is followed so far beyond the simulated strength."""
-NEAREST = 0.08
-CANDIDATES = (3, 2, 2)
-"""Sets of one, two and three effects that are simulated in a round, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +146,9 @@ def _least_squares(
     except np.linalg.LinAlgError:
         return None
     size = np.where(both, np.abs(found), found)
-    if (size < NEAREST).any():
+    if (size < THRESHOLDS.least_strength).any():
         return None
-    return np.clip(found, -FARTHEST, FARTHEST)
+    return np.clip(found, -THRESHOLDS.farthest, THRESHOLDS.farthest)
 
 
 def _useful(best: dict[tuple[object, ...], Proposed], rays: Sequence[Ray], count: int) -> list[int]:
@@ -180,7 +175,7 @@ def promising(proposals: Sequence[Proposed]) -> list[Proposed]:
         own = [item for item in proposals if len(item.members) == size]
         if own and own[0].expected < 0.95 * least - 20.0:  # more effects must be worth it
             near = [item for item in own if item.expected <= 1.3 * own[0].expected + 50.0]
-            chosen += near[: CANDIDATES[size - 1]]
+            chosen += near[: THRESHOLDS.candidates[size - 1]]
             least = own[0].expected
     return list(dict.fromkeys(chosen))
 

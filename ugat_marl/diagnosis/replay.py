@@ -38,6 +38,7 @@ from ugat_marl.diagnosis.features import (
     bins_of,
 )
 from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import (
     Effect,
     depart_s,
@@ -64,9 +65,6 @@ from ugat_marl.scenarios import (
 )
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import launch_of, loops_document, one_line, read_loops, read_trips
-
-WARM_UP_S = 600.0
-"""Simulated before a period that does not begin with the scenario, under its own first signals."""
 
 _DAYS = 64
 
@@ -177,7 +175,7 @@ class Replay:
     def _run(self, scenario: Scenario, period: Period, seed: int, directory: Path) -> Day:
         settings = scenario.settings
         step = settings.step_length_s
-        begin = max(settings.begin_s, period.begin_s - WARM_UP_S)
+        begin = max(settings.begin_s, period.begin_s - THRESHOLDS.warm_up_s)
         begin = settings.begin_s + step * round((begin - settings.begin_s) / step)
         loops = directory / "loops.xml"
         signals = replay_document(scenario, period, begin)
@@ -274,9 +272,6 @@ def _durations(
 
 
 # --- arrivals -------------------------------------------------------------------------------------
-
-_FASTEST = 1.3
-"""Multiple of the limit at which nobody drives from one detector to the next."""
 
 
 @dataclass(frozen=True)
@@ -542,7 +537,7 @@ def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
         zone = zones[advance[0]]
         begin = zone.position_m
         end = begin if stop is None else zones[stop].position_m
-        travel = max(end - begin, 0.0) / (_FASTEST * lane.speed_mps)
+        travel = max(end - begin, 0.0) / (THRESHOLDS.fastest * lane.speed_mps)
         known.append(
             _Lane(
                 advance[0],
@@ -566,18 +561,6 @@ def _factor(item: ET.Element) -> float:
     return float(item.get("speedFactor", "1"))
 
 
-HELD_UP, FREE = 0.55, 0.85
-"""Shares of the limit: who is slower at the advance detector comes out of a queue, who is faster
-does not; who is between them does if he closely follows one who does."""
-_CLOSE_S = 3.5
-_LENGTH_M = 5.0
-"""Of a vehicle whose speed has to be told from its time on the detector."""
-_WINDOW_S = 600.0
-_MISSING, _MISSING_SHARE = 10.0, 0.1
-"""Vehicles, and share of those seen, that the stop detectors of an approach must have seen beyond
-the advance ones for the latter to have missed them."""
-
-
 def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float = 0.0) -> Array:
     """When vehicles would have come if nobody had stood in their way, s.
 
@@ -594,12 +577,12 @@ def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float =
     times = seen.on_s.copy()
     over = np.maximum(seen.off_s - seen.on_s, 1e-3)
     pace = (
-        np.where(np.isfinite(seen.speed_mps), seen.speed_mps, (_LENGTH_M + zone_m) / over)
+        np.where(np.isfinite(seen.speed_mps), seen.speed_mps, (THRESHOLDS.length_m + zone_m) / over)
         / limit_mps
     )
-    slow = pace < HELD_UP
-    close = np.diff(times, prepend=-np.inf) < _CLOSE_S
-    for place in np.flatnonzero(close & ~slow & (pace < FREE)).tolist():
+    slow = pace < THRESHOLDS.held_up
+    close = np.diff(times, prepend=-np.inf) < THRESHOLDS.close_s
+    for place in np.flatnonzero(close & ~slow & (pace < THRESHOLDS.free)).tolist():
         slow[place] = slow[place - 1]  # it stood farther back in the same queue
     edges = np.flatnonzero(np.diff(np.concatenate(([False], slow, [False]))))
     for first, behind in zip(edges[::2], edges[1::2], strict=True):
@@ -641,9 +624,9 @@ def by_lane_left(
 
 def missed(times: Array, crossed: Array, period: Period) -> Array:
     """Vehicles advance detectors missed if the stop detectors saw many more, by window."""
-    if len(crossed) - len(times) <= _MISSING + _MISSING_SHARE * len(times):
+    if len(crossed) - len(times) <= THRESHOLDS.missing + THRESHOLDS.missing_share * len(times):
         return np.empty(0)
-    count = max(1, round((period.end_s - period.begin_s) / _WINDOW_S))
+    count = max(1, round((period.end_s - period.begin_s) / THRESHOLDS.missed_window_s))
     edges = np.linspace(period.begin_s, period.end_s, count + 1)
     lacking = np.histogram(crossed, edges)[0] - np.histogram(times, edges)[0]
     lacking = np.maximum(lacking, 0)

@@ -30,15 +30,12 @@ from ugat_marl.diagnosis.statistics import (
     softened,
     without_noise,
 )
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
 
 Directed = Callable[[Distance], Mapping[str, float]]
 """Statistics of a distance."""
-
-_DRAWS = 40
-ONE_DAY = 0.25
-"""Chance above which data without some day are nothing unusual."""
 
 
 class Null:
@@ -74,7 +71,7 @@ class Null:
             own = directed(model) if directed else None
             others = tallies[1 - half :: 2]
             size = min(periods, max(len(others) - 1, 1))
-            for _ in range(_DRAWS):
+            for _ in range(THRESHOLDS.null_draws):
                 chosen = generator.choice(len(others), size, replace=False)
                 found = model.distance([others[int(i)] for i in chosen])
                 for name, value in _statistics(found, own).items():
@@ -98,11 +95,11 @@ class Null:
             extra: Variance of the expected statistics for the parameters' errors.
         """
         found = self._judge(self.reference.distance(data, extra=extra))
-        if len(data) < 2 or found.p > ONE_DAY:
+        if len(data) < 2 or found.p > THRESHOLDS.one_day:
             return found
         others = [[*data[:i], *data[i + 1 :]] for i in range(len(data))]
         without = [self._judge(self.reference.distance(part, extra=extra)).p for part in others]
-        return replace(found, p=max(without)) if max(without) > ONE_DAY else found
+        return replace(found, p=max(without)) if max(without) > THRESHOLDS.one_day else found
 
     def _judge(self, found: Distance) -> Residual:
         values = _statistics(found, self._directed)
@@ -144,9 +141,6 @@ def _log_moments(values: Sequence[float]) -> tuple[float, float]:
 
 
 # --- single effects -------------------------------------------------------------------------------
-
-LEAST_APART = 0.3
-"""Directions of which a fit has used up all but this share are not looked at."""
 
 
 class Matched:
@@ -197,7 +191,7 @@ class Matched:
             self._away = _spanned(rows(fitted))
         found = found - (found @ self._away) @ self._away.T
         left = np.sqrt((found**2).sum(axis=1))
-        seen = (left > LEAST_APART * size) & (size > 0)
+        seen = (left > THRESHOLDS.least_apart * size) & (size > 0)
         self._units = found[seen] / left[seen, None]
 
     def __call__(self, distance: Distance) -> float:

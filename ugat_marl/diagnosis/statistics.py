@@ -18,21 +18,19 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import EVENT_FEATURES, FEATURES, SPEED_FEATURES, Tally
 from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
 
-MIN_OBSERVATIONS = 3.0
-"""Observations per period below which a mean is not used."""
-_GRAIN = 0.3
-"""A mean is not known better than to this much of a unit in one observation."""
-_EVENT = 1.0
-"""What hardly ever happens is not known better than to one event in a period."""
 SINGLE = ("lane", "time")
 """Blocks with so many statistics of single lanes and minutes that most of an effect's differences
 there are chance: those are left as they were."""
-CERTAIN = 6.0
-"""Squared standardised difference beyond which one is not chance."""
-SOFT = {"network": np.inf, "intersection": np.inf, "lane": 5.0, "time": 4.0}
+SOFT = {
+    "network": np.inf,
+    "intersection": np.inf,
+    "lane": THRESHOLDS.soft_lane,
+    "time": THRESHOLDS.soft_time,
+}
 """Standardised differences beyond this count less: queues reach a place or they do not, and single
 lanes and minutes have heavy tails."""
 
@@ -178,8 +176,7 @@ class Reference:
             variance = _smoothed(mean, variance)
         error = variance / len(sums)
         if prior is not None:
-            few = 6.0
-            scale = len(sums) / (len(sums) + few)
+            scale = len(sums) / (len(sums) + THRESHOLDS.few_days)
             variance = scale * variance + (1 - scale) * prior.variance
             error = variance / len(sums)
             if partner is not None:
@@ -191,7 +188,7 @@ class Reference:
         if timed:
             used = mean > 0.5
         else:
-            used = (weight >= MIN_OBSERVATIONS) & np.isfinite(mean)
+            used = (weight >= THRESHOLDS.least_observations) & np.isfinite(mean)
             used &= ~_constant(self._speeds)[None, :]
         if timed:
             correlation = np.eye(sums.shape[2])
@@ -286,7 +283,7 @@ def _moved(mean: Array, residual: Array, partner: Array) -> NDArray[np.bool_]:
     before, _, _, other = _moments(partner)
     days = len(partner)
     noise = ((residual - other) ** 2).sum(axis=0) / max(days - 1, 1) / days
-    return np.nan_to_num((mean - before) ** 2, nan=np.inf) > CERTAIN * noise
+    return np.nan_to_num((mean - before) ** 2, nan=np.inf) > THRESHOLDS.certain * noise
 
 
 def _controlled(
@@ -308,8 +305,13 @@ def _controlled(
 def _grain(width: int) -> Array:
     """The smallest sum that is known to be one, for every feature, or bin of time."""
     if width != len(FEATURES):
-        return np.full(width, _GRAIN)
-    return np.array([_EVENT if name in EVENT_FEATURES else _GRAIN for name, _, _ in FEATURES])
+        return np.full(width, THRESHOLDS.grain)
+    return np.array(
+        [
+            THRESHOLDS.least_events if name in EVENT_FEATURES else THRESHOLDS.grain
+            for name, _, _ in FEATURES
+        ]
+    )
 
 
 @functools.cache
@@ -375,7 +377,7 @@ def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> di
     found: dict[str, Array] = {}
     for name, values in difference.items():
         squared = np.maximum(values**2, 1e-300)
-        found[name] = values * np.maximum(1.0 - CERTAIN * variance[name] / squared, 0.0)
+        found[name] = values * np.maximum(1.0 - THRESHOLDS.certain * variance[name] / squared, 0.0)
     return found
 
 
@@ -385,7 +387,7 @@ def without_noise(
     """Differences with those of single lanes and minutes set to 0 that may be chance."""
     found: dict[str, Array] = {}
     for name, values in difference.items():
-        certain = values**2 > CERTAIN * variance[name]
+        certain = values**2 > THRESHOLDS.certain * variance[name]
         found[name] = np.where(certain, values, 0.0) if name in SINGLE else values
     return found
 

@@ -19,26 +19,15 @@ from ugat_marl.diagnosis.places import Proposer, Routes
 from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
-from ugat_marl.diagnosis.select import Effort, Selector
+from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, added, shift
+from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, THRESHOLDS, Effort
 from ugat_marl.effects import Effect
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios import Detector, Network, Period, Scenario, edge_of, driven_routes
-
-PRICE = 14.0
-"""What an effect must take off the distance to be worth naming."""
-EFFORTS = ((4, Effort()), (8, Effort(40, 3, 5, 32)))
-"""Numbers of days for so many intersections. With more of them every day says more, since effects
-on the whole network are seen at each, and costs more: fewer are simulated."""
-LEAST_EFFORT = Effort(24, 2, 3, 16)
-DOUBT_DAYS = 24
-"""Simulated with other vehicles than those the signals answered."""
-OPEN = 0.6
-"""Share of what other arrivals change by which a statistic may still be off with the measured ones:
-set on empty cases of seeds 11 and 12, which no blind test uses."""
+from ugat_marl.scenarios import Detector, Network, Period, Scenario, driven_routes, edge_of
 
 
 @dataclass(frozen=True)
@@ -184,7 +173,7 @@ class Study:
         with reporter.task("the scenario as it is", self.effort.base) as advance:
             days = self.engine.replicates([], range(self.effort.base), advance)
         if self.other_days is not None:
-            numbers = range(min(DOUBT_DAYS, self.effort.base))
+            numbers = range(min(THRESHOLDS.doubt_days, self.effort.base))
             with reporter.task("the same with other vehicles", len(numbers)) as advance:
                 self.other_days.replicates([], numbers, advance)  # remembered for `doubt`
         aside = self.engine.usual.set_aside
@@ -262,13 +251,15 @@ class Study:
         if self.other_days is None:
             return None
         if effects not in self._doubts:
-            numbers = range(min(DOUBT_DAYS, self.effort.base))
+            numbers = range(min(THRESHOLDS.doubt_days, self.effort.base))
             own = self.engine.ordinary(effects, numbers)
             other = self.other_days.ordinary(effects, numbers)
             both = [number for number in own if number in other]
             days = [[found[number].tally for number in both] for found in (own, other)]
             apart, _ = shift(self.pools, *days)
-            self._doubts[effects] = {name: (OPEN * values) ** 2 for name, values in apart.items()}
+            self._doubts[effects] = {
+                name: (THRESHOLDS.left_open * values) ** 2 for name, values in apart.items()
+            }
         return self._doubts[effects]
 
     @functools.cached_property
@@ -285,7 +276,7 @@ class Study:
             base.model.days,
             self.fit,
             days=self.effort.fit,
-            price=PRICE,
+            price=THRESHOLDS.price,
             speeds=self.speeds,
         )
 

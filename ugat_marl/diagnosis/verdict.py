@@ -8,7 +8,6 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from ugat_marl.diagnosis.features import FEATURES
-from ugat_marl.diagnosis.fit import HALF_INTERVAL
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members
 from ugat_marl.diagnosis.places import one_behind_the_other
 from ugat_marl.diagnosis.records import (
@@ -22,19 +21,11 @@ from ugat_marl.diagnosis.records import (
 )
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect, known_effects
 
-INDISTINCT = 25.0
-"""Models whose distances differ by less fit equally well: a likelihood ratio above e^12 either way
-would be needed to drop one."""
-RIVALS_TESTED = 2
-FIT_LEVEL = 0.01
-"""The fitted periods must not contradict the model more than this; the held-out ones decide."""
-PART = 0.5
 NOUNS = {"swapped": "swapped detectors", "stuck": "a stuck detector"}
 """Effects whose names are no nouns, in a sentence."""
-CONFIRMED = 10.0
-"""What the effects must take off the distance of the held-out periods."""
 
 
 def conclude(
@@ -56,7 +47,7 @@ def conclude(
         site: Lanes and detectors.
     """
     base, best = located.base, selection.best
-    confirmed = verification.before.distance - verification.after.distance >= CONFIRMED
+    confirmed = verification.before.distance - verification.after.distance >= THRESHOLDS.confirmed
     chance = combined(base.residual.p, verification.before.p)
     if chance > alpha and not confirmed and selection.complete:
         sentence = (
@@ -69,7 +60,7 @@ def conclude(
         return Conclusion("unknown", best, (), sentence, _look_at(selection))
     names = describe_members(best.model.members)
     shrink = verification.shrink if verification.shrink is not None else 0.0
-    chance_only = verification.after.p > alpha and best.residual.p > FIT_LEVEL
+    chance_only = verification.after.p > alpha and best.residual.p > THRESHOLDS.fit_level
     if not confirmed:
         sentence = (
             f"The fitted periods hint at {names}, but the held-out periods do not confirm it."
@@ -77,7 +68,7 @@ def conclude(
         return Conclusion("unknown", best, (), sentence, "more periods")
     if chance_only and selection.complete:
         return _sufficient(selection, selector, alpha, site)
-    if shrink >= PART:
+    if shrink >= THRESHOLDS.part:
         verb = "explains" if len(best.model.members) == 1 else "explain"
         sentence = f"{names[:1].upper()}{names[1:]} {verb} {100 * shrink:.0f} % of the gap; " + (
             "something else remains that the library does not have."
@@ -177,9 +168,9 @@ def _rivals(selection: Selected, selector: Selector, alpha: float) -> tuple[Fitt
         for rival in selection.rivals
         if len(rival.members) <= len(best.members)
         and not _kinds(rival.members) >= names
-        and rival.cost - best.cost < INDISTINCT
+        and rival.cost - best.cost < THRESHOLDS.indistinct
     ]
-    for rival in near[:RIVALS_TESTED]:
+    for rival in near[: THRESHOLDS.rivals_tested]:
         tested = selector.test(rival)
         if tested.residual.p > alpha:
             found.append(rival)
@@ -269,8 +260,8 @@ def effect_record(
     for index, (name, value) in enumerate(zip(hypothesis.free, values, strict=True)):
         allowed, low, high = ranges[name], None, None
         if errors is not None:
-            low = max(value - HALF_INTERVAL * errors[index], allowed.low)
-            high = min(value + HALF_INTERVAL * errors[index], allowed.high)
+            low = max(value - THRESHOLDS.half_interval * errors[index], allowed.low)
+            high = min(value + THRESHOLDS.half_interval * errors[index], allowed.high)
         parameters[name] = Parameter(value, low, high, allowed.unit)
     for name, value in hypothesis.fixed:
         if not isinstance(value, str) and name not in WINDOW:
