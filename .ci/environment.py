@@ -36,7 +36,7 @@ import gymnasium, jinja2, lazy_loader, libsumo, matplotlib, numpy, pettingzoo, p
 import rich, scipy, sumo, supersuit, tensorboard, torch, tyro
 import ugat_marl
 """
-PROBE_DEV = "import hatchling, hypothesis, osmium, pytest, pytest_timeout, xdist"
+PROBE_DEV = "import hatchling, hypothesis, osmium, pytest, pytest_timeout, sklearn, xdist"
 
 
 class Record(TypedDict):

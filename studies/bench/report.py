@@ -1,4 +1,4 @@
-"""Report of a bench: rows of numbers, targets, and the machine they belong to."""
+"""What a bench found: rows of numbers, targets, and the machine they belong to."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Target:
 
     @property
     def met(self) -> bool:
-        """True if the figure reaches its limit; false for nan."""
+        """Whether the figure is reached; not so for nan."""
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit
 
     def __str__(self) -> str:
@@ -104,7 +104,7 @@ class Report:
 
     @property
     def met(self) -> bool:
-        """True if every target is met."""
+        """Whether every target is met."""
         return all(target.met for target in self.targets)
 
     def as_dict(self) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class Report:
         }
 
     def write(self, path: Path) -> None:
-        """Write the report as JSON; an interrupted write leaves an older file as it was."""
+        """Writes the report as JSON; an interrupted write leaves an older file as it was."""
         write_whole(path, json.dumps(self.as_dict(), indent=2, allow_nan=False) + "\n")
 
     def tables(self) -> Group:
@@ -152,7 +152,7 @@ class Report:
 
 
 def require_positive(bench: str, **options: float) -> None:
-    """Refuse options of a bench that are not at least 1.
+    """Refuses options of a bench that are not at least 1.
 
     Raises:
         OptionError: An option is smaller.

@@ -1,10 +1,9 @@
-"""Diagnose the cases of a blind test, without opening their labels."""
+"""Diagnoses the cases of a blind test, without opening their labels."""
 
 from __future__ import annotations
 
 import concurrent.futures
 import json
-import os
 import subprocess
 import sys
 import time
@@ -17,7 +16,7 @@ from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
 
 Diagnose = Callable[[Case, Path, Path], None]
-"""Diagnose a case: the case, its measured data, and the folder that gets ``diagnosis.json``."""
+"""Diagnoses a case: the case, its measured data, and the folder that gets ``diagnosis.json``."""
 
 
 def run_cases(
@@ -29,7 +28,7 @@ def run_cases(
     command: Sequence[str] = (),
     reporter: Reporter | None = None,
 ) -> tuple[int, int]:
-    """Diagnose the cases that have no diagnosis yet; one that fails does not stop the others.
+    """Diagnoses the cases that have no diagnosis yet; one that fails does not stop the others.
 
     Args:
         directory: A blind test.
@@ -74,7 +73,7 @@ def run_cases(
 
 
 def _one(directory: Path, case: Case, diagnose: Diagnose) -> bool:
-    """Diagnose a case here; notes how long it took, or why it failed."""
+    """Diagnoses a case here; notes how long it took, or why it failed."""
     folder = directory / case.case
     start = time.monotonic()
     error = None
@@ -89,14 +88,12 @@ def _one(directory: Path, case: Case, diagnose: Diagnose) -> bool:
 
 
 def _apart(directory: Path, case: Case, command: Sequence[str]) -> bool:
-    """Diagnose a case in a process of its own."""
+    """Diagnoses a case in a process of its own."""
     folder = directory / case.case
     start = time.monotonic()
     (folder / RUN).unlink(missing_ok=True)
-    call = [sys.executable, "-m", "studies.blind", *command, "--only", case.case]
-    # the module path of this process, which found the checkout
-    variables = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    done = subprocess.run(call, capture_output=True, text=True, env=variables, check=False)
+    call = [sys.executable, "-m", "ugat_marl", *command, "--only", case.case]
+    done = subprocess.run(call, capture_output=True, text=True, check=False)
     if not (folder / RUN).exists():  # it did not even get so far as to say why
         said = " ".join(done.stderr.split())[-500:]
         _note(folder, time.monotonic() - start, f"exit code {done.returncode}: {said}")

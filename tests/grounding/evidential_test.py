@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.distributions import Dirichlet, kl_divergence
 
-from ugat_marl.grounding.evidential import (
+from ugat_marl.grounding.uncertainty import (
     annealing,
     concentration,
     divergence_from_uniform,

@@ -8,30 +8,33 @@ import math
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import spearmanr
+from sklearn.metrics import roc_auc_score
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.errors import LogError, OptionError
 from ugat_marl.grounding import (
     FitConfig,
+    Fitter,
     InverseConfig,
     InverseModel,
+    PhaseTransform,
     Stack,
-    fit,
     fit_inverse,
     stack_log,
 )
-from ugat_marl.grounding.calibration import (
+from ugat_marl.grounding.fitting import PAIRS, EpochCallback, split
+from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
+from ugat_marl.grounding.phase import PhaseReport, fit_forward
+from ugat_marl.grounding.reports import (
     auroc,
     expected_calibration_error,
-    ranks,
     rate_by_quantile,
     risk_by_coverage,
     spearman,
 )
-from ugat_marl.grounding.fit_config import PAIRS
-from ugat_marl.grounding.fit_loop import split
-from ugat_marl.grounding.fitting import fit_forward
-from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.seeding import torch_generator
 
 LAYOUTS = {"a_0": AgentLayout(6, 3), "b_0": AgentLayout(4, 2, 2)}
@@ -83,6 +86,21 @@ def models(seed: int = 0) -> tuple[ForwardModel, InverseModel]:
     )
 
 
+def fit(
+    f: ForwardModel,
+    h: InverseModel,
+    real: TransitionLog,
+    simulated: TransitionLog,
+    config: FitConfig,
+    seed: int,
+    on_epoch: EpochCallback | None = None,
+) -> PhaseReport:
+    """Fits two models as those of a transform."""
+    made = PhaseTransform(LAYOUTS, 0, f.config, h.config)
+    made.forward, made.inverse = f, h
+    return made.fit(real, simulated, Fitter(config, seed, on_epoch))
+
+
 @pytest.fixture(scope="module")
 def fitted():
     f, h = models()
@@ -96,7 +114,7 @@ def noisy():
     """Chance moves the lanes as much as the phase does, so that h must err sometimes."""
     _, h = models()
     log = planted(0.12, seed=2, noise=0.1)
-    return fit_inverse(h, log, FitConfig(epochs=30, learning_rate=3e-3), seed=0)
+    return fit_inverse(h, log, Fitter(FitConfig(epochs=30, learning_rate=3e-3), seed=0))
 
 
 def test_forward_beats_no_change_and_comes_near_the_noise(fitted) -> None:
@@ -224,7 +242,7 @@ def test_the_number_of_threads_changes_nothing() -> None:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             f, _ = models()
-            errors.append(fit_forward(f, log, QUICK, seed=0).error.tolist())
+            errors.append(fit_forward(f, log, Fitter(QUICK, seed=0)).error.tolist())
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
@@ -235,13 +253,13 @@ def test_a_cold_start_forgets_and_a_warm_one_goes_on() -> None:
     log = planted(0.3, episodes=3, steps=100)
     cold, warm = QUICK, dataclasses.replace(QUICK, warm_start=True)
     _, h = models()
-    first = fit_inverse(h, log, cold, seed=1)
+    first = fit_inverse(h, log, Fitter(cold, seed=1))
     _, other = models()
-    fit_inverse(other, planted(0.1, episodes=2, steps=50), cold, seed=9)
-    again = fit_inverse(other, log, cold, seed=1)
+    fit_inverse(other, planted(0.1, episodes=2, steps=50), Fitter(cold, seed=9))
+    again = fit_inverse(other, log, Fitter(cold, seed=1))
     assert again.training == first.training
     assert again.accuracy.tolist() == first.accuracy.tolist()
-    further = fit_inverse(h, log, dataclasses.replace(warm, epochs=1), seed=2)
+    further = fit_inverse(h, log, Fitter(dataclasses.replace(warm, epochs=1), seed=2))
     assert further.training.held_out_loss <= first.training.held_out_loss + 1e-2
     assert further.accuracy.mean() > 0.8
 
@@ -249,10 +267,10 @@ def test_a_cold_start_forgets_and_a_warm_one_goes_on() -> None:
 def test_a_warm_start_that_can_only_do_harm_leaves_the_weights_alone() -> None:
     log = planted(0.3, episodes=2, steps=60)
     f, _ = models()
-    fit_forward(f, log, QUICK, seed=1)
+    fit_forward(f, log, Fitter(QUICK, seed=1))
     before = {name: value.clone() for name, value in f.state_dict().items()}
     wild = dataclasses.replace(QUICK, warm_start=True, learning_rate=10.0, epochs=3)
-    fit_forward(f, log, wild, seed=2)
+    fit_forward(f, log, Fitter(wild, seed=2))
     assert all(torch.equal(before[name], value) for name, value in f.state_dict().items())
 
 
@@ -263,7 +281,7 @@ def test_each_agent_keeps_its_own_best_weights() -> None:
     start = {name: value.clone() for name, value in f.state_dict().items()}
     config = dataclasses.replace(QUICK, warm_start=True)
     f.fitted.fill_(True)  # keeps the weights drawn here
-    together = fit_forward(f, log, config, seed=1)
+    together = fit_forward(f, log, Fitter(config, seed=1))
     for i, agent in enumerate(LAYOUTS):
         layouts = {agent: LAYOUTS[agent]}
         alone = ForwardModel(Stack(layouts), ForwardConfig(**SMALL), torch_generator(0))
@@ -279,7 +297,7 @@ def test_each_agent_keeps_its_own_best_weights() -> None:
         small = TransitionLog(dataclasses.replace(log.provenance, layouts=layouts), frame)
         # Patience counts all agents together, so give the lone one the epochs they had.
         epochs = dataclasses.replace(config, epochs=together.training.epochs, patience=999)
-        report = fit_forward(alone, small, epochs, seed=1)
+        report = fit_forward(alone, small, Fitter(epochs, seed=1))
         assert report.error[0] == pytest.approx(together.error[i], rel=1e-3)
 
 
@@ -326,10 +344,10 @@ def test_one_episode_is_split_in_time() -> None:
 def test_too_little_data_and_foreign_data_are_refused() -> None:
     f, h = models()
     with pytest.raises(LogError, match="a_0 has .* record at least two whole episodes"):
-        fit_forward(f, planted(0.3, episodes=1, steps=1), QUICK, seed=0)
+        fit_forward(f, planted(0.3, episodes=1, steps=1), Fitter(QUICK, seed=0))
     foreign = InverseModel(Stack({"a_0": AgentLayout(6, 3)}), InverseConfig(), torch_generator(0))
     with pytest.raises(LogError, match="does not fit the models"):
-        fit_inverse(foreign, planted(0.3, episodes=2, steps=5), QUICK, seed=0)
+        fit_inverse(foreign, planted(0.3, episodes=2, steps=5), Fitter(QUICK, seed=0))
     assert not h.fitted
 
 
@@ -394,8 +412,7 @@ def test_impossible_options_are_refused(options: dict) -> None:
         FitConfig(**options)
 
 
-def test_ranks_auroc_and_spearman_by_hand() -> None:
-    assert ranks(np.array([3.0, 1.0, 3.0, 2.0])).tolist() == [3.5, 1.0, 3.5, 2.0]
+def test_auroc_and_spearman_by_hand() -> None:
     wrong = np.array([False, False, True, True])
     assert auroc(np.array([0.1, 0.2, 0.3, 0.4]), wrong) == 1.0
     assert auroc(np.array([0.4, 0.3, 0.2, 0.1]), wrong) == 0.0
@@ -406,6 +423,20 @@ def test_ranks_auroc_and_spearman_by_hand() -> None:
     assert math.isnan(spearman(np.array([1, 2]), np.array([4, 4])))
     u = np.array([0.4, 0.1, 0.3, 0.2])
     assert rate_by_quantile(u, np.array([True, False, False, False]), 2) == (0.0, 0.5)
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.booleans()), max_size=40))
+def test_auroc_and_spearman_are_those_of_the_libraries(rows: list[tuple[int, bool]]) -> None:
+    u = np.array([number for number, _ in rows]) / 7
+    wrong = np.array([flag for _, flag in rows], bool)
+    if wrong.any() and not wrong.all():
+        assert auroc(u, wrong) == pytest.approx(roc_auc_score(wrong, u))
+    else:
+        assert math.isnan(auroc(u, wrong))
+    if len(set(u)) > 1 and len(set(wrong)) > 1:
+        assert spearman(u, wrong) == pytest.approx(spearmanr(u, wrong).statistic)
+    else:
+        assert math.isnan(spearman(u, wrong))
 
 
 def test_risk_by_coverage_by_hand() -> None:

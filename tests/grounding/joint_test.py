@@ -11,15 +11,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-import ugat_marl.grounding.transform as transform_module
+import ugat_marl.grounding.phase as phase_module
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.grounding import (
     FitConfig,
+    Fitter,
     GateConfig,
-    GroundedActionTransform,
     InputsConfig,
     InverseConfig,
-    fit,
+    PhaseTransform,
 )
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import Gate
@@ -178,9 +178,9 @@ def road(crossed: bool, seed: int) -> TransitionLog:
     return recorder.log()
 
 
-def fitted(hops: int) -> tuple[GroundedActionTransform, np.ndarray]:
+def fitted(hops: int) -> tuple[PhaseTransform, np.ndarray]:
     """Models of the pair, and f's error relative to predicting no change."""
-    made = GroundedActionTransform(
+    made = PhaseTransform(
         LAYOUTS,
         0,
         ForwardConfig(hidden=(32,)),
@@ -189,22 +189,22 @@ def fitted(hops: int) -> tuple[GroundedActionTransform, np.ndarray]:
         neighbours=BOTH,
     )
     config = FitConfig(epochs=20, learning_rate=1e-2)
-    report = fit(made.forward, made.inverse, road(True, 1), road(False, 2), config, seed=0)
+    report = made.fit(road(True, 1), road(False, 2), Fitter(config, seed=0))
     assert (report.inverse.accuracy > 0.95).all()
     return made, report.forward.ratio
 
 
 @pytest.fixture(scope="module")
-def seeing() -> tuple[GroundedActionTransform, np.ndarray]:
+def seeing() -> tuple[PhaseTransform, np.ndarray]:
     return fitted(hops=1)
 
 
 @pytest.fixture
-def pair(seeing: tuple[GroundedActionTransform, np.ndarray]) -> GroundedActionTransform:
+def pair(seeing: tuple[PhaseTransform, np.ndarray]) -> PhaseTransform:
     return copy.deepcopy(seeing[0])
 
 
-def inflow(made: GroundedActionTransform) -> tuple[float, np.ndarray]:
+def inflow(made: PhaseTransform) -> tuple[float, np.ndarray]:
     """What b's f last said of its first lane, and what was then executed."""
     said: list[float] = []
     predict = made.forward.predict
@@ -225,7 +225,7 @@ def inflow(made: GroundedActionTransform) -> tuple[float, np.ndarray]:
         del made.forward.predict
 
 
-def test_f_of_b_is_fed_what_a_executes(pair: GroundedActionTransform) -> None:
+def test_f_of_b_is_fed_what_a_executes(pair: PhaseTransform) -> None:
     came, executed = inflow(pair)
     assert executed.tolist() == [1, 1]  # a is grounded to the other phase, b as it was
     assert came == pytest.approx(0.0, abs=0.05)  # no platoon: a's phase 1 runs
@@ -233,21 +233,21 @@ def test_f_of_b_is_fed_what_a_executes(pair: GroundedActionTransform) -> None:
 
 
 def test_fed_what_a_asked_for_f_of_b_expects_what_does_not_come(
-    pair: GroundedActionTransform, monkeypatch: pytest.MonkeyPatch
+    pair: PhaseTransform, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The subject of the test above, broken."""
 
     def apart(answer, _gate, _in_turn, actions, permitted):
         return alone(answer, actions, permitted)
 
-    monkeypatch.setattr(transform_module, "together", apart)
+    monkeypatch.setattr(phase_module, "together", apart)
     came, executed = inflow(pair)
     assert executed[0] == 1
     assert came == pytest.approx(PLATOON, abs=0.05)
 
 
 def test_without_neighbours_f_of_b_cannot_know_what_comes(
-    seeing: tuple[GroundedActionTransform, np.ndarray],
+    seeing: tuple[PhaseTransform, np.ndarray],
 ) -> None:
     """Half the platoons, at ± PLATOON / 2: the error of a mean; with neighbours little is left."""
     (_, blind), (_, told) = fitted(hops=0), seeing
@@ -277,9 +277,9 @@ def test_what_arrives_later_is_seen_by_a_history_and_by_nothing_less() -> None:
     log, error = recorder.log(), {}
     for history in (1, 2):
         shape = ForwardConfig(hidden=(32,)), InverseConfig(hidden=(8,), embedding=4)
-        made = GroundedActionTransform(layouts, 0, *shape, inputs=InputsConfig(history))
+        made = PhaseTransform(layouts, 0, *shape, inputs=InputsConfig(history))
         config = FitConfig(epochs=30, learning_rate=5e-3)
-        report = fit(made.forward, made.inverse, log, log, config, seed=0)
+        report = made.fit(log, log, Fitter(config, seed=0))
         error[history] = report.forward.error[0] ** 2 * 2  # of both lanes together
     # far is 1/12 each time, whoever predicts it; near, too, unless it was seen coming.
     assert error[1] == pytest.approx(2 / 12, rel=0.2)

@@ -18,16 +18,16 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments import student_p
 from ugat_marl.grounding import SimulatedWorld, TimedConfig, TimedTransform, UgatConfig
-from ugat_marl.grounding.matching import (
+from ugat_marl.grounding.delays import (
     CHANCE,
-    Floats,
-    Paid,
+    EpisodeRewards,
     chance_of,
     episode_rewards,
     falling,
-    match,
+    match_delays,
     matching_delays,
 )
+from ugat_marl.grounding.reports import Floats
 from ugat_marl.policies import controller_for
 
 LAYOUTS = {"b_0": AgentLayout(2, 2), "a_0": AgentLayout(2, 2)}
@@ -99,19 +99,24 @@ def test_chance_is_that_of_students_t() -> None:
     varies, degrees = math.sqrt(6 * 0.1**2 / 7), 7
     for expected, delay_s in ((10.0, 0.0), (12.0, 1.0), (13.0, 1.5), (20.0, 4.0)):
         t = (expected - 10.0) / (varies * math.sqrt(10.0**2 / 2 + expected**2 / 2))
-        found = chance_of(Paid(street, simulated, before), np.array([delay_s]))
+        found = chance_of(EpisodeRewards(street, simulated, before), np.array([delay_s]))
         assert found == pytest.approx(student_p(t, degrees))
 
 
 def test_one_episode_of_each_says_nothing_of_chance() -> None:
-    assert chance_of(Paid(np.array([[-50.0]]), np.array([[[-10.0]], [[-60.0]]])), np.zeros(1)) == 1
+    assert (
+        chance_of(
+            EpisodeRewards(np.array([[-50.0]]), np.array([[[-10.0]], [[-60.0]]])), np.zeros(1)
+        )
+        == 1
+    )
 
 
 def test_rewards_that_never_vary_leave_nothing_to_chance() -> None:
-    paid = Paid(np.array([[-10.0], [-10.0]]), twice(np.array([-10.0, -12.0])))
+    paid = EpisodeRewards(np.array([[-10.0], [-10.0]]), twice(np.array([-10.0, -12.0])))
     assert chance_of(paid, np.zeros(1)) == 1.0
     assert chance_of(paid, np.ones(1)) == 0.0
-    assert chance_of(Paid(np.zeros((2, 1)), twice(np.zeros(2))), np.zeros(1)) == 1.0
+    assert chance_of(EpisodeRewards(np.zeros((2, 1)), twice(np.zeros(2))), np.zeros(1)) == 1.0
 
 
 CURVE = -10.0 * np.array([1.0, 1.15, 1.35, 1.6, 2.0, 2.6])
@@ -131,8 +136,8 @@ def test_chance_is_seldom_taken_for_a_delay_and_a_delay_seldom_for_chance(agents
     for late, taken in found.items():
         street = float(np.interp(late, np.arange(6), CURVE))
         for _ in range(400):
-            paid = Paid(hours(rng, street, agents), hours(rng, CURVE, agents))
-            matched = match(paid, np.full(agents, min(late, 1.0)))
+            paid = EpisodeRewards(hours(rng, street, agents), hours(rng, CURVE, agents))
+            matched = match_delays(paid, np.full(agents, min(late, 1.0)))
             taken.append(matched.chance < CHANCE)
             assert taken[-1] or not matched.beyond_s.any()
     assert np.mean(found[0.0]) < 0.07 and np.mean(found[1.0]) < 0.07
@@ -156,8 +161,8 @@ def test_a_planted_delay_is_found() -> None:
         log = real.collect(policy, 0, 3)
         real.close()
         assert log is not None
-        paid = Paid(episode_rewards(log, agents), simulated)
-        found = match(paid, np.zeros(1))  # where nothing is known of a lost time
+        paid = EpisodeRewards(episode_rewards(log, agents), simulated)
+        found = match_delays(paid, np.zeros(1))  # where nothing is known of a lost time
         assert found.delay_s == pytest.approx([planted_s], abs=1.2)  # an hour is one sample
         assert (found.beyond_s == found.delay_s * (planted_s > 0)).all()
 
@@ -185,7 +190,6 @@ def test_all_delays_of_an_intersection_move_together(tmp_path: Path) -> None:
         TimedTransform(LAYOUTS, 2).load(tmp_path / "moved.pt")
 
 
-def test_runs_that_match_nothing_are_known_by_what_they_were_known_by() -> None:
-    plain, matching = (UgatConfig("timed", timed=TimedConfig(match=on)) for on in (False, True))
-    assert "match" not in plain.identity["timed"] and matching.identity["timed"]["match"]
+def test_phase_grounding_matches_no_rewards() -> None:
+    assert UgatConfig("timed", timed=TimedConfig(match=True)).matches
     assert not UgatConfig("phase", timed=TimedConfig(match=True)).matches

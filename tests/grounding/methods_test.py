@@ -14,17 +14,20 @@ from hypothesis import strategies as st
 from ugat_marl.data import AgentLayout
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding import METHODS, FitConfig, InverseConfig, InverseModel, Stack
-from ugat_marl.grounding.dropout import DropoutNet, divergence, thinned
-from ugat_marl.grounding.ensemble import EnsembleNet, PlainNet
-from ugat_marl.grounding.evidential import EvidentialNet
 from ugat_marl.grounding.uncertainty import (
+    DropoutNet,
+    EnsembleNet,
+    EvidentialNet,
     Lesson,
     Method,
     MethodName,
     NetShape,
+    PlainNet,
+    divergence,
     divergence_from_even,
     negative_log_likelihood,
     normalised_entropy,
+    thinned,
 )
 from ugat_marl.seeding import torch_generator
 

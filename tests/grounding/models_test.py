@@ -11,7 +11,7 @@ from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRec
 from ugat_marl.errors import LogError, OptionError
 from ugat_marl.grounding import METHODS, InverseConfig, InverseModel, Stack, stack_log
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
-from ugat_marl.grounding.scaling import FARTHEST, Standardiser
+from ugat_marl.grounding.networks import FARTHEST, Standardiser
 from ugat_marl.grounding.uncertainty import Method, MethodName
 from ugat_marl.seeding import torch_generator
 

@@ -9,17 +9,17 @@ import torch
 from ugat_marl.data import Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.grounding import (
     FitConfig,
-    GroundedActionTransform,
+    Fitter,
     InverseConfig,
+    PhaseTransform,
     Stack,
     answer_with_noise,
-    fit,
     stack_log,
 )
-from ugat_marl.grounding.fit_loop import split
-from ugat_marl.grounding.fit_report import FitReport
+from ugat_marl.grounding.controls import shuffled
+from ugat_marl.grounding.fitting import split
 from ugat_marl.grounding.forward import ForwardConfig
-from ugat_marl.grounding.worlds import shuffled
+from ugat_marl.grounding.phase import PhaseReport
 from ugat_marl.testing import ToyTraffic
 
 FIT = FitConfig(epochs=25, learning_rate=3e-3)
@@ -47,16 +47,16 @@ SIMULATED = played(6, seed=2)
 STATES = stack_log(played(6, seed=9, episodes=3), STACK)
 
 
-def fitted(real: TransitionLog, noise: bool = False) -> tuple[GroundedActionTransform, FitReport]:
-    made = GroundedActionTransform(
+def fitted(real: TransitionLog, noise: bool = False) -> tuple[PhaseTransform, PhaseReport]:
+    made = PhaseTransform(
         LAYOUTS, 0, ForwardConfig((32, 32)), InverseConfig((32, 32), embedding=16)
     )
     if noise:
         answer_with_noise(made.forward, 0)
-    return made, fit(made.forward, made.inverse, real, SIMULATED, FIT, seed=0)
+    return made, made.fit(real, SIMULATED, Fitter(FIT, seed=0))
 
 
-def grounded(made: GroundedActionTransform) -> tuple[float, float, float]:
+def grounded(made: PhaseTransform) -> tuple[float, float, float]:
     """Grounds an episode; acceptance, share of changed actions, and mean u, over all agents."""
     for k in range(STATES.observation.shape[1]):
         made(STATES.observation[:, k : k + 1], STATES.executed[:, k].numpy())
@@ -67,7 +67,7 @@ def grounded(made: GroundedActionTransform) -> tuple[float, float, float]:
 
 
 @pytest.fixture(scope="module")
-def honest() -> tuple[GroundedActionTransform, FitReport]:
+def honest() -> tuple[PhaseTransform, PhaseReport]:
     """A real world with half the saturation flow."""
     return fitted(played(3, seed=1))
 
@@ -141,7 +141,7 @@ def test_with_noise_for_f_u_rises_and_a_gate_that_asks_for_proof_stays_shut(hone
 def test_another_seed_makes_another_noise() -> None:
     answers = []
     for seed in (0, 1):
-        made = GroundedActionTransform(LAYOUTS, 0)
+        made = PhaseTransform(LAYOUTS, 0)
         answer_with_noise(made.forward, seed)
         with torch.no_grad():
             answers.append(made.forward(STATES.observation, STATES.executed))

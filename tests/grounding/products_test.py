@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from ugat_marl.grounding import products
-from ugat_marl.grounding.products import MANY, full_width
+from ugat_marl.grounding import networks
+from ugat_marl.grounding.networks import MANY, full_width
 from ugat_marl.seeding import torch_generator
 
 SETTING: Any = getattr(torch.backends.mkldnn, "matmul", None)
@@ -57,9 +57,9 @@ def test_a_processor_that_would_round_is_left_alone(monkeypatch: pytest.MonkeyPa
         return product(one.bfloat16().float(), two)
 
     monkeypatch.setattr(torch, "bmm", rounding)
-    products._is_exact.cache_clear()
+    networks._is_exact.cache_clear()
     try:
         with full_width(MANY):
             assert SETTING.fp32_precision == before
     finally:
-        products._is_exact.cache_clear()
+        networks._is_exact.cache_clear()

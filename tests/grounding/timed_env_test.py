@@ -22,8 +22,8 @@ from ugat_marl.experiments.recipes import simulated_worlds
 from ugat_marl.grounding import (
     FitConfig,
     GateConfig,
-    GroundedActionTransform,
     GroundedEnv,
+    PhaseTransform,
     RandomDelays,
     SimulatedWorld,
     TimedConfig,
@@ -307,7 +307,7 @@ def test_the_kind_of_grounding_decides_what_is_made(env: TrafficEnv) -> None:
         UgatConfig(grounding="time")  # pyright: ignore[reportArgumentType]
     phase, timely = UgatConfig(), UgatConfig(grounding="timed", timed=TimedConfig(most_s=7))
     assert (phase.grounding, phase.most_delay_s, timely.most_delay_s) == ("phase", 0, 7)
-    assert isinstance(phase.transform(env.layouts, 0), GroundedActionTransform)
+    assert isinstance(phase.transform(env.layouts, 0), PhaseTransform)
     made = timely.transform(env.layouts, 0)
     assert isinstance(made, TimedTransform) and made.timed.most_s == 7
     with pytest.raises(OptionError, match="include_phase"):

@@ -13,12 +13,18 @@ import torch
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.errors import LogError
-from ugat_marl.grounding import FitConfig, InverseConfig, TimedConfig, TimedTransform, stack_log
+from ugat_marl.grounding import (
+    FitConfig,
+    Fitter,
+    InverseConfig,
+    TimedConfig,
+    TimedTransform,
+    stack_log,
+)
+from ugat_marl.grounding.controls import shuffled
+from ugat_marl.grounding.delays import LEAST_ROWS, LostTime
 from ugat_marl.grounding.forward import ForwardConfig
-from ugat_marl.grounding.lost_time import LEAST_ROWS, LostTime
-from ugat_marl.grounding.timed_fitting import fit_timed
-from ugat_marl.grounding.timed_report import TimedReport
-from ugat_marl.grounding.worlds import shuffled
+from ugat_marl.grounding.timed import TimedReport
 
 LAYOUTS = {"a_0": AgentLayout(6, 3), "b_0": AgentLayout(4, 2, 2)}
 SHAPES = {
@@ -110,7 +116,7 @@ def fitted(
     seed: int = 0,
 ) -> tuple[TimedTransform, TimedReport]:
     made = TimedTransform(LAYOUTS, seed, **SHAPES, timed=TimedConfig(most_s=MOST_S))
-    return made, fit_timed(made, real, simulated, config, seed)
+    return made, made.fit(real, simulated, Fitter(config, seed))
 
 
 @pytest.fixture(scope="module")
@@ -296,7 +302,7 @@ def test_fitting_twice_gives_the_same_models_and_another_seed_others() -> None:
     for seed in (1, 1, 2):
         torch.rand(3)  # global randomness must not matter
         made = TimedTransform(LAYOUTS, 0, **SHAPES, timed=TimedConfig(most_s=MOST_S))
-        fit_timed(made, real, simulated, BRIEF, seed)
+        made.fit(real, simulated, Fitter(BRIEF, seed))
         models = made.models.items()
         states.append({f"{n}.{k}": v for n, m in models for k, v in m.state_dict().items()})
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
@@ -309,7 +315,7 @@ def test_epochs_are_reported_for_each_of_the_three_models() -> None:
     made = TimedTransform(LAYOUTS, 0, **SHAPES, timed=TimedConfig(most_s=MOST_S))
     real = street(PLANTED, seed=10, episodes=2)
     config = FitConfig(epochs=2)
-    fit_timed(made, real, SIMULATED, config, 0, lambda name, n, _: seen.append((name, n)))
+    made.fit(real, SIMULATED, Fitter(config, 0, lambda name, n, _: seen.append((name, n))))
     assert seen == [(name, n) for name in ("forward", "simulated", "inverse") for n in (1, 2)]
 
 

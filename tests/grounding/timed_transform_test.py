@@ -16,14 +16,15 @@ from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding import (
     METHODS,
     GateConfig,
-    GroundedActionTransform,
     InverseConfig,
+    PhaseTransform,
     Stack,
     TimedConfig,
     TimedTransform,
 )
-from ugat_marl.grounding.delays import DelayedForward, DelayModel, likely_delay
-from ugat_marl.grounding.forward import ForwardConfig
+from ugat_marl.grounding.forward import DelayedForward, ForwardConfig
+from ugat_marl.grounding.inverse import DelayModel
+from ugat_marl.grounding.timed import likely_delay
 from ugat_marl.grounding.transform import Grounding
 from ugat_marl.grounding.uncertainty import Method, MethodName
 from ugat_marl.seeding import torch_generator
@@ -277,7 +278,7 @@ def test_the_model_of_the_simulation_travels_with_the_checkpoint(tmp_path: Path)
 
 @pytest.mark.parametrize("alike", [False, True])
 def test_checkpoints_of_another_grounding_are_refused(tmp_path: Path, alike: bool) -> None:
-    phase = GroundedActionTransform(LAYOUTS, 0)
+    phase = PhaseTransform(LAYOUTS, 0)
     phase.forward.fitted.fill_(True)
     phase.inverse.fitted.fill_(True)
     # As many classes as there are phases, so that all but the inputs of h would fit.

@@ -18,24 +18,23 @@ from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRec
 from ugat_marl.grounding import (
     METHODS,
     FitConfig,
+    Fitter,
     GateConfig,
     InverseConfig,
     InverseModel,
     Stack,
     fit_inverse,
 )
-from ugat_marl.grounding.dropout import DropoutNet
-from ugat_marl.grounding.ensemble import EnsembleNet
-from ugat_marl.grounding.fit_report import InverseReport
 from ugat_marl.grounding.gate import Gate
-from ugat_marl.grounding.uncertainty import MethodName
+from ugat_marl.grounding.phase import PhaseInverseReport
+from ugat_marl.grounding.uncertainty import DropoutNet, EnsembleNet, MethodName
 from ugat_marl.seeding import torch_generator
 
 LAYOUTS = {"two_0": AgentLayout(3, 2), "three_0": AgentLayout(3, 3, 1)}
 STACK = Stack(LAYOUTS)
 UNSURE: tuple[MethodName, ...] = ("edl", "dropout", "ensemble")
 CONFIG = FitConfig(epochs=40, learning_rate=3e-3)
-Fits = dict[str, tuple[InverseModel, InverseReport]]
+Fits = dict[str, tuple[InverseModel, PhaseInverseReport]]
 
 
 def features(fog: bool, direction: int, k: int, length: float = 1.0) -> list[float]:
@@ -73,11 +72,12 @@ def world(
 
 def fitted(
     method: MethodName, log: TransitionLog, config: FitConfig = CONFIG, seed: int = 0
-) -> tuple[InverseModel, InverseReport]:
+) -> tuple[InverseModel, PhaseInverseReport]:
     layouts = dict(log.provenance.layouts)
     shape = InverseConfig(hidden=(32, 32), embedding=16)
     h = InverseModel(Stack(layouts), shape, torch_generator(0))
-    return h, fit_inverse(h, log, dataclasses.replace(config, uncertainty=method), seed)
+    fitter = Fitter(dataclasses.replace(config, uncertainty=method), seed)
+    return h, fit_inverse(h, log, fitter)
 
 
 @pytest.fixture(scope="module")
@@ -247,8 +247,8 @@ def test_little_data_is_thinned_more_than_much() -> None:
 def test_a_warm_start_goes_on_with_its_own_method_only(weather: TransitionLog) -> None:
     config = dataclasses.replace(CONFIG, epochs=1, warm_start=True)
     h, first = fitted("ensemble", weather, dataclasses.replace(config, epochs=20))
-    again = fit_inverse(h, weather, dataclasses.replace(config, uncertainty="ensemble"), 3)
+    again = fit_inverse(h, weather, Fitter(dataclasses.replace(config, uncertainty="ensemble"), 3))
     assert again.training.held_out_loss <= first.training.held_out_loss + 0.01
-    other = fit_inverse(h, weather, dataclasses.replace(config, uncertainty="dropout"), 3)
+    other = fit_inverse(h, weather, Fitter(dataclasses.replace(config, uncertainty="dropout"), 3))
     assert other.training.held_out_loss > first.training.held_out_loss
     assert h.method.name == "dropout" and isinstance(h.net, DropoutNet)

@@ -12,30 +12,29 @@ import polars as pl
 import pytest
 import torch
 
-import ugat_marl.experiments.transfers as transfer_module
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError
 from ugat_marl.experiments import TransferConfig, transfer
 from ugat_marl.grounding import (
     FitConfig,
+    Fitter,
     GateConfig,
-    GroundedActionTransform,
     GroundedEnv,
     InputsConfig,
     InverseConfig,
+    PhaseTransform,
     Stack,
     State,
     TimedConfig,
     TimedTransform,
+    Ugat,
     UgatConfig,
-    fit,
     neighbours_of,
     stack_log,
 )
+from ugat_marl.grounding.fitting import OffData
 from ugat_marl.grounding.forward import ForwardConfig
-from ugat_marl.grounding.off_data import OffData
-from ugat_marl.grounding.timed_fitting import fit_timed
 from ugat_marl.grounding.view import Moment, View
 from ugat_marl.policies import observer_of, roll_out
 from ugat_marl.scenarios import within_hops
@@ -168,7 +167,7 @@ class Cycling:
 def test_an_episode_in_sumo_shows_the_models_what_its_log_will_show_them() -> None:
     """Grounded at the same time, everyone's f was last fed the phases that then ran upstream."""
     env = parallel_env("grid2x2-v1", duration_s=300)
-    made = GroundedActionTransform(
+    made = PhaseTransform(
         env.layouts,
         0,
         **SHAPES,
@@ -266,8 +265,8 @@ def test_agents_recorded_at_different_times_have_no_neighbours_but_a_past() -> N
 def test_checkpoints_know_what_their_models_saw(tmp_path: Path) -> None:
     inputs = InputsConfig(history=2, hops=1)
 
-    def made(how: InputsConfig, near: Any = ROW) -> GroundedActionTransform:
-        return GroundedActionTransform(LAYOUTS, 0, **SHAPES, inputs=how, neighbours=near)
+    def made(how: InputsConfig, near: Any = ROW) -> PhaseTransform:
+        return PhaseTransform(LAYOUTS, 0, **SHAPES, inputs=how, neighbours=near)
 
     one = made(inputs)
     one.save(tmp_path / "x.pt")
@@ -279,9 +278,10 @@ def test_checkpoints_know_what_their_models_saw(tmp_path: Path) -> None:
     made(InputsConfig()).save(tmp_path / "plain.pt")
     with pytest.raises(CheckpointError, match="use the same inputs"):
         one.load(tmp_path / "plain.pt")
-    before = made(InputsConfig()).state_dict()
-    del before["inputs"]  # written before there were inputs
-    made(InputsConfig()).load_state_dict(before)
+    incomplete = made(InputsConfig()).state_dict()
+    del incomplete["inputs"]
+    with pytest.raises(CheckpointError, match="use the same inputs"):
+        made(InputsConfig()).load_state_dict(incomplete)
 
 
 def test_off_the_data_phases_of_neighbours_stay_phases() -> None:
@@ -303,9 +303,9 @@ def test_both_groundings_fit_and_ground_with_all_inputs(grounding: Any) -> None:
     clock = [(episode, step) for episode in range(2) for step in range(40)]
     log, brief = recorded(clock, delayed=grounding == "timed"), FitConfig(epochs=2)
     if isinstance(made, TimedTransform):
-        report = fit_timed(made, log, log, brief, seed=0)
+        report = made.fit(log, log, Fitter(brief, seed=0))
     else:
-        report = fit(made.forward, made.inverse, log, log, brief, seed=0)
+        report = made.fit(log, log, Fitter(brief, seed=0))
     assert all(np.isfinite(report.forward.error))
     assert made.forward.standardise.mean.shape[-1] == made.forward.view.width > STACK.width
     data = stack_log(log, STACK)
@@ -323,10 +323,10 @@ def test_a_run_finds_the_neighbours_by_itself(
     class Begun(Exception):
         pass
 
-    def begun(state: State, *_others: Any) -> None:
+    def begun(_ugat: Ugat, state: State) -> None:
         raise Begun(state.transform)
 
-    monkeypatch.setattr(transfer_module, "train_ugat", begun)
+    monkeypatch.setattr(Ugat, "train", begun)
     config = TransferConfig("grid2x2-v1", ugat=UgatConfig(inputs=InputsConfig(history=2, hops=1)))
     with pytest.raises(Begun) as told:
         transfer(config, tmp_path / "run")

@@ -9,7 +9,7 @@ import polars as pl
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.grounding import ShuffledWorld
-from ugat_marl.grounding.worlds import shuffled
+from ugat_marl.grounding.controls import shuffled
 from ugat_marl.policies import Policy
 
 LAYOUTS = {"a_0": AgentLayout(2, 2), "b_0": AgentLayout(1, 2, 1)}

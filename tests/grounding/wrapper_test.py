@@ -13,7 +13,7 @@ from pettingzoo.test import parallel_api_test
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.errors import ActionError, OptionError
-from ugat_marl.grounding import GateConfig, GroundedActionTransform, GroundedEnv
+from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform
 
 LAYOUTS = {"a_0": AgentLayout(3, 4), "b_0": AgentLayout(2, 2, 1)}
 KEYS = {"grounded_action", "uncertainty", "accepted"}
@@ -85,8 +85,8 @@ class Crossing(ParallelEnv):
         self.closed = True
 
 
-def transform(mode: str = "infinite", **options: Any) -> GroundedActionTransform:
-    made = GroundedActionTransform(LAYOUTS, 0, gate=GateConfig(mode=mode, **options))
+def transform(mode: str = "infinite", **options: Any) -> PhaseTransform:
+    made = PhaseTransform(LAYOUTS, 0, gate=GateConfig(mode=mode, **options))
     made.forward.fitted.fill_(True)
     made.inverse.fitted.fill_(True)
     return made
@@ -221,9 +221,9 @@ def test_impossible_actions_are_refused_before_anything_moves(wrong: object) -> 
 
 
 def test_a_grounding_for_something_else_is_refused() -> None:
-    other = GroundedActionTransform({"a_0": AgentLayout(3, 4)}, 0)
+    other = PhaseTransform({"a_0": AgentLayout(3, 4)}, 0)
     with pytest.raises(OptionError, match="1 agents .*has 2"):
         GroundedEnv(Crossing(), other)
-    wider = GroundedActionTransform({"a_0": AgentLayout(3, 4), "b_0": AgentLayout(2, 2, 5)}, 0)
+    wider = PhaseTransform({"a_0": AgentLayout(3, 4), "b_0": AgentLayout(2, 2, 5)}, 0)
     with pytest.raises(OptionError, match=r"\(9,\) and 2 phases from b_0.*\(5,\)"):
         GroundedEnv(Crossing(), wider)

@@ -16,7 +16,7 @@ from pettingzoo import ParallelEnv
 import ugat_marl
 from ugat_marl.envs import agent_indicator, pad
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
-from ugat_marl.grounding import GateConfig, GroundedActionTransform, GroundedEnv
+from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform
 from ugat_marl.policies import Learner, NetworkPolicy, Policy, load_baseline
 from ugat_marl.testing import ToyTraffic, check_policy, failures
 
@@ -318,7 +318,7 @@ def test_it_keeps_the_protocols_and_its_policies_conform(tmp_path: Path) -> None
 @pytest.mark.parametrize("centralised", [False, True])
 def test_it_trains_in_a_grounded_environment(centralised: bool) -> None:
     env = ToyTraffic()
-    transform = GroundedActionTransform(env.layouts, 0, gate=GateConfig(mode="infinite"))
+    transform = PhaseTransform(env.layouts, 0, gate=GateConfig(mode="infinite"))
     transform.forward.fitted.fill_(True)
     transform.inverse.fitted.fill_(True)
     learner = IPPO(env, Config(**QUICK, centralised=centralised))

@@ -20,7 +20,7 @@ from pettingzoo import ParallelEnv
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.experiments import policy_factory
-from ugat_marl.grounding import GateConfig, GroundedActionTransform, GroundedEnv
+from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform
 from ugat_marl.policies import (
     BASELINES,
     Learner,
@@ -241,7 +241,7 @@ def test_it_keeps_the_protocols_and_its_policies_conform(name: str, tmp_path: Pa
 @every
 def test_it_trains_in_a_grounded_environment(name: str) -> None:
     env = ToyTraffic()
-    transform = GroundedActionTransform(env.layouts, 0, gate=GateConfig(mode="infinite"))
+    transform = PhaseTransform(env.layouts, 0, gate=GateConfig(mode="infinite"))
     transform.forward.fitted.fill_(True)
     transform.inverse.fitted.fill_(True)
     learner = made(name, env)

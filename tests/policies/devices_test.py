@@ -22,8 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 import ugat_marl.experiments.transfers as transfer_module
-import ugat_marl.grounding.ugat as ugat_module
-from studies.bench.learning_program import Noise
+from studies.bench.learning_episodes import Noise
 from ugat_marl.__main__ import main
 from ugat_marl.data import SETTINGS as SETTINGS_FILE
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
@@ -34,18 +33,18 @@ from ugat_marl.experiments.paper.tables import Planner
 from ugat_marl.grounding import (
     METHODS,
     FitConfig,
-    GroundedActionTransform,
+    Fitter,
     InputsConfig,
     InverseConfig,
+    PhaseTransform,
     TimedConfig,
     TimedTransform,
+    Ugat,
     UgatConfig,
     answer_with_noise,
-    fit,
 )
+from ugat_marl.grounding.fitting import OffData
 from ugat_marl.grounding.forward import ForwardConfig
-from ugat_marl.grounding.off_data import OffData
-from ugat_marl.grounding.timed_fitting import fit_timed
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.policies import CPU, DQN, NetworkPolicy, device_of, placed, require_device_name
 from ugat_marl.policies.learners.dqn import DQNConfig
@@ -350,11 +349,11 @@ def fitted(
     around = {"inputs": INPUTS[inputs], "neighbours": NEAR, **SHAPES}
     if timed:
         late = TimedTransform(LAYOUTS, 0, timed=TimedConfig(most_s=3), **around)
-        return fit_timed(late, *logs, how, 0, device=device).as_dict(), late
-    made = GroundedActionTransform(LAYOUTS, 0, **around)
+        return late.fit(*logs, Fitter(how, 0, device=device)).as_dict(), late
+    made = PhaseTransform(LAYOUTS, 0, **around)
     if noise:
         answer_with_noise(made.forward, 0)
-    return fit(made.forward, made.inverse, *logs, how, 0, device=device).as_dict(), made
+    return made.fit(*logs, Fitter(how, 0, device=device)).as_dict(), made
 
 
 @pytest.fixture
@@ -409,25 +408,25 @@ def test_a_warm_start_goes_on_on_either_device(
 ) -> None:
     how = FitConfig(epochs=2, warm_start=True)
     _, unbroken = fitted(logs, CPU, how)
-    numbers = fit(unbroken.forward, unbroken.inverse, *logs, how, 1).as_dict()
+    numbers = unbroken.fit(*logs, Fitter(how, 1)).as_dict()
     _, first = fitted(logs, device, how)
     first.save(tmp_path / "grounding.pt")
-    second = GroundedActionTransform(LAYOUTS, 5, **SHAPES)
+    second = PhaseTransform(LAYOUTS, 5, **SHAPES)
     second.load(tmp_path / "grounding.pt")
-    found = fit(second.forward, second.inverse, *logs, how, 1, device=device).as_dict()
+    found = second.fit(*logs, Fitter(how, 1, device=device)).as_dict()
     assert_same(list(numbers.values()), list(found.values()), device)
 
 
 def test_models_come_back_from_a_fit_that_failed(
     standin: torch.device, logs: tuple[TransitionLog, TransitionLog]
 ) -> None:
-    made = GroundedActionTransform(LAYOUTS, 0, **SHAPES)
+    made = PhaseTransform(LAYOUTS, 0, **SHAPES)
 
     def stop(_model: str, _epoch: int, _loss: float) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit(made.forward, made.inverse, *logs, FitConfig(epochs=2), 0, stop, standin)
+        made.fit(*logs, Fitter(FitConfig(epochs=2), 0, stop, standin))
     assert {tensor.device for tensor in made.forward.state_dict().values()} == {CPU}
 
 
@@ -503,7 +502,7 @@ def test_a_run_is_the_same_elsewhere_and_goes_on_here(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(ugat_module, "_fit", stop)
+        patch.setattr(Ugat, "_fit", stop)
         with pytest.raises(KeyboardInterrupt):
             transfer(elsewhere, tmp_path / "broken")
     transfer(RUN, tmp_path / "broken", resume=True)
@@ -519,7 +518,7 @@ class Judged:
 
 @pytest.mark.parametrize(
     "command",
-    [["train", "single-v1"], ["paper", "gap"]],
+    [["train", "single-v1"], ["paper", "gap"], ["bench", "strength"], ["bench", "device"]],
 )
 def test_commands_refuse_what_is_not_there_and_leave_nothing(
     command: list[str],

@@ -15,7 +15,7 @@ from pettingzoo.test import parallel_api_test
 import ugat_marl
 from ugat_marl.effects import in_domain
 from ugat_marl.errors import ActionError
-from ugat_marl.grounding import GroundedActionTransform, GroundedEnv
+from ugat_marl.grounding import GroundedEnv, PhaseTransform
 from ugat_marl.testing import (
     ENVIRONMENT_CHECKS,
     ConformanceError,
@@ -541,7 +541,7 @@ def test_the_options_of_the_suites_environments_pass(options: dict[str, Any]) ->
 
 def grounded() -> GroundedEnv:
     env = ugat_marl.parallel_env("mixed-v1", duration_s=100)
-    transform = GroundedActionTransform(env.layouts, 0)
+    transform = PhaseTransform(env.layouts, 0)
     transform.forward.fitted.fill_(True)
     transform.inverse.fitted.fill_(True)
     return GroundedEnv(env, transform)

@@ -59,7 +59,7 @@ class Record:
     workers: Workers = None
 
     def run(self, console: Console) -> int:
-        """Record and write."""
+        """Records and writes."""
         scenario = load_scenario(self.scenario)
         in_domain(scenario, self.domain)  # a wrong name is an error before anything is written
         policy = policy_factory(self.policy)

@@ -41,12 +41,11 @@ from ugat_marl.grounding import (
     RecordedWorld,
     ShuffledWorld,
     State,
+    Ugat,
     UgatConfig,
     World,
     answer_with_noise,
     neighbours_of,
-    restore,
-    train_ugat,
 )
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
@@ -244,7 +243,7 @@ def transfer(
     write_settings(directory, asdict(config))
     try:
         state = State(learner, transform)
-        restore(state, run, NetworkPolicy.load)
+        state.restore(run, NetworkPolicy.load)
         policy = _train(config, scenario, env, recorded, state, run, workers)
         assert state.direct is not None  # plain training comes first
         policies: dict[str, Policy] = {DIRECT: state.direct}
@@ -344,8 +343,8 @@ def _train(
     if config.placebo == "shuffled":
         real = ShuffledWorld(real)
     try:
-        how = config.ugat, config.seed, run, probe, config.device
-        return train_ugat(state, env, sim, real, *how)
+        ugat = Ugat(env, sim, real, config.ugat, config.seed, run, probe, config.device)
+        return ugat.train(state)
     finally:
         sim.close()
         real.close()
@@ -399,7 +398,7 @@ def _other_env(
 def _identity(
     config: TransferConfig, scenario: Scenario, env: TrafficEnv, controls: Sequence[Control]
 ) -> dict[str, Any]:
-    settings = {**asdict(config), "ugat": config.ugat.identity}
+    settings = asdict(config)
     for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", "device", "corrected", *ADDED):
         settings.pop(other)
     if config.placebo == "none":  # runs from before there were any can be resumed

@@ -59,7 +59,7 @@ class Answering:
         return answer
 
     def close(self) -> None:
-        """Let the thread end as soon as it is free."""
+        """Lets the thread end as soon as it is free."""
         self._questions.put(None)
 
 

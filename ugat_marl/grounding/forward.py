@@ -1,4 +1,4 @@
-"""Forward models f_i: what the real world makes of a state and an action.
+"""Forward models f_i: the outcome of a state and an action in the real world.
 
 One multi-layer perceptron per intersection, all of them computed as one batch. A model predicts
 the *change* of the features over one decision interval: knowing nothing is predicting no change.
@@ -12,8 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.errors import OptionError
-from ugat_marl.grounding.products import rows_at_once
-from ugat_marl.grounding.scaling import SMALLEST_SPREAD, Standardiser
+from ugat_marl.grounding.networks import (
+    SMALLEST_SPREAD,
+    Standardiser,
+    TrainableModel,
+    rows_at_once,
+)
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.view import View
 from ugat_marl.policies import BatchedMLP, mask_of
@@ -25,7 +29,7 @@ class ForwardConfig:
 
     Attributes:
         hidden: Sizes of the hidden layers.
-        include_phase: Whether the phase of s' is predicted, too. Off: it is known from the action,
+        include_phase: True if the phase of s' is predicted, too. Off: it is known from the action,
             and with it an inverse model could only answer the action that made it.
     """
 
@@ -37,7 +41,7 @@ class ForwardConfig:
             raise OptionError(f"forward hidden is {self.hidden}; allowed: one or more sizes >= 1")
 
 
-class ForwardModel(nn.Module):
+class ForwardModel(TrainableModel):
     """f of every intersection: (s, a) -> features of s'.
 
     Args:
@@ -48,7 +52,6 @@ class ForwardModel(nn.Module):
         view: What the models see beside s and a; nothing unless given.
     """
 
-    fitted: Tensor
     scale: Tensor
     offsets: Tensor
     extra_places: Tensor
@@ -62,9 +65,7 @@ class ForwardModel(nn.Module):
         extra: int = 0,
         view: View | None = None,
     ) -> None:
-        super().__init__()
-        self.stack = stack
-        self.view = view or View(stack)
+        super().__init__(stack, view or View(stack))
         self.config = config
         heads = stack.heads(config.include_phase)
         sizes = self.view.sizes
@@ -73,7 +74,6 @@ class ForwardModel(nn.Module):
         self.standardise = Standardiser(len(heads), self.view.width)
         self.width = max(fan_in)
         self.register_buffer("scale", torch.ones(len(heads), 1, 1))
-        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
         self.register_buffer("offsets", torch.tensor(sizes)[:, None, None], persistent=False)
         self.register_buffer("valid_outputs", mask_of(heads)[:, None, :], persistent=False)
         behind = torch.tensor(sizes) + torch.tensor(stack.phases)
@@ -81,13 +81,27 @@ class ForwardModel(nn.Module):
         self.register_buffer("extra_places", places, persistent=False)
         self.renew(generator)
 
+    @property
+    def members(self) -> int:
+        """One network per agent."""
+        return 1
+
+    @property
+    def parts(self) -> int:
+        """The agents, which share no weight."""
+        return len(self.stack.agents)
+
+    def loss_by_part(self, loss: Tensor) -> Tensor:
+        """Return the loss of every agent as it is."""
+        return loss
+
     def renew(self, generator: torch.Generator) -> None:
-        """Forgets everything: a new network with weights from `generator`."""
+        """Forget everything: make a new network with weights from `generator`."""
         self.network = BatchedMLP(self._fan_in, self.config.hidden, self._outputs, generator)
         self.fitted.fill_(False)
 
     def forward(self, observation: Tensor, action: Tensor, extra: Tensor | None = None) -> Tensor:
-        """Predicted change in units of ``scale``: ``(agents, batch, outputs)``, 0 in padding.
+        """Predict the change in units of ``scale``: ``(agents, batch, outputs)``, 0 in padding.
 
         Args:
             observation: ``(agents, batch, view.width)``, as `view` makes it.
@@ -97,16 +111,16 @@ class ForwardModel(nn.Module):
         return self.read(self.inputs(observation, action, extra))
 
     def read(self, inputs: Tensor) -> Tensor:
-        """The answer, as `forward` gives it, to ``(agents, batch, width)`` from `inputs`."""
+        """Predict as `forward` does, from ``(agents, batch, width)`` of `inputs`."""
         return self.network(inputs) * self.valid_outputs
 
     def read_all(self, inputs: Tensor) -> Tensor:
-        """As `read`, for any number of rows: some after the others."""
+        """Predict as `read` does, for any number of rows: some after the others."""
         parts = inputs.split(rows_at_once(len(inputs)), dim=1)
         return torch.cat([self.read(part) for part in parts], 1)
 
     def inputs(self, observation: Tensor, action: Tensor, extra: Tensor | None = None) -> Tensor:
-        """What the network is given, ``(agents, batch, width)``; arguments as of `forward`."""
+        """Return the network's inputs, ``(agents, batch, width)``; arguments as of `forward`."""
         inputs = nn.functional.pad(
             self.standardise(observation), (0, self.width - observation.shape[-1])
         )
@@ -117,19 +131,51 @@ class ForwardModel(nn.Module):
         return inputs
 
     def predict(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Predicted features (and phase, if included) of s', ``(agents, batch, outputs)``."""
+        """Predict the features (and phase, if included) of s', ``(agents, batch, outputs)``."""
         change = self.read_all(self.inputs(observation, action)) * self.scale
         return observation[..., : change.shape[-1]] * self.valid_outputs + change
 
     def change(self, observation: Tensor, next_observation: Tensor) -> Tensor:
-        """The change that happened, ``(agents, batch, outputs)`` in the features' own unit."""
+        """Return the change that happened, ``(agents, batch, outputs)`` in the unit of features."""
         size = self.valid_outputs.shape[-1]
         return (next_observation[..., :size] - observation[..., :size]) * self.valid_outputs
 
     def fit_scale(self, observation: Tensor, change: Tensor, weight: Tensor) -> None:
-        """Takes the statistics of inputs and of changes from the training rows."""
+        """Take the statistics of inputs and of changes from the training rows."""
         self.standardise.fit(observation, weight)
         share = (weight / weight.sum(1, keepdim=True))[..., None]
         outputs = self.valid_outputs.sum(-1, keepdim=True)
         spread = ((share * change**2).sum((1, 2), keepdim=True) / outputs).sqrt()
         self.scale.copy_(spread.clamp(min=SMALLEST_SPREAD))
+
+
+class DelayedForward(ForwardModel):
+    """Model of the simulation: (s, a, delay of a's green) -> change of the features.
+
+    The effect of a delay bends where queues and greens end, and jumps where one more vehicle gets
+    through. So every whole second has an input of its own; a delay between two of them counts for
+    both.
+
+    Args:
+        stack: The agents.
+        config: Shape of the models.
+        most_s: Longest delay.
+        generator: Source of the initial weights.
+        view: What the models see beside s, a and the delay; nothing unless given.
+    """
+
+    def __init__(
+        self,
+        stack: Stack,
+        config: ForwardConfig,
+        most_s: int,
+        generator: torch.Generator,
+        view: View | None = None,
+    ) -> None:
+        super().__init__(stack, config, generator, extra=most_s, view=view)
+        self.most_s = most_s
+
+    def extra(self, delay_s: Tensor) -> Tensor:
+        """Return the further inputs for delays ``(agents, batch)``."""
+        seconds = torch.arange(1.0, self.most_s + 1.0)
+        return (1.0 - (delay_s[..., None] - seconds).abs()).clamp(min=0.0)

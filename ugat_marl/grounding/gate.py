@@ -28,7 +28,7 @@ STARTS = ("open", "fitted")
 
 @dataclass(frozen=True)
 class GateConfig:
-    """How alpha is found.
+    """Settings of alpha.
 
     Attributes:
         mode: "infinite" takes every grounded action, "static" compares with `static_alpha`,
@@ -62,7 +62,7 @@ class GateConfig:
 
 @dataclass(frozen=True)
 class GateReport:
-    """What the gate did since the last update; arrays over the agents.
+    """Decisions of the gate since the last update; arrays over the agents.
 
     Attributes:
         agents: Names.
@@ -72,7 +72,7 @@ class GateReport:
         acceptance: Share of decisions in which the grounded action was taken.
         mean_u: Mean uncertainty.
         change_rate: Share of decisions in which another action than the policy's was executed.
-        trusted: Whether the agent's models may be obeyed at all (`Gate.trust`).
+        trusted: Agents whose models may be obeyed at all (`Gate.trust`).
         warning: A sentence if the gate let everything or nothing through, else "".
     """
 
@@ -87,7 +87,7 @@ class GateReport:
     warning: str
 
     def as_dict(self) -> dict[str, float]:
-        """Flat numbers: means over agents, and the same per agent."""
+        """Return flat numbers: means over agents, and the same per agent."""
         numbers: dict[str, float] = {"decisions": float(self.decisions.sum())}
         for name in ("alpha", "acceptance", "mean_u", "change_rate", "trusted"):
             values: NDArray[Any] = getattr(self, name)
@@ -97,11 +97,11 @@ class GateReport:
 
 
 class Gate:
-    """Accepts or refuses grounded actions and counts what it did.
+    """Threshold alpha of every agent: accepts or refuses grounded actions, and counts them.
 
     Args:
         agents: Names, in the order of all arrays.
-        config: How alpha is found.
+        config: Settings.
     """
 
     def __init__(self, agents: Sequence[str], config: GateConfig) -> None:
@@ -116,15 +116,15 @@ class Gate:
         self._counts = np.zeros((4, len(self.agents)))  # decisions, accepted, changed, sum of u
 
     def trust(self, agents: NDArray[np.bool_]) -> None:
-        """Says at which agents, ``(agents,)`` bool, the models may be obeyed at all.
+        """Set the agents, ``(agents,)`` bool, whose models may be obeyed at all.
 
-        Alpha is infinite at first, so a poor h would be obeyed everywhere; it makes a policy worse.
+        Alpha is infinite at first, so a poor h would be obeyed everywhere, and make a policy worse.
         All agents are trusted until this is called; `FitReport.trusted` knows whom to trust.
         """
         self.trusted = np.asarray(agents, bool).copy()
 
     def begin(self, mean_u: NDArray[np.float64]) -> None:
-        """Tells a gate that starts "fitted" what u to expect; later iterations have logged theirs.
+        """Tell a gate that starts "fitted" which u to expect; later iterations have logged theirs.
 
         Args:
             mean_u: ``(agents,)`` means; where one is 0 there is nothing to gate by.
@@ -141,7 +141,7 @@ class Gate:
     def accepts(
         self, u: NDArray[np.floating[Any]], permitted: NDArray[np.bool_] | None = None
     ) -> NDArray[np.bool_]:
-        """Which grounded actions `decide` would take; nothing is logged."""
+        """Return the grounded actions that `decide` would take, bool; nothing is logged."""
         accepted = (u < self.alpha) & self.trusted
         return accepted if permitted is None else accepted & permitted
 
@@ -153,14 +153,14 @@ class Gate:
         permitted: NDArray[np.bool_] | None = None,
         asked: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.bool_]:
-        """Which grounded actions are taken; logs u and counts.
+        """Decide which grounded actions are taken; log u and count.
 
         Args:
             u: ``(agents,)`` uncertainties.
             action: ``(agents,)`` the policy's actions.
             grounded: ``(agents,)`` the grounded actions.
             permitted: ``(agents,)`` false where the grounded action is masked out.
-            asked: ``(agents,)`` false where there is nothing to ground; that is not logged.
+            asked: ``(agents,)`` false where there is nothing to ground; these are not logged.
 
         Returns:
             ``(agents,)`` bool: u < alpha, permitted, asked, and the agent's models trusted.
@@ -173,13 +173,13 @@ class Gate:
         return accepted
 
     def end_epoch(self) -> None:
-        """Closes an epoch: its u count as one of the window's E epochs. Empty ones do not."""
+        """Close an epoch: its u count as one of the window's epochs. Empty ones do not."""
         if self._running[1].any():
             self._epochs.append(self._running)
             self._running = np.zeros_like(self._running)
 
     def update(self) -> GateReport:
-        """Ends an iteration: reports, moves a dynamic alpha, and starts counting anew.
+        """End an iteration: report, move a dynamic alpha, and start counting anew.
 
         Warns (UserWarning) if, after the first iteration, some intersections took everything or
         nothing, unless that is the mode's purpose.
@@ -198,7 +198,7 @@ class Gate:
         return report
 
     def report(self) -> GateReport:
-        """What the gate did since the last update."""
+        """Return the decisions since the last update."""
         decisions, accepted, changed, total = self._counts
         count = np.maximum(decisions, 1.0)
         return GateReport(
@@ -234,7 +234,7 @@ class Gate:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on as if never interrupted."""
+        """Return everything needed to go on as if never interrupted."""
         epochs = np.array(self._epochs).reshape(-1, 2, len(self.agents))
         return {
             "agents": list(self.agents),
@@ -249,7 +249,7 @@ class Gate:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores `state_dict`.
+        """Restore `state_dict`.
 
         Raises:
             CheckpointError: Of other agents, incomplete, or with impossible numbers.

@@ -1,4 +1,4 @@
-"""Inverse models h_i: which action of the simulation leads from one state to another.
+"""Inverse models h_i: the action of the simulation that leads from one state to another.
 
 Every intersection has an encoder of its own; one head is shared by all of them. Phases an
 intersection does not have are masked, and its uncertainty counts its own number of phases.
@@ -9,16 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ugat_marl.errors import OptionError
-from ugat_marl.grounding.dropout import DropoutNet
-from ugat_marl.grounding.ensemble import EnsembleNet, PlainNet
-from ugat_marl.grounding.evidential import EvidentialNet
-from ugat_marl.grounding.products import rows_at_once
-from ugat_marl.grounding.scaling import Standardiser
+from ugat_marl.grounding.networks import Standardiser, TrainableModel, rows_at_once
 from ugat_marl.grounding.stacked import Stack
-from ugat_marl.grounding.uncertainty import AnswerNet, InversePrediction, Method, NetShape
+from ugat_marl.grounding.uncertainty import (
+    AnswerNet,
+    DropoutNet,
+    EnsembleNet,
+    EvidentialNet,
+    InversePrediction,
+    Method,
+    NetShape,
+    PlainNet,
+)
 from ugat_marl.grounding.view import View
 
 
@@ -28,8 +33,8 @@ class InverseConfig:
 
     Attributes:
         hidden: Sizes of the hidden layers of an encoder.
-        embedding: Size of what an encoder hands to the shared head.
-        include_phase: Whether h sees the phase of s'. Off: the phase alone would give the action
+        embedding: Size of the output of an encoder, which the shared head reads.
+        include_phase: True if h sees the phase of s'. Off: the phase alone would give the action
             away, and h would never look at the traffic.
     """
 
@@ -44,7 +49,7 @@ class InverseConfig:
             raise OptionError(f"inverse embedding is {self.embedding}; allowed: >= 1")
 
 
-class AnswerModel(nn.Module):
+class AnswerModel(TrainableModel):
     """A network that answers inputs with one of some classes and an uncertainty.
 
     Args:
@@ -56,7 +61,6 @@ class AnswerModel(nn.Module):
         method: Which uncertainty; the evidential one unless given.
     """
 
-    fitted: Tensor
     valid_answers: Tensor
     method: Method
     net: AnswerNet
@@ -70,18 +74,29 @@ class AnswerModel(nn.Module):
         generator: torch.Generator,
         method: Method | None,
     ) -> None:
-        super().__init__()
-        self.stack = view.stack
-        self.view = view
+        super().__init__(view.stack, view)
         self.config = config
         self._fan_in = fan_in
         self.standardise = Standardiser(len(fan_in), max(fan_in))
-        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
         self.register_buffer("valid_answers", valid_answers[:, None, :], persistent=False)
         self.renew(method or Method(), generator)
 
+    @property
+    def members(self) -> int:
+        """Networks of an ensemble, 1 of the other methods."""
+        return self.net.members
+
+    @property
+    def parts(self) -> int:
+        """The members of an ensemble; the head of each is shared by all agents."""
+        return self.net.members
+
+    def loss_by_part(self, loss: Tensor) -> Tensor:
+        """Return the mean loss over agents of every member."""
+        return loss.mean(0).view(-1)
+
     def renew(self, method: Method, generator: torch.Generator) -> None:
-        """Forgets everything: a new network, of this method, with weights from `generator`."""
+        """Forget everything: make a new network of this method, weights from `generator`."""
         self.method = method
         shape = NetShape(
             self._fan_in, self.config.hidden, self.config.embedding, self.valid_answers
@@ -98,7 +113,7 @@ class AnswerModel(nn.Module):
         self.fitted.fill_(False)
 
     def answer(self, inputs: Tensor) -> InversePrediction:
-        """Answers to unscaled inputs, ``(agents, batch, width)``."""
+        """Answer unscaled inputs, ``(agents, batch, width)``."""
         rows = rows_at_once(len(inputs) * self.net.members)
         parts = [self.net.answer(self.standardise(part)) for part in inputs.split(rows, dim=1)]
         return parts[0] if len(parts) == 1 else InversePrediction.joined(parts)
@@ -135,7 +150,7 @@ class InverseModel(AnswerModel):
         self.register_buffer("valid_inputs", valid, persistent=False)
 
     def inputs(self, observation: Tensor, next_features: Tensor) -> Tensor:
-        """The state, and directly behind it the change of its features; unscaled.
+        """Return the state, and directly behind it the change of its features; unscaled.
 
         Args:
             observation: ``(agents, batch, view.width)``, as `view` makes it.
@@ -149,12 +164,12 @@ class InverseModel(AnswerModel):
         return both.gather(2, columns) * self.valid_inputs
 
     def predict(self, observation: Tensor, next_features: Tensor) -> InversePrediction:
-        """The action that h holds responsible for the step from s to s'."""
+        """Name the action that h holds responsible for the step from s to s'."""
         return self.answer(self.inputs(observation, next_features))
 
 
 def _columns(sizes: list[int], heads: list[int]) -> tuple[Tensor, Tensor]:
-    """Where input j of each agent lies in ``[observation | change]``, padded; and if it exists."""
+    """Return the column of each agent's input j in ``[observation | change]``, and if it exists."""
     width = max(size + head for size, head in zip(sizes, heads, strict=True))
     columns = torch.zeros(len(sizes), 1, width, dtype=torch.long)
     valid = torch.zeros(len(sizes), 1, width)
@@ -163,3 +178,67 @@ def _columns(sizes: list[int], heads: list[int]) -> tuple[Tensor, Tensor]:
         columns[i, 0, size : size + head] = max(sizes) + torch.arange(head)
         valid[i, 0, : size + head] = 1.0
     return columns, valid
+
+
+class DelayModel(AnswerModel):
+    """h of every intersection: (s, a, change of the features) -> delay in whole seconds, and u.
+
+    Args:
+        stack: The agents.
+        config: Shape of the models.
+        most_s: Longest delay; the classes are 0, 1, ..., `most_s` s.
+        generator: Source of the initial weights.
+        method: Which uncertainty; the evidential one unless given.
+        view: What the models see beside s, a and the change; nothing unless given.
+    """
+
+    def __init__(
+        self,
+        stack: Stack,
+        config: InverseConfig,
+        most_s: int,
+        generator: torch.Generator,
+        method: Method | None = None,
+        view: View | None = None,
+    ) -> None:
+        self.most_s = most_s
+        view = view or View(stack)
+        heads = stack.heads(include_phase=False)
+        sizes = zip(view.sizes, heads, stack.phases, strict=True)
+        fan_in = [size + head + phases for size, head, phases in sizes]
+        classes = torch.ones(len(fan_in), most_s + 1, dtype=torch.bool)
+        super().__init__(view, config, fan_in, classes, generator, method)
+
+    def inputs(self, observation: Tensor, action: Tensor, change: Tensor) -> Tensor:
+        """Return state, change and action directly behind each other; unscaled.
+
+        Args:
+            observation: ``(agents, batch, view.width)``, as `view` makes it.
+            action: ``(agents, batch)`` int64, the phase that turns green.
+            change: ``(agents, batch, features)``.
+        """
+        batch = action.shape[1]
+        found = torch.zeros(len(self._fan_in), batch, max(self._fan_in))
+        for i, (size, layout) in enumerate(
+            zip(self.view.sizes, self.stack.layouts.values(), strict=True)
+        ):
+            end = size + layout.features
+            found[i, :, :size] = observation[i, :, :size]
+            found[i, :, size:end] = change[i, :, : layout.features]
+            found[i].scatter_(1, end + action[i][:, None], 1.0)
+        return found
+
+    @property
+    def action_columns(self) -> Tensor:
+        """Columns of the action in the inputs, ``(agents, 1, width)`` bool."""
+        found = torch.zeros(len(self._fan_in), 1, max(self._fan_in), dtype=torch.bool)
+        for i, (size, layout) in enumerate(
+            zip(self.view.sizes, self.stack.layouts.values(), strict=True)
+        ):
+            start = size + layout.features
+            found[i, 0, start : start + layout.phases] = True
+        return found
+
+    def predict(self, observation: Tensor, action: Tensor, change: Tensor) -> InversePrediction:
+        """Name the delay that h holds responsible for a change."""
+        return self.answer(self.inputs(observation, action, change))

@@ -1,12 +1,12 @@
-"""Grounding neighbours at the same time: everyone's models see the phases that will really run.
+"""Grounding of neighbours at the same time: models see the phases that will really run.
 
 Models that see their neighbours are told which phases run there, and those are only known once the
-neighbours are grounded. With roads in both directions everyone is upstream of somebody who is
-upstream of them, so that no order of the agents gives each the final phases of the others. The
-answer is a fixed point: all agents are grounded for the phases the others ask for, again for those
-that would then run, and so on until nothing changes. Neighbours change their minds in turn, or two
-of them could go on answering each other's last word. Who does so nevertheless is left with its own
-action, so that an end always comes.
+neighbours are grounded. With roads in both directions each agent is upstream of one that is
+upstream of it, so that no order of the agents gives each the final phases of the others. The answer
+is a fixed point: all agents are grounded for the phases the others ask for, again for those that
+would then run, and so on until nothing changes. Neighbours change their answers in turn, or two of
+them could alternate for ever. An agent that does not settle keeps its own action, so that the
+search always ends.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Answer = Callable[[NDArray[np.int64]], tuple[NDArray[np.int64], NDArray[np.float
 
 @dataclass(frozen=True)
 class Settled:
-    """Answers that hold together: each was given for the phases that will run.
+    """Answers that fit together: each was given for the phases that will run.
 
     Attributes:
         grounded: ``(agents,)`` int64.
@@ -43,7 +43,7 @@ class Settled:
 
 
 def turns(agents: Sequence[str], near: Mapping[str, Sequence[str]]) -> NDArray[np.bool_]:
-    """Who may change its mind at the same time: nobody and a neighbour; ``(turns, agents)``."""
+    """Return groups of agents without neighbours among them, ``(turns, agents)`` bool."""
     pairs = {(a, b) for a in agents for b in near.get(a, ())}
     turn: dict[str, int] = {}
     for agent in agents:
@@ -53,7 +53,7 @@ def turns(agents: Sequence[str], near: Mapping[str, Sequence[str]]) -> NDArray[n
 
 
 def running(actions: NDArray[np.int64], permitted: NDArray[np.bool_] | None) -> NDArray[np.int64]:
-    """The phases that run if these are asked for: a light that may not change yet does not.
+    """Return the phases that run if these are asked for: a light that may not change stays.
 
     Args:
         actions: ``(agents,)``.
@@ -68,7 +68,7 @@ def running(actions: NDArray[np.int64], permitted: NDArray[np.bool_] | None) -> 
 def alone(
     answer: Answer, actions: NDArray[np.int64], permitted: NDArray[np.bool_] | None
 ) -> Settled:
-    """One pass, for models that see no neighbours."""
+    """Ground all agents once, for models that see no neighbours."""
     grounded, u = answer(actions)
     return Settled(grounded, u, None if permitted is None else _allowed(grounded, permitted))
 
@@ -80,7 +80,7 @@ def together(
     actions: NDArray[np.int64],
     permitted: NDArray[np.bool_] | None,
 ) -> Settled:
-    """Grounds all agents until the phases they were told of are those that will run.
+    """Ground all agents until the phases they were told of are those that will run.
 
     Args:
         answer: Asks the models; called at least once.

@@ -41,11 +41,11 @@ class Stack:
         self.valid_actions = mask_of(self.phases)
 
     def heads(self, include_phase: bool) -> list[int]:
-        """Length of each agent's predicted part: its features, with its phase if asked for."""
+        """Return the length of each agent's predicted part: features, with phase if asked for."""
         return [layout.features + layout.phases * include_phase for layout in self.layouts.values()]
 
     def current_phase(self, observation: Tensor) -> Tensor:
-        """The phase shown, ``(agents, batch)``, in observations ``(agents, batch, width)``."""
+        """Return the phase shown, ``(agents, batch)``, by ``(agents, batch, width)`` rows."""
         found = torch.zeros(observation.shape[:2], dtype=torch.long)
         for i, layout in enumerate(self.layouts.values()):
             shown = observation[i, :, layout.features : layout.features + layout.phases]
@@ -53,14 +53,14 @@ class Stack:
         return found
 
     def observations(self, observations: Mapping[str, NDArray[np.float32]]) -> Tensor:
-        """One observation per agent as ``(agents, 1, width)`` float32."""
+        """Return one observation per agent as ``(agents, 1, width)`` float32."""
         rows = np.zeros((len(self.agents), 1, self.width), np.float32)
         for row, agent, size in zip(rows, self.agents, self.sizes, strict=True):
             row[0, :size] = observations[agent]
         return torch.from_numpy(rows)
 
     def masks(self, masks: Mapping[str, NDArray[np.int8] | None]) -> NDArray[np.bool_]:
-        """Action masks as ``(agents, actions)`` bool; an agent without a mask may do all it has."""
+        """Return action masks as ``(agents, actions)`` bool; all phases of an agent without one."""
         rows = self.valid_actions.numpy().copy()
         for row, agent, phases in zip(rows, self.agents, self.phases, strict=True):
             mask = masks.get(agent)
@@ -98,7 +98,7 @@ class StackedTransitions:
 
     @property
     def outcome(self) -> Tensor:
-        """The features that tell most of what a green did: of those served, else those after.
+        """Features that show best what a green did: those served if measured, else those after.
 
         Counts after ten seconds hardly know when a green began: often the same number of vehicles
         has got through, and others have arrived.
@@ -107,7 +107,7 @@ class StackedTransitions:
 
 
 def refuse_other_agents(log: TransitionLog, stack: Stack) -> None:
-    """Transitions of other agents, or seen otherwise, are nothing for models of these."""
+    """Refuse transitions of other agents, or with other observations, than those of the stack."""
     if dict(log.provenance.layouts) != stack.layouts:
         raise LogError(
             f"the transition log of {log.provenance.scenario} "
@@ -118,7 +118,7 @@ def refuse_other_agents(log: TransitionLog, stack: Stack) -> None:
 
 
 def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
-    """All transitions of a log as padded tensors.
+    """Return all transitions of a log as padded tensors.
 
     Raises:
         LogError: The log is of other agents, or an agent has no rows.

@@ -8,29 +8,90 @@ is not trusted, the delay is the one that fits all the street's transitions best
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ugat_marl.data import AgentLayout
+from ugat_marl.data import AgentLayout, TransitionLog
 from ugat_marl.errors import OptionError
-from ugat_marl.grounding.delays import DelayedForward, DelayModel, TimedConfig, likely_delay
-from ugat_marl.grounding.forward import ForwardConfig
+from ugat_marl.grounding.delays import (
+    EpisodeRewards,
+    LostTime,
+    MatchedDelays,
+    ModelErrors,
+    lost_time,
+    match_delays,
+)
+from ugat_marl.grounding.fitting import Changes, Fitter, OffData, Questions, Split, refuse_mismatch
+from ugat_marl.grounding.forward import DelayedForward, ForwardConfig
 from ugat_marl.grounding.gate import GateConfig
-from ugat_marl.grounding.inverse import InverseConfig
+from ugat_marl.grounding.inverse import DelayModel, InverseConfig
 from ugat_marl.grounding.joint import running
-from ugat_marl.grounding.stacked import Stack
+from ugat_marl.grounding.reports import (
+    Calibration,
+    FitReport,
+    Floats,
+    ForwardReport,
+    InverseReport,
+    TrainingRecord,
+    complaint,
+    flat,
+)
+from ugat_marl.grounding.stacked import Stack, StackedTransitions, stack_log
 from ugat_marl.grounding.transform import Grounding, Transform
 from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours
+from ugat_marl.policies import one_thread
 from ugat_marl.seeding import torch_generator
+
+END_S = 0.5
+"""A best delay so close to the longest one tried may well be longer."""
+
+ANSWERS = ("state", "constant")
+
+
+@dataclass(frozen=True)
+class TimedConfig:
+    """Settings of timed grounding.
+
+    Attributes:
+        most_s: Longest delay of a green, in whole s; roll-outs for D_sim try all up to it. What is
+            longer than the green that clearance leaves of a decision interval cannot be told apart.
+        answer: "state" asks h in every state, as far as the gate lets it; "constant" takes the
+            delay that fits all transitions best, per intersection and phase.
+        spread_s: Expected distance, in s, of delays of single phases and states from those of their
+            intersection and phase. Where the data say little, delays stay close.
+        target_noise: Noise on the changes that h learns to read, in units of what the simulation
+            leaves unpredicted: f, too, is fitted to finitely many transitions.
+        match: True if the delays of an intersection are raised or lowered together until the
+            simulation pays the policy in training what the street pays it
+            (`delays.match_delays`); needs roll-outs of that policy in both.
+    """
+
+    most_s: int = 5
+    answer: Literal["state", "constant"] = "state"
+    spread_s: float = 1.0
+    target_noise: float = 0.2
+    match: bool = False
+
+    def __post_init__(self) -> None:
+        if self.most_s < 1:
+            raise OptionError(f"timed most_s is {self.most_s}; allowed: >= 1")
+        if self.answer not in ANSWERS:
+            raise OptionError(f"timed answer is {self.answer!r}; allowed: {', '.join(ANSWERS)}")
+        if not 0 < self.spread_s < float("inf"):
+            raise OptionError(f"timed spread_s is {self.spread_s}; allowed: > 0, finite")
+        if not 0 <= self.target_noise < float("inf"):
+            raise OptionError(f"timed target_noise is {self.target_noise}; allowed: >= 0, finite")
 
 
 class _Constants(nn.Module):
-    """The delay in s that is expected of every intersection and phase.
+    """Delays in s that are taken where h is not trusted.
 
     Attributes:
         delay_s: What greens lose when they begin, ``(agents, phases)``.
@@ -43,7 +104,7 @@ class _Constants(nn.Module):
     def __init__(self, stack: Stack, match: bool) -> None:
         super().__init__()
         self.register_buffer("delay_s", torch.zeros(len(stack.agents), stack.actions))
-        # Checkpoints of those that match nothing do without.
+        # Without matching there is nothing to load, so that other checkpoints are refused.
         self.register_buffer("beyond_s", torch.zeros(len(stack.agents), 1), persistent=match)
 
 
@@ -55,9 +116,9 @@ class TimedTransform(Transform):
         seed: Decides the initial weights.
         forward: Shape of the forward models, of the street and of the simulation.
         inverse: Shape of the inverse models.
-        gate: How alpha is found.
-        timed: How greens are delayed.
-        inputs: What the models see beside the intersection's own state and action.
+        gate: Settings of alpha.
+        timed: Settings of the delays.
+        inputs: Inputs of the models beside the intersection's own state and action.
         neighbours: Agent to the agents one road away, for inputs with hops.
     """
 
@@ -94,11 +155,11 @@ class TimedTransform(Transform):
 
     @property
     def models(self) -> dict[str, nn.Module]:
-        """Whatever has weights, under its name in a checkpoint."""
+        """All modules with weights, by their names in a checkpoint."""
         return {**super().models, "simulated": self.simulated, "constants": self.constants}
 
     def fresh_inverse(self, method: Method) -> DelayModel:
-        """An unfitted h of the same shape with this method of uncertainty."""
+        """Return an unfitted h of the same shape with this method of uncertainty."""
         return DelayModel(
             self.stack,
             self.inverse.config,
@@ -108,6 +169,125 @@ class TimedTransform(Transform):
             self.local,
         )
 
+    @one_thread()
+    def fit(
+        self,
+        real: TransitionLog,
+        simulated: TransitionLog,
+        fitter: Fitter,
+        rewards: EpisodeRewards | None = None,
+    ) -> TimedReport:
+        """Fit f on the street, a model with delays and h on the simulation, and the constants.
+
+        Args:
+            real: Transitions of the world to be matched.
+            simulated: Transitions of the simulation under random delays.
+            fitter: How to train.
+            rewards: Rewards of the policy in both worlds. With them all delays of an intersection
+                are moved together until it gets the same, where lost time does not explain it.
+
+        Raises:
+            LogError: As `Transform.fit`.
+        """
+        refuse_mismatch(real, simulated)
+        stack, model = self.stack, self.simulated
+        street, data = _alike(stack_log(real, stack), stack_log(simulated, stack))
+        view = self.forward.view
+        lesson = Changes("forward", view.of(street), street.outcome, street.asked)
+        f = fitter.fit_changes(self.forward, lesson, fitter.split(street, stack))
+        rows = fitter.split(data, stack)
+        extra = model.extra(data.delay_s)
+        lesson = Changes("simulated", view.of(data), data.outcome, data.executed, extra)
+        g = fitter.fit_changes(model, lesson, rows)
+        begins = _begins(data, stack)
+        known = ModelErrors.of(model, replace(data, weight=rows.train * begins))
+        street = replace(street, weight=street.weight * _begins(street, stack))
+        lost = lost_time(model, street, known, self.timed.spread_s)
+        # Models that know nothing of a street or of the simulation know of no lost time either.
+        learnt = f.learnt & g.learnt
+        matched = self._set_constants(lost, learnt, rewards)
+        data = replace(data, weight=data.weight * begins)
+        h = self._fit_inverse(data, _where(begins, rows), known.spread[:, None], fitter)
+        mean_u = self._mean_u(street)
+        return TimedReport(stack.agents, f, h, mean_u, g, lost, self.timed.most_s, matched)
+
+    def _set_constants(
+        self, lost: LostTime, learnt: NDArray[np.bool_], rewards: EpisodeRewards | None
+    ) -> MatchedDelays | None:
+        """Take the best constants where models have learnt something; return those of rewards."""
+        found = learnt & lost.shown
+        self.constants.delay_s.copy_(lost.phase_s * torch.from_numpy(found)[:, None])
+        if rewards is None:
+            return None
+        matched = match_delays(rewards, np.where(found, lost.best_s, 0.0))
+        matched = replace(matched, beyond_s=matched.beyond_s * learnt)
+        self.constants.beyond_s.copy_(torch.from_numpy(matched.beyond_s)[:, None])
+        return matched
+
+    def _fit_inverse(
+        self, data: StackedTransitions, rows: Split, spread: Tensor, fitter: Fitter
+    ) -> TimedInverseReport:
+        """Fit h to the change that a model of the simulation expects in every state under a delay.
+
+        Not to single transitions: from one of those the delay can hardly be told, and the best
+        guess under noise is the middle of the range. f, whose output h is to read, predicts means,
+        and so does the model.
+        """
+        model, simulated, seed = self.inverse, self.simulated, fitter.seed
+        seen = model.view.of(data)
+        generator = torch_generator(seed, "inverse", "delays")
+        answers = torch.randint(model.most_s + 1, data.executed.shape, generator=generator)
+        with torch.no_grad():
+            extra = simulated.extra(answers.float())
+            change = simulated(simulated.view.of(data), data.executed, extra)
+            noise = torch.randn(change.shape, generator=generator) * spread
+            change = (change + self.timed.target_noise * noise) * simulated.scale
+        inputs = model.inputs(seen, data.executed, change)
+        off_data = OffData.around(inputs, rows.train, model.view, model.action_columns)
+        lesson = Questions(inputs, answers, off_data)
+        record = fitter.fit_answers(model, lesson, rows)
+        return self._inverse_report(data, rows, lesson, record, torch_generator(seed, "off data"))
+
+    @torch.no_grad()
+    def _inverse_report(
+        self,
+        data: StackedTransitions,
+        rows: Split,
+        lesson: Questions,
+        record: TrainingRecord,
+        generator: torch.Generator,
+    ) -> TimedInverseReport:
+        """Measure h on the held-out rows of its lesson and on single transitions."""
+        model = self.inverse
+        seconds = torch.arange(model.most_s + 1, dtype=torch.float32)
+        answer = model.answer(lesson.inputs)
+        happened = self.simulated.change(data.observation, data.outcome)
+        single = model.predict(model.view.of(data), data.executed, happened)
+        held = rows.held_out * data.weight  # nothing is known of an agent that had to take all rows
+        count = int(held.sum(1).max().clamp(min=1))
+        drawn = lesson.off_data.draw(count, generator, state_share=1.0)
+        missed = answer.action != lesson.answers
+        return TimedInverseReport(
+            training=record,
+            calibration=Calibration.of(answer, missed, held.bool(), model.answer(drawn)),
+            uncertainty=model.method.name,
+            error_s=mean_error(
+                (answer.probability * seconds).sum(-1), lesson.answers.float(), held
+            ),
+            error_on_transitions_s=mean_error(
+                (single.probability * seconds).sum(-1), data.delay_s, held
+            ),
+            guess_s=float((seconds - seconds.mean()).abs().mean()),
+        )
+
+    @torch.no_grad()
+    def _mean_u(self, street: StackedTransitions) -> Floats:
+        """Return the mean u of h's answers to what f predicts, per agent, by weights of rows."""
+        seen, local = self.forward.view.of(street), self.local.of(street)
+        u = self.delays(seen, local, street.executed)[1]
+        mean = (u * street.weight).sum(1) / street.weight.sum(1)
+        return mean.double().numpy()
+
     def ground(
         self,
         observations: Tensor,
@@ -115,10 +295,10 @@ class TimedTransform(Transform):
         permitted: NDArray[np.bool_] | None,
         earlier: Sequence[Moment],
     ) -> Grounding:
-        """The policy's phases, with a delay where they change.
+        """Return the policy's phases, with a delay where they change.
 
-        The gate sees delays in whole seconds; an action counts as changed if h's delay is another
-        than the one taken without h.
+        Line numbers are those of Algorithm 1 (`ugat`). The gate sees delays in whole seconds; an
+        action counts as changed if h's delay is another than the one taken without h.
         """
         asked = torch.from_numpy(actions)[:, None]
         usual = self._later(self.constants.delay_s.gather(1, asked))
@@ -128,12 +308,12 @@ class TimedTransform(Transform):
             return Grounding(actions, actions, np.zeros_like(delay), np.ones_like(switched), delay)
         # No phase is changed, so that it is known at once what runs at the neighbours.
         phases = torch.from_numpy(running(actions, permitted))[:, None]
-        found, u = self.delays(
+        found, u = self.delays(  # lines 11 and 12
             self.forward.view.seen(observations, phases, earlier),
             self.local.seen(observations, phases),
             asked,
         )
-        accepted = self.gate.decide(
+        accepted = self.gate.decide(  # lines 13 and 15
             u[:, 0].numpy(),
             usual[:, 0].round().long().numpy(),
             found[:, 0].round().long().numpy(),
@@ -144,7 +324,7 @@ class TimedTransform(Transform):
         return Grounding(actions, actions, u[:, 0].numpy(), accepted, delay)
 
     def delays(self, seen: Tensor, local: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """H's delays in s, in the light of the best constants, and its u: ``(agents, batch)``.
+        """Return h's delays in s, drawn to the best constants, and its u: ``(agents, batch)``.
 
         Args:
             seen: ``(agents, batch, forward.view.width)``, the observations as f sees them.
@@ -159,5 +339,158 @@ class TimedTransform(Transform):
         return self._later(found), answer.u
 
     def _later(self, delay_s: Tensor) -> Tensor:
-        """Delays ``(agents, batch)`` after all of an intersection have been moved."""
+        """Return delays ``(agents, batch)`` after all of an intersection have been moved."""
         return (delay_s + self.constants.beyond_s).clamp(0.0, float(self.timed.most_s))
+
+
+def likely_delay(probability: Tensor, expected_s: Tensor, spread_s: float) -> Tensor:
+    """Return the likeliest delay in s, ``(...)``, if delays are expected around some value.
+
+    Where h does not know, its even odds leave the expected delay as it is.
+
+    Args:
+        probability: ``(..., classes)`` of delays of 0, 1, 2, ... s.
+        expected_s: ``(...)``.
+        spread_s: Standard deviation around it.
+    """
+    seconds = torch.arange(probability.shape[-1], dtype=torch.float32)
+    fine = torch.linspace(0.0, float(seconds[-1]), 10 * (len(seconds) - 1) + 1)
+    # Log-probabilities between whole seconds, on the line between their neighbours.
+    below = fine.floor().long().clamp(max=len(seconds) - 2)
+    share = fine - below
+    log = probability.clamp(min=1e-12).log()
+    between = log[..., below] * (1.0 - share) + log[..., below + 1] * share
+    prior = -0.5 * ((fine - expected_s[..., None]) / spread_s) ** 2
+    return fine[(between + prior).argmax(-1)]
+
+
+def _alike(
+    one: StackedTransitions, two: StackedTransitions
+) -> tuple[StackedTransitions, StackedTransitions]:
+    """Return both with the features that were served, or both without."""
+    if one.served_features is None or two.served_features is None:
+        return replace(one, served_features=None), replace(two, served_features=None)
+    return one, two
+
+
+def _begins(data: StackedTransitions, stack: Stack) -> Tensor:
+    """Return bool ``(agents, n)``, true where a green begins: elsewhere it cannot be late."""
+    return stack.current_phase(data.observation) != data.executed
+
+
+def _where(begins: Tensor, rows: Split) -> Split:
+    """Return the rows in which a green begins; all of an agent's if it lacks them on one side.
+
+    The head of h is shared: without rows of one agent the loss of all would be no number.
+    """
+    train, held_out = rows.train * begins, rows.held_out * begins
+    enough = (train.any(1) & held_out.any(1))[:, None]
+    return Split(
+        torch.where(enough, train, rows.train),
+        torch.where(enough, held_out, rows.held_out),
+        rows.kind,
+    )
+
+
+# --- reports
+
+
+@dataclass(frozen=True)
+class TimedInverseReport(InverseReport):
+    """Held-out quality of h, per agent where an array; delays and errors in s.
+
+    Attributes:
+        error_s: Mean absolute error on the changes it was trained to read, of held-out states;
+            `calibration` is that of u against naming another second.
+        error_on_transitions_s: The same on single transitions as they happened, whose noise no
+            answer can see through.
+        guess_s: Mean absolute error of always answering the middle of the range.
+    """
+
+    error_s: Floats
+    error_on_transitions_s: Floats
+    guess_s: float
+
+    def as_dict(self, agents: Sequence[str]) -> dict[str, float]:
+        """Return everything as flat numbers; arrays as their mean and one entry per agent."""
+        numbers = self.training.as_dict("inverse")
+        for name in ("error_s", "error_on_transitions_s"):
+            numbers |= flat(f"inverse/{name}", getattr(self, name), agents)
+        return numbers | {"inverse/guess_s": self.guess_s} | self.calibration.as_dict()
+
+
+@dataclass(frozen=True)
+class TimedReport(FitReport):
+    """Worth of the parts of timed grounding.
+
+    Attributes:
+        inverse: h. `mean_u_on_predictions` is of its answers where greens begin on the street.
+        simulated: The model of the simulation with delays, on held-out simulated transitions.
+        lost: The delays that fit the street best.
+        most_s: Longest delay tried.
+        matched: The delays by which rewards match, if they were given.
+    """
+
+    inverse: TimedInverseReport
+    simulated: ForwardReport
+    lost: LostTime
+    most_s: int
+    matched: MatchedDelays | None = None
+
+    def doubts(self) -> Iterator[str]:
+        """Yield sentences on what is wrong, some of them empty."""
+        yield from self.forward.doubts("f", self.agents)
+        yield from self.simulated.doubts("the model of the simulation", self.agents)
+        yield complaint(
+            f"too few greens begin to tell how late they are (0 to {self.most_s} s would all "
+            "fit; give more roll-outs or longer episodes)",
+            self.lost.high_s - self.lost.low_s > self.most_s - END_S,
+            self.agents,
+        )
+        yield complaint(
+            f"the best delay is the longest tried ({self.most_s} s; raise timed most_s)",
+            self._delay_s > self.most_s - END_S,
+            self.agents,
+        )
+        if self.inverse.uncertainty == "none":
+            yield "without uncertainty u is 0, and the gate takes every answer of h"
+        elif (off := self.calibration.auroc_off_data) <= 0.5:
+            yield f"u does not rise off the data (AUROC {off:.2f})"
+
+    @property
+    def _delay_s(self) -> Floats:
+        """Mean delay of greens, per agent."""
+        beyond_s = 0.0 if self.matched is None else self.matched.beyond_s
+        return self.lost.best_s * self._found + beyond_s
+
+    @property
+    def _found(self) -> NDArray[np.bool_]:
+        """Agents with a lost time by models that have learnt something."""
+        return self.forward.learnt & self.simulated.learnt & self.lost.shown
+
+    def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
+        """Return the agents whose h may be obeyed, for `Gate.trust`; the others take the constant.
+
+        f and the model of the simulation have learnt something, there is a lost time for h to
+        refine, and h, on its own task, beats a guess by the share `least_accuracy`.
+        """
+        return self._found & (self.inverse.error_s < (1.0 - least_accuracy) * self.inverse.guess_s)
+
+    def as_dict(self) -> dict[str, float]:
+        """Return flat numbers; arrays as their mean over agents and as one entry per agent."""
+        numbers = self.forward.as_dict("forward", self.agents)
+        numbers |= self.simulated.as_dict("simulated", self.agents)
+        numbers |= self.inverse.as_dict(self.agents)
+        for name in ("best_s", "low_s", "high_s"):
+            numbers |= flat(f"lost_time/{name}", getattr(self.lost, name), self.agents)
+        if self.matched is not None:
+            numbers |= flat("lost_time/matched_s", self.matched.delay_s, self.agents)
+            numbers |= flat("lost_time/beyond_s", self.matched.beyond_s, self.agents)
+            numbers["lost_time/chance"] = self.matched.chance
+        return numbers
+
+
+def mean_error(found_s: Tensor, true_s: Tensor, weight: Tensor) -> Floats:
+    """Return the mean absolute error per agent, ``(agents,)``; NaN without rows."""
+    total = ((found_s - true_s).abs() * weight).sum(1).double()
+    return (total / weight.sum(1).double()).numpy()

@@ -1,15 +1,22 @@
-"""What every method of uncertainty has to offer: a loss to train h with, and answers with a u.
+"""Methods by which h says that it is unsure: a loss to train h with, and answers with a u.
 
 A method is a network with an encoder per intersection and one head shared by all, whose outputs it
 reads in its own way. u is always in [0, 1] and comparable in its ends: 0 is one action beyond
 doubt, 1 knows nothing and gives every phase of the intersection the same probability.
 
-- ``edl``: u = K / S of a Dirichlet distribution (`evidential`).
-- ``dropout`` and ``ensemble``: the predictive entropy of the mean over networks, in units of its
+- ``edl``: u = K / S of a Dirichlet distribution (Sensoy, Kaplan, Kandemir, "Evidential Deep
+  Learning to Quantify Classification Uncertainty", NeurIPS 2018).
+- ``dropout`` (Gal, Hron, Kendall, "Concrete Dropout", NeurIPS 2017) and ``ensemble``
+  (Lakshminarayanan, Pritzel, Blundell, "Simple and Scalable Predictive Uncertainty Estimation using
+  Deep Ensembles", NeurIPS 2017): the predictive entropy of the mean over networks, in units of its
   maximum log K (`normalised_entropy`). Not the mutual information of network and action, which is
   blind to states in which several actions lead to the same next one: all networks agree on a coin
   flip there, and the gate would take it. The evidence of ``edl`` is low in such states, too.
 - ``none``: u = 0.
+
+Rows may have different numbers of classes: a mask says which are theirs, and K is their number, row
+by row. Shapes are ``(..., K)`` for logits, concentrations and masks (broadcastable), ``(...)`` for
+losses and u.
 """
 
 from __future__ import annotations
@@ -18,13 +25,14 @@ import abc
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from ugat_marl.errors import OptionError
-from ugat_marl.policies import BatchedMLP
+from ugat_marl.policies import BatchedLinear, BatchedMLP
 
 MOST = 100
 """Members or passes above which a number is taken for a mistake."""
@@ -35,7 +43,7 @@ METHODS: tuple[MethodName, ...] = ("edl", "dropout", "ensemble", "none")
 
 @dataclass(frozen=True)
 class Method:
-    """Which uncertainty h has, and how many networks it asks.
+    """Method of uncertainty of h, and the number of its networks.
 
     Attributes:
         name: "edl", "dropout", "ensemble" or "none".
@@ -58,7 +66,7 @@ class Method:
 
 @dataclass(frozen=True)
 class InversePrediction:
-    """What h answers; tensors with the leading axes ``(agents, batch)``.
+    """Answers of h; tensors with the leading axes ``(agents, batch)``.
 
     Attributes:
         action: int64, the likeliest action.
@@ -72,7 +80,7 @@ class InversePrediction:
 
     @classmethod
     def joined(cls, parts: Sequence[InversePrediction]) -> InversePrediction:
-        """Answers to some rows and those to the next ones, together."""
+        """Return the answers to some rows and those to the next ones as one."""
         return cls(
             torch.cat([part.action for part in parts], 1),
             torch.cat([part.probability for part in parts], 1),
@@ -82,13 +90,13 @@ class InversePrediction:
 
 @dataclass(frozen=True)
 class Lesson:
-    """What a loss may ask for beside the rows; every method takes what it needs.
+    """Arguments of a loss beside the rows; every method takes what it needs.
 
     Attributes:
-        held_out: Whether the rows are held out: the loss only ranks weights then.
+        held_out: True if the rows are held out: the loss only ranks weights then.
         generator: Source of all that is drawn; on the CPU wherever the rows are.
         rows: ``(agents,)`` rows each agent is trained on in all.
-        share: How far terms that would keep fresh weights from learning are annealed in, 0 to 1.
+        share: Part, 0 to 1, by which terms that keep fresh weights from learning are annealed in.
         kl_weight: Final weight of the divergence of misleading evidence.
         off_data_weight: Final weight of certainty on invented inputs.
         invent: Standardised inputs off the data, a number of rows per agent.
@@ -110,7 +118,7 @@ class NetShape:
     Attributes:
         fan_in: Number of inputs of each agent.
         hidden: Hidden layers of an encoder.
-        embedding: What an encoder hands to the head.
+        embedding: Size of the output of an encoder, which the head reads.
         valid_actions: ``(agents, 1, actions)`` bool, the phases each agent has.
     """
 
@@ -146,27 +154,27 @@ class AnswerNet(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
-        """What `row_loss` and `certainty` read, rows on the last axis but one."""
+        """Return the tensor that `row_loss` and `certainty` read, rows on the last axis but one."""
 
     @abc.abstractmethod
     def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
-        """Loss of every row, in the shape of `target`."""
+        """Return the loss of every row, in the shape of `target`."""
 
     @abc.abstractmethod
     def certainty(self, outputs: Tensor) -> Tensor:
-        """What is claimed about rows off the data, in nats; 0 where nothing is claimed.
+        """Return the certainty about rows off the data, in nats; 0 for even odds.
 
         ``(agents, count)`` or ``(agents, members, count)``.
         """
 
     def loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
-        """Loss of every row, in the shape of `target`, with what is claimed off the data.
+        """Return the loss of every row, in the shape of `target`, with the certainty off the data.
 
         Args:
             inputs: ``(agents, batch, width)`` standardised, or ``(agents, members, batch, width)``
                 if every member has rows of its own.
             target: ``(agents, batch)`` or ``(agents, members, batch)`` int64, the true actions.
-            lesson: What else a loss may need.
+            lesson: Further arguments of a loss.
         """
         if not lesson.off_data_weight:
             return self.row_loss(self.outputs(inputs, lesson), target, lesson)
@@ -182,21 +190,21 @@ class AnswerNet(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def answer(self, inputs: Tensor) -> InversePrediction:
-        """Answers to ``(agents, batch, width)`` standardised inputs, each row for itself."""
+        """Answer ``(agents, batch, width)`` standardised inputs, each row for itself."""
 
 
 def log_probability(logits: Tensor, mask: Tensor) -> Tensor:
-    """Log of the softmax over the classes a row has; minus infinity for the others."""
+    """Return the log of the softmax over the classes a row has; minus infinity for others."""
     return logits.masked_fill(~mask, -math.inf).log_softmax(-1)
 
 
 def negative_log_likelihood(logits: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """Cross-entropy of every row in nats, ``(...)`` for logits ``(..., actions)``."""
+    """Return the cross-entropy of every row in nats, ``(...)`` for logits ``(..., actions)``."""
     return -log_probability(logits, mask).gather(-1, target[..., None])[..., 0]
 
 
 def divergence_from_even(logits: Tensor, mask: Tensor) -> Tensor:
-    """KL divergence of the softmax from even odds among a row's own classes, in nats, ``(...)``.
+    """Return the KL divergence of the softmax from even odds among a row's classes, in nats.
 
     Its gradient is that of the cross-entropy with even odds, with which Hendrycks, Mazeika and
     Dietterich, "Deep Anomaly Detection with Outlier Exposure", ICLR 2019, teach what is unknown.
@@ -206,7 +214,7 @@ def divergence_from_even(logits: Tensor, mask: Tensor) -> Tensor:
 
 
 def normalised_entropy(probability: Tensor, mask: Tensor) -> Tensor:
-    """Entropy over its maximum log K, in [0, 1], K being a row's own number of classes.
+    """Return the entropy over its maximum log K, in [0, 1]; K is a row's number of classes.
 
     Of the mean over networks this is the predictive entropy (Gal, "Uncertainty in Deep Learning",
     2016, section 3.3; Lakshminarayanan et al., NeurIPS 2017, section 3.5): what the data leave
@@ -217,6 +225,332 @@ def normalised_entropy(probability: Tensor, mask: Tensor) -> Tensor:
 
 
 def prediction(probability: Tensor, mask: Tensor) -> InversePrediction:
-    """The likeliest action, its probabilities, and their normalised entropy as u."""
+    """Return the likeliest action, its probabilities, and their normalised entropy as u."""
     u = normalised_entropy(probability, mask)
     return InversePrediction(probability.argmax(-1), probability, u)
+
+
+# --- edl: evidence for every action
+
+
+def concentration(logits: Tensor, mask: Tensor) -> Tensor:
+    """Return concentrations ``softplus(logits) + 1``; 0 where a row has no such class."""
+    return (functional.softplus(logits) + 1.0) * mask
+
+
+def expected_probability(alpha: Tensor) -> Tensor:
+    """Return the mean of the Dirichlet; 0 for classes a row does not have."""
+    return alpha / alpha.sum(-1, keepdim=True)
+
+
+def uncertainty(alpha: Tensor, mask: Tensor) -> Tensor:
+    """Return u = K / S, in (0, 1]: 1 without any evidence. K is the row's number of classes."""
+    return mask.sum(-1) / alpha.sum(-1)
+
+
+def expected_squared_error(alpha: Tensor, target: Tensor) -> Tensor:
+    """Return E[sum_j (y_j - p_j)^2] for p from the Dirichlet (Sensoy et al., equation 5).
+
+    Args:
+        alpha: ``(..., K)`` concentrations, 0 where masked.
+        target: ``(...)`` int64, the true class.
+    """
+    total = alpha.sum(-1, keepdim=True)
+    mean = alpha / total
+    truth = functional.one_hot(target, alpha.shape[-1])
+    return ((truth - mean) ** 2 + mean * (1.0 - mean) / (total + 1.0)).sum(-1)
+
+
+def divergence_from_uniform(alpha: Tensor, mask: Tensor) -> Tensor:
+    """Return KL of Dirichlet(alpha) from the uniform Dirichlet over a row's classes, in nats."""
+    return _Divergence.apply(alpha, mask)  # pyright: ignore[reportReturnType]
+
+
+class _Divergence(torch.autograd.Function):
+    """Divergence from uniform with its derivative in closed form: all digammas have cancelled.
+
+    With S the total: dKL/d alpha_k = (alpha_k - 1) trigamma(alpha_k) - (S - K) trigamma(S).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, alpha: Tensor, mask: Tensor) -> Tensor:
+        own = torch.where(mask, alpha, 1.0)  # a concentration of 1 contributes nothing below
+        total = (own * mask).sum(-1)
+        count = mask.sum(-1).to(alpha.dtype)
+        ctx.save_for_backward(own, mask, total, count)
+        pull = ((own - 1.0) * (torch.digamma(own) - torch.digamma(total)[..., None])).sum(-1)
+        return torch.lgamma(total) - torch.lgamma(count) - torch.lgamma(own).sum(-1) + pull
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        own, mask, total, count = ctx.saved_tensors
+        shared = (total - count) * torch.polygamma(1, total)
+        slope = (own - 1.0) * torch.polygamma(1, own) - shared[..., None]
+        return gradients[0][..., None] * slope * mask, None
+
+
+def misleading(alpha: Tensor, target: Tensor) -> Tensor:
+    """Return `alpha` without the evidence for the true class (Sensoy et al., section 3)."""
+    truth = functional.one_hot(target, alpha.shape[-1])
+    return truth + (1 - truth) * alpha
+
+
+def evidential_loss(alpha: Tensor, target: Tensor, mask: Tensor, kl_weight: float) -> Tensor:
+    """Return expected squared error plus weighted divergence of misleading evidence, per row."""
+    error = expected_squared_error(alpha, target)
+    if kl_weight == 0.0:
+        return error
+    return error + kl_weight * divergence_from_uniform(misleading(alpha, target), mask)
+
+
+def annealing(epoch: int, epochs: int = 10) -> float:
+    """Return the weight of the divergence in epoch 0, 1, ...: min(1, epoch / epochs)."""
+    return 1.0 if epochs <= 0 else min(1.0, epoch / epochs)
+
+
+class EvidentialNet(AnswerNet):
+    """One network whose outputs are evidence; u = K / S.
+
+    Outputs become the concentration of a Dirichlet distribution over class probabilities. Its mean
+    is the prediction; the lack of evidence is u.
+    """
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return concentrations ``(agents, batch, actions)`` for standardised inputs."""
+        embedding = torch.relu(self.encoders(inputs))
+        return concentration(self.head(embedding), self.valid_actions)
+
+    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+        """Return the concentrations."""
+        del lesson
+        return self(inputs)
+
+    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+        """Return the evidential loss, its divergence annealed in."""
+        weight = lesson.kl_weight * lesson.share
+        return evidential_loss(outputs, target, self.valid_actions, weight)
+
+    def certainty(self, outputs: Tensor) -> Tensor:
+        """Return the divergence of the evidence from none."""
+        return divergence_from_uniform(outputs, self.valid_actions)
+
+    def answer(self, inputs: Tensor) -> InversePrediction:
+        """Return the mean of the Dirichlet, and u."""
+        alpha = self(inputs)
+        return InversePrediction(
+            action=alpha.argmax(-1),
+            probability=expected_probability(alpha),
+            u=uncertainty(alpha, self.valid_actions),
+        )
+
+
+# --- dropout: thinned networks
+
+COIN_TEMPERATURE = 0.1
+"""Of the relaxed coin, as in the paper."""
+
+START_RATE = 0.1
+"""Rate of a fresh network, as in the authors' code."""
+
+RATE_SPEED = 10.0
+"""Rates learn so much faster than weights: a fit is a few hundred updates long."""
+
+LENGTH_SCALE = 1e-2
+"""l of the prior, as in the authors' code: weights of a hundred would be no surprise."""
+
+SMALLEST_RATE = 1e-6
+"""Rates and draws keep this distance from 0 and 1, where logarithms end."""
+
+ROWS_IN_DROPOUT = 256
+"""Rows answered at once, which bounds the memory of all passes over them."""
+
+
+def thinned(inputs: Tensor, logit: Tensor, draw: Tensor) -> Tensor:
+    """Return inputs times a relaxed coin, 0 at rate p, over 1 - p, so that the mean stays.
+
+    Args:
+        inputs: Any shape; units last.
+        logit: log p - log (1 - p), broadcastable.
+        draw: Uniform numbers in [0, 1), broadcastable: above 1 - p leaves a unit out.
+    """
+    dropped = torch.sigmoid((logit + torch.logit(draw, SMALLEST_RATE)) / COIN_TEMPERATURE)
+    return inputs * (1.0 - dropped) / torch.sigmoid(-logit)
+
+
+def divergence(weight: Tensor, logit: Tensor, units: Tensor | int) -> Tensor:
+    """Return the divergence of a layer's posterior from the prior, in nats, up to a constant.
+
+    The objective of Concrete Dropout is the likelihood of the data and, over their number N, the
+    divergence of the posterior over thinned networks from a Gaussian prior of length scale l. For
+    an affine map W of n inputs with rate p it is l^2 (1 - p) |W|^2 / 2 - n H(p), H being the
+    entropy of a coin. Much data press the rates down, little data let H pull them up.
+
+    Args:
+        weight: ``(..., inputs, outputs)``, 0 for inputs it does not have. `thinned` divides what
+            the layer is given by 1 - p, so the W of the formula is weight / (1 - p).
+        logit: ``(...)`` of its rate.
+        units: Number of its inputs, ``(...)`` or the same for all.
+    """
+    p = torch.sigmoid(logit).clamp(SMALLEST_RATE, 1.0 - SMALLEST_RATE)
+    entropy = torch.special.entr(p) + torch.special.entr(1.0 - p)
+    size = weight.square().sum((-2, -1))
+    return LENGTH_SCALE**2 / 2 * size / (1.0 - p) - units * entropy
+
+
+class DropoutNet(AnswerNet):
+    """One network, thinned before every affine map at a learned rate of that map.
+
+    Gal et al. 2017: a network with random units left out is a draw from an approximate posterior
+    over networks. The coin that leaves units out is relaxed, so that its rate has a gradient.
+
+    An intersection's encoder has rates of its own. Answers average over `passes` thinned networks
+    that were drawn when this one was made and are kept in checkpoints: the same input always gets
+    the same answer, whatever it is asked together with, and u needs no generator when it is used.
+
+    Args:
+        shape: Sizes.
+        generator: Source of the initial weights and of the thinned networks.
+        passes: Number of thinned networks, T in the papers.
+    """
+
+    fan_in: Tensor
+    own_inputs: Tensor
+
+    def __init__(self, shape: NetShape, generator: torch.Generator, passes: int) -> None:
+        super().__init__(shape, generator)
+        agents, widest = len(shape.fan_in), max(shape.fan_in)
+        widths = [widest, *shape.hidden, shape.embedding]
+        owners = [agents] * (len(widths) - 1) + [1]  # the head is shared
+        start = math.log(START_RATE) - math.log(1.0 - START_RATE)
+        self.slow_logits = nn.ParameterList(
+            torch.full((n, 1, 1), start / RATE_SPEED) for n in owners
+        )
+        for k, (n, width) in enumerate(zip(owners, widths, strict=True)):
+            draws = torch.rand(n, passes, 1, width, generator=generator)
+            self.register_buffer(f"draws_{k}", draws)
+        fan_in = torch.tensor([*shape.fan_in])
+        self.register_buffer("fan_in", fan_in.float(), persistent=False)
+        own_inputs = torch.arange(widest)[None, :, None] < fan_in[:, None, None]
+        self.register_buffer("own_inputs", own_inputs, persistent=False)
+
+    @property
+    def rates(self) -> list[Tensor]:
+        """Learned dropout rates, layer by layer: ``(agents,)``, and ``(1,)`` for the head."""
+        return [torch.sigmoid(logit.detach()).flatten() for logit in self._logits()]
+
+    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+        """Return cross-entropy of one thinned network per row, and the divergence by all rows.
+
+        Held-out rows are judged by the whole network and by its likelihood alone.
+        """
+        likelihood = negative_log_likelihood(outputs, target, self.valid_actions)
+        return likelihood if lesson.held_out else likelihood + self._divergence(lesson.rows)
+
+    def certainty(self, outputs: Tensor) -> Tensor:
+        """Return the divergence from even odds of one thinned network per row."""
+        return divergence_from_even(outputs, self.valid_actions)
+
+    def answer(self, inputs: Tensor) -> InversePrediction:
+        """Return the mean of the thinned networks' probabilities; u is its entropy."""
+        means = [self._mean(rows) for rows in inputs.split(ROWS_IN_DROPOUT, dim=1)]
+        return prediction(torch.cat(means, 1), self.valid_actions)
+
+    def _logits(self) -> list[Tensor]:
+        """Return the log odds of every rate, ``(agents, 1, 1)`` and ``(1, 1, 1)``."""
+        return [RATE_SPEED * logit for logit in self.slow_logits]
+
+    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+        """Return logits ``(agents, batch, actions)``, every row from a network thinned anew."""
+        if lesson.held_out:
+            return self.head(torch.relu(self.encoders(inputs)))
+        x = inputs
+        for k, (layer, logit) in enumerate(zip(self._maps(), self._logits(), strict=True)):
+            draw = torch.rand(x.shape, generator=lesson.generator).to(x.device)
+            x = layer(thinned(x if k == 0 else torch.relu(x), logit, draw))
+        return x
+
+    def _maps(self) -> list[BatchedLinear | nn.Linear]:
+        """Return the affine maps in their order, the head last; a ReLU lies between any two."""
+        return [*(m for m in self.encoders.layers if isinstance(m, BatchedLinear)), self.head]
+
+    def _mean(self, inputs: Tensor) -> Tensor:
+        agents, rows, _ = inputs.shape
+        x = inputs[:, None]  # a second axis for the passes
+        for k, (layer, logit) in enumerate(zip(self._maps(), self._logits(), strict=True)):
+            draws = self.get_buffer(f"draws_{k}")
+            x = thinned(x if k == 0 else torch.relu(x), logit[..., None], draws)
+            passes = x.shape[1]
+            x = layer(x.reshape(agents, passes * rows, -1)).view(agents, passes, rows, -1)
+        return log_probability(x, self.valid_actions[:, None]).exp().mean(1)
+
+    def _divergence(self, rows: Tensor) -> Tensor:
+        """Return the divergence per row, ``(agents, 1)``; that of the head is shared by all."""
+        *maps, head = (layer.weight for layer in self._maps())
+        logits = [logit.flatten() for logit in self._logits()]
+        total = divergence(maps[0] * self.own_inputs, logits[0], self.fan_in)
+        for weight, logit in zip(maps[1:], logits[1:-1], strict=True):
+            total = total + divergence(weight, logit, weight.shape[-2])
+        shared = divergence(head[None], logits[-1], head.shape[-1])
+        return (total / rows + shared / rows.sum())[:, None]
+
+
+# --- ensemble, and none: networks side by side
+
+
+class EnsembleNet(AnswerNet):
+    """Networks side by side in one batched product; u is the entropy of their mean.
+
+    Lakshminarayanan et al. 2017: networks that differ in their initial weights and in the order of
+    their data agree where there are data and need not agree elsewhere. Every member has all rows,
+    each in an order of its own: the paper found bootstrap samples to do harm (section 2.4). Its
+    adversarial training is left out, as its inputs have no common scale here.
+    """
+
+    def logits(self, inputs: Tensor) -> Tensor:
+        """Return logits ``(agents, members, batch, actions)``; inputs as of `loss` and `answer`."""
+        if inputs.dim() == 3:
+            inputs = inputs[:, None].expand(-1, self.members, -1, -1)
+        agents, members, rows, width = inputs.shape
+        own = inputs.transpose(0, 1).reshape(members * agents, rows, width)
+        embedding = torch.relu(self.encoders(own)).view(members, agents * rows, -1)
+        weight = self.head.weight.view(members, -1, embedding.shape[-1])
+        bias = self.head.bias.view(members, 1, -1)
+        out = torch.baddbmm(bias, embedding, weight.transpose(1, 2))
+        return out.view(members, agents, rows, -1).transpose(0, 1)
+
+    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+        """Return the logits."""
+        del lesson
+        return self.logits(inputs)
+
+    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+        """Return the cross-entropy, member by member."""
+        del lesson
+        own = target.reshape(outputs.shape[:3])
+        return negative_log_likelihood(outputs, own, self.valid_actions[:, None]).view(target.shape)
+
+    def certainty(self, outputs: Tensor) -> Tensor:
+        """Return the divergence from even odds, member by member."""
+        certain = divergence_from_even(outputs, self.valid_actions[:, None])
+        return certain if self.members > 1 else certain[:, 0]
+
+    def answer(self, inputs: Tensor) -> InversePrediction:
+        """Return the mean of the members' probabilities (section 2.4); u is its entropy."""
+        each = log_probability(self.logits(inputs), self.valid_actions[:, None]).exp()
+        return prediction(each.mean(1), self.valid_actions)
+
+
+class PlainNet(EnsembleNet):
+    """One network without uncertainty: u = 0, so that every grounded action is taken.
+
+    This is the grounded action transformation without a gate (GAT; Hanna and Stone, AAAI 2017).
+    """
+
+    def loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+        """Return the cross-entropy alone: without u there is nothing to teach off the data."""
+        return self.row_loss(self.outputs(inputs, lesson), target, lesson)
+
+    def answer(self, inputs: Tensor) -> InversePrediction:
+        """Return the likeliest action with u = 0."""
+        found = super().answer(inputs)
+        return InversePrediction(found.action, found.probability, torch.zeros_like(found.u))

@@ -1,4 +1,4 @@
-"""What a model sees beside its own state: earlier states, and the neighbours with what they do.
+"""Views: the inputs of models beside an agent's own state, from earlier and from neighbours.
 
 A view widens the observations of a `Stack` to the right, so that an agent's own numbers still begin
 at 0: ``own | earlier ones, each with the phase that ran | neighbours, each with the phase that
@@ -24,18 +24,19 @@ Neighbours = Mapping[str, Sequence[str]]
 """Agent to the agents around it."""
 
 UNKNOWN = -1
-"""The phase of a decision that nobody has seen."""
+"""Phase of a decision before the first one of an episode."""
 
 
 @dataclass(frozen=True)
 class InputsConfig:
-    """What f and h are told beside the intersection's own state and action.
+    """Inputs of f and h beside the intersection's own state and action.
 
     Attributes:
         history: Observations f sees, the current one and the last ones before it, with the phases
             that ran since.
-        hops: How many roads away intersections are whose features and phases f and h see, with the
-            phases that run in the step. The joint-local grounding of JL-GAT (Turnau et al. 2025).
+        hops: Number of roads to the farthest intersections whose features and phases f and h see,
+            with the phases that run in the step. The joint-local grounding of JL-GAT (Turnau et al.
+            2025).
     """
 
     history: int = 1
@@ -48,7 +49,7 @@ class InputsConfig:
             raise OptionError(f"inputs hops is {self.hops}; allowed: 0 or a number of roads")
 
     def near(self, agents: Sequence[str], neighbours: Neighbours | None) -> Neighbours:
-        """The neighbours each agent's models see, nearest first; none without hops.
+        """Return the neighbours that each agent's models see, nearest first; none without hops.
 
         Raises:
             OptionError: There are hops, but nothing, or nothing sensible, is known of neighbours.
@@ -70,7 +71,7 @@ class InputsConfig:
 
 
 def neighbours_of(env: AnyParallelEnv) -> dict[str, tuple[str, ...]]:
-    """The agents one road away from each agent of an environment of the suite, wrapped or not."""
+    """Return the agents one road away from each agent of an environment, wrapped or not."""
     base: Any = env.unwrapped
     agent = {light: name for name, light in base.intersection_of.items()}
     return {
@@ -81,7 +82,7 @@ def neighbours_of(env: AnyParallelEnv) -> dict[str, tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class Moment:
-    """A decision of all agents, in any number of episodes.
+    """Decisions of all agents, in any number of episodes.
 
     Attributes:
         observation: ``(agents, n, width)`` float32.
@@ -93,7 +94,7 @@ class Moment:
 
 
 class View:
-    """Widens observations by what lies before and around them.
+    """A way to widen observations by earlier ones and by those of neighbours.
 
     Args:
         stack: The agents.
@@ -102,8 +103,8 @@ class View:
 
     Attributes:
         sizes: Length of each agent's widened observation; ``width`` is the largest.
-        lights: ``(agents, 1, width)`` bool, where phases stand: 0 or 1, and one of them is 1.
-        joint: Whether somebody sees a neighbour.
+        lights: ``(agents, 1, width)`` bool, columns of phases: 0 or 1, and one of them is 1.
+        joint: True if some agent sees a neighbour.
     """
 
     def __init__(self, stack: Stack, history: int = 1, near: Neighbours | None = None) -> None:
@@ -123,7 +124,7 @@ class View:
             self.lights[i, 0, : len(own)] = torch.tensor([light for _, light in own])
 
     def seen(self, now: Tensor, running: Tensor, earlier: Sequence[Moment] = ()) -> Tensor:
-        """Widened observations ``(agents, n, width)``.
+        """Return widened observations ``(agents, n, width)``.
 
         Args:
             now: ``(agents, n, stack.width)``, what is observed.
@@ -143,7 +144,7 @@ class View:
         return rows.view(-1, *self._columns.shape).transpose(0, 1).contiguous()
 
     def of(self, data: StackedTransitions) -> Tensor:
-        """Widened observations of all rows of a log, ``(agents, n, width)``.
+        """Return widened observations of all rows of a log, ``(agents, n, width)``.
 
         Raises:
             LogError: Neighbours are seen, but the agents were not recorded at the same times.
@@ -165,12 +166,12 @@ class View:
         return self.seen(data.observation, data.executed, earlier)
 
     def _shown(self, phase: Tensor) -> Tensor:
-        """Phases ``(agents, n)`` one-hot; an unknown one is zeros."""
+        """Return phases ``(agents, n)`` one-hot; an unknown one is zeros."""
         shown = nn.functional.one_hot(phase.clamp(min=0), self.stack.actions)
         return shown * (phase != UNKNOWN)[..., None].float()
 
     def _places(self, agent: str) -> list[tuple[int, bool]]:
-        """Where each number of an agent lies in a row of all moments; and if it is a light."""
+        """Return each number's column in a row of all moments; and if it is a light."""
         stack = self.stack
 
         def moment(name: str, lag: int, end: int, executed: bool) -> list[tuple[int, bool]]:

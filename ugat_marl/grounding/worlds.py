@@ -1,4 +1,4 @@
-"""Where transitions come from: roll-outs in a domain, or a log of the street."""
+"""Sources of transitions: roll-outs in a domain, or a log of the street."""
 
 from __future__ import annotations
 
@@ -8,39 +8,36 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import polars as pl
-
 from ugat_marl.data import Scores, TransitionLog
 from ugat_marl.effects import Domain
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import LogError
-from ugat_marl.grounding.fit_config import FitConfig
-from ugat_marl.grounding.fit_loop import split
-from ugat_marl.grounding.random_delays import RandomDelays
+from ugat_marl.grounding.fitting import FitConfig, split
 from ugat_marl.grounding.stacked import Stack, stack_log
+from ugat_marl.grounding.wrappers import RandomDelays
 from ugat_marl.parallel import Stop, Workers, as_done, persistently
 from ugat_marl.policies import Exploring, Policy, PolicyFactory, observer_of, roll_out, until
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
-from ugat_marl.seeding import derive_seed, numpy_generator
+from ugat_marl.seeding import derive_seed
 
 EPISODES_PER_DELAY = 2
 """The fewest that tell how much chance there is in one."""
 
 
 class World(Protocol):
-    """Where transitions come from."""
+    """A source of transitions."""
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
-        """The transitions this iteration adds; None if there are no more."""
+        """Return the transitions this iteration adds; None if there are no more."""
         ...
 
     def stop(self) -> None:
-        """Ends a `collect` that is under way in another thread, with `Stopped`."""
+        """End a `collect` that is under way in another thread, with `Stopped`."""
         ...
 
     def close(self) -> None:
-        """Gives up what the world holds."""
+        """Give up what the world holds."""
         ...
 
 
@@ -76,7 +73,7 @@ class SimulatedWorld:
         self._stop = Stop()
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
-        """Plays the iteration's episodes and returns their transitions."""
+        """Play the iteration's episodes and return their transitions."""
         seeds = [
             derive_seed(seed, "roll-out", self._name, iteration, episode)
             for episode in range(self._episodes)
@@ -87,14 +84,12 @@ class SimulatedWorld:
         if self._env is None:
             self._env = _delayed(self._make_env, self._most_delay_s)
         env, exploring = self._env, Exploring(policy, self._epsilon)
-        return TransitionLog.concatenate(
-            [_recorded(env, exploring, s, None, self._stop) for s in seeds]
-        )
+        return TransitionLog.concatenate([_recorded(env, exploring, s, self._stop) for s in seeds])
 
     def under_delays(
         self, policy: Policy, iteration: int, seed: int, on_done: Callable[[], object]
     ) -> list[TransitionLog]:
-        """Roll-outs for each delay of 0, 1, ... s up to the longest, which every green has.
+        """Play roll-outs for each delay of 0, 1, ... s up to the longest, which every green has.
 
         Each has traffic of its own: a busy hour would make all delays look short. There are
         `EPISODES_PER_DELAY` of each.
@@ -117,7 +112,7 @@ class SimulatedWorld:
 
     @property
     def roll_outs_under_delays(self) -> int:
-        """How many `under_delays` plays."""
+        """Number of roll-outs of `under_delays`."""
         return EPISODES_PER_DELAY * (self._most_delay_s + 1)
 
     def _played_by(
@@ -127,68 +122,74 @@ class SimulatedWorld:
         parts: Sequence[tuple[int, int | None]],
         on_done: Callable[[], object] = lambda: None,
     ) -> list[TransitionLog]:
-        """Roll-outs by their seeds and constant delays, in that order."""
-        stop, made = self._stop, (self._make_env, self._most_delay_s, policy, self._epsilon)
-        found: dict[int, TransitionLog] = {}
-        given = [(*made, *part, stop) for part in parts]
-        for number, log in as_done(workers, _roll_out_alone, given, stop):
-            found[number] = log
+        """Play roll-outs by their seeds and constant delays, in that order."""
+        alone = _RollOutAlone(self._make_env, self._most_delay_s, policy, self._epsilon)
+        given = [(*part, self._stop) for part in parts]
+        logs: dict[int, TransitionLog] = {}
+        for number, log in as_done(workers, alone.play, given, self._stop):
+            logs[number] = log
             on_done()
         self._stop = Stop()  # the other is set now, since nobody waits any more
-        return [found[number] for number in range(len(parts))]
+        return [logs[number] for number in range(len(parts))]
 
     def stop(self) -> None:
-        """Ends the roll-out that is under way."""
+        """End the roll-out that is under way."""
         self._stop.set()
 
     def close(self) -> None:
-        """Ends the simulation."""
+        """End the simulation."""
         if self._env is not None:
             self._env.close()
             self._env = None
 
 
-def _delayed(make_env: Callable[[], TrafficEnv], most_delay_s: int) -> AnyParallelEnv:
+def _delayed(
+    make_env: Callable[[], TrafficEnv], most_delay_s: int, always_s: int | None = None
+) -> AnyParallelEnv:
     env = make_env()
-    return RandomDelays(env, most_delay_s) if most_delay_s else env
+    return RandomDelays(env, most_delay_s, always_s) if most_delay_s else env
 
 
-def _recorded(
-    env: AnyParallelEnv, policy: Policy, seed: int, always_s: int | None, stop: Stop
-) -> TransitionLog:
+def _recorded(env: AnyParallelEnv, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
     observer = observer_of(env)
-    if isinstance(env, RandomDelays):
-        env.always_s = always_s
     played = persistently(lambda: roll_out(env, policy, seed, record=observer, on_step=until(stop)))
     assert played.log is not None
     return played.log
 
 
-def _roll_out_alone(
-    make_env: Callable[[], TrafficEnv],
-    most_delay_s: int,
-    policy: Policy,
-    epsilon: float,
-    seed: int,
-    always_s: int | None,
-    stop: Stop,
-) -> TransitionLog:
-    """One roll-out in an environment of its own, wherever that is."""
-    env = _delayed(make_env, most_delay_s)
-    own = copy.deepcopy(policy)  # some remember their episode, and others play beside this one
-    try:
-        return _recorded(env, Exploring(own, epsilon), seed, always_s, stop)
-    finally:
-        env.close()
+@dataclass(frozen=True)
+class _RollOutAlone:
+    """Roll-outs in environments of their own, wherever they are played.
+
+    Attributes:
+        make_env: Makes an environment of the domain.
+        most_delay_s: Longest of the random delays of greens; 0 for none.
+        policy: Who acts.
+        epsilon: Chance of a random phase.
+    """
+
+    make_env: Callable[[], TrafficEnv]
+    most_delay_s: int
+    policy: Policy
+    epsilon: float
+
+    def play(self, seed: int, always_s: int | None, stop: Stop) -> TransitionLog:
+        """Play one, with random delays or always the same."""
+        env = _delayed(self.make_env, self.most_delay_s, always_s)
+        own = copy.deepcopy(self.policy)  # some remember their episode, and others play beside it
+        try:
+            return _recorded(env, Exploring(own, self.epsilon), seed, stop)
+        finally:
+            env.close()
 
 
 @dataclass(frozen=True)
 class RollOut:
-    """What roll-outs have in common: all that whoever plays one has to be sent.
+    """Settings that roll-outs have in common; sent to every process that plays one.
 
     Attributes:
-        scenario: Where.
-        domain: In which domain.
+        scenario: The network and its traffic.
+        domain: The domain they are played in.
         options: Of the environment; those the policy relies on are added.
         make: Makes who acts; rules remember their episode, so that each has its own.
         epsilon: Chance of a random phase.
@@ -205,7 +206,7 @@ class RollOut:
     neighbours: int = 0
 
     def play(self, seed: int, stop: Stop) -> tuple[TransitionLog, Scores]:
-        """Plays one episode in an environment of its own."""
+        """Play one episode in an environment of its own."""
         probe = parallel_env(self.scenario, self.domain, **self.options)
         policy = self.make(probe)
         options = {**self.options, **policy.env_options}
@@ -230,7 +231,7 @@ def roll_outs(
     reporter: Reporter | None = None,
     title: str = "rolling out",
 ) -> tuple[TransitionLog, tuple[Scores, ...]]:
-    """Plays episodes, several at a time, and records them in the order of their seeds.
+    """Play episodes, several at a time, and record them in the order of their seeds.
 
     Args:
         each: What they have in common.
@@ -289,59 +290,12 @@ class RecordedWorld:
         self._log = log
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
-        """The whole log at the first iteration, nothing afterwards."""
+        """Return the whole log at the first iteration, nothing afterwards."""
         del policy, seed
         return self._log if iteration == 0 else None
 
     def stop(self) -> None:
-        """Nothing is under way."""
+        """Do nothing: nothing is under way."""
 
     def close(self) -> None:
-        """Nothing to give up."""
-
-
-class ShuffledWorld:
-    """Another world whose transitions lead anywhere: a negative control.
-
-    Among the rows of an agent, what followed is dealt out anew. Where vehicles were and what they
-    did next is as it was; that one came of the other is not.
-
-    Args:
-        world: Where the transitions come from.
-    """
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-
-    def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
-        """The other world's transitions, shuffled."""
-        log = self._world.collect(policy, iteration, seed)
-        return None if log is None else shuffled(log, derive_seed(seed, "shuffled", iteration))
-
-    def stop(self) -> None:
-        """Ends what is under way in the other world."""
-        self._world.stop()
-
-    def close(self) -> None:
-        """Gives up what the other world holds."""
-        self._world.close()
-
-
-def shuffled(log: TransitionLog, seed: int) -> TransitionLog:
-    """The log with the outcomes of each agent's rows in random order.
-
-    What is seen next and what was served belong together, and stay so; state, action and reward
-    stay where they are.
-
-    Args:
-        log: Any log; it does not change.
-        seed: Of the order.
-    """
-    outcomes = ["next_observation", "served_features"]
-    parts: list[pl.DataFrame] = []
-    for agent in log.agents:
-        own = log.frame.filter(pl.col("agent") == agent)
-        order = numpy_generator(seed, "shuffled", agent).permutation(own.height)
-        parts.append(own.with_columns(own[name].gather(order) for name in outcomes))
-    frame = pl.concat(parts).sort("episode", "step", maintain_order=True)
-    return TransitionLog(log.provenance, frame)
+        """Do nothing: there is nothing to give up."""

@@ -1,4 +1,4 @@
-"""Policies choose green phases; learners improve them.
+"""Policies: what chooses green phases, and what learns to.
 
 `rules` holds controllers that follow a rule, `learners` the algorithms that improve a policy, and
 `export` writes trained policies for places where the suite is not installed.

@@ -1,4 +1,4 @@
-"""Mapping file: the meaning of the numbers in a controller's log on the network."""
+"""The table that says what the numbers in a controller's log mean on the network."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Text = Annotated[str, Field(min_length=1)]
 
 
 def _name(value: Any) -> Any:
-    """Accept numbers as names: ``id = 1136``."""
+    """Numbers are names too: ``id = 1136``."""
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
@@ -52,7 +52,7 @@ LinksOf = Annotated[Links, pydantic.BeforeValidator(_as_links)]
 
 
 class Channel(pydantic.BaseModel):
-    """Detector channel of a controller, and its place."""
+    """A detector channel of a controller, and where it lies."""
 
     model_config = _STRICT
 
@@ -63,11 +63,11 @@ class Channel(pydantic.BaseModel):
     kind: DetectorKind
     id: Name = ""
     latency_s: float = 0.0
-    """Delay of the detector's time stamps, s; subtracted from them."""
+    """Delay of the detector's stamps, which is taken off them."""
 
 
 class Device(pydantic.BaseModel):
-    """Controller and its traffic light in the network."""
+    """A controller and the traffic light it is in the network."""
 
     model_config = _STRICT
 
@@ -104,7 +104,7 @@ class AtspmMapping(pydantic.BaseModel):
     devices: Annotated[tuple[Device, ...], Field(min_length=1)]
 
     def spans(self) -> tuple[Span, ...]:
-        """Return all periods, with names."""
+        """All periods, with names."""
         given = self.periods or tuple(Span(zero=zero) for zero in self.zero)
         return tuple(
             span.model_copy(
@@ -121,7 +121,7 @@ class AtspmMapping(pydantic.BaseModel):
 def read_mapping(
     path: Path, widths: Mapping[str, int], driven: Mapping[str, Collection[int]]
 ) -> AtspmMapping:
-    """Read and check a mapping file.
+    """Reads and checks a mapping file.
 
     Args:
         path: TOML.

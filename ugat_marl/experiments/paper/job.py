@@ -28,7 +28,7 @@ from ugat_marl.experiments.randomised import randomised_env
 from ugat_marl.experiments.recipes import simulated_worlds, train_until
 from ugat_marl.experiments.tuning import tuned_rules
 from ugat_marl.files import write_whole
-from ugat_marl.grounding import RandomDelays, State, UgatConfig, neighbours_of, restore, train_ugat
+from ugat_marl.grounding import RandomDelays, State, Ugat, UgatConfig, neighbours_of
 from ugat_marl.policies import DQN, DQNConfig, NetworkPolicy, Policy, device_of
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.simulation import end_with_input
@@ -82,7 +82,6 @@ class Job:
     def identity(self) -> dict[str, Any]:
         """What decides the policy: a job with the same is the same job."""
         settings = asdict(self)
-        settings["ugat"] = None if self.ugat is None else self.ugat.identity
         for other in ("domains", "evaluation_seeds", "scenario", "device"):
             settings.pop(other)
         worlds = sorted({world for world in (self.sim, self.target, self.world) if world})
@@ -216,8 +215,8 @@ def _grounded(job: Job, folder: Path, reporter: Reporter) -> DQN:
         learner.load(before)
         transform = job.ugat.transform(env.layouts, job.seed, neighbours_of(env))
         state = State(learner, transform, learner.policy(), pretrained=job.ugat.pretrain_episodes)
-        restore(state, run, NetworkPolicy.load)
-        train_ugat(state, env, sim, real, job.ugat, job.seed, run, device=job.device)
+        state.restore(run, NetworkPolicy.load)
+        Ugat(env, sim, real, job.ugat, job.seed, run, device=job.device).train(state)
     finally:
         for made in (env, sim, real, run):
             made.close()

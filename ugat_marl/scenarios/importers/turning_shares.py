@@ -18,7 +18,7 @@ import numpy as np
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, replacing
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.importers.making import ROUTES, VehicleFiles, VehicleSource
+from ugat_marl.scenarios.importers.making import ROUTES, Fleet, Vehicles
 from ugat_marl.scenarios.importers.streets import Streets
 from ugat_marl.seeding import numpy_generator
 
@@ -30,9 +30,9 @@ CAR = {
 """SUMO's passenger car, spelled out."""
 
 MOST_VEHICLES = 5_000_000
-"""Most vehicles of a scenario."""
+"""More make no scenario that anybody could drive."""
 _TRIES = 200
-"""Walks that may end in a circle before a vehicle is left out."""
+"""Walks that may end in a circle before a vehicle is given up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Drive:
 def walked(
     streets: Streets, vph: float, shares: tuple[float, float, float], length_s: float, seed: int
 ) -> list[Drive]:
-    """Draw vehicles at every entry of a network.
+    """Vehicles at every entry of a network.
 
     Args:
         streets: Where.
@@ -65,7 +65,7 @@ def walked(
         shares: Of left turns, straight on and right turns; where one of them is not possible,
             the others keep their proportion.
         length_s: For how long vehicles enter.
-        seed: Seed of all draws.
+        seed: Decides everything.
 
     Returns:
         The vehicles in the order of their departures.
@@ -116,7 +116,7 @@ def walked(
 def _walk(
     streets: Streets, entry: str, shares: Mapping[str, float], random: np.random.Generator
 ) -> tuple[str, ...]:
-    """Draw roads from an entry to an exit, no junction twice; empty if none was found."""
+    """Roads from an entry to an exit, passing no junction twice; empty if none was found."""
     for _ in range(_TRIES):
         road, route, passed = entry, [entry], {streets.start[entry]}
         while road not in streets.exits and streets.end[road] not in passed:
@@ -137,7 +137,7 @@ def _walk(
 def poisson_arrivals(
     random: np.random.Generator, rate_per_s: float, length_s: float
 ) -> list[float]:
-    """Draw Poisson arrivals in [0, length_s)."""
+    """Poisson arrivals in [0, length_s)."""
     found: list[float] = []
     moment = 0.0
     while rate_per_s > 0:
@@ -149,7 +149,7 @@ def poisson_arrivals(
 
 
 def weighted_choice(shares: Mapping[str, float], random: np.random.Generator) -> str:
-    """Draw a key of `shares`, with probability proportional to its value."""
+    """A key of `shares`, with probability proportional to its value."""
     mark = float(random.random()) * sum(shares.values())
     for name, share in shares.items():
         mark -= share
@@ -161,7 +161,7 @@ def weighted_choice(shares: Mapping[str, float], random: np.random.Generator) ->
 def write_drives(
     path: Path, drives: Iterable[Drive], types: Iterable[Mapping[str, str]] = (CAR,)
 ) -> None:
-    """Write the vehicles as a route file, one after the other.
+    """Writes the vehicles as a route file, one after the other.
 
     Args:
         path: The file.
@@ -193,15 +193,15 @@ def _attributes(values: Mapping[str, str]) -> str:
 
 def from_turns(
     vph: float, shares: tuple[float, float, float], begin_s: float, length_s: float, seed: int
-) -> VehicleSource:
-    """Return a source of vehicles by turning shares, as `walked` draws them, from `begin_s` on."""
+) -> Vehicles:
+    """Vehicles by turning shares, as `walked` draws them, from `begin_s` on."""
 
-    def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
         del reporter
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         drives = walked(streets, vph, shares, length_s, seed)
         later = (replace(drive, depart_s=begin_s + drive.depart_s) for drive in drives)
         write_drives(folder / ROUTES, later)
-        return VehicleFiles((ROUTES,))
+        return Fleet((ROUTES,))
 
     return vehicles

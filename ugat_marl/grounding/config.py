@@ -1,0 +1,123 @@
+"""Settings of UGAT: everything that decides a training across the gap, in one dataclass."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ugat_marl.data import AgentLayout
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.grounding.fitting import FitConfig
+from ugat_marl.grounding.forward import ForwardConfig
+from ugat_marl.grounding.gate import GateConfig
+from ugat_marl.grounding.inverse import InverseConfig
+from ugat_marl.grounding.phase import PhaseTransform
+from ugat_marl.grounding.timed import TimedConfig, TimedTransform
+from ugat_marl.grounding.transform import Transform
+from ugat_marl.grounding.view import InputsConfig, Neighbours
+
+GROUNDINGS = ("phase", "timed")
+
+
+@dataclass(frozen=True)
+class UgatConfig:
+    """Settings of the algorithm.
+
+    Attributes:
+        grounding: What a grounded action is: "phase", another phase, as in the paper; "timed", the
+            policy's own phase with a green that begins later.
+        pretrain_episodes: M, episodes in plain sim before the first iteration.
+        iterations: I, rounds of rolling out, fitting and grounded training.
+        grounded_episodes: E, episodes of training in the grounded sim per iteration.
+        sim_rollouts: Episodes added to D_sim per iteration.
+        real_rollouts: Episodes added to D_real per iteration.
+        rollout_epsilon: Chance of a random phase in these roll-outs.
+        least_accuracy: Held-out accuracy h must have at an intersection before grounded actions
+            are taken there; f and h must beat their trivial rivals, too, which is all that 0 asks.
+            None obeys them from the start, as the paper does. With "timed" the share by which h
+            must beat a guess.
+        inputs: Inputs of f and h beside the intersection's own state and action.
+        forward: Shape of f.
+        inverse: Shape of h.
+        fit: Settings of the training of f and h.
+        gate: Settings of alpha.
+        timed: Settings of the delays, with "timed".
+    """
+
+    grounding: Literal["phase", "timed"] = "phase"
+    pretrain_episodes: int = 60
+    iterations: int = 4
+    grounded_episodes: int = 10
+    sim_rollouts: int = 3
+    real_rollouts: int = 3
+    rollout_epsilon: float = 0.3
+    least_accuracy: float | None = 0.0
+    inputs: InputsConfig = field(default_factory=InputsConfig)
+    forward: ForwardConfig = field(default_factory=ForwardConfig)
+    inverse: InverseConfig = field(default_factory=InverseConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    gate: GateConfig = field(default_factory=GateConfig)
+    timed: TimedConfig = field(default_factory=TimedConfig)
+
+    @property
+    def most_delay_s(self) -> int:
+        """Longest of the random delays in the roll-outs for D_sim; 0 for none."""
+        return self.timed.most_s if self.grounding == "timed" else 0
+
+    @property
+    def matches(self) -> bool:
+        """True if delays are sought by which rewards match those of the street."""
+        return self.grounding == "timed" and self.timed.match
+
+    def transform(
+        self,
+        layouts: Mapping[str, AgentLayout],
+        seed: int,
+        neighbours: Neighbours | None = None,
+    ) -> Transform:
+        """Return unfitted models and gate for these agents.
+
+        Args:
+            layouts: Agent to the division of its observation.
+            seed: Decides the initial weights.
+            neighbours: Agent to the agents one road away (`grounding.view.neighbours_of`); needed
+                for inputs with hops.
+        """
+        if self.grounding == "timed":
+            return TimedTransform(
+                layouts,
+                seed,
+                forward=self.forward,
+                inverse=self.inverse,
+                gate=self.gate,
+                timed=self.timed,
+                inputs=self.inputs,
+                neighbours=neighbours,
+            )
+        return PhaseTransform(
+            layouts,
+            seed,
+            forward=self.forward,
+            inverse=self.inverse,
+            gate=self.gate,
+            inputs=self.inputs,
+            neighbours=neighbours,
+        )
+
+    def __post_init__(self) -> None:
+        if self.grounding not in GROUNDINGS:
+            raise UnknownNameError("grounding", self.grounding, GROUNDINGS)
+        for name, least in (
+            ("pretrain_episodes", 0),
+            ("iterations", 0),
+            ("grounded_episodes", 1),
+            ("sim_rollouts", 1),
+            ("real_rollouts", 1),
+        ):
+            if getattr(self, name) < least:
+                raise OptionError(f"{name} = {getattr(self, name)}: must be at least {least}")
+        for name in ("rollout_epsilon", "least_accuracy"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= 1:
+                raise OptionError(f"{name} = {value}: must be from 0 to 1")

@@ -1,0 +1,140 @@
+"""Building blocks of all models: batched products, scaled inputs, a common base.
+
+Products of many intersections are taken at the processor's full width and in its cache. torch
+multiplies float32 with MKL, which on an AMD EPYC was half as fast as oneDNN: 109 against 227
+GFLOP/s, as if half of each vector lay idle. torch brings oneDNN as well, but only asks it for
+products of float32 where less precision is allowed. Processors without units for bfloat16 tiles
+then compute in plain float32 all the same, only faster; on others numbers would really be rounded.
+So `full_width` tries oneDNN, and takes it only where nothing is rounded.
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import functools
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ugat_marl.grounding.stacked import Stack
+from ugat_marl.grounding.view import View
+
+SMALLEST_SPREAD = 1e-3
+"""A number that varied less than this is not scaled up: its noise would be mistaken for traffic."""
+
+FARTHEST = 5.0
+"""Inputs are cut off at this many standard deviations, so that a rare lane cannot dominate."""
+
+MANY = 16
+"""Networks side by side from which on this pays: fewer lose more by oneDNN's overhead."""
+
+ROWS_AT_ONCE = 8192
+"""Rows, of all networks together, whose hidden layers still fit into a cache of a few MiB."""
+
+
+def rows_at_once(networks: int) -> int:
+    """Return the rows of each of so many networks that are answered in one product."""
+    return min(2048, max(64, ROWS_AT_ONCE // networks))
+
+
+@contextlib.contextmanager
+def full_width(networks: int) -> Iterator[None]:
+    """Multiply batches of so many networks by oneDNN, where that is as precise and faster."""
+    setting: Any = getattr(torch.backends.mkldnn, "matmul", None)  # torch 2.9 has it, 2.4 does not
+    asked_for = setting is not None and setting.fp32_precision != "none"  # the user's own choice
+    if networks < MANY or setting is None or asked_for or not _is_exact(setting):
+        yield
+        return
+    with _allowed(setting):
+        yield
+
+
+@contextlib.contextmanager
+def _allowed(setting: Any) -> Iterator[None]:
+    before = setting.fp32_precision
+    setting.fp32_precision = "bf16"
+    try:
+        yield
+    finally:
+        setting.fp32_precision = before
+
+
+@functools.cache
+def _is_exact(setting: Any) -> bool:
+    """Return True if products keep the last bits of float32 although they need not."""
+    if not torch.backends.mkldnn.is_available():
+        return False
+    numbers, one = torch.full((2, 64, 64), 1.0 + 2.0**-23), torch.eye(64).repeat(2, 1, 1)
+    with _allowed(setting):
+        return torch.equal(torch.bmm(numbers, one), numbers)
+
+
+class Standardiser(nn.Module):
+    """Maps each agent's inputs to mean 0 and deviation 1 of the data it was fitted to.
+
+    Args:
+        agents: Number of agents.
+        width: Padded size of the inputs. A padded input stays zero.
+    """
+
+    mean: Tensor
+    spread: Tensor
+
+    def __init__(self, agents: int, width: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(agents, 1, width))
+        self.register_buffer("spread", torch.ones(agents, 1, width))
+
+    def fit(self, inputs: Tensor, weight: Tensor) -> None:
+        """Take mean and deviation of ``(agents, n, width)`` rows with weights ``(agents, n)``."""
+        share = (weight / weight.sum(1, keepdim=True))[..., None]
+        mean = (share * inputs).sum(1, keepdim=True)
+        spread = (share * (inputs - mean) ** 2).sum(1, keepdim=True).sqrt()
+        self.mean.copy_(mean)
+        self.spread.copy_(torch.where(spread > SMALLEST_SPREAD, spread, 1.0))
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map ``(agents, batch, width)`` to the same shape, within ``FARTHEST`` of zero."""
+        return ((inputs - self.mean) / self.spread).clamp(-FARTHEST, FARTHEST)
+
+
+class TrainableModel(nn.Module, abc.ABC):
+    """A model of all intersections whose parts keep their own best weights in training.
+
+    Parts share no weight, and every parameter holds them in order, so that
+    ``parameter.view(parts, -1)`` has one row for each.
+
+    Attributes:
+        stack: The agents.
+        view: What the model sees beside an agent's own state and action.
+        fitted: Scalar bool, whether the model has been fitted.
+    """
+
+    fitted: Tensor
+
+    def __init__(self, stack: Stack, view: View) -> None:
+        super().__init__()
+        self.stack = stack
+        self.view = view
+        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
+
+    @property
+    @abc.abstractmethod
+    def members(self) -> int:
+        """Networks side by side that read the rows in orders of their own."""
+
+    @property
+    @abc.abstractmethod
+    def parts(self) -> int:
+        """Number of parts that share no weight."""
+
+    @abc.abstractmethod
+    def loss_by_part(self, loss: Tensor) -> Tensor:
+        """Return the loss of every part, ``(parts,)``.
+
+        Args:
+            loss: ``(agents,)``, or ``(agents, members)`` with several members.
+        """

@@ -1,0 +1,363 @@
+"""Phase grounding, the paper's: the grounded action is another phase."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ugat_marl.data import AgentLayout, TransitionLog
+from ugat_marl.errors import OptionError
+from ugat_marl.grounding.delays import EpisodeRewards
+from ugat_marl.grounding.fitting import Changes, Fitter, OffData, Questions, refuse_mismatch
+from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
+from ugat_marl.grounding.gate import GateConfig
+from ugat_marl.grounding.inverse import InverseConfig, InverseModel
+from ugat_marl.grounding.joint import alone, together, turns
+from ugat_marl.grounding.reports import (
+    Calibration,
+    FitReport,
+    Floats,
+    ForwardReport,
+    InverseReport,
+    TrainingRecord,
+    auroc,
+    complaint,
+    flat,
+)
+from ugat_marl.grounding.stacked import StackedTransitions, stack_log
+from ugat_marl.grounding.transform import Grounding, Transform
+from ugat_marl.grounding.uncertainty import Method
+from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours
+from ugat_marl.policies import one_thread
+from ugat_marl.seeding import torch_generator
+
+DISCRIMINATES = 0.55
+"""AUROC below which u is called uninformative in the warnings."""
+
+
+class PhaseTransform(Transform):
+    """Phase grounding, the paper's: the grounded action is another phase.
+
+    Args:
+        layouts: Agent to the division of its observation, in the environment's order.
+        seed: Decides the initial weights.
+        forward: Shape of the forward models.
+        inverse: Shape of the inverse models.
+        gate: Settings of alpha.
+        inputs: Inputs of the models beside the intersection's own state and action.
+        neighbours: Agent to the agents one road away, for inputs with hops.
+    """
+
+    inverse: InverseModel
+
+    def __init__(
+        self,
+        layouts: Mapping[str, AgentLayout],
+        seed: int,
+        forward: ForwardConfig | None = None,
+        inverse: InverseConfig | None = None,
+        gate: GateConfig | None = None,
+        inputs: InputsConfig | None = None,
+        neighbours: Neighbours | None = None,
+    ) -> None:
+        forward, inverse = forward or ForwardConfig(), inverse or InverseConfig()
+        if forward.include_phase != inverse.include_phase:
+            raise OptionError(
+                f"include_phase is {forward.include_phase} in the forward and "
+                f"{inverse.include_phase} in the inverse model; h must be given what f predicts"
+            )
+        super().__init__(layouts, seed, forward, gate, inputs, neighbours)
+        self.inverse = InverseModel(
+            self.stack, inverse, torch_generator(seed, "inverse"), view=self.local
+        )
+        self._in_turn = turns(self.stack.agents, self.local.near)
+
+    @one_thread()
+    def fit(
+        self,
+        real: TransitionLog,
+        simulated: TransitionLog,
+        fitter: Fitter,
+        rewards: EpisodeRewards | None = None,
+    ) -> PhaseReport:
+        """Fit f on the real log, and h on the simulated log; rewards are left alone."""
+        del rewards
+        refuse_mismatch(real, simulated)
+        f, h = self.forward, self.inverse
+        d_real, d_sim = stack_log(real, self.stack), stack_log(simulated, self.stack)
+        forward = _fit_forward(f, d_real, fitter)
+        means = _expected(f, d_sim, fitter)
+        pairs = means if fitter.config.pairs == "smoothed" else d_sim.next_observation
+        inverse = _fit_inverse(h, d_sim, pairs, fitter)
+        held_out = fitter.split(d_sim, self.stack).held_out
+        held_out_real = fitter.split(d_real, self.stack).held_out
+        agreement, u_on_predictions = on_predictions(f, h, d_sim, held_out)
+        accuracy_on_real, u_on_real = on_transitions(h, d_real, held_out_real)
+        accuracy_on_means, _ = _accuracy(h, d_sim, means, held_out)
+        return PhaseReport(
+            agents=self.stack.agents,
+            forward=forward,
+            inverse=inverse,
+            mean_u_on_predictions=u_on_predictions,
+            agreement=agreement,
+            accuracy_on_real=accuracy_on_real,
+            mean_u_on_real=u_on_real,
+            accuracy_on_means=accuracy_on_means,
+        )
+
+    def ground(
+        self,
+        observations: Tensor,
+        actions: NDArray[np.int64],
+        permitted: NDArray[np.bool_] | None,
+        earlier: Sequence[Moment],
+    ) -> Grounding:
+        """Ask f, then h, then the gate; where neighbours are seen, until all answers fit together.
+
+        Line numbers are those of Algorithm 1 (`ugat`).
+        """
+        asked = torch.from_numpy(actions)[:, None]
+
+        def answer(phases: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+            running = torch.from_numpy(phases)[:, None]
+            seen = self.forward.view.seen(observations, running, earlier)
+            predicted = self.forward.predict(seen, asked)  # line 11
+            local = self.local.seen(observations, running)
+            inverse = self.inverse.predict(local, predicted)  # line 12
+            return inverse.action[:, 0].numpy(), inverse.u[:, 0].numpy()
+
+        if self.local.joint:
+            settled = together(answer, self.gate, self._in_turn, actions, permitted)
+        else:
+            settled = alone(answer, actions, permitted)
+        grounded, u = settled.grounded, settled.u
+        accepted = self.gate.decide(u, actions, grounded, settled.allowed)  # lines 13 and 15
+        executed = np.where(accepted, grounded, actions)
+        return Grounding(executed, grounded, u, accepted, np.zeros_like(u))
+
+    def fresh_inverse(self, method: Method) -> InverseModel:
+        """Return an unfitted h of the same shape with this method of uncertainty."""
+        return InverseModel(self.stack, self.inverse.config, torch_generator(0), method, self.local)
+
+
+# --- fits of single models
+
+
+@one_thread()
+def fit_forward(model: ForwardModel, log: TransitionLog, fitter: Fitter) -> ForwardReport:
+    """Fit f alone on a log of the real world, by least squares on the change of the features.
+
+    Args:
+        model: Changed in place.
+        log: What the *asked* action does there is learnt.
+        fitter: How to train.
+
+    Raises:
+        LogError: The log is of other agents, or too short to be split.
+    """
+    return _fit_forward(model, stack_log(log, model.stack), fitter)
+
+
+@one_thread()
+def fit_inverse(model: InverseModel, log: TransitionLog, fitter: Fitter) -> PhaseInverseReport:
+    """Fit h alone on a log of the simulation, with the loss of the method asked for.
+
+    Args:
+        model: Changed in place; the head learns from all agents at once.
+        log: Which *executed* action did what is learnt.
+        fitter: How to train.
+
+    Raises:
+        LogError: The log is of other agents, or too short to be split.
+    """
+    data = stack_log(log, model.stack)
+    return _fit_inverse(model, data, data.next_observation, fitter)
+
+
+def _fit_forward(model: ForwardModel, data: StackedTransitions, fitter: Fitter) -> ForwardReport:
+    lesson = Changes("forward", model.view.of(data), data.next_observation, data.asked)
+    return fitter.fit_changes(model, lesson, fitter.split(data, model.stack))
+
+
+def _expected(forward: ForwardModel, data: StackedTransitions, fitter: Fitter) -> Tensor:
+    """Return what the simulation makes of its states and actions in the mean.
+
+    ``(agents, n, outputs)``, by a model of the shape of `forward` that is fitted to the simulation.
+    """
+    generator, seen = torch_generator(fitter.seed, "simulated"), forward.view.of(data)
+    model = ForwardModel(forward.stack, forward.config, generator, view=forward.view)
+    lesson = Changes("simulated", seen, data.next_observation, data.executed)
+    fitter.fit_changes(model, lesson, fitter.split(data, forward.stack))
+    with torch.no_grad():
+        return model.predict(seen, data.executed)
+
+
+def _fit_inverse(
+    model: InverseModel, data: StackedTransitions, outcome: Tensor, fitter: Fitter
+) -> PhaseInverseReport:
+    """Fit h to read `outcome`, ``(agents, n, features or more)``, as what followed."""
+    rows = fitter.split(data, model.stack)
+    inputs = model.inputs(model.view.of(data), outcome)
+    off_data = OffData.around(inputs, rows.train, model.view)
+    record = fitter.fit_answers(model, Questions(inputs, data.executed, off_data), rows)
+    generator = torch_generator(fitter.seed, "inverse", "off data")
+    return _inverse_report(model, data, rows.train, rows.held_out, record, generator)
+
+
+# --- reports
+
+
+@dataclass(frozen=True)
+class PhaseInverseReport(InverseReport):
+    """Held-out quality of h, per agent where an array.
+
+    Attributes:
+        accuracy: Share of right answers.
+        chance: 1 / number of phases.
+        majority: Accuracy of always answering the phase most frequent in training.
+        mean_u: Mean uncertainty.
+        auroc: u against being wrong, agent by agent; `calibration` has the same and more, pooled.
+    """
+
+    accuracy: Floats
+    chance: Floats
+    majority: Floats
+    mean_u: Floats
+    auroc: Floats
+
+    def as_dict(self, agents: Sequence[str]) -> dict[str, float]:
+        """Return everything as flat numbers; arrays as their mean and one entry per agent."""
+        numbers = self.training.as_dict("inverse")
+        for name in ("accuracy", "chance", "majority", "mean_u", "auroc"):
+            numbers |= flat(f"inverse/{name}", getattr(self, name), agents)
+        return numbers | self.calibration.as_dict()
+
+
+@dataclass(frozen=True)
+class PhaseReport(FitReport):
+    """Worth of f and h of phase grounding, alone and together.
+
+    Attributes:
+        inverse: h, on held-out simulated transitions.
+        agreement: Per agent, share of held-out simulated states in which h, fed by f, answers the
+            action that f was given. Without a gap and with a perfect f this is h's accuracy; what
+            is missing is the gap and the errors of both models. It says how much grounding would
+            change if every grounded action were taken. `mean_u_on_predictions` is of these answers.
+        accuracy_on_real: Per agent, share of held-out real transitions whose action h names. What
+            it lacks of h's own accuracy is the gap itself, in actions, without f's part in it.
+        mean_u_on_real: Per agent, mean u of these answers: how foreign the real world is to h.
+        accuracy_on_means: Per agent, accuracy of h on held-out simulated states and what a model of
+            the simulation expects of their actions: means, such as f predicts.
+    """
+
+    inverse: PhaseInverseReport
+    agreement: Floats
+    accuracy_on_real: Floats
+    mean_u_on_real: Floats
+    accuracy_on_means: Floats
+
+    def doubts(self) -> Iterator[str]:
+        """Yield sentences on what is wrong, some of them empty."""
+        h, u = self.inverse, self.calibration
+        yield from self.forward.doubts("f", self.agents)
+        poor = h.accuracy <= h.majority
+        yield complaint("h is no better than the most frequent phase", poor, self.agents)
+        if h.uncertainty == "none":
+            yield "without uncertainty u is 0, and the gate takes every grounded action"
+            return
+        if u.auroc < DISCRIMINATES:
+            yield f"u does not tell wrong answers (AUROC {u.auroc:.2f})"
+        if u.mean_u_off_data <= u.mean_u:
+            yield (
+                f"u does not rise off the data ({u.mean_u_off_data:.2f} against "
+                f"{u.mean_u:.2f} on it)"
+            )
+
+    def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
+        """Return the agents whose models may be obeyed, ``(agents,)``, for `Gate.trust`.
+
+        f has learnt something, and h beats both the most frequent phase and `least_accuracy`.
+        """
+        h = self.inverse
+        better = self.forward.learnt & (h.accuracy > h.majority)
+        return better & (h.accuracy >= least_accuracy)
+
+    def as_dict(self) -> dict[str, float]:
+        """Return flat numbers; arrays as their mean over agents and as one entry per agent."""
+        numbers = self.forward.as_dict("forward", self.agents) | self.inverse.as_dict(self.agents)
+        for name in (
+            "agreement",
+            "mean_u_on_predictions",
+            "accuracy_on_real",
+            "mean_u_on_real",
+            "accuracy_on_means",
+        ):
+            numbers |= flat(name, getattr(self, name), self.agents)
+        return numbers
+
+
+@torch.no_grad()
+def _inverse_report(
+    model: InverseModel,
+    data: StackedTransitions,
+    train: Tensor,
+    held_out: Tensor,
+    training: TrainingRecord,
+    generator: torch.Generator,
+) -> PhaseInverseReport:
+    """Measure accuracy of h and calibration of its u on the held-out rows."""
+    inputs = model.inputs(model.view.of(data), data.next_observation)
+    answer = model.answer(inputs)
+    missed = answer.action != data.executed
+    kept, wrong, u = held_out.bool().numpy(), missed.numpy(), answer.u.numpy()
+    drawn = OffData.around(inputs, train, model.view).draw(
+        int(held_out.sum(1).max()), generator, state_share=1.0
+    )
+    counts = torch.zeros(train.shape[0], model.stack.actions)
+    counts.scatter_add_(1, data.executed, train)
+    usual = counts.argmax(1)[:, None]
+    majority = ((data.executed == usual) * held_out).sum(1) / held_out.sum(1)
+    rows = range(len(kept))
+    return PhaseInverseReport(
+        training=training,
+        accuracy=np.array([1.0 - wrong[i][kept[i]].mean() for i in rows]),
+        chance=1.0 / np.array(model.stack.phases, float),
+        majority=majority.double().numpy(),
+        mean_u=np.array([u[i][kept[i]].mean() for i in rows], float),
+        auroc=np.array([auroc(u[i][kept[i]], wrong[i][kept[i]]) for i in rows]),
+        calibration=Calibration.of(answer, missed, held_out.bool(), model.answer(drawn)),
+        uncertainty=model.method.name,
+    )
+
+
+@torch.no_grad()
+def on_predictions(
+    forward: ForwardModel, inverse: InverseModel, data: StackedTransitions, held_out: Tensor
+) -> tuple[Floats, Floats]:
+    """Return, per agent, agreement and mean u of h fed by f in held-out simulated states."""
+    predicted = forward.predict(forward.view.of(data), data.executed)
+    return _accuracy(inverse, data, predicted, held_out)
+
+
+@torch.no_grad()
+def on_transitions(
+    inverse: InverseModel, data: StackedTransitions, held_out: Tensor
+) -> tuple[Floats, Floats]:
+    """Return, per agent, accuracy and mean u of h on transitions as they happened."""
+    return _accuracy(inverse, data, data.next_observation, held_out)
+
+
+@torch.no_grad()
+def _accuracy(
+    inverse: InverseModel, data: StackedTransitions, next_features: Tensor, held_out: Tensor
+) -> tuple[Floats, Floats]:
+    """Return, per agent, accuracy and mean u of h asked what led to `next_features`."""
+    answer = inverse.predict(inverse.view.of(data), next_features)
+    share = held_out.double() / held_out.double().sum(1, keepdim=True)
+    agreement = ((answer.action == data.executed) * share).sum(1)
+    return agreement.numpy(), (answer.u * share).sum(1).numpy()

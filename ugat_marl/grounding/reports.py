@@ -1,0 +1,356 @@
+"""Reports of a fit: held-out errors of f, calibration of u, and the base of what a fit returns.
+
+All numbers are measured on episodes that the models did not see in training.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+from torch import Tensor
+
+from ugat_marl.grounding.forward import ForwardModel
+from ugat_marl.grounding.uncertainty import InversePrediction, MethodName
+
+Floats = NDArray[np.float64]
+Numbers = NDArray[np.floating] | NDArray[np.integer] | NDArray[np.bool_]
+
+QUANTILES = 5
+"""Groups of rising u in which errors are counted."""
+
+# --- calibration statistics
+
+
+def spearman(one: Numbers, other: Numbers) -> float:
+    """Return the rank correlation of two samples; NaN if one of them is constant, or empty."""
+    if not len(one):
+        return float("nan")
+    a, b = stats.rankdata(one), stats.rankdata(other)
+    a, b = a - a.mean(), b - b.mean()
+    norm = float(np.sqrt((a**2).sum() * (b**2).sum()))
+    return float((a * b).sum() / norm) if norm > 0 else float("nan")
+
+
+def auroc(score: Numbers, positive: NDArray[np.bool_]) -> float:
+    """Return the probability that a positive scores above a negative, ties half.
+
+    This is the statistic of Mann and Whitney over the number of pairs. NaN if there are no
+    positives or no negatives.
+    """
+    pairs = int(positive.sum()) * int((~positive).sum())
+    if not pairs:
+        return float("nan")
+    exact = score.astype(np.float64)  # the sum of ranks would be one of float32 otherwise
+    test: Any = stats.mannwhitneyu(exact[positive], exact[~positive], method="asymptotic")
+    return float(test.statistic / pairs)
+
+
+def rate_by_quantile(score: Numbers, hit: NDArray[np.bool_], bins: int) -> tuple[float, ...]:
+    """Return the share of hits in `bins` equally filled groups of rising score.
+
+    NaN for an empty group.
+    """
+    order = np.argsort(score, kind="stable")
+    groups = np.array_split(hit[order], bins)
+    return tuple(float(group.mean()) if len(group) else float("nan") for group in groups)
+
+
+def risk_by_coverage(u: Numbers, wrong: NDArray[np.bool_], bins: int) -> tuple[float, ...]:
+    """Return the error rate among the 1/bins, 2/bins, ... of the answers with the lowest u.
+
+    The risk-coverage curve of selective classification (El-Yaniv and Wiener, JMLR 2010): what a
+    gate that lets so many answers pass lets through. Equal u share their errors evenly, so that it
+    is flat for a u that says nothing. NaN for a share without an answer.
+    """
+    _, group, counts = np.unique(u, return_inverse=True, return_counts=True)
+    rate = np.bincount(group, weights=wrong) / counts
+    errors = np.concatenate([[0.0], np.cumsum(np.repeat(rate, counts))])
+    shares = [round(len(u) * (i + 1) / bins) for i in range(bins)]
+    return tuple(float(errors[n] / n) if n else float("nan") for n in shares)
+
+
+def expected_calibration_error(
+    confidence: Numbers, correct: NDArray[np.bool_], bins: int = 15
+) -> float:
+    """Return the mean distance of confidence from accuracy over equally wide bins of confidence.
+
+    Guo, Pleiss, Sun, Weinberger, "On Calibration of Modern Neural Networks", ICML 2017, equation 3,
+    with their 15 bins. Confidence is the probability of the answer given; NaN without an answer.
+    """
+    if not len(correct):
+        return float("nan")
+    place = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
+    surplus = np.bincount(place, weights=confidence - correct, minlength=bins)
+    return float(np.abs(surplus).sum() / len(correct))
+
+
+# --- numbers and sentences of a report
+
+
+def flat(name: str, values: Floats, agents: Sequence[str]) -> dict[str, float]:
+    """Return an array over agents as flat numbers: its mean, and one entry per agent."""
+    known = values[~np.isnan(values)]
+    numbers = {name: float(known.mean()) if len(known) else float("nan")}
+    by_agent = zip(agents, values, strict=True)
+    return numbers | {f"{name}/{agent}": float(value) for agent, value in by_agent}
+
+
+def complaint(text: str, where: NDArray[np.bool_], agents: Sequence[str]) -> str:
+    """Return a sentence about the agents that `where`, ``(agents,)``, marks; empty if none."""
+    names = [agent for agent, marked in zip(agents, where, strict=True) if marked]
+    shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+    return f"{text} at {len(names)} of {len(agents)} ({shown})" if names else ""
+
+
+def mean_of_known(u: Floats) -> Floats:
+    """Return u per agent, NaN replaced by the mean of the other agents; of all by 1, the most."""
+    known = u[~np.isnan(u)]
+    return np.where(np.isnan(u), known.mean() if known.size else 1.0, u)
+
+
+# --- parts of a report
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """Course of a training.
+
+    Attributes:
+        epochs: Epochs run before held-out loss stopped falling.
+        train_loss: Mean loss of the last epoch, over agents.
+        held_out_loss: Mean held-out loss of the weights that were kept.
+        split: "episodes", or "steps" where the log has only one episode.
+        train_rows: Rows trained on, over all agents.
+        held_out_rows: Rows held out, over all agents.
+    """
+
+    epochs: int
+    train_loss: float
+    held_out_loss: float
+    split: str
+    train_rows: int
+    held_out_rows: int
+
+    def as_dict(self, prefix: str) -> dict[str, float]:
+        """Return epochs and losses as flat numbers."""
+        return {
+            f"{prefix}/epochs": float(self.epochs),
+            f"{prefix}/train_loss": self.train_loss,
+            f"{prefix}/held_out_loss": self.held_out_loss,
+        }
+
+
+@dataclass(frozen=True)
+class ForwardReport:
+    """Held-out error of f, per agent: root mean squares in the unit of the features.
+
+    Attributes:
+        training: How the training went.
+        error: Of f.
+        no_change: Of predicting that nothing changes.
+        mean_outcome: Of predicting the mean of what follows, whatever the state.
+    """
+
+    training: TrainingRecord
+    error: Floats
+    no_change: Floats
+    mean_outcome: Floats
+
+    @property
+    def ratio(self) -> Floats:
+        """Error over the error of no change, per agent: below 1, f has learnt something."""
+        return self.error / np.maximum(self.no_change, 1e-12)
+
+    @property
+    def learnt(self) -> NDArray[np.bool_]:
+        """Agents whose f beats both: without the second, it does so on rows that are mixed up."""
+        return (self.ratio < 1.0) & (self.error < self.mean_outcome)
+
+    def doubts(self, model: str, agents: Sequence[str]) -> Iterator[str]:
+        """Yield what is wrong with the model of that name; sentences, some of them empty."""
+        poor = self.ratio >= 1.0
+        mixed = ~self.learnt & ~poor
+        yield complaint(f"{model} is no better than predicting no change", poor, agents)
+        yield complaint(f"{model} is no better than one answer for every state", mixed, agents)
+
+    def as_dict(self, prefix: str, agents: Sequence[str]) -> dict[str, float]:
+        """Return training and errors as flat numbers."""
+        numbers = self.training.as_dict(prefix)
+        for name in ("error", "no_change", "mean_outcome", "ratio"):
+            numbers |= flat(f"{prefix}/{name}", getattr(self, name), agents)
+        return numbers
+
+
+@torch.no_grad()
+def forward_report(
+    model: ForwardModel,
+    predicted: Tensor,
+    happened: Tensor,
+    off_mean: Tensor,
+    held_out: Tensor,
+    training: TrainingRecord,
+) -> ForwardReport:
+    """Measure predicted changes on held-out rows.
+
+    Args:
+        model: A model of changes.
+        predicted: ``(agents, n, outputs)`` changes, as the model predicts them.
+        happened: ``(agents, n, outputs)`` changes, as they happened.
+        off_mean: ``(agents, n, outputs)``, by how much the features that followed differ from
+            their mean in training.
+        held_out: ``(agents, n)`` weights of the held-out rows.
+        training: How the training went.
+    """
+    outputs = model.valid_outputs.sum(-1)[:, 0].double()
+    share = (held_out / held_out.sum(1, keepdim=True)).double()
+
+    def root_mean_square(error: Tensor) -> Floats:
+        return ((error.double() ** 2).sum(-1) * share).sum(1).div(outputs).sqrt().numpy()
+
+    errors = (predicted - happened, happened, off_mean)
+    return ForwardReport(training, *map(root_mean_square, errors))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Power of u to tell right from wrong, and known from unknown, over all agents together.
+
+    Attributes:
+        spearman: Rank correlation of u with being wrong.
+        auroc: Probability that u is higher for a wrong answer than for a right one.
+        error_by_quantile: Error rate in fifths of rising u.
+        risk_by_coverage: Error rate of the fifth with the lowest u, of two fifths, ..., of all.
+        ece: Expected calibration error of the probability of the answer.
+        mean_u: Mean u on held-out data.
+        mean_u_off_data: Mean u on states and changes drawn around, not from, the data.
+        auroc_off_data: Probability that u is higher off the data than on it.
+    """
+
+    spearman: float
+    auroc: float
+    error_by_quantile: tuple[float, ...]
+    risk_by_coverage: tuple[float, ...]
+    ece: float
+    mean_u: float
+    mean_u_off_data: float
+    auroc_off_data: float
+
+    @classmethod
+    def of(
+        cls,
+        answer: InversePrediction,
+        wrong: Tensor,
+        held_out: Tensor,
+        off_data: InversePrediction,
+    ) -> Calibration:
+        """Measure answers on held-out rows and answers off the data.
+
+        Args:
+            answer: To all rows, ``(agents, n)``.
+            wrong: ``(agents, n)`` bool, the wrong ones among them.
+            held_out: ``(agents, n)`` bool.
+            off_data: Answers to invented rows.
+        """
+        on_u, on_wrong = answer.u[held_out].numpy(), wrong[held_out].numpy()
+        off_u = off_data.u.flatten().numpy()
+        both = np.concatenate([on_u, off_u])
+        likeliest = answer.probability.amax(-1)[held_out].numpy()
+        return cls(
+            spearman=spearman(on_u, on_wrong),
+            auroc=auroc(on_u, on_wrong),
+            error_by_quantile=rate_by_quantile(on_u, on_wrong, QUANTILES),
+            risk_by_coverage=risk_by_coverage(on_u, on_wrong, QUANTILES),
+            ece=expected_calibration_error(likeliest, ~on_wrong),
+            mean_u=float(on_u.mean()) if len(on_u) else math.nan,
+            mean_u_off_data=float(off_u.mean()),
+            auroc_off_data=auroc(both, np.arange(len(both)) >= len(on_u)),
+        )
+
+    def as_dict(self) -> dict[str, float]:
+        """Return flat numbers, one entry per fifth."""
+        numbers: dict[str, float] = {}
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if isinstance(value, tuple):
+                for i, rate in enumerate(value):
+                    numbers[f"calibration/{entry.name}/{i}"] = rate
+            else:
+                numbers[f"calibration/{entry.name}"] = value
+        return numbers
+
+
+@dataclass(frozen=True)
+class InverseReport(abc.ABC):
+    """Held-out quality of h.
+
+    Attributes:
+        training: How the training went.
+        calibration: u against wrong answers, pooled over agents.
+        uncertainty: Where u came from.
+    """
+
+    training: TrainingRecord
+    calibration: Calibration
+    uncertainty: MethodName
+
+    @abc.abstractmethod
+    def as_dict(self, agents: Sequence[str]) -> dict[str, float]:
+        """Return everything as flat numbers; arrays as their mean and one entry per agent."""
+
+
+@dataclass(frozen=True)
+class FitReport(abc.ABC):
+    """Worth of f and h after a fit, alone and together.
+
+    Attributes:
+        agents: Names, the order of all arrays.
+        forward: f, on held-out real transitions.
+        inverse: h, on held-out simulated transitions.
+        mean_u_on_predictions: Per agent, mean u of h's answers to what f predicts: what the gate
+            will see. NaN where an agent has no such rows.
+    """
+
+    agents: tuple[str, ...]
+    forward: ForwardReport
+    inverse: InverseReport
+    mean_u_on_predictions: Floats
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of u."""
+        return self.inverse.calibration
+
+    @property
+    def expected_u(self) -> Floats:
+        """Mean u to expect at the gate, per agent; of all agents where one has no rows."""
+        return mean_of_known(self.mean_u_on_predictions)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons to doubt the grounded actions; empty if there are none."""
+        return tuple(sentence for sentence in self.doubts() if sentence)
+
+    @abc.abstractmethod
+    def doubts(self) -> Iterator[str]:
+        """Yield sentences on what is wrong, some of them empty."""
+
+    @abc.abstractmethod
+    def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
+        """Return the agents whose models may be obeyed, ``(agents,)``, for `Gate.trust`.
+
+        Args:
+            least_accuracy: How good h must be there, from 0 to 1; 0 asks only that the models beat
+                their trivial rivals.
+        """
+
+    @abc.abstractmethod
+    def as_dict(self) -> dict[str, float]:
+        """Return flat numbers; arrays as their mean over agents and as one entry per agent."""
