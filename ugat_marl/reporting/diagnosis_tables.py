@@ -10,6 +10,7 @@ from rich.text import Text
 from ugat_marl.diagnosis import statistic
 from ugat_marl.reporting import diagnosis_words as words
 from ugat_marl.reporting.diagnosis_words import Record
+from ugat_marl.reporting.formats import chance, number, share, signed
 
 _SHOWN = 3
 
@@ -66,11 +67,11 @@ def _where(record: Record) -> Table:
     table.add_column("size", justify="right", no_wrap=True)
     table.add_column("z", justify="right", no_wrap=True)
     for item in words.strongest(record, _SHOWN):
-        size = f"{words.signed(item['size'])} {item['unit']}".rstrip()
+        size = f"{signed(item['size'])} {item['unit']}".rstrip()
         what = f"{item['regime']}: {statistic(item['statistic'])}"
         if item.get("window"):
             what += f", {words.window(item['window'])}"
-        row = (words.disagreement_place(item), what, size, words.signed(item["z"]))
+        row = (words.disagreement_place(item), what, size, signed(item["z"]))
         table.add_row(*map(Text, row))
     return table
 
@@ -85,12 +86,12 @@ def _heldout(record: Record) -> RenderableType:
     for heading in ("before", "after", "floor", "shrink", "p before", "p after"):
         table.add_column(heading, justify="right")
     table.add_row(
-        words.number(found["before"]),
-        words.number(found["after"]) if found["shrink"] is not None else "–",
-        words.number(found["floor"]),
-        words.share(found["shrink"]),
-        words.chance(found["p_before"]),
-        words.chance(found["p_after"]) if found["shrink"] is not None else "–",
+        number(found["before"]),
+        number(found["after"]) if found["shrink"] is not None else "–",
+        number(found["floor"]),
+        share(found["shrink"]),
+        chance(found["p_before"]),
+        chance(found["p_after"]) if found["shrink"] is not None else "–",
     )
     lines.append(table)
     lines.append(Text("floor: 99 of 100 data sets of the simulation itself stay below", "dim"))

@@ -7,9 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from ugat_marl.diagnosis import clock
-from ugat_marl.reporting.formats import chance, number, share, signed
-
-__all__ = ["chance", "number", "share", "signed"]
+from ugat_marl.reporting.formats import number, share
 
 Record = Mapping[str, Any]
 """The content of ``diagnosis.json``, or a part of it."""
