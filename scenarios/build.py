@@ -24,7 +24,7 @@ BEGIN, END = "<!-- headroom: begin -->\n", "<!-- headroom: end -->\n"
 
 
 def build(name: str, into: Path) -> list[Path]:
-    """Writes network.net.xml and demand.rou.xml of scenario `name` below `into`."""
+    """Write network.net.xml and demand.rou.xml of scenario `name` below `into`."""
     source = _read(HERE / name / "source.toml")
     settings = _read(HERE / name / "scenario.toml")
     vehicles = _read(HERE / "vehicles.toml")
@@ -43,7 +43,7 @@ def build(name: str, into: Path) -> list[Path]:
 
 
 def measure(name: str, seeds: list[int], workers: int | None) -> Path:
-    """Writes the headroom of scenario `name` between the markers of its README."""
+    """Write the headroom of scenario `name` between the markers of its README."""
     # Building needs no simulation; only this does.
     from ugat_marl.experiments import headroom, markdown
     from ugat_marl.scenarios import read_scenario

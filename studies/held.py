@@ -246,7 +246,9 @@ def step_together(scenario: str) -> Values:
                 one.see("observations", batch.observations[i])
                 one.see("rewards", batch.rewards[i])
                 one.see("infos", [batch.masks[i], batch.executed[i], bool(batch.truncated[i])])
-                one.see("seeds", [env.episodes[i].seed, env.episodes[i].domain])
+                episode = env.episodes[i]
+                assert episode is not None
+                one.see("seeds", [episode.seed, episode.domain])
             for end in batch.ended:
                 watched[end.environment].see("last", [end.observations, end.masks])
                 watched[end.environment].score(end.scores)

@@ -6,13 +6,13 @@ in time, since a machine's speed drifts by more than what is measured.
 """
 
 from studies.bench.device import DeviceBench
+from studies.bench.env import EnvBench
 from studies.bench.everything import AllBench
 from studies.bench.fitting import FittingBench
 from studies.bench.learning import LearningBench
 from studies.bench.memory import MemoryBench
 from studies.bench.report import Report, Spread, Target
 from studies.bench.scale import ScaleBench
-from studies.bench.speed import EnvBench
 from studies.bench.strength import StrengthBench
 
 __all__ = [

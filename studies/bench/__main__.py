@@ -11,7 +11,7 @@ from ugat_marl.cli import CommandLine, run
 from ugat_marl.progress import Bars
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "env": ("studies.bench.speed:EnvBench", "speed against SUMO alone and sumo-rl"),
+    "env": ("studies.bench.env:EnvBench", "speed against SUMO alone and sumo-rl"),
     "learning": ("studies.bench.learning:LearningBench", "what learning adds to an episode"),
     "fitting": (
         "studies.bench.fitting:FittingBench",

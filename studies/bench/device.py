@@ -1,4 +1,4 @@
-"""``bench device``: from how many intersections on a GPU pays, for updates of DQN and for fits."""
+"""``bench device``: number of intersections from which on a GPU is faster."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from studies.bench.measured import in_fresh_process
+from studies.bench.fresh_process import in_fresh_process
 from studies.bench.report import Report, Spread, require_positive
 from ugat_marl.errors import OptionError
 from ugat_marl.policies import device_of
 from ugat_marl.progress import Reporter, Silent
 
-_PROGRAM = ["-m", "studies.bench.device_rounds"]
+_PROGRAM = ["-m", "studies.bench.device_program"]
 
 
 @dataclass(frozen=True)
 class DeviceBench:
-    """What an update of DQN and a fit of f and h take on the CPU and on a GPU, size by size.
+    """Time of an update of DQN and of a fit of f and h, on the CPU and on a GPU, size by size.
 
     Observations, rewards and transitions are random: nothing is simulated. Every round measures
     each size on the CPU and directly after it on the GPU. Times are wall time, with all that goes
@@ -68,7 +68,7 @@ class DeviceBench:
             )
 
     def run(self, reporter: Reporter | None = None) -> Report:
-        """Measures, and writes `out` if it is given.
+        """Measure, and write `out` if it is given.
 
         Args:
             reporter: Is told what is being measured.
@@ -88,10 +88,10 @@ class DeviceBench:
 
 
 def compared(found: dict[str, Any], settings: dict[str, Any]) -> Report:
-    """The times of both as a table, and from which size on the other device is the faster one.
+    """Tabulate the times of both devices, and note from which size on the device is faster.
 
     Args:
-        found: What `device_rounds.measure` returns.
+        found: What `device_program.measure` returns.
         settings: Options of the bench.
     """
     sizes, device = settings["sizes"], settings["device"]
@@ -119,7 +119,7 @@ def compared(found: dict[str, Any], settings: dict[str, Any]) -> Report:
 
 
 def pays_from(sizes: Sequence[int], ratios: Sequence[float]) -> int | None:
-    """The smallest size from which on all are faster than on the CPU; None if the largest is not.
+    """Return the smallest size from which on the device is faster; None if it never is.
 
     Args:
         sizes: Rising.

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from studies.bench.env import EnvBench
 from studies.bench.fitting import FittingBench
 from studies.bench.learning import LearningBench
 from studies.bench.memory import MemoryBench
 from studies.bench.report import Report
-from studies.bench.speed import EnvBench
 from ugat_marl.progress import Reporter
 
 
@@ -35,7 +35,7 @@ class AllBench:
     out: Path | None = None
 
     def run(self, reporter: Reporter | None = None) -> list[Report]:
-        """Measures all of them; each report is written as soon as it is there.
+        """Measure all of them; each report is written as soon as it is there.
 
         Args:
             reporter: Is told how far the measuring has come.

@@ -1,4 +1,4 @@
-"""``bench fitting``: what each uncertainty of the inverse models costs and is worth."""
+"""``bench fitting``: cost and calibration of each uncertainty of the inverse models."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from studies.bench.measured import in_fresh_process
+from studies.bench.fresh_process import in_fresh_process
 from studies.bench.report import Report, Spread, require_positive
 from ugat_marl.grounding import METHODS
 from ugat_marl.progress import Reporter, Silent
 
-_PROGRAM = ["-m", "studies.bench.fitting_rounds"]
+_PROGRAM = ["-m", "studies.bench.fitting_program"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class FittingBench:
         require_positive("fitting", episodes=self.episodes, rounds=self.rounds, epochs=self.epochs)
 
     def run(self, reporter: Reporter | None = None) -> Report:
-        """Measures, and writes `out` if it is given.
+        """Measure, and write `out` if it is given.
 
         Args:
             reporter: Is told what is being measured.

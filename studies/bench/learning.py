@@ -1,4 +1,4 @@
-"""``bench learning``: what learning adds to an episode, and what many agents add to an update."""
+"""``bench learning``: cost of learning in an episode, and of many agents in an update."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from studies.bench.measured import in_fresh_process
+from studies.bench.fresh_process import in_fresh_process
 from studies.bench.report import Report, Spread, Target, require_positive
 from ugat_marl.progress import Reporter, Silent
 
-_PROGRAM = ["-m", "studies.bench.learning_episodes"]
+_PROGRAM = ["-m", "studies.bench.learning_program"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class LearningBench:
         )
 
     def run(self, reporter: Reporter | None = None) -> Report:
-        """Measures, and writes `out` if it is given.
+        """Measure, and write `out` if it is given.
 
         Args:
             reporter: Is told what is being measured.

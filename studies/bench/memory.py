@@ -1,4 +1,4 @@
-"""``bench memory``: does an environment that is reset again and again grow?"""
+"""``bench memory``: growth of an environment over many resets."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from studies.bench.measured import in_fresh_process
+from studies.bench.fresh_process import in_fresh_process
 from studies.bench.report import Report, Target, require_positive
 from ugat_marl.errors import OptionError
 from ugat_marl.progress import Reporter, Silent
@@ -45,7 +45,7 @@ class MemoryBench:
             )
 
     def run(self, reporter: Reporter | None = None) -> Report:
-        """Measures, and writes `out` if it is given.
+        """Measure, and write `out` if it is given.
 
         Args:
             reporter: Is told what is being measured.
@@ -58,7 +58,7 @@ class MemoryBench:
         for simulator in SIMULATORS:
             asked = {**asdict(self), "out": None, "simulator": simulator}
             with (reporter or Silent()).task(f"resets, {simulator}", 1):
-                found = in_fresh_process(["-m", "studies.bench.memory_resets"], asked)
+                found = in_fresh_process(["-m", "studies.bench.memory_program"], asked)
             for what in found["early"]:
                 early, late = float(found["early"][what]), float(found["late"][what])
                 growth = 100 * growth_of(early, late)
@@ -85,7 +85,7 @@ class MemoryBench:
 
 
 def growth_of(early: float, late: float) -> float:
-    """Relative growth; from nothing to nothing is none, from nothing to something infinite."""
+    """Return the relative growth; 0 from 0 to 0, infinite from 0 to more."""
     if early == 0:
         return 0.0 if late == 0 else float("inf")
     return late / early - 1

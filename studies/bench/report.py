@@ -1,4 +1,4 @@
-"""What a bench found: rows of numbers, targets, and the machine they belong to."""
+"""Report of a bench: rows of numbers, targets, and the machine they belong to."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Target:
 
     @property
     def met(self) -> bool:
-        """Whether the figure is reached; not so for nan."""
+        """True if the figure reaches its limit; false for nan."""
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit
 
     def __str__(self) -> str:
@@ -104,7 +104,7 @@ class Report:
 
     @property
     def met(self) -> bool:
-        """Whether every target is met."""
+        """True if every target is met."""
         return all(target.met for target in self.targets)
 
     def as_dict(self) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class Report:
         }
 
     def write(self, path: Path) -> None:
-        """Writes the report as JSON; an interrupted write leaves an older file as it was."""
+        """Write the report as JSON; an interrupted write leaves an older file as it was."""
         write_whole(path, json.dumps(self.as_dict(), indent=2, allow_nan=False) + "\n")
 
     def tables(self) -> Group:
@@ -152,7 +152,7 @@ class Report:
 
 
 def require_positive(bench: str, **options: float) -> None:
-    """Refuses options of a bench that are not at least 1.
+    """Refuse options of a bench that are not at least 1.
 
     Raises:
         OptionError: An option is smaller.

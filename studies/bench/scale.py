@@ -1,4 +1,4 @@
-"""``bench scale``: many simulations, large networks, and what happens when processes die."""
+"""``bench scale``: many simulations, large networks, processes that die."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from studies.bench.measured import in_fresh_process
+from studies.bench.fresh_process import in_fresh_process
 from studies.bench.memory import growth_of
 from studies.bench.report import Report, Spread, Target, require_positive
 from ugat_marl.errors import MeasurementError, OptionError
 from ugat_marl.policies import is_installed, require_known
 from ugat_marl.progress import Reporter, Silent
 
-_PROGRAM = ["-m", "studies.bench.scale_work"]
+_PROGRAM = ["-m", "studies.bench.scale_program"]
 PARTS = ("workers", "grounded", "size", "decision", "leaks", "kills", "learner", "ray")
 Run = dict[str, Any]
 
@@ -42,12 +42,12 @@ class Figure:
 
     @property
     def target(self) -> Target:
-        """For the report."""
+        """Target for the report."""
         middle = self.value.median if isinstance(self.value, Spread) else self.value
         return Target(self.name, middle, self.reach, self.at_least)
 
     def row(self) -> dict[str, Any]:
-        """For the report's table."""
+        """Return a row of the report's table."""
         bounds = {"reach": self.reach, "aim": self.aim}
         sign = ">=" if self.at_least else "<="
         shown = {name: f"{sign} {x:g}" if x == x else "" for name, x in bounds.items()}
@@ -109,7 +109,7 @@ class ScaleBench:
                 raise OptionError(f"bench scale: parts holds {part!r}; allowed: {', '.join(PARTS)}")
 
     def run(self, reporter: Reporter | None = None) -> Report:
-        """Measures, and writes `out` if it is given.
+        """Measure, and write `out` if it is given.
 
         Args:
             reporter: Is told how far the measuring has come.
@@ -356,7 +356,7 @@ _METHOD = (
 
 
 def _told(name: str, value: Spread | float) -> Figure:
-    """A figure that has nothing to reach."""
+    """Make a figure without a target."""
     return Figure(name, value, float("nan"), float("nan"), True)
 
 

@@ -1,4 +1,4 @@
-"""What a blind test consists of on disk: a plan the diagnosis may read, and labels it may not.
+"""Files of a blind test: a plan the diagnosis may read, and labels it may not.
 
 A folder of a blind test holds ``plan.json``, one folder per case with its measured data and, in
 time, its diagnosis, and ``labels/<case>.json``, opened by the grading alone.
@@ -44,7 +44,7 @@ class Hidden:
 
     @classmethod
     def of(cls, effect: Effect, nominal: Mapping[str, float] | None = None) -> Hidden:
-        """An effect of the library as a diagnosis would write it."""
+        """Write an effect of the library as a diagnosis would."""
         record = effect.record()
         texts = [str(record[key]) for key in effect.texts]
         window = None
@@ -59,7 +59,7 @@ class Hidden:
 
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Hidden:
-        """From JSON."""
+        """Read from JSON."""
         window = raw.get("window")
         return cls(
             str(raw["name"]),
@@ -72,7 +72,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Label:
-    """The truth about one case.
+    """Truth about one case.
 
     Attributes:
         case: Id of the case.
@@ -111,7 +111,7 @@ class Label:
 
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Label:
-        """From JSON."""
+        """Read from JSON."""
         values = {item.name: raw[item.name] for item in fields(cls)}
         values["effects"] = tuple(Hidden.from_dict(item) for item in raw["effects"])
         for key in ("leave_out", "lights"):
@@ -121,7 +121,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Case:
-    """What the diagnosis may know about a case.
+    """Facts about a case that the diagnosis may know.
 
     Attributes:
         case: Its id, which says nothing.
@@ -135,13 +135,13 @@ class Case:
 
 
 def write_plan(directory: Path, cases: tuple[Case, ...]) -> None:
-    """Writes what the diagnosis may know."""
+    """Write what the diagnosis may know."""
     content = {"schema": SCHEMA, "cases": [asdict(case) for case in cases]}
     write_whole(directory / PLAN, json.dumps(content, indent=1) + "\n")
 
 
 def read_plan(directory: Path) -> tuple[Case, ...]:
-    """Reads what the diagnosis may know.
+    """Read what the diagnosis may know.
 
     Raises:
         BlindTestError: There is no plan, or it is not one.
@@ -160,7 +160,7 @@ def read_plan(directory: Path) -> tuple[Case, ...]:
 
 
 def chosen(directory: Path, only: Sequence[str]) -> tuple[Case, ...]:
-    """The cases with these ids; all of them without any.
+    """Return the cases with these ids; all cases without any.
 
     Raises:
         BlindTestError: Not a blind test.
@@ -175,18 +175,18 @@ def chosen(directory: Path, only: Sequence[str]) -> tuple[Case, ...]:
 
 
 def label_path(directory: Path, case: str) -> Path:
-    """Where the truth about a case lies."""
+    """Return the path of the label of a case."""
     return directory / LABELS / f"{case}.json"
 
 
 def write_label(directory: Path, label: Label) -> None:
-    """Seals the truth about a case."""
+    """Seal the truth about a case."""
     text = json.dumps(asdict(label), indent=1, allow_nan=False)
     write_whole(label_path(directory, label.case), text + "\n")
 
 
 def read_label(directory: Path, case: str) -> Label:
-    """Opens the truth about a case.
+    """Open the truth about a case.
 
     Raises:
         BlindTestError: It is missing or damaged.
@@ -199,7 +199,7 @@ def read_label(directory: Path, case: str) -> Label:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object a JSON file holds.
+    """Read the object in a JSON file.
 
     Raises:
         BlindTestError: Missing, cut short, or not an object.

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from rich.console import Console
 from tyro.conf import Positional, arg
 
 from studies.blind.cases import Case
-from studies.blind.drawing import GROUPS
 from studies.blind.generate import Blueprint, generate
 from studies.blind.grade import grade_cases, read_grades
 from studies.blind.run import Diagnose, run_cases
+from studies.blind.sampling import GROUPS
 from studies.blind.strengths import STRENGTHS
 from studies.blind.table import markdown, write_table
-from studies.blind.visible import judge_visibility
-from ugat_marl.cli.arguments import LengthS
+from studies.blind.visibility import judge_visibility
+from ugat_marl.cli import LengthS
 from ugat_marl.data import read_measured
+from ugat_marl.diagnosis import DiagnosisConfig, diagnose
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import BlindTestError, OptionError
+from ugat_marl.errors import OptionError
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars, Silent
 from ugat_marl.scenarios import Network
@@ -29,7 +29,7 @@ from ugat_marl.scenarios import Network
 
 @dataclass(frozen=True)
 class BlindGenerate:
-    """Hides effects in scenarios, measures them, and seals what was hidden.
+    """Hide effects in scenarios, measures them, and seals what was hidden.
 
     Then follow blind run, blind grade and blind table (docs/explanation/blind-tests.md).
 
@@ -82,7 +82,7 @@ class BlindGenerate:
 
 @dataclass(frozen=True)
 class BlindRun:
-    """Diagnoses the cases that have no diagnosis yet; the labels stay closed.
+    """Diagnose the cases that have no diagnosis yet; the labels stay closed.
 
     Examples:
         python -m studies.blind run blind --budget-s 600
@@ -106,11 +106,11 @@ class BlindRun:
     ] = ()
 
     def run(self, console: Console) -> int:
-        """Runs; the exit code is 1 if a diagnosis failed."""
+        """Run; the exit code is 1 if a diagnosis failed."""
         if self.jobs < 1 or self.budget_s <= 0:
             raise OptionError("--jobs must be at least 1 and --budget-s above 0")
         command = [
-            "blind", "run", str(self.directory), "--budget-s", str(self.budget_s),
+            "run", str(self.directory), "--budget-s", str(self.budget_s),
             "--alpha", str(self.alpha), "--seed", str(self.seed),
         ]  # fmt: skip
         done, failed = run_cases(
@@ -125,25 +125,20 @@ class BlindRun:
         return 1 if failed else 0
 
     def _diagnose(self) -> Diagnose:
-        try:
-            workflow: Any = importlib.import_module("ugat_marl.diagnosis.workflow")
-        except ModuleNotFoundError as error:
-            raise BlindTestError(f"the diagnosis is not installed ({error})") from None
-
-        def diagnose(case: Case, measured: Path, directory: Path) -> None:
+        def run_diagnosis(case: Case, measured: Path, directory: Path) -> None:
             scenario = load_scenario(case.scenario)
-            config = workflow.DiagnosisConfig(
+            config = DiagnosisConfig(
                 budget_s=self.budget_s, alpha=self.alpha, seed=self.seed, leave_out=case.leave_out
             )
             data = read_measured(measured, scenario, Network.read(scenario))
-            workflow.diagnose(scenario, data, directory, config, Silent())
+            diagnose(scenario, data, directory, config, Silent())
 
-        return diagnose
+        return run_diagnosis
 
 
 @dataclass(frozen=True)
 class BlindVisible:
-    """Asks of single effects whether a test that knows them would see them.
+    """Judge single effects by a test that knows them: would it see them?
 
     Opens the labels of diagnosed cases, and of no others. Grade them again then.
 
@@ -163,7 +158,7 @@ class BlindVisible:
     ] = ()
 
     def run(self, console: Console) -> int:
-        """Judges."""
+        """Judge."""
         found = judge_visibility(
             self.directory, only=self.only, seed=self.seed, reporter=Bars(console)
         )
@@ -175,7 +170,7 @@ class BlindVisible:
 
 @dataclass(frozen=True)
 class BlindGrade:
-    """Opens the labels of the cases that have been diagnosed, and writes grades.json.
+    """Open the labels of the cases that have been diagnosed, and writes grades.json.
 
     Examples:
         python -m studies.blind grade blind
@@ -187,7 +182,7 @@ class BlindGrade:
     directory: Annotated[Positional[Path], arg(metavar="DIR")]
 
     def run(self, console: Console) -> int:
-        """Grades."""
+        """Grade."""
         grades = grade_cases(self.directory)
         for item in grades:
             wrong = ", confident and wrong" if item.confident_wrong else ""
@@ -200,7 +195,7 @@ class BlindGrade:
 
 @dataclass(frozen=True)
 class BlindTable:
-    """Sums up the grades of one blind test or several.
+    """Sum up the grades of one blind test or several.
 
     Examples:
         python -m studies.blind table blind nulls --out table.md
@@ -218,7 +213,7 @@ class BlindTable:
     ] = None
 
     def run(self, console: Console) -> int:
-        """Prints, and writes."""
+        """Print, and writes."""
         if not self.directories:
             raise OptionError("give at least one blind test")
         if self.out is not None:

@@ -1,13 +1,15 @@
-"""Makes blind cases: draws what is hidden, measures it, and seals the label."""
+"""Make blind cases: draws what is hidden, measures it, and seals the label."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from studies.blind.busy import Busy, busy_places
+import numpy as np
+
 from studies.blind.cases import (
     LABELS,
     PLAN,
@@ -19,16 +21,16 @@ from studies.blind.cases import (
     write_label,
     write_plan,
 )
-from studies.blind.consequence import Consequences
-from studies.blind.drawing import GROUPS, Drawn, Task, deck, draw_hidden
+from studies.blind.places import Busy, busy_places
+from studies.blind.sampling import GROUPS, Sample, Task, draw_sample, draw_tasks
 from studies.blind.strengths import STRENGTHS, nominal_of
 from ugat_marl.data import write_measured
-from ugat_marl.effects import load_scenario
+from ugat_marl.effects import Effect, load_scenario
 from ugat_marl.errors import BlindTestError, OptionError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
-from ugat_marl.scenarios import Network, Scenario
+from ugat_marl.scenarios import Network, Period, Scenario
 from ugat_marl.seeding import derive_seed, numpy_generator
 
 FIXED_TIMES = ("fixed-time:20", "fixed-time:30", "fixed-time:40")
@@ -36,9 +38,13 @@ PRESSURES = ("max-pressure:10", "max-pressure:20")
 """The signals of the hidden world: fixed-time control, and at times one that reacts to traffic."""
 
 
+LEAST = 20
+"""Detections of a day that have to come, go or move by more than a tenth of a second."""
+
+
 @dataclass(frozen=True)
 class Blueprint:
-    """What decides a blind test, together with the scenarios' files.
+    """Settings that decide a blind test, together with the scenarios' files.
 
     Attributes:
         scenarios: Names of scenarios, as `load` takes them.
@@ -79,13 +85,13 @@ class _Planned:
     """One case before it is measured."""
 
     case: Case
-    drawn: Drawn
+    sample: Sample
     policy: str
     seed: int
 
 
 def generate(directory: Path, blueprint: Blueprint, reporter: Reporter | None = None) -> int:
-    """Writes the cases of a blind test that are not there yet.
+    """Write the cases of a blind test that are not there yet.
 
     Args:
         directory: New, or one of the same blueprint, which is gone on with.
@@ -131,9 +137,9 @@ def _plan(
     busy: dict[str, Busy],
     reporter: Reporter,
 ) -> list[_Planned]:
-    """Draws all cases; case by case, so that a longer test begins like a shorter one."""
+    """Draw all cases; case by case, so that a longer test begins like a shorter one."""
     generator = numpy_generator(blueprint.seed, "blind", "deck")
-    tasks = deck(blueprint.classes, blueprint.strengths, blueprint.cases, generator)
+    tasks = draw_tasks(blueprint.classes, blueprint.strengths, blueprint.cases, generator)
     spare = _spare(tasks)
     consequences = Consequences(blueprint.seed)
     planned: list[_Planned] = []
@@ -145,7 +151,7 @@ def _plan(
 
 
 def _spare(tasks: Sequence[Task]) -> dict[str, list[Task]]:
-    """By group, what may be drawn instead of something no scenario has a place for."""
+    """Group the tasks, as substitutes for one that no scenario has a place for."""
     found: dict[str, list[Task]] = {}
     for task in tasks:
         found.setdefault(task.group, []).append(task)
@@ -166,18 +172,18 @@ def _planned(
     others = spare[task.group]
     for attempt in (task, *(others[i] for i in generator.permutation(len(others)))):
         for name in names:
-            drawn = draw_hidden(attempt, scenarios[name], busy[name], generator)
-            if drawn is not None:
+            sample = draw_sample(attempt, scenarios[name], busy[name], generator)
+            if sample is not None:
                 policies = FIXED_TIMES
                 # In V4 max-pressure locks some networks up, and a standstill says nothing.
-                if generator.random() < blueprint.pressure_share and drawn.group != "setting":
+                if generator.random() < blueprint.pressure_share and sample.group != "setting":
                     policies = PRESSURES
                 policy = policies[int(generator.integers(len(policies)))]
-                if not consequences.has(scenarios[name], drawn, policy):
+                if not consequences.has(scenarios[name], sample, policy):
                     continue
-                case = Case(f"case{index + 1:03d}", name, drawn.leave_out)
+                case = Case(f"case{index + 1:03d}", name, sample.leave_out)
                 seed = derive_seed(blueprint.seed, "blind", "case", index)
-                return _Planned(case, drawn, policy, seed)
+                return _Planned(case, sample, policy, seed)
     raise BlindTestError(
         f"none of the scenarios {', '.join(names)} has a place busy enough to hide "
         f"{task.member or task.group!r}; add a scenario with more traffic"
@@ -185,7 +191,7 @@ def _planned(
 
 
 def _begin(directory: Path, blueprint: Blueprint, cases: tuple[Case, ...]) -> None:
-    """Writes the plan, and beside the labels what they were drawn from."""
+    """Write the plan, and beside the labels what they were drawn from."""
     sealed = directory / LABELS / "blueprint.json"
     text = json.dumps(asdict(blueprint), indent=1) + "\n"
     if (directory / PLAN).exists() and (
@@ -204,10 +210,10 @@ def _begin(directory: Path, blueprint: Blueprint, cases: tuple[Case, ...]) -> No
 
 
 def _make(directory: Path, blueprint: Blueprint, item: _Planned, scenario: Scenario) -> None:
-    """Measures one case, and seals its label last, which marks it as made."""
+    """Measure one case, and seals its label last, which marks it as made."""
     measured = record(
         scenario,
-        item.drawn.effects,
+        item.sample.effects,
         policy_factory(item.policy),
         periods=blueprint.periods,
         seed=item.seed,
@@ -218,11 +224,11 @@ def _make(directory: Path, blueprint: Blueprint, item: _Planned, scenario: Scena
     label = Label(
         case=item.case.case,
         scenario=item.case.scenario,
-        group=item.drawn.group,
-        hidden=item.drawn.hidden,
-        strength=item.drawn.strength,
-        effects=tuple(Hidden.of(x, nominal_of(x.name, scenario)) for x in item.drawn.effects),
-        leave_out=item.drawn.leave_out,
+        group=item.sample.group,
+        hidden=item.sample.hidden,
+        strength=item.sample.strength,
+        effects=tuple(Hidden.of(x, nominal_of(x.name, scenario)) for x in item.sample.effects),
+        leave_out=item.sample.leave_out,
         lights=tuple(item.id for item in Network.read(scenario).intersections),
         begin_s=period.begin_s,
         end_s=period.end_s,
@@ -233,3 +239,48 @@ def _make(directory: Path, blueprint: Blueprint, item: _Planned, scenario: Scena
         measured=measured.hash,
     )
     write_label(directory, label)
+
+
+class Consequences:
+    """Compare a day with an effect with the same day without it.
+
+    Args:
+        seed: Root of the seed of that day.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._seed = derive_seed(seed, "blind", "consequences")
+        self._plain: dict[tuple[str, str], Period] = {}
+
+    def has(self, scenario: Scenario, sample: Sample, policy: str) -> bool:
+        """Return true if each effect changes the measured data; faults of detectors always do.
+
+        A setting is judged as a whole: beside drivers who brake as usual an emergency braking is
+        never seen, and V1 to V4 have one all the same.
+        """
+        alone = [(effect,) for effect in sample.effects if not effect.on_detectors]
+        for effects in [sample.effects] if sample.group == "setting" else alone:
+            key = (scenario.hash, policy)
+            plain = self._plain.get(key)
+            if plain is None:
+                plain = self._plain[key] = self._day(scenario, policy, ())
+            if differing(plain, self._day(scenario, policy, effects)) < LEAST:
+                return False
+        return True
+
+    def _day(self, scenario: Scenario, policy: str, effects: tuple[Effect, ...]) -> Period:
+        day = record(scenario, effects, policy_factory(policy), periods=1, seed=self._seed)
+        return day.periods[0]
+
+
+def differing(one: Period, two: Period) -> int:
+    """Detections of one period that the other does not have, both ways, to a tenth of a second."""
+    return sum(((_seen(one) - _seen(two)) + (_seen(two) - _seen(one))).values())
+
+
+def _seen(period: Period) -> Counter[tuple[str, float]]:
+    return Counter(
+        (name, time)
+        for name, item in period.passages.items()
+        for time in np.round(item.off_s[np.isfinite(item.off_s)], 1).tolist()
+    )

@@ -1,10 +1,10 @@
-"""Grades of diagnosed cases against their labels, by docs/explanation/blind-tests.md."""
+"""Grade of diagnosed cases against their labels, by docs/explanation/blind-tests.md."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -21,14 +21,8 @@ from studies.blind.cases import (
     read_label,
     read_plan,
 )
-from studies.blind.equivalence import (
-    canonical,
-    canonical_effect,
-    found_effect,
-    match,
-    required_and_allowed,
-    same_name,
-)
+from studies.blind.strengths import KINDS
+from ugat_marl.effects import EVERYWHERE
 from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
 
@@ -41,7 +35,16 @@ SEEN = 3.2
 """Standard deviations: a level of 5 % shared by the 32 effects of the library, on two sides."""
 
 NAMING: frozenset[Verdict] = frozenset({"explained", "partially_explained"})
-"""Verdicts that say: this is it."""
+"""Verdicts that name the effects."""
+
+OPTIONAL = frozenset({"emergency_deceleration"})
+"""Hidden effects that need not be named: nobody who drives as usual shows them."""
+
+WEAK_STARTUP_S = 0.5
+"""Below this, a start-up delay beside other effects need not be named (V3 has 0.25 s)."""
+
+WHOLE = 0.95
+"""A window over this share of the period is no window."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Grade:
-    """How one case was diagnosed.
+    """Grade of one diagnosed case.
 
     Attributes:
         case: Id of the case.
@@ -120,7 +123,7 @@ class Grade:
 
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Grade:
-        """From JSON."""
+        """Read from JSON."""
         values = dict(raw)
         values["named"] = tuple(raw["named"])
         values["estimates"] = tuple(Estimate(**item) for item in raw["estimates"])
@@ -128,7 +131,7 @@ class Grade:
 
 
 def grade_cases(directory: Path) -> tuple[Grade, ...]:
-    """Grades every case whose diagnosis is there, or whose diagnosis failed, and writes them.
+    """Grade every case whose diagnosis is there, or whose diagnosis failed, and writes them.
 
     The labels of other cases stay closed.
 
@@ -162,7 +165,7 @@ def grade_cases(directory: Path) -> tuple[Grade, ...]:
 
 
 def read_grades(directory: Path) -> tuple[Grade, ...]:
-    """What `grade_cases` wrote.
+    """Read the grades of a blind test.
 
     Raises:
         BlindTestError: It is missing or damaged.
@@ -177,7 +180,7 @@ def read_grades(directory: Path) -> tuple[Grade, ...]:
 
 
 def grade(label: Label, diagnosis: Mapping[str, Any], wall_s: float | None = None) -> Grade:
-    """Compares a diagnosis with the truth.
+    """Compare a diagnosis with the truth.
 
     Args:
         label: The truth.
@@ -262,7 +265,7 @@ def _where(
     named: Sequence[Hidden],
     truth: Sequence[Hidden],
 ) -> tuple[bool | None, float | None]:
-    """Whether all places are right and no other is named, and how far the windows overlap."""
+    """Judge the places (all right, no other named), and return the overlap of the windows."""
     windows = [
         _overlap(item.window, other.window)
         for item, same in matched
@@ -273,9 +276,6 @@ def _where(
         extra = any(match(item, truth) is None for item in named)
         place_right = not extra and all(same is not None for item, same in matched if item.place)
     return place_right, sum(windows) / len(windows) if windows else None
-
-
-# --- numbers --------------------------------------------------------------------------------------
 
 
 def _overlap(one: tuple[float, float] | None, two: tuple[float, float] | None) -> float:
@@ -349,3 +349,80 @@ def _number(value: Any) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return None
     return float(value)
+
+
+def required_and_allowed(
+    label: Label, truth: Sequence[Hidden]
+) -> tuple[frozenset[str], frozenset[str]]:
+    """Return the names a diagnosis must give, and those it may give."""
+    allowed = frozenset(item.name for item in truth)
+    if label.group == "outside":
+        return frozenset(), allowed
+    required = allowed - OPTIONAL
+    if label.group == "setting":
+        weak = {
+            item.name
+            for item in truth
+            if item.name == "startup_delay" and item.parameters["seconds"] < WEAK_STARTUP_S
+        }
+        required -= weak
+    return required, allowed
+
+
+def canonical(effects: Iterable[Hidden], label: Label) -> list[Hidden]:
+    """Effects in one spelling, so that two descriptions of the same thing are equal."""
+    found = [canonical_effect(item, label) for item in effects]
+    kept: list[Hidden] = []
+    for item in found:
+        kind = KINDS.get(item.name)
+        if kind is not None and kind.where == "light" and len(label.lights) > 1:
+            same = [x for x in found if x.name == item.name]
+            if {x.place for x in same} == set(label.lights):  # at all lights means everywhere
+                keys = item.parameters
+                mean = {k: sum(x.parameters[k] for x in same) / len(same) for k in keys}
+                item = replace(item, place=EVERYWHERE, parameters=mean)
+        if item not in kept:
+            kept.append(item)
+    return kept
+
+
+def canonical_effect(item: Hidden, label: Label) -> Hidden:
+    """One effect in its one spelling."""
+    name, place, window, parameters = item.name, item.place, item.window, dict(item.parameters)
+    if name == "demand_surge" and window is not None and _covers(window, label):
+        name, window = "demand_level", None
+    kind = KINDS.get(name)
+    where = kind.where if kind else "everywhere"
+    if where == "everywhere" and place in (None, EVERYWHERE):
+        place = None
+    if where in ("light", "origin", "detector") and place is None:
+        place = EVERYWHERE
+    if where == "light" and len(label.lights) == 1 and place == label.lights[0]:
+        place = EVERYWHERE
+    if where == "pair" and place is not None:
+        place = ">".join(sorted(place.split(">")))
+    return Hidden(name, place, window, parameters, item.nominal)
+
+
+def _covers(window: tuple[float, float], label: Label) -> bool:
+    inside = min(window[1], label.end_s) - max(window[0], label.begin_s)
+    return inside >= WHOLE * (label.end_s - label.begin_s)
+
+
+def found_effect(raw: Mapping[str, Any]) -> Hidden:
+    """An effect of a diagnosis, values without their intervals."""
+    values = {
+        key: float(item["value"]) if isinstance(item, Mapping) else float(item)
+        for key, item in (raw.get("parameters") or {}).items()
+    }
+    return Hidden.from_dict({**raw, "parameters": values, "nominal": {}})
+
+
+def match(item: Hidden, others: Sequence[Hidden]) -> Hidden | None:
+    """The effect of the same name at the same place."""
+    return next((x for x in others if (x.name, x.place) == (item.name, item.place)), None)
+
+
+def same_name(name: str, others: Sequence[Hidden]) -> Hidden | None:
+    """The effect of the same name, wherever it is."""
+    return next((x for x in others if x.name == name), None)

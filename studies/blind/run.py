@@ -1,9 +1,10 @@
-"""Diagnoses the cases of a blind test, without opening their labels."""
+"""Diagnose the cases of a blind test, without opening their labels."""
 
 from __future__ import annotations
 
 import concurrent.futures
 import json
+import os
 import subprocess
 import sys
 import time
@@ -16,7 +17,7 @@ from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
 
 Diagnose = Callable[[Case, Path, Path], None]
-"""Diagnoses a case: the case, its measured data, and the folder that gets ``diagnosis.json``."""
+"""Diagnose a case: the case, its measured data, and the folder that gets ``diagnosis.json``."""
 
 
 def run_cases(
@@ -28,7 +29,7 @@ def run_cases(
     command: Sequence[str] = (),
     reporter: Reporter | None = None,
 ) -> tuple[int, int]:
-    """Diagnoses the cases that have no diagnosis yet; one that fails does not stop the others.
+    """Diagnose the cases that have no diagnosis yet; one that fails does not stop the others.
 
     Args:
         directory: A blind test.
@@ -73,7 +74,7 @@ def run_cases(
 
 
 def _one(directory: Path, case: Case, diagnose: Diagnose) -> bool:
-    """Diagnoses a case here; notes how long it took, or why it failed."""
+    """Diagnose a case here; notes how long it took, or why it failed."""
     folder = directory / case.case
     start = time.monotonic()
     error = None
@@ -88,12 +89,14 @@ def _one(directory: Path, case: Case, diagnose: Diagnose) -> bool:
 
 
 def _apart(directory: Path, case: Case, command: Sequence[str]) -> bool:
-    """Diagnoses a case in a process of its own."""
+    """Diagnose a case in a process of its own."""
     folder = directory / case.case
     start = time.monotonic()
     (folder / RUN).unlink(missing_ok=True)
-    call = [sys.executable, "-m", "ugat_marl", *command, "--only", case.case]
-    done = subprocess.run(call, capture_output=True, text=True, check=False)
+    call = [sys.executable, "-m", "studies.blind", *command, "--only", case.case]
+    # the module path of this process, which found the checkout
+    variables = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run(call, capture_output=True, text=True, env=variables, check=False)
     if not (folder / RUN).exists():  # it did not even get so far as to say why
         said = " ".join(done.stderr.split())[-500:]
         _note(folder, time.monotonic() - start, f"exit code {done.returncode}: {said}")

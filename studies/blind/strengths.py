@@ -1,4 +1,4 @@
-"""How strong a hidden effect is: the medium strength of every effect, and what is small and large.
+"""Strengths of hidden effects: small, medium and large, effect by effect.
 
 Small is half and large twice the distance of the medium strength from the value without the effect.
 What is told by counts alone is at medium strength at least so large that it can be told from them.
@@ -30,7 +30,7 @@ Where = Literal[
 
 @dataclass(frozen=True)
 class Kind:
-    """How an effect of the library is hidden.
+    """Form in which an effect of the library is hidden.
 
     Attributes:
         family: Pairs are made of two families.

@@ -1,9 +1,8 @@
-"""Sums up grades: one row per measure with its interval, and what was taken for what."""
+"""Sum up grades: one row per measure with its interval, and what was taken for what."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from studies.blind.cases import SCHEMA
 from studies.blind.grade import Grade
@@ -41,9 +41,6 @@ AIMS = {
 }
 """What would be better still than the goal, by measure."""
 
-_Z = 1.959964
-"""Two-sided 95 % of the normal distribution."""
-
 
 @dataclass(frozen=True)
 class Row:
@@ -73,21 +70,18 @@ class Row:
 
 
 def wilson(count: int, n: int) -> tuple[float, float]:
-    """The 95 % interval of a share (Wilson 1927).
+    """Return the 95 % interval of a share (Wilson 1927).
 
     Args:
-        count: How often it happened.
-        n: Out of how many; at least 1.
+        count: Number of successes.
+        n: Number of cases, at least 1.
     """
-    share = count / n
-    scale = 1 + _Z**2 / n
-    centre = (share + _Z**2 / (2 * n)) / scale
-    half = _Z * math.sqrt(share * (1 - share) / n + _Z**2 / (4 * n**2)) / scale
-    return max(centre - half, 0.0), min(centre + half, 1.0)
+    interval = binomtest(count, n).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def rows_of(grades: Sequence[Grade]) -> list[Row]:
-    """All measures: first what is named, then how well."""
+    """Compute all measures: names first, then numbers."""
     return [*_naming(grades), *_numbers(grades)]
 
 
@@ -150,7 +144,7 @@ def _numbers(grades: Sequence[Grade]) -> list[Row]:
 
 
 def confusion(grades: Iterable[Grade]) -> dict[str, Counter[str]]:
-    """What was hidden to what it was taken for, and how often."""
+    """Count, for each hidden effect, the names that diagnoses gave it."""
     found: dict[str, Counter[str]] = defaultdict(Counter)
     for item in grades:
         found[item.hidden][_taken_for(item)] += 1
@@ -180,7 +174,7 @@ def markdown(grades: Sequence[Grade]) -> str:
 
 
 def write_table(grades: Sequence[Grade], path: Path) -> None:
-    """Writes the table as Markdown, or as JSON where the name ends so."""
+    """Write the table as Markdown, or as JSON where the name ends so."""
     if path.suffix != ".json":
         write_whole(path, markdown(grades))
         return
@@ -209,7 +203,7 @@ def _explained(grade: Grade) -> bool:
 
 
 def _taken_for(grade: Grade) -> str:
-    """In a word or two, what a diagnosis says."""
+    """Return the verdict of a diagnosis in a word or two."""
     names = "+".join(grade.named)
     words = {
         "no_discrepancy": "nothing",
@@ -236,7 +230,7 @@ def _share(
 
 
 def _coverage(inside: Sequence[bool | None]) -> Row:
-    """Of the intervals at 95 %, those that hold the value: neither too few nor all of them."""
+    """Return the share of 95 % intervals that hold the value; too few and all are both missed."""
     known = [x for x in inside if x is not None]
     n, count = len(known), sum(known)
     share = count / n if n else None

@@ -84,7 +84,7 @@ MEASURING = ("record", "import-atspm", "diagnose", "policy-gap")
 
 
 @pytest.mark.parametrize(
-    "command", [c for c in COMMANDS if c.split()[0] in (*MEASURING, "blind", "scenario")]
+    "command", [c for c in COMMANDS if c.split()[0] in (*MEASURING, "scenario")]
 )
 def test_help_fits_a_terminal_and_says_what_defaults_mean(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

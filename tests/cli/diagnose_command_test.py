@@ -23,7 +23,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.cli import diagnose as command
 from ugat_marl.data import write_measured
 from ugat_marl.diagnosis import DiagnosisConfig
-from ugat_marl.diagnosis.select import Effort
+from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.effects import known_effects, load_scenario
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.reporting.diagnosis_words import VERDICTS

@@ -169,9 +169,9 @@ def trips(rows: Sequence[tuple[float, float, bool, bool]]) -> Trips:
 
 
 def test_relative_slowness() -> None:
-    seen = snapshot([0, 0, 0], [10.5, 5.0, 0.0])
-    np.testing.assert_allclose(relative_slowness(seen, TABLE, np.array([0, 1, 2])), [0, 0.75, 1])
-    np.testing.assert_allclose(relative_slowness(seen, TABLE, np.array([2])), [1])
+    speeds, limits = np.array([10.5, 5.0, 0.0]), TABLE.speed_mps
+    np.testing.assert_allclose(relative_slowness(speeds, limits), [0, 0.75, 1])
+    np.testing.assert_allclose(relative_slowness(speeds[2:], limits[2:]), [1])
 
 
 def test_means_over_decisions_intersections_and_lanes() -> None:

@@ -9,13 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
-from ugat_marl.diagnosis.engine import Engine, Replicate
+from ugat_marl.diagnosis.engine import Engine, Replicate, Usual
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.fit import FAR, NEARBY, SETTLING_DAYS, SHORTEST_S, Fitter
+from ugat_marl.diagnosis.fit import Fitter, uncertainty
 from ugat_marl.diagnosis.hypotheses import Members
-from ugat_marl.diagnosis.intervals import uncertainty
-from ugat_marl.diagnosis.standstill import Usual
 from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect
 
 Array = NDArray[np.float64]
@@ -172,7 +171,7 @@ def test_a_fit_that_stopped_early_takes_a_last_step() -> None:
     found = fitter.settled(early, np.array([0.03]))
     assert found.values[0] == pytest.approx(1.43, abs=0.09)  # three standard errors of five days
     assert found.cost < early.cost
-    assert len(found.tallies) == SETTLING_DAYS > len(early.tallies)
+    assert len(found.tallies) == THRESHOLDS.settling_days > len(early.tallies)
 
 
 class LocksUp(World):
@@ -203,7 +202,7 @@ def test_a_fit_within_its_errors_stays_where_it_is() -> None:
     fitter = a_fitter({"headway": 1.43}, street=15)
     found = fitter.settled(fitter.simulate(start((HEADWAY, 1.46))), np.array([1.0]))
     assert found.values[0] == 1.46
-    assert len(found.tallies) == SETTLING_DAYS
+    assert len(found.tallies) == THRESHOLDS.settling_days
     plain = fitter.simulate(())
     assert fitter.settled(plain, np.empty(0)) is plain
 
@@ -212,8 +211,8 @@ def test_a_derivative_is_taken_over_a_move_that_does_something_plain() -> None:
     fitter = a_fitter({"headway": 1.43}, street=16)
     model = fitter.simulate(start((HEADWAY, 2.5), (GAP, 3.7)))
     (strong, far), (weak, farther) = fitter.changes(model)
-    assert far == pytest.approx(NEARBY * 1.5), "a strong effect is moved a little"
-    assert 1.5 * NEARBY * 1.2 < farther <= FAR * 1.2 + 1e-4, "a weak one more"
+    assert far == pytest.approx(THRESHOLDS.nearby * 1.5), "a strong effect is moved a little"
+    assert 1.5 * THRESHOLDS.nearby * 1.2 < farther <= THRESHOLDS.far * 1.2 + 1e-4, "a weak one more"
     for name, change, delta in (("headway", strong, far), ("min_gap", weak, farther)):
         assert change["network"][0, :WIDTH] / delta == pytest.approx(SLOPES[name], rel=1e-6)
 
@@ -224,7 +223,7 @@ def test_what_does_nothing_is_moved_no_farther_than_nominal() -> None:
     dead = Hypothesis("demand_surge", after, ("factor",), ((1.5,),), (1.0,), 0.05)
     model = fitter.simulate(start((dead, 1.3)))
     ((change, delta),) = fitter.changes(model)
-    assert abs(delta) <= FAR * 0.3 + 1e-4
+    assert abs(delta) <= THRESHOLDS.far * 0.3 + 1e-4
     assert not change["network"][0].any()
 
 
@@ -301,7 +300,7 @@ def test_windows_stay_on_the_clock_and_keep_a_minute() -> None:
     for text in {item for model in world.asked for item in model}:
         began, ended = map(float, text.split(",")[1:3])
         assert began >= 0.0
-        assert ended - began >= SHORTEST_S
+        assert ended - began >= THRESHOLDS.shortest_window_s
 
 
 def test_how_strong_a_surge_was_is_only_known_together_with_how_long_it_lasted() -> None:

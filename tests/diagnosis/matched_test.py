@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, EVENT_FEATURES, FEATURES
-from ugat_marl.diagnosis.matched import LEAST_APART, Directions, Matched
-from ugat_marl.diagnosis.residual import Directed, Null
-from ugat_marl.diagnosis.search import Ray
+from ugat_marl.diagnosis.propose import Ray
+from ugat_marl.diagnosis.residual import Directed, Directions, Matched, Null
 from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
 
@@ -147,7 +147,7 @@ def test_what_a_fit_has_used_up_is_not_looked_at(reference: Reference) -> None:
 def test_a_direction_nearly_inside_the_fit_is_dropped(
     reference: Reference, across: float, seen: bool
 ) -> None:
-    assert (across > LEAST_APART) == seen
+    assert (across > THRESHOLDS.least_apart) == seen
     direction = np.sqrt(1 - across**2) * unit(0) + across * unit(1)
     found = matched(reference, [direction], fitted=[unit(0)])(4.0 * unit(1))
     assert found == pytest.approx(16.0 if seen else 0.0, abs=1e-9)

@@ -13,8 +13,9 @@ import pytest
 from ugat_marl.diagnosis import Hypothesis, records
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Members
-from ugat_marl.diagnosis.pruning import NEGLIGIBLE, pruned
 from ugat_marl.diagnosis.records import Fitted
+from ugat_marl.diagnosis.select import pruned
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.progress import Advance, Silent
 
 HEADWAY = (Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05), (1.5,))
@@ -71,7 +72,7 @@ def names(members: Members) -> tuple[str, ...]:
     return tuple(hypothesis.name for hypothesis, _ in members)
 
 
-@pytest.mark.parametrize("more", [1.0, 100.0, NEGLIGIBLE - 1.0])
+@pytest.mark.parametrize("more", [1.0, 100.0, THRESHOLDS.negligible - 1.0])
 def test_what_the_other_explains_alone_is_left_out(more: float) -> None:
     both = ("headway", "demand_level")
     ledger = Ledger(

@@ -11,7 +11,7 @@ import pytest
 
 from ugat_marl.data import Measured
 from ugat_marl.diagnosis import DiagnosisConfig, Study
-from ugat_marl.diagnosis.reach import unreached
+from ugat_marl.diagnosis.study import unreached
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Detector, Passages, Period, Scenario

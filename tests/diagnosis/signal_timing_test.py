@@ -10,8 +10,14 @@ import pytest
 
 from ugat_marl.data import Measured
 from ugat_marl.diagnosis import DiagnosisConfig, diagnose
-from ugat_marl.diagnosis.counted import bins_together, counts_tally, without_gaps
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.features import (
+    BIN_FEATURES,
+    FEATURES,
+    INDEX,
+    bins_together,
+    counts_tally,
+    without_gaps,
+)
 from ugat_marl.diagnosis.signal_timing import timing_effects
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Pools

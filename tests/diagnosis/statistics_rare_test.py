@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Reference, Tally
+from ugat_marl.diagnosis.engine import locked_up
 from ugat_marl.diagnosis.features import BIN_FEATURES, EVENT_FEATURES, FEATURES, INDEX
-from ugat_marl.diagnosis.standstill import locked_up
 from ugat_marl.diagnosis.statistics import Pools, shrunk, softened
 
 Array = NDArray[np.float64]

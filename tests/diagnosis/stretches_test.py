@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import BIN_FEATURES
+from ugat_marl.diagnosis.places import largest_stretches, most_unusual, occupied_between
 from ugat_marl.diagnosis.statistics import Distance
-from ugat_marl.diagnosis.stretches import largest_stretches, most_unusual, occupied_between
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from ugat_marl.data import Measured
 from ugat_marl.diagnosis import Study, Tally
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
-from ugat_marl.diagnosis.select import Effort
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.study import OPEN, effort_for, heard
+from ugat_marl.diagnosis.study import effort_for, heard
+from ugat_marl.diagnosis.thresholds import THRESHOLDS, Effort
 from ugat_marl.effects import Effect, Headway
 from ugat_marl.scenarios import Detector, Passages, Period
 
@@ -133,7 +133,7 @@ def test_what_measured_arrivals_leave_open_is_a_matter_of_the_model() -> None:
     without, within = found.doubt(), found.doubt((Headway(1.5),))
     assert without is not None and within is not None
     assert without["lane"][place] == 0.0
-    assert within["lane"][place] == pytest.approx((OPEN * 3.0) ** 2)
+    assert within["lane"][place] == pytest.approx((THRESHOLDS.left_open * 3.0) ** 2)
     found.doubt((Headway(1.5),))
     assert own.asked == other.asked == [(), (Headway(1.5),)]
 

@@ -12,8 +12,8 @@ import pytest
 from pydantic import TypeAdapter
 
 from ugat_marl.diagnosis import Hypothesis
-from ugat_marl.diagnosis.faults import one_behind_the_other
 from ugat_marl.diagnosis.features import FEATURES
+from ugat_marl.diagnosis.places import one_behind_the_other
 from ugat_marl.diagnosis.records import EffectRecord, Located, Parameter, Selected
 from ugat_marl.diagnosis.verdict import (
     combined,

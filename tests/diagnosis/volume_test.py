@@ -10,9 +10,10 @@ import pytest
 
 from ugat_marl.diagnosis import Hypothesis, Routes
 from ugat_marl.diagnosis.features import FEATURES, INDEX
+from ugat_marl.diagnosis.places import Volume
 from ugat_marl.diagnosis.site import Site, SiteLane
 from ugat_marl.diagnosis.statistics import Distance
-from ugat_marl.diagnosis.volume import _ALONE, Volume
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import load_scenario
 from ugat_marl.scenarios import Scenario
 
@@ -75,7 +76,7 @@ def test_a_vehicle_that_is_counted_twice_counts_once() -> None:
     site, counts = a_site(("a",), ("b",)), {"a": (60.0, 20.0), "b": (60.0, 20.0)}
     # 1' C^-1 1 with correlation 1 - _ALONE between them: 2 / (2 - _ALONE), and not 2.
     shared = directed(site, {("a", "b"): 400.0}, counts)["demand"]
-    assert shared == pytest.approx(9.0 * 2 / (2 - _ALONE))
+    assert shared == pytest.approx(9.0 * 2 / (2 - THRESHOLDS.alone))
     # Two edges of one origin that share no vehicle are two observations.
     apart = directed(a_site(("a", "c")), {("o", "a"): 400.0, ("o", "c"): 400.0},
                      {"a": (60.0, 20.0), "c": (60.0, 20.0)})["demand"]  # fmt: skip

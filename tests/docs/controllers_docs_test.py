@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from ugat_marl.policies import NAMES, RULES, STANDARD_RULES, parse_spec
+from ugat_marl.policies import RULE_NAMES, RULES, STANDARD_RULES, parse_spec
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rules.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|$", PAGE, flags=re.MULTILINE))
 
 
 def test_every_rule_has_a_row_and_a_paragraph() -> None:
-    assert list(ROWS) == list(NAMES)
+    assert list(ROWS) == list(RULE_NAMES)
     told = re.findall(r"^- \*\*`([\w-]+)`\*\*", PAGE, flags=re.MULTILINE)
-    assert sorted(told) == sorted(set(NAMES) - {"programme", "random"})
+    assert sorted(told) == sorted(set(RULE_NAMES) - {"programme", "random"})
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", RULE_NAMES)
 def test_the_row_says_names_defaults_and_what_tuning_tries(name: str) -> None:
     numbers = [
         f"{parameter.default:g}; {', '.join(f'{value:g}' for value in parameter.choices)}"

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from studies.blind.outside import BusStops, Driveway
+from studies.blind.outside_effects import BusStops, Driveway
 from ugat_marl.effects import (
     apply_effects,
     in_domain,

@@ -198,8 +198,8 @@ def test_sumo_does_not_outlive_the_process_that_started_it(
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # nobody is left to clear away
     code = (
         "import time\n"
-        "from ugat_marl.effects import load\n"
-        "from ugat_marl.field.started import StartedSumo\n"
+        "from ugat_marl.effects import load_scenario\n"
+        "from ugat_marl.field.street import StartedSumo\n"
         "with StartedSumo(load_scenario('single-v1'), 0) as sumo:\n"
         "    print(sumo.process.pid, flush=True)\n"
         "    time.sleep(60)\n"

@@ -22,7 +22,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 import ugat_marl.experiments.transfers as transfer_module
+<<<<<<< 9de2347
+import ugat_marl.grounding.ugat as ugat_module
+from studies.bench.learning_program import Noise
+=======
 from studies.bench.learning_episodes import Noise
+>>>>>>> 18bc32a
 from ugat_marl.__main__ import main
 from ugat_marl.data import SETTINGS as SETTINGS_FILE
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
@@ -518,7 +523,7 @@ class Judged:
 
 @pytest.mark.parametrize(
     "command",
-    [["train", "single-v1"], ["paper", "gap"], ["bench", "strength"], ["bench", "device"]],
+    [["train", "single-v1"], ["paper", "gap"]],
 )
 def test_commands_refuse_what_is_not_there_and_leave_nothing(
     command: list[str],

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from ugat_marl.diagnosis import statistic
 from ugat_marl.diagnosis.features import FEATURES
-from ugat_marl.diagnosis.wording import STATISTICS
+from ugat_marl.diagnosis.verdict import STATISTICS
 from ugat_marl.effects import load_scenario
 from ugat_marl.reporting import commands_on_page, diagnosis_summary, formats, write_diagnosis_page
 from ugat_marl.reporting import diagnosis_words as words

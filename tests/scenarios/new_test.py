@@ -30,7 +30,7 @@ from ugat_marl.scenarios import (
     shipped_scenarios,
 )
 from ugat_marl.scenarios.importers.long_files import scan
-from ugat_marl.scenarios.importers.making import Fleet, new_folder
+from ugat_marl.scenarios.importers.making import VehicleFiles, new_folder
 from ugat_marl.scenarios.importers.streets import Streets
 from ugat_marl.scenarios.importers.turning_shares import Drive, walked, write_drives
 
@@ -444,10 +444,10 @@ def test_long_files_are_read_with_progress(tmp_path: Path, monkeypatch: pytest.M
     assert reporter.heard == ["MiB of long.net.xml"]
 
 
-def nobody(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+def nobody(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
     del network, reporter
     (folder / "none.rou.xml").write_text("<routes/>")
-    return Fleet(("none.rou.xml",))
+    return VehicleFiles(("none.rou.xml",))
 
 
 def test_a_long_additional_file_is_never_in_memory(

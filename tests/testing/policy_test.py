@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ugat_marl
-from ugat_marl.policies import DQN, NAMES, controller_for
+from ugat_marl.policies import DQN, RULE_NAMES, controller_for
 from ugat_marl.testing import POLICY_CHECKS, ToyTraffic, check_policy, failures
 
 BROKEN: list[tuple[str, type[Good]]] = []
@@ -192,7 +192,7 @@ def test_what_a_failing_policy_does_not_show_is_not_checked() -> None:
     assert results["it_respects_masks"] is None and results["order_does_not_matter"] is None
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", RULE_NAMES)
 def test_the_controllers_pass(name: str) -> None:
     scenario = ugat_marl.load_scenario("mixed-v1")
     options: dict[str, Any] = {"duration_s": 300}

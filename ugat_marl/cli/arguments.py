@@ -1,4 +1,4 @@
-"""Options that several commands have, with what their default means in place of None."""
+"""Options that several commands share; their help says what the default means."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LengthS = Annotated[
 def workers_of(
     workers: int | None, ray: str | None, option: str = "--workers"
 ) -> Iterator[parallel.Workers]:
-    """Who does the work that a command can do in parts.
+    """Yield the workers for the parts of a command: processes of this machine, or Ray.
 
     Args:
         workers: How many at a time on this machine.

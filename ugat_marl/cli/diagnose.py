@@ -1,4 +1,4 @@
-"""``ugat-marl diagnose``: where simulation and measurement disagree, and what is missing."""
+"""``ugat-marl diagnose``: compare a scenario with measured data and name what it lacks."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Diagnose:
         )
 
     def _check_out(self) -> None:
-        """Measured data stay as they are, so nothing is written among them."""
+        """Refuse an output among the measured data, which are never written to."""
         out, measured = self.out.resolve(), self.measured.resolve()
         if out == measured or measured in out.parents:
             raise OptionError(
@@ -116,7 +116,7 @@ class Diagnose:
             )
 
     def _check_cache(self) -> None:
-        """Better now than after the first simulated day."""
+        """Refuse an unwritable cache before the first day is simulated."""
         place = self.cache or default_cache()
         try:
             require_writable(place / "writable")
@@ -127,7 +127,7 @@ class Diagnose:
             ) from None
 
     def _commands(self, diagnosis: Diagnosis) -> list[str]:
-        """The command itself, and what comes next."""
+        """Return the command itself and the next one."""
         given = ["ugat-marl", "diagnose", self.scenario, str(self.measured), "--out", str(self.out)]
         given += ["--budget-s", f"{self.budget_s:g}", "--alpha", f"{self.alpha:g}"]
         given += ["--seed", str(self.seed)]
@@ -136,7 +136,7 @@ class Diagnose:
         return [shlex.join(given), *self._next(diagnosis)]
 
     def _next(self, diagnosis: Diagnosis) -> list[str]:
-        """The command that uses the corrected scenario, if anything in it is corrected."""
+        """Return the command that uses the corrected scenario, if anything in it is corrected."""
         if diagnosis.corrected is None or not any(map(_in_the_model, diagnosis.effects)):
             return []
         corrected = str(self.out / CORRECTED)
@@ -158,7 +158,7 @@ class Diagnose:
 
 
 def _say_what_cannot_be_seen(measured: Measured, console: Console) -> None:
-    """Which effects are ruled out before anything runs; what was found in the files follows."""
+    """Print the effects that the data rule out, before anything runs."""
     ruled_out = {name for finding in measured.findings for name in finding.rules_out}
     if not ruled_out:
         return
@@ -172,5 +172,5 @@ def _say_what_cannot_be_seen(measured: Measured, console: Console) -> None:
 
 
 def _in_the_model(effect: NamedEffect) -> bool:
-    """Whether an effect changes the simulation, and not only what detectors see."""
+    """Return true if an effect changes the simulation, not only the detections."""
     return not known_effects()[effect.name].on_detectors

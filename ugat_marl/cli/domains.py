@@ -1,4 +1,4 @@
-"""``ugat-marl domains``: the worlds that have a name, by the gap they open."""
+"""``ugat-marl domains``: the named domains, by the gap they open."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TITLES = {
 
 @dataclass(frozen=True)
 class Domains:
-    """Lists the domains that have a name: their gap, effects, and counterpart in Sim2Signal.
+    """List the domains that have a name: their gap, effects, and counterpart in Sim2Signal.
 
     Any of them, and any effect, goes together with others: V4+zone-50+counting_noise=0.1.
 
@@ -45,7 +45,7 @@ class Domains:
     json: bool = False
 
     def run(self, console: Console) -> int:
-        """Prints the lists."""
+        """Print the lists."""
         if self.gap is not None and self.gap not in GAPS:
             raise UnknownNameError("gap", self.gap, GAPS)
         listed = [item for item in NAMED.values() if self.gap in (None, item.gap)]
@@ -85,7 +85,7 @@ def _table(title: str, domains: list[NamedDomain]) -> Table:
 
 
 def _notes(domains: list[NamedDomain]) -> list[str]:
-    """What there is to say of some of them, each thing once."""
+    """Return the notes on the listed domains, each one once."""
     said: dict[str, list[str]] = {}
     for item in domains:
         if item.note:

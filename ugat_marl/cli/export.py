@@ -33,7 +33,7 @@ class Export:
     scenario: str | None = None
 
     def run(self, console: Console) -> int:
-        """Exports and says where."""
+        """Export and say where."""
         policy, env = NetworkPolicy.load(self.policy), None
         if self.scenario is not None:
             env = parallel_env(load_scenario(self.scenario), **policy.env_options)

@@ -16,8 +16,8 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory
 from ugat_marl.field import (
+    CountSource,
     DecisionLog,
-    DetectorKind,
     FieldLoop,
     Limits,
     Site,
@@ -65,12 +65,12 @@ class Field:
     domain: str = "sim"
     seed: int = 0
     seconds: LengthS = None
-    detectors: DetectorKind = "lanes"
+    detectors: CountSource = "lanes"
     log: Log = None
     limits: Limits = field(default_factory=Limits)
 
     def run(self, console: Console) -> int:
-        """Drives and sums up."""
+        """Drive and sum up."""
         if self.port is None and not self.start:
             raise OptionError("--port is missing: where SUMO listens; or let --start run one")
         if self.start and self.host != "localhost":

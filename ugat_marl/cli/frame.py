@@ -1,4 +1,4 @@
-"""The frame of a command line: picks a command, reads its options, turns errors into one line."""
+"""Frame of a command line: pick a command, read its options, turn errors into one line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def run_command(command: Any, console: Console) -> int:
 
 @dataclass(frozen=True)
 class CommandLine:
-    """The commands of one program.
+    """Commands of one program.
 
     Attributes:
         program: Name of the program, as a user types it.
@@ -101,7 +101,7 @@ def _run(line: CommandLine, given: list[str], console: Console) -> int:
 
 
 def _parse(line: CommandLine, name: str, rest: list[str]) -> Any:
-    """The command's dataclass, filled in; what tyro has to say becomes one line."""
+    """Parse the command's dataclass; turn a message of tyro into one line."""
     import tyro
 
     module, _, attribute = line.commands[name][0].partition(":")
@@ -136,7 +136,7 @@ def _parse(line: CommandLine, name: str, rest: list[str]) -> Any:
 
 
 def _with_address(rest: list[str]) -> list[str]:
-    """A bare ``--ray`` means the Ray of this machine."""
+    """Complete a bare ``--ray``, which means the Ray of this machine."""
     followed = zip(rest, [*rest[1:], "--"], strict=False)
     bare = [word == "--ray" and after.startswith("-") for word, after in followed]
     return [
@@ -147,12 +147,12 @@ def _with_address(rest: list[str]) -> list[str]:
 
 
 def _description(kind: Any) -> str:
-    """The docstring up to its list of attributes, examples included."""
+    """Return the docstring up to its list of attributes, examples included."""
     return (inspect.getdoc(kind) or "").partition("\nAttributes:")[0].strip()
 
 
 def _options(kind: Any, prefix: str = "") -> set[str]:
-    """The long options of a command, nested settings included."""
+    """Return the long options of a command, nested settings included."""
     found: set[str] = set()
     hints = get_type_hints(kind, include_extras=True)
     for item in fields(kind):
@@ -169,7 +169,7 @@ def _options(kind: Any, prefix: str = "") -> set[str]:
 
 
 def _one_line(box: str) -> str:
-    """The message inside the frame that tyro draws."""
+    """Return the message inside the box that tyro draws."""
     lines = [re.sub(r"[│╭╮╰╯]", " ", line).strip() for line in box.splitlines()]
     until = next((i for i, line in enumerate(lines) if line.startswith("──")), len(lines))
     words = " ".join(re.sub(r"─+", " ", line) for line in lines[:until])

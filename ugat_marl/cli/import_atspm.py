@@ -40,7 +40,7 @@ class ImportAtspm:
     csv: bool = False
 
     def run(self, console: Console) -> int:
-        """Imports, writes, and prints what was found."""
+        """Import the log, write the data, and print the findings."""
         scenario = load_scenario(self.scenario)
         require_replaceable(self.out)
         measured = import_atspm(self.events, self.mapping, scenario, Network.read(scenario))

@@ -59,7 +59,7 @@ class Record:
     workers: Workers = None
 
     def run(self, console: Console) -> int:
-        """Records and writes."""
+        """Record and write."""
         scenario = load_scenario(self.scenario)
         in_domain(scenario, self.domain)  # a wrong name is an error before anything is written
         policy = policy_factory(self.policy)

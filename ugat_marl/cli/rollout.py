@@ -26,7 +26,7 @@ from ugat_marl.seeding import derive_seed
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """What of an episode is filmed.
+    """Part of an episode to film, and the form of the video.
 
     Attributes:
         from_s: Where it begins, in s from the beginning of the episode.
@@ -49,7 +49,7 @@ class VideoConfig:
 
 @dataclass(frozen=True)
 class Rollout:
-    """Records transitions, for `train --real-log` or for study, or films an episode.
+    """Record transitions, for `train --real-log` or for study, or film an episode.
 
     Examples:
         ugat-marl rollout single-v1 --domain V4 --policy largest-queue:20 --out v4.parquet
@@ -101,7 +101,7 @@ class Rollout:
     film: VideoConfig = field(default_factory=VideoConfig)
 
     def run(self, console: Console) -> int:
-        """Records, films and writes."""
+        """Record, film and write."""
         if self.episodes < 1 or not 0 <= self.epsilon <= 1:
             raise OptionError("--episodes must be at least 1 and --epsilon from 0 to 1")
         if self.workers is not None and self.workers < 1:

@@ -81,7 +81,7 @@ class ScenarioCheck:
     workers: Workers = None
 
     def run(self, console: Console) -> int:
-        """Checks and prints."""
+        """Check and print."""
         if self.conformance:
             return self._kit(console)
         if self.headroom < 0:
@@ -241,7 +241,7 @@ def _runs(runs: Sequence[Run]) -> Table:
 
 
 def _headroom(rows: Sequence[Row]) -> Table:
-    """What the rule that is best in sim loses elsewhere is what a transfer can win."""
+    """Return the headroom per domain: the loss elsewhere of the rule that is best in sim."""
     holds = [f"{hold_s} s" for hold_s in HOLDS_S]
     table = _table(
         "Headroom: ATT [s] of the largest-queue rule held so long", "domain", *holds,

@@ -31,7 +31,7 @@ class ScenarioDraw:
     out: Path
 
     def run(self, console: Console) -> int:
-        """Draws."""
+        """Draw."""
         scenario = load_scenario(self.scenario)
         require_writable(self.out / "network.svg")
         files = draw(scenario, self.out, Bars(console))

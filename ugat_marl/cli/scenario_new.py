@@ -14,8 +14,8 @@ from tyro.conf import Positional, arg
 from ugat_marl.errors import OptionError
 from ugat_marl.progress import Bars
 from ugat_marl.scenarios import (
-    Roads,
-    Vehicles,
+    RoadSource,
+    VehicleSource,
     arterial,
     from_cityflow,
     from_counts,
@@ -99,7 +99,7 @@ class ScenarioNew:
     force: bool = False
 
     def run(self, console: Console) -> int:
-        """Makes it and says what it is."""
+        """Make the scenario and say what it is."""
         roads, vehicles = self._roads(), self._vehicles()
         made = make_scenario(
             self.name,
@@ -125,7 +125,7 @@ class ScenarioNew:
         console.print(f"next: ugat-marl scenario check {where}", markup=False, soft_wrap=True)
         return 0
 
-    def _roads(self) -> Roads:
+    def _roads(self) -> RoadSource:
         given = [name for name in ROADS if getattr(self, name) is not None]
         if len(given) != 1:
             raise OptionError(
@@ -151,7 +151,7 @@ class ScenarioNew:
     def _demands(self) -> list[str]:
         return [name for name in DEMANDS if getattr(self, name) not in (None, ())]
 
-    def _vehicles(self) -> Vehicles | None:
+    def _vehicles(self) -> VehicleSource | None:
         given = self._demands()
         comes_along = self.cityflow or (self.sumo is not None and ".sumocfg" in self.sumo.name)
         if len(given) > 1 or (not given and not comes_along):

@@ -21,7 +21,7 @@ _UNREADABLE = (
 
 
 def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
-    """Writes `content` so that `path` holds the old checkpoint or the new one, never half.
+    """Write `content` so that `path` holds the old checkpoint or the new one, never half.
 
     Raises:
         CheckpointError: A number in `content` is not finite; the file at `path` is left as it was.
@@ -32,7 +32,7 @@ def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
-    """Reads what `write_checkpoint` wrote, without executing anything from the file.
+    """Read what `write_checkpoint` wrote, without executing anything from the file.
 
     Raises:
         CheckpointError: Missing, cut short, of another kind, or with a number that is not finite.
@@ -56,7 +56,7 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
 
 
 def _require_sums(path: Path) -> None:
-    """Compares the check sums of the archive, which torch does not: a flipped bit is an error."""
+    """Compare the check sums of the archive, which torch does not: a flipped bit is an error."""
     with zipfile.ZipFile(path) as archive:
         damaged = archive.testzip()
     if damaged is not None:
@@ -64,7 +64,7 @@ def _require_sums(path: Path) -> None:
 
 
 def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> None:
-    """Refuses NaN and infinity anywhere below `content`.
+    """Refuse NaN and infinity anywhere below `content`.
 
     Raises:
         CheckpointError: Names the entry that is not finite.

@@ -41,18 +41,18 @@ class Metrics:
     rows: list[tuple[str, int, str, float]] = field(default_factory=list)
 
     def add(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
-        """Appends a number of values."""
+        """Append a number of values."""
         self.rows += [(stage, step, name, float(value)) for name, value in numbers.items()]
 
     def write(self, path: Path) -> None:
-        """Writes all rows as Parquet, whole or not at all."""
+        """Write all rows as Parquet, whole or not at all."""
         frame = pl.DataFrame(self.rows, schema=_SCHEMA, orient="row")
         with replacing(path) as temporary:
             frame.write_parquet(temporary)
 
     @classmethod
     def read(cls, path: Path) -> Metrics:
-        """Reads what `write` wrote.
+        """Read what `write` wrote.
 
         Raises:
             CheckpointError: The file is missing, cut short or of another form.
@@ -108,11 +108,11 @@ class Run:
 
     @property
     def resumable(self) -> bool:
-        """Whether there is a checkpoint."""
+        """True if there is a checkpoint."""
         return (self.directory / CHECKPOINT / "state.json").is_file()
 
     def save(self, state: Mapping[str, Any], write: Callable[[Path], None]) -> None:
-        """Makes the next checkpoint.
+        """Make the next checkpoint.
 
         Args:
             state: Plain values that say where the run stands.
@@ -133,7 +133,7 @@ class Run:
             self._board.flush()
 
     def restore(self, read: Callable[[Path], None]) -> dict[str, Any]:
-        """Takes up the checkpoint.
+        """Take up the checkpoint.
 
         Args:
             read: Reads what `write` wrote.
@@ -156,7 +156,7 @@ class Run:
         return state
 
     def log(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
-        """Keeps numbers in the metrics and shows them on TensorBoard."""
+        """Keep numbers in the metrics and show them on TensorBoard."""
         self.metrics.add(stage, step, numbers)
         board = self._tensorboard(step)
         for name, value in numbers.items():
@@ -164,7 +164,7 @@ class Run:
                 board.add_scalar(f"{stage}/{name}", value, step)
 
     def close(self) -> None:
-        """Ends the TensorBoard file and gives the folder free."""
+        """End the TensorBoard file and release the folder."""
         self._lock.close()
         if self._board is not None:
             self._board.close()
@@ -181,7 +181,7 @@ class Run:
 
 
 def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
-    """Keeps all options of a run, and the versions it is made with, for readers.
+    """Keep all options of a run, and the versions it is made with, for readers.
 
     ``run.json`` holds only what must be the same for `--resume`.
     """
@@ -230,7 +230,7 @@ def _short(value: Any) -> str:
 
 
 def _remove_remains(directory: Path) -> None:
-    """Clears what a run killed in the middle of a rename left, keeping a whole checkpoint."""
+    """Clear what a run killed in the middle of a rename left, keeping a whole checkpoint."""
     current, old = directory / CHECKPOINT, directory / f".{CHECKPOINT}.old"
     fresh = directory / f".{CHECKPOINT}.new"
     if old.exists() and not current.exists():
@@ -241,7 +241,7 @@ def _remove_remains(directory: Path) -> None:
 
 
 def remove_temporaries(directory: Path) -> None:
-    """Clears files that were being written (`files.replacing`) when their process was killed.
+    """Clear files that were being written (`files.replacing`) when their process was killed.
 
     For whoever has locked the folder: nobody else may be writing there.
     """
@@ -258,5 +258,5 @@ def version_of(distribution: str) -> str | None:
 
 
 def versions_of(*distributions: str) -> dict[str, str | None]:
-    """That of each package, by name."""
+    """Return the installed version of each package, or None, by name."""
     return {name: version_of(name) for name in distributions}

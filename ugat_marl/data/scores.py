@@ -14,7 +14,7 @@ from ugat_marl.simulation import Snapshot, Trips
 
 @dataclass(frozen=True)
 class Scores:
-    """How an episode went.
+    """Measures of one episode.
 
     Attributes:
         att_s: Average travel time in s over all vehicles due, from the scheduled departure to the
@@ -60,15 +60,9 @@ MORE_IS_BETTER = ("throughput", "reward")
 
 
 def relative_slowness(
-    snapshot: Snapshot, lanes: LaneTable, incoming: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """1 - v / v_max of each lane of `incoming`, clipped to [0, 1] (vehicles may speed a little)."""
-    return _slowness(snapshot.mean_speed_mps[incoming], lanes.speed_mps[incoming])
-
-
-def _slowness(
     speed_mps: NDArray[np.float64], limit_mps: NDArray[np.float64]
 ) -> NDArray[np.float64]:
+    """Return 1 - v / v_max of each lane, clipped to [0, 1] (vehicles may speed a little)."""
     return np.minimum(np.maximum(1.0 - speed_mps / limit_mps, 0.0), 1.0)
 
 
@@ -91,11 +85,13 @@ class EpisodeRecorder:
         self._reward = self._queue = self._delay = 0.0
 
     def add(self, snapshot: Snapshot, mean_reward: float) -> None:
-        """Records the state after one decision and the mean reward of the agents."""
+        """Record the state after one decision and the mean reward of the agents."""
         self._decisions += 1
         self._reward += mean_reward
         self._queue += float(snapshot.halting[self._all].sum()) / len(self.incoming)
-        self._delay += float(_slowness(snapshot.mean_speed_mps[self._all], self._limits).mean())
+        self._delay += float(
+            relative_slowness(snapshot.mean_speed_mps[self._all], self._limits).mean()
+        )
 
     def scores(self, trips: Trips) -> Scores:
         """The scores of the episode that ended with `trips`."""

@@ -62,7 +62,7 @@ CHOICES = ("action", "executed")
 
 @dataclass(frozen=True)
 class AgentLayout:
-    """How the observation vector of an agent is divided: features | phase one-hot | context.
+    """Layout of an agent's observation vector: features | phase one-hot | context.
 
     Attributes:
         features: Traffic numbers of the intersection itself; what f predicts and h compares.
@@ -86,7 +86,7 @@ class AgentLayout:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a log comes from; everything a reader needs to use it without its writer.
+    """Origin of a log, with everything a reader needs to use it without its writer.
 
     Attributes:
         scenario: Scenario id.
@@ -271,13 +271,13 @@ class TransitionLog:
         return TransitionLog(provenance, pl.concat(frames))
 
     def write(self, path: Path) -> None:
-        """Writes the log as Parquet; an existing file is replaced whole or left as it was."""
+        """Write the log as Parquet; an existing file is replaced whole or left as it was."""
         with replacing(path) as temporary:
             self.frame.write_parquet(temporary, metadata={METADATA_KEY: self.provenance.to_json()})
 
     @classmethod
     def read(cls, path: Path | str) -> TransitionLog:
-        """Reads and checks what `write` wrote, here or elsewhere.
+        """Read and check what `write` wrote, here or elsewhere.
 
         Raises:
             LogError: Missing, cut short, not a transition log, or with impossible contents.
@@ -323,7 +323,7 @@ class TransitionRecorder:
         delays_s: Mapping[str, float] | None = None,
         served: Mapping[str, NDArray[np.float32]] | None = None,
     ) -> None:
-        """Adds one step of all agents; the arrays are copied.
+        """Add one step of all agents; the arrays are copied.
 
         Without delays no green was held back, without served features none were measured.
 

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.features import BIN_FEATURES, BIN_S, INDEX, Tally
+from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.statistics import Array
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
-LEAST_DAYS = 3
-"""Fewer days have no variation to speak of."""
-_INTERVAL_S = 900.0
 _COUNTED = ("count_stop", "count_exit")
 
 
@@ -67,13 +65,13 @@ def fhwa(measured: Sequence[Tally], simulated: Sequence[Tally], together: int) -
         None where there are too few days, or no detector counts in all intervals of all days.
     """
     shortest = min(day.bins.shape[-1] for day in (*measured, *simulated))
-    bins = min(max(round(_INTERVAL_S / BIN_S), together), shortest)
+    bins = min(max(round(THRESHOLDS.interval_s / THRESHOLDS.bin_s), together), shortest)
     real = [_intervals(day, bins, shortest // bins) for day in measured]
     days = np.stack([counts for counts, _ in real])
     model = np.mean([_intervals(day, bins, shortest // bins)[0] for day in simulated], axis=0)
     whole = np.all([known for _, known in real], axis=(0, 2))
     used = whole & (days.sum(axis=(0, 2)) > 0)
-    if len(measured) < LEAST_DAYS or not used.any():
+    if len(measured) < THRESHOLDS.least_days or not used.any():
         return None
     days, model = days[:, used], model[used]
     chosen = representative(days)

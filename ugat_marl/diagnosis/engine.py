@@ -18,20 +18,72 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ugat_marl.data import version_of
-from ugat_marl.diagnosis.arrivals import Due, corrected
 from ugat_marl.diagnosis.features import FEATURES, Tally, tally
-from ugat_marl.diagnosis.replay import Day, Replay
+from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
 from ugat_marl.diagnosis.site import Greens, Site
-from ugat_marl.diagnosis.standstill import Usual, locked_up
-from ugat_marl.diagnosis.unmeasured import Unmeasured
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
 from ugat_marl.files import user_cache, write_whole
 from ugat_marl.parallel import Workers, parts_at_a_time
 from ugat_marl.scenarios import Period, Scenario
 from ugat_marl.seeding import derive_seed
+
+# --- days on which traffic stood still ------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Usual:
+    """Ordinary days of the scenario as it is.
+
+    Attributes:
+        set_aside: Numbers of its days on which traffic came to a standstill.
+        day_to_day: Robust standard deviation of the vehicles counted on the others.
+    """
+
+    set_aside: frozenset[int] = frozenset()
+    day_to_day: float = 0.0
+
+    @classmethod
+    def of(cls, tallies: Sequence[Tally]) -> Usual:
+        """Tell the ordinary days from the others.
+
+        Args:
+            tallies: All days from the first on.
+        """
+        aside = frozenset(locked_up(tallies))
+        return cls(aside, day_to_day([day for n, day in enumerate(tallies) if n not in aside]))
+
+
+def day_to_day(tallies: Sequence[Tally]) -> float:
+    """Robust standard deviation of the vehicles counted on a day."""
+    counts = _counts(tallies)
+    return 1.4826 * float(np.median(np.abs(counts - np.median(counts)))) + 1e-9
+
+
+def locked_up(tallies: Sequence[Tally], usual: float = 0.0) -> list[int]:
+    """Places of the few days on which traffic came to a standstill and on others did not.
+
+    One of them widens the noise of everything. Where they are common they are part of the model.
+
+    Args:
+        tallies: Days of one model.
+        usual: Least `day_to_day`, where few days hardly tell it.
+    """
+    counts = _counts(tallies)
+    spread = max(day_to_day(tallies), usual)
+    found = np.flatnonzero(np.abs(counts - np.median(counts)) > THRESHOLDS.locked_up * spread)
+    return found.tolist() if len(found) <= max(1.0, THRESHOLDS.rare * len(tallies)) else []
+
+
+def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
+    return np.array([item.bins[:3].sum() for item in tallies])
+
+
+# --- simulated days -------------------------------------------------------------------------------
 
 VERSION = 4
 """Of features and replays: a tally remembered under another version is not used."""

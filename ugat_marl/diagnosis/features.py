@@ -8,13 +8,16 @@ stop detector, since a vehicle may wait anywhere on it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.site import Greens, Site, SiteLane
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.scenarios import Passages, Period
 
 Array = NDArray[np.float64]
@@ -86,12 +89,6 @@ EVENT_FEATURES = frozenset(
 COUNT_FEATURES = ("count_advance", "count_stop", "count_exit")
 PLATOON_FEATURES = ("platoon_gap", "platoon_short", "platoon_middle", "platoon_time")
 BIN_FEATURES = (*COUNT_FEATURES, "occupied")
-BIN_S = 300.0
-
-_BREAK_S = 5.0
-_FIRST_S = 12.0
-_MOVING_MPS = 6.0
-_AFTER_RED_S = 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +143,7 @@ class Tally:
 
 def bins_of(period: Period) -> int:
     """Number of bins of time in a period."""
-    return max(1, round((period.end_s - period.begin_s) / BIN_S))
+    return max(1, round((period.end_s - period.begin_s) / THRESHOLDS.bin_s))
 
 
 def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
@@ -245,8 +242,10 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     queue = came[first] < start
     before = np.where(number == 0, start, np.roll(crossed, 1))
     gap = crossed - before
-    broken = np.cumsum(gap > np.where(number == 0, _FIRST_S, _BREAK_S))
-    alive = queue & (broken - broken[first] + (gap[first] > _FIRST_S) == 0)
+    broken = np.cumsum(
+        gap > np.where(number == 0, THRESHOLDS.first_gap_s, THRESHOLDS.queue_break_s)
+    )
+    alive = queue & (broken - broken[first] + (gap[first] > THRESHOLDS.first_gap_s) == 0)
     protected = alive & greens.protected[cycle]
     counter.add("gap_permitted", gap[alive & ~greens.protected[cycle] & (number >= 1)])
     lost = gap[protected & (number == 0)]
@@ -288,7 +287,9 @@ def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
     counter.ratio("yellow_crossings", float((counted & (red <= 0)).sum()), cycles)
     counter.ratio("late_crossings", float((counted & (red > 0) & (red <= 2.0)).sum()), cycles)
     counter.ratio(
-        "red_crossings", float((counted & (red > 2.0) & (red <= _AFTER_RED_S)).sum()), cycles
+        "red_crossings",
+        float((counted & (red > 2.0) & (red <= THRESHOLDS.after_red_s)).sum()),
+        cycles,
     )
     counter.add("last_crossing", after[counted & (red <= 3.0)])
 
@@ -311,7 +312,7 @@ def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: f
     on, speed = advance.on_s, advance.speed_mps
     over = advance.off_s - on
     gap = np.append(np.inf, np.diff(on))
-    moving = np.where(np.isfinite(speed), speed > _MOVING_MPS, over < 1.2)
+    moving = np.where(np.isfinite(speed), speed > THRESHOLDS.moving_mps, over < 1.2)
     platoon = moving & np.append(False, moving[:-1]) & (gap < 6.0)
     counter.add("platoon_gap", gap[platoon])
     counter.add("platoon_short", (gap[platoon] < 1.6).astype(np.float64))
@@ -384,3 +385,60 @@ def _conserved(counter: _Counter, site: Site, advances: Array, stops: Array, exi
         if incoming and outgoing:
             counter.place = incoming[0]
             counter.ratio("kept_to_exit", exits[outgoing].sum(), stops[incoming].sum())
+
+
+# --- counts alone ---------------------------------------------------------------------------------
+
+
+def bins_together(counts: pl.DataFrame | None) -> int:
+    """How many bins a count covers: within it nobody knows when vehicles came.
+
+    Args:
+        counts: ``begin_s, end_s`` and others; None where single vehicles were detected.
+    """
+    if counts is None or counts.is_empty():
+        return 1
+    longest = float((counts["end_s"] - counts["begin_s"]).cast(pl.Float64).to_numpy().max())
+    return max(1, math.ceil(longest / THRESHOLDS.bin_s - 1e-6))
+
+
+def without_gaps(counts: pl.DataFrame, periods: Sequence[Period]) -> frozenset[str]:
+    """Detectors that were counted in every period from begin to end."""
+    length = pl.col("end_s").cast(pl.Float64) - pl.col("begin_s").cast(pl.Float64)
+    found = set(counts["detector_id"].to_list())
+    for period in periods:
+        own = counts.filter(pl.col("period_id") == period.id)
+        times = dict(own.group_by("detector_id").agg(length.sum()).iter_rows())
+        least = THRESHOLDS.whole * (period.end_s - period.begin_s)
+        found = {name for name in found if times.get(name, 0.0) >= least}
+    return frozenset(found)
+
+
+def counts_tally(site: Site, period: Period, counts: pl.DataFrame, whole: Collection[str]) -> Tally:
+    """Puts counts where the counts of detected vehicles would be; all else stays empty.
+
+    Args:
+        site: Lanes and detectors.
+        period: Which period.
+        counts: ``period_id, begin_s, end_s, detector_id, count``.
+        whole: Detectors `without_gaps`. Of the others only single bins are used: the mean of some
+            hours is not that of all.
+    """
+    places = len(site.lanes) + len(site.exits)
+    length = bins_of(period)
+    sums = np.zeros((len(FEATURES), places, 2))
+    bins = np.zeros((len(BIN_FEATURES), places, length))
+    covered = np.zeros_like(bins)
+    edges = np.linspace(period.begin_s, period.end_s, length + 1)
+    for row in counts.filter(pl.col("period_id") == period.id).iter_rows(named=True):
+        name, place = site.counted.get(row["detector_id"], ("", -1))
+        if place >= 0:
+            begin, end, count = float(row["begin_s"]), float(row["end_s"]), float(row["count"])
+            if row["detector_id"] in whole:
+                sums[INDEX[name], place] += (count, (end - begin) / 60.0)
+            inside = np.clip(np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin), 0.0, None)
+            line = BIN_FEATURES.index(name), place
+            bins[line] += count * inside / max(end - begin, 1e-9)
+            covered[line] += inside
+    known = (covered > THRESHOLDS.whole * np.diff(edges)).astype(np.float64)
+    return Tally(sums, bins * known, known=known)

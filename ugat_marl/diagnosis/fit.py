@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_of
 from ugat_marl.diagnosis.records import Fitted
-from ugat_marl.diagnosis.statistics import Pools, Reference, shift, shrunk
-from ugat_marl.diagnosis.whitening import Whitener
+from ugat_marl.diagnosis.statistics import Array, Pools, Reference, Whitener, shift, shrunk
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import EVERYWHERE
-
-Array = NDArray[np.float64]
-
 
 Change = tuple[dict[str, Array], float]
 """What moving a free value does to the statistics, and how far it was moved."""
@@ -25,19 +21,6 @@ Change = tuple[dict[str, Array], float]
 WIDE = ("network", "intersection")
 """Blocks that effects on the whole network are fitted to: single lanes add more noise than they
 tell of them."""
-WINDOW_STEPS_S = (120.0, 60.0, 30.0)
-WINDOW_DAYS = 4
-SHORTEST_S = 60.0
-SETTLING_DAYS = 16
-NEARBY, FAR = 0.2, 0.9
-"""Shares of its distance from nominal by which a value is moved for a derivative."""
-PLAIN = 10.0
-"""Standard deviations that such a move is meant to make."""
-NEAR = 0.2
-"""Standard errors by which a value may be off."""
-INTERPOLATION = 0.02
-"""Share of a measured difference that a model is forgiven while it is fitted: simulation steps
-round what the street does not."""
 
 
 def cost_of(model: Fitted) -> float:
@@ -122,7 +105,7 @@ class Fitter:
                     jacobian = None
                     continue
             gain, best = best.cost - found.cost, found
-            if gain < 1.0 and number:
+            if gain < THRESHOLDS.least_gain and number:
                 break
         return best
 
@@ -135,12 +118,12 @@ class Fitter:
         """
         if not len(model.values):
             return model
-        precise = self.simulate(model.members, SETTLING_DAYS)
+        precise = self.simulate(model.members, THRESHOLDS.settling_days)
         whitener = self.whitener(precise)
         step = _solve(self.jacobian(model, whitener), whitener.measured)
-        if (np.abs(step) <= NEAR * errors).all():
+        if (np.abs(step) <= THRESHOLDS.settled_within * errors).all():
             return precise
-        moved = self.simulate(self._moved(precise, step), SETTLING_DAYS)
+        moved = self.simulate(self._moved(precise, step), THRESHOLDS.settling_days)
         return moved if moved.cost < precise.cost else precise
 
     def fitted(self, start: Fitted) -> Fitted:
@@ -157,16 +140,16 @@ class Fitter:
         The same few days before and after a move tell whether it helps.
         """
         members = best.members
-        cost = self.simulate(members, WINDOW_DAYS).cost
-        for step in WINDOW_STEPS_S:
+        cost = self.simulate(members, THRESHOLDS.window_days).cost
+        for step in THRESHOLDS.window_steps_s:
             for direction in ((-1, 0), (1, 0), (0, -1), (0, 1)):
                 while True:
                     move = (step * direction[0], step * direction[1])
                     moved = tuple((_shifted(h, move), values) for h, values in members)
                     if moved == members:
                         break
-                    found = self.simulate(moved, WINDOW_DAYS).cost
-                    if found >= cost - 1.0:
+                    found = self.simulate(moved, THRESHOLDS.window_days).cost
+                    if found >= cost - THRESHOLDS.least_gain:
                         break
                     members, cost = moved, found
         if members == best.members:
@@ -183,7 +166,7 @@ class Fitter:
             if value != EVERYWHERE
         ]
         blocks = None if places else WIDE
-        return Whitener(model.reference, self.data, INTERPOLATION, self.base, blocks)
+        return Whitener(model.reference, self.data, THRESHOLDS.interpolation, self.base, blocks)
 
     def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
         """Derivatives of the whitened statistics, ``(free values, statistics)``."""
@@ -198,10 +181,13 @@ class Fitter:
         found: list[Change] = []
         for place, (hypothesis, values) in enumerate(model.members):
             for index in range(len(values)):
-                change, delta = self._change(model, place, index, NEARBY)
+                change, delta = self._change(model, place, index, THRESHOLDS.nearby)
                 errors = float(np.linalg.norm(whitener(change)))
-                if errors < PLAIN and not hypothesis.step:
-                    share = min(NEARBY * PLAIN / max(errors, 1e-9), FAR)
+                if errors < THRESHOLDS.plain_move and not hypothesis.step:
+                    share = min(
+                        THRESHOLDS.nearby * THRESHOLDS.plain_move / max(errors, 1e-9),
+                        THRESHOLDS.far,
+                    )
                     change, delta = self._change(model, place, index, share)
                 found.append((change, delta))
         return found
@@ -220,11 +206,13 @@ class Fitter:
         """
         found: list[Change] = []
         for place, (hypothesis, values) in enumerate(model.members):
-            for move in ((SHORTEST_S, 0.0), (0.0, -SHORTEST_S)):
+            for move in ((THRESHOLDS.shortest_window_s, 0.0), (0.0, -THRESHOLDS.shortest_window_s)):
                 moved = _shifted(hypothesis, move) if values else hypothesis
                 if moved is not hypothesis:
                     members = (*model.members[:place], (moved, values), *model.members[place + 1 :])
-                    found.append((shrunk(*self.difference(model, members)), SHORTEST_S))
+                    found.append(
+                        (shrunk(*self.difference(model, members)), THRESHOLDS.shortest_window_s)
+                    )
         return found
 
     def difference(
@@ -272,7 +260,7 @@ def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
     if not set(WINDOW) <= known.keys():
         return hypothesis
     begin, end = (known[name] + shift for name, shift in zip(WINDOW, move, strict=True))
-    if begin < 0 or end - begin < SHORTEST_S:
+    if begin < 0 or end - begin < THRESHOLDS.shortest_window_s:
         return hypothesis
     changed = {**known, WINDOW[0]: begin, WINDOW[1]: end}
     return replace(hypothesis, fixed=tuple((name, changed[name]) for name, _ in hypothesis.fixed))
@@ -288,10 +276,104 @@ def _solve(jacobian: Array, residual: Array) -> Array:
     """Least squares with a touch of ridge, each value on its own scale."""
     scale = np.sqrt((jacobian**2).sum(axis=1)) + 1e-12
     scaled = jacobian / scale[:, None]
-    normal = scaled @ scaled.T + 1e-3 * np.eye(len(scaled))
+    normal = scaled @ scaled.T + THRESHOLDS.ridge * np.eye(len(scaled))
     return np.linalg.solve(normal, scaled @ residual) / scale
 
 
 def derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
     """Changes as derivatives of the whitened statistics, ``(changes, statistics)``."""
     return np.stack([whitener(change) / delta for change, delta in changes])
+
+
+# --- intervals ------------------------------------------------------------------------------------
+
+
+def _crookedness(
+    fitter: Fitter, model: Fitted, errors: Array, response: Callable[[dict[str, Array]], Array]
+) -> Array:
+    """By how much an estimate is off, squared, since statistics do not follow a value straight.
+
+    Args:
+        fitter: Simulates.
+        model: The model.
+        errors: Standard errors of its free values.
+        response: What a change of the statistics would make of the free values.
+    """
+    found: list[float] = []
+    for place, (hypothesis, values) in enumerate(model.members):
+        for index, value in enumerate(values):
+            row = len(found)
+            moves: list[tuple[float, float]] = []
+            for share in THRESHOLDS.straightness_moves:
+                changed = list(values)
+                changed[index] = value + share * errors[row]
+                moved = hypothesis.clipped(changed)
+                if moved != values:
+                    change, _ = fitter.difference(model, replaced(model.members, place, moved))
+                    moves.append((moved[index] - value, float(response(change)[row])))
+            asked, got = np.array(moves).reshape(-1, 2).T
+            slope = float(asked @ got) / max(float(asked @ asked), 1e-12)
+            if len(moves) < 2:
+                found.append(0.0)
+            elif slope < THRESHOLDS.blunt:
+                found.append(float(np.mean(asked**2)))
+            else:
+                found.append(float(((got / slope - asked) ** 2).sum()) / (len(moves) - 1))
+    return np.array(found)
+
+
+def uncertainty(
+    fitter: Fitter, model: Fitted, days: Sequence[Tally] = (), *, steps: bool = False
+) -> tuple[Array, dict[str, Array]]:
+    """Standard errors of the free values, and what they make uncertain in the statistics.
+
+    The parts of the distance depend on each other, so the errors come from how much the estimate
+    would move between simulated days (a sandwich estimate), not from the curvature alone. Where
+    windows begin and end is estimated as well. A value whose change does nothing that is more than
+    chance is not known better than to this change.
+
+    Args:
+        fitter: Simulates.
+        model: The model.
+        days: Simulated days of it, the more the better; none for those it was fitted with.
+        steps: Whether to look, too, how far from straight the way is within the interval: as whole
+            vehicles cross a detector or the start of green, what a value does may come in steps.
+
+    Returns:
+        Standard errors ``(free values,)``, and variances of the expected statistics per block.
+    """
+    if not len(model.values):
+        return np.empty(0), {
+            name: np.zeros_like(b.mean) for name, b in model.reference.blocks.items()
+        }
+    whitener = fitter.whitener(model)
+    changes = fitter.changes(model)
+    free = len(changes)
+    changes += fitter.window_changes(model)
+    jacobian = derivatives(changes, whitener)
+    inverse = np.linalg.pinv(jacobian @ jacobian.T)
+    influences: list[Array] = []
+    days = days or model.tallies
+    for item in days:
+        difference, _ = shift(fitter.pools, [item], days)
+        influences.append(inverse @ (jacobian @ whitener(difference)))
+    spread = np.atleast_2d(np.cov(np.stack(influences).T))
+    covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies))
+    grids = np.array([h.step for h, values in model.members for _ in values])
+    covariance[:free, :free] += np.diag(grids**2 / 12.0)
+    unseen = np.flatnonzero(~jacobian[:free].any(axis=1))
+    covariance[unseen, unseen] += [changes[index][1] ** 2 for index in unseen]
+    extra: dict[str, Array] = {}
+    for name, block in model.reference.blocks.items():
+        slopes = np.stack([change[name] / delta for change, delta in changes])
+        extra[name] = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes) + 0.0 * block.mean
+        extra[name] = np.nan_to_num(extra[name])
+    errors = np.sqrt(np.diag(covariance)[:free])
+    if steps:
+
+        def response(change: dict[str, Array]) -> Array:
+            return inverse @ (jacobian @ whitener(change))
+
+        errors = np.sqrt(errors**2 + _crookedness(fitter, model, errors, response))
+
+    return errors, extra

@@ -12,6 +12,7 @@ from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 SHOWN = 40
 _REGIME_OF_BINS = ("volume", "volume", "volume", "storage")
@@ -122,7 +123,7 @@ def _stretch(z: Array) -> tuple[float, int, int] | None:
     """The contiguous bins with the largest standardised sum."""
     sums = np.concatenate(([0.0], np.cumsum(np.clip(z, -15, 15))))
     best: tuple[float, int, int] | None = None
-    for length in range(1, max(int(0.7 * len(z)), 1) + 1):
+    for length in range(1, max(int(THRESHOLDS.longest_stretch * len(z)), 1) + 1):
         values = (sums[length:] - sums[:-length]) / math.sqrt(length)
         place = int(np.argmax(np.abs(values)))
         if best is None or abs(values[place]) > abs(best[0]):

@@ -1,7 +1,14 @@
 """Simulated days under the measured signals, in plain SUMO.
 
 The measured states drive the simulation, so that the controller is not mistaken for physics. One
-process per day; the same day has the same vehicles under every model (common random numbers).
+process runs per day; the same day has the same vehicles under every model (common random numbers).
+
+Signals that follow the traffic gave green where that day's vehicles stood. With other vehicles a
+queue finds a red that was never shown to it, and everything differs though nothing is missing. So a
+simulated day under such signals is given the arrivals that the advance detectors saw: as many
+vehicles, at these times, on lanes from where they can go on as they did. Their routes, types and
+speeds are those of the model. The number of vehicles to be expected is then no longer in what is
+simulated: it is read from the demand and put in the place of the counts.
 """
 
 from __future__ import annotations
@@ -11,22 +18,34 @@ import subprocess
 import tempfile
 import threading
 import xml.etree.ElementTree as ET
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections import Counter, OrderedDict, deque
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ugat_marl.data import as_logged
-from ugat_marl.diagnosis.arrivals import Array, Arrivals, Due
+from ugat_marl.diagnosis.features import (
+    BIN_FEATURES,
+    COUNT_FEATURES,
+    INDEX,
+    PLATOON_FEATURES,
+    Array,
+    Tally,
+    bins_of,
+)
 from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import (
     Effect,
+    depart_s,
     detector_effects,
     late_greens,
     parked_at_other_times,
+    sort_departures,
 )
 from ugat_marl.errors import MeasuredDataError, SimulatorCrashed, SimulatorError
 from ugat_marl.files import xml_bytes
@@ -35,6 +54,7 @@ from ugat_marl.scenarios import (
     Detector,
     Document,
     Network,
+    Passages,
     Period,
     Scenario,
     SignalLog,
@@ -45,9 +65,6 @@ from ugat_marl.scenarios import (
 )
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import launch_of, loops_document, one_line, read_loops, read_trips
-
-WARM_UP_S = 600.0
-"""Simulated before a period that does not begin with the scenario, under its own first signals."""
 
 _DAYS = 64
 
@@ -158,7 +175,7 @@ class Replay:
     def _run(self, scenario: Scenario, period: Period, seed: int, directory: Path) -> Day:
         settings = scenario.settings
         step = settings.step_length_s
-        begin = max(settings.begin_s, period.begin_s - WARM_UP_S)
+        begin = max(settings.begin_s, period.begin_s - THRESHOLDS.warm_up_s)
         begin = settings.begin_s + step * round((begin - settings.begin_s) / step)
         loops = directory / "loops.xml"
         signals = replay_document(scenario, period, begin)
@@ -252,3 +269,426 @@ def _durations(
         (round((after - tick) * step_s, 6), state)
         for (tick, state), after in zip(shown, ticks[1:], strict=True)
     ]
+
+
+# --- arrivals -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Lane:
+    """A lane on which vehicles are seen to come."""
+
+    advance: str
+    stop: str | None
+    position_m: float
+    zone_m: float
+    speed_mps: float
+    travel_s: float
+    following: frozenset[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Due:
+    """Vehicles a day of the model asks for, and those it was given; by edge and bin of time.
+
+    Attributes:
+        asked: Edge to vehicles that would come by its end if nobody stood anywhere, ``(bins,)``.
+        given: The same of the vehicles that were simulated.
+    """
+
+    asked: Mapping[str, Array]
+    given: Mapping[str, Array]
+
+
+class Arrivals:
+    """Reads when vehicles came, and makes a simulated day's vehicles come then.
+
+    Args:
+        site: Lanes and detectors.
+        network: The network.
+    """
+
+    def __init__(self, site: Site, network: Network) -> None:
+        lanes = network.lanes.values()
+        self._pace_s = {lane.edge: lane.length_m / lane.speed_mps for lane in lanes}
+        self._ways: dict[str, _Way] = {}
+        self._approaches = _approaches(site)
+        self._counted = frozenset(edge for _, edge, _ in site.places)
+
+    def given(self, asked: Scenario, drivers: Scenario, period: Period) -> tuple[Scenario, Due]:
+        """The day with the measured arrivals.
+
+        Args:
+            asked: The day as the model has it, with all its effects.
+            drivers: The same without effects on how many vehicles depart, and when: vehicles are
+                taken from here, so that such effects leave what is simulated alone.
+            period: The measured one.
+
+        Returns:
+            What is to be simulated, and what was asked for beside it. Vehicles that come by no
+            approach with advance detectors, or stop on their way, or come before the period, stay
+            as they are.
+        """
+        document = drivers.routes[0]
+        root = document.parse()
+        demand = root if asked is drivers else asked.routes[0].parse()
+        due = self._by_edge(demand, period)
+        pools: dict[str, list[_Coming]] = {edge: [] for edge in self._approaches}
+        stay: list[ET.Element] = []
+        for item in root:
+            coming = self._coming(item, period) if item.tag == "vehicle" else None
+            if coming is None:
+                stay.append(item)
+            else:
+                pools[coming.approach].append(coming)
+        for edge, pool in pools.items():
+            stay += _filled(pool, self._came(edge, period), drivers.settings.begin_s, period)
+        root[:] = stay
+        sort_departures(root)
+        changed = Document(document.name, None, xml_bytes(root))
+        return (
+            replace(drivers, routes=(changed, *drivers.routes[1:])),
+            Due(due, self._by_edge(root, period)),
+        )
+
+    def asked(self, day: Scenario, period: Period) -> dict[str, Array]:
+        """Vehicles of a day that would come by the end of each counted edge, by bin of time."""
+        return self._by_edge(day.routes[0].parse(), period)
+
+    def _coming(self, item: ET.Element, period: Period) -> _Coming | None:
+        """Where a vehicle is seen first, and when; None if it has to be left alone."""
+        way = self._way(_route(item))
+        if way.approach is None or item.find("stop") is not None:
+            return None
+        way_s = way.approach_s / _factor(item)
+        time = depart_s(item) + way_s
+        if not time >= period.begin_s:
+            return None
+        return _Coming(way.approach, time, way_s, way.following, item)
+
+    def _way(self, route: str) -> _Way:
+        """A route at the speed limit; remembered, since thousands drive the same few."""
+        found = self._ways.get(route)
+        if found is not None:
+            return found
+        edges = route.split()
+        ends = np.cumsum([0.0, *(self._pace_s[edge] for edge in edges)]).tolist()
+        counted = tuple(
+            (edge, end) for edge, end in zip(edges, ends[1:], strict=True) if edge in self._counted
+        )
+        found = _Way(counted)
+        first = next((i for i, edge in enumerate(edges) if edge in self._approaches), None)
+        if first is not None:
+            lane = self._approaches[edges[first]][0]
+            following = edges[first + 1] if first + 1 < len(edges) else None
+            there = ends[first] + lane.position_m / lane.speed_mps
+            found = _Way(counted, edges[first], there, following)
+        self._ways[route] = found
+        return found
+
+    def _came(self, edge: str, period: Period) -> list[tuple[float, frozenset[str]]]:
+        """When vehicles would have come by an approach's advance detectors, and where they went."""
+        lanes = self._approaches[edge]
+        seen = [period.passages.get(lane.advance, Passages.none()) for lane in lanes]
+        times = [
+            unhindered(one, lane.speed_mps, period, lane.zone_m)
+            for one, lane in zip(seen, lanes, strict=True)
+        ]
+        crossed = [
+            np.sort(found.off_s[np.isfinite(found.off_s)])
+            for lane in lanes
+            for found in [period.passages.get(lane.stop or "", Passages.none())]
+        ]
+        if any(lane.stop is None for lane in lanes):
+            left = times
+        else:
+            more = missed(np.concatenate(times), np.concatenate(crossed), period)
+            spread = [more[index :: len(lanes)] for index in range(len(lanes))]
+            times = [np.sort(np.concatenate(pair)) for pair in zip(times, spread, strict=True)]
+            left = by_lane_left(times, crossed, [lane.travel_s for lane in lanes])
+        found = [
+            (float(time), lane.following)
+            for lane, own in zip(lanes, left, strict=True)
+            for time in own
+        ]
+        return sorted(found, key=lambda row: row[0])
+
+    def _by_edge(self, vehicles: Iterable[ET.Element], period: Period) -> dict[str, Array]:
+        """Vehicles that would come by the end of each counted edge, by bin of time."""
+        bins = bins_of(period)
+        times: dict[str, list[float]] = {edge: [] for edge in self._counted}
+        for item in vehicles:
+            if item.tag == "vehicle":
+                depart, factor = depart_s(item), _factor(item)
+                for edge, end_s in self._way(_route(item)).counted:
+                    times[edge].append(depart + end_s / factor)
+        span = period.begin_s, period.end_s
+        return {
+            edge: np.histogram(found, bins, span)[0].astype(np.float64)
+            for edge, found in times.items()
+        }
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A route at the speed limit.
+
+    Attributes:
+        counted: Edges with detectors, and when their ends are reached, s.
+        approach: The first one on which vehicles are seen to come.
+        approach_s: When its advance detector is reached, s.
+        following: The edge behind it.
+    """
+
+    counted: tuple[tuple[str, float], ...]
+    approach: str | None = None
+    approach_s: float = 0.0
+    following: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Coming:
+    """A vehicle on its way to the first approach where it is seen."""
+
+    approach: str
+    time_s: float
+    way_s: float
+    following: str | None
+    item: ET.Element
+
+
+def _filled(
+    pool: Sequence[_Coming],
+    came: Sequence[tuple[float, frozenset[str]]],
+    earliest_s: float,
+    period: Period,
+) -> list[ET.Element]:
+    """Vehicles of the pool at the times of those that came; again from the first if too few.
+
+    In their own order, each where it can go on as it means to.
+    """
+    queues: dict[str | None, deque[_Coming]] = {}
+    for item in sorted(pool, key=lambda item: item.time_s):
+        queues.setdefault(item.following, deque()).append(item)
+    found: list[ET.Element] = []
+    turns: dict[str | None, int] = dict.fromkeys(queues, 0)
+    sizes = {name: len(queue) for name, queue in queues.items()}
+    for time, following in came:
+        fitting = [name for name in queues if name is None or name in following] or list(queues)
+        if not fitting:
+            break  # the model has nobody who comes this way
+
+        def waiting(name: str | None) -> float:
+            rounds = turns[name] // sizes[name]
+            return queues[name][0].time_s + rounds * (period.end_s - period.begin_s)
+
+        name = min(fitting, key=waiting)
+        queue = queues[name]
+        coming = queue[0]
+        queue.rotate(-1)
+        item = ET.Element(coming.item.tag, dict(coming.item.attrib))
+        item.extend(coming.item)
+        if again := turns[name] // sizes[name]:
+            item.set("id", f"{item.get('id')}+{again}")
+        item.set("depart", f"{max(time - coming.way_s, earliest_s):.2f}")
+        turns[name] += 1
+        found.append(item)
+    return found
+
+
+def corrected(counted: Tally, site: Site, due: Due) -> Tally:
+    """The tally with the counts the demand asks for, in the place of those that were given.
+
+    Args:
+        counted: Of a day with measured arrivals.
+        site: Lanes and detectors.
+        due: What was asked for beside what was given.
+
+    Returns:
+        Its gaps in moving platoons are left out: they are what was put in.
+    """
+    sums, bins = counted.sums.copy(), counted.bins.copy()
+    lanes = Counter(edge for _, edge, _ in site.places)
+    for place, (_, edge, _) in enumerate(site.places):
+        more = due.asked[edge] - due.given[edge]
+        given = float(due.given[edge].sum())
+        for name in COUNT_FEATURES:
+            row, line = INDEX[name], BIN_FEATURES.index(name)
+            if sums[row, place, 1] > 0:
+                share = sums[row, place, 0] / given if given else 1.0 / lanes[edge]
+                sums[row, place, 0] = max(sums[row, place, 0] + share * more.sum(), 0.0)
+                width = min(len(more), bins.shape[-1])
+                bins[line, place, :width] += share * more[:width]
+    sums[[INDEX[name] for name in PLATOON_FEATURES]] = 0.0
+    return replace(counted, sums=sums, bins=np.maximum(bins, 0.0))
+
+
+def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
+    """Edges all of whose lanes in front of the traffic light have an advance detector."""
+    zones = {item.id: item for item in site.detectors}
+    lanes: dict[str, list[_Lane] | None] = {}
+    for lane in site.lanes:
+        advance = lane.detectors.get("advance")
+        known = lanes.setdefault(lane.edge, [])
+        if advance is None or known is None:
+            lanes[lane.edge] = None
+            continue
+        stop = lane.detectors.get("stop", (None,))[0]
+        zone = zones[advance[0]]
+        begin = zone.position_m
+        end = begin if stop is None else zones[stop].position_m
+        travel = max(end - begin, 0.0) / (THRESHOLDS.fastest * lane.speed_mps)
+        known.append(
+            _Lane(
+                advance[0],
+                stop,
+                begin,
+                zone.length_m,
+                lane.speed_mps,
+                travel,
+                lane.following,
+            )
+        )
+    return {edge: tuple(known) for edge, known in lanes.items() if known}
+
+
+def _route(item: ET.Element) -> str:
+    route = item.find("route")
+    return "" if route is None else route.get("edges", "")
+
+
+def _factor(item: ET.Element) -> float:
+    return float(item.get("speedFactor", "1"))
+
+
+def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float = 0.0) -> Array:
+    """When vehicles would have come if nobody had stood in their way, s.
+
+    Vehicles that came through a queue arrived at its end before; when, nobody saw. They are spread
+    evenly between the last that came freely and the next, but none comes later than it did.
+
+    Args:
+        seen: An advance detector's vehicles.
+        limit_mps: Speed limit there.
+        period: Its begin and end.
+        zone_m: Length of the detection zone.
+    """
+    seen = seen.at(np.isfinite(seen.on_s))
+    times = seen.on_s.copy()
+    over = np.maximum(seen.off_s - seen.on_s, 1e-3)
+    pace = (
+        np.where(np.isfinite(seen.speed_mps), seen.speed_mps, (THRESHOLDS.length_m + zone_m) / over)
+        / limit_mps
+    )
+    slow = pace < THRESHOLDS.held_up
+    close = np.diff(times, prepend=-np.inf) < THRESHOLDS.close_s
+    for place in np.flatnonzero(close & ~slow & (pace < THRESHOLDS.free)).tolist():
+        slow[place] = slow[place - 1]  # it stood farther back in the same queue
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], slow, [False]))))
+    for first, behind in zip(edges[::2], edges[1::2], strict=True):
+        before = times[first - 1] if first else period.begin_s
+        after = times[behind] if behind < len(times) else period.end_s
+        spread = np.linspace(before, after, behind - first + 2)[1:-1]
+        times[first:behind] = np.minimum(times[first:behind], spread)
+    return times
+
+
+def by_lane_left(
+    came: Sequence[Array], crossed: Sequence[Array], travel_s: Sequence[float]
+) -> list[Array]:
+    """When the vehicles came that left an approach by each of its lanes.
+
+    Between the detectors some change lanes. Every vehicle at a stop detector is taken for the first
+    that came on its lane and has not left yet; if there is none, for the first on any other lane.
+
+    Args:
+        came: Times at the advance detectors in order, per lane.
+        crossed: Times at the stop detectors in order, per lane.
+        travel_s: Least time from the one to the other, per lane.
+
+    Returns:
+        Times per lane; who never left is counted for the lane on which he came.
+    """
+    waiting = [deque(times.tolist()) for times in came]
+    found: list[list[float]] = [[] for _ in came]
+    events = sorted((time, lane) for lane, times in enumerate(crossed) for time in times.tolist())
+    for time, lane in events:
+        latest = time - travel_s[lane]
+        source = waiting[lane]
+        if not source or source[0] > latest:
+            source = min(waiting, key=lambda queue: queue[0] if queue else np.inf)
+        if source and source[0] <= latest:
+            found[lane].append(source.popleft())
+    return [np.array(sorted([*own, *left])) for own, left in zip(found, waiting, strict=True)]
+
+
+def missed(times: Array, crossed: Array, period: Period) -> Array:
+    """Vehicles advance detectors missed if the stop detectors saw many more, by window."""
+    if len(crossed) - len(times) <= THRESHOLDS.missing + THRESHOLDS.missing_share * len(times):
+        return np.empty(0)
+    count = max(1, round((period.end_s - period.begin_s) / THRESHOLDS.missed_window_s))
+    edges = np.linspace(period.begin_s, period.end_s, count + 1)
+    lacking = np.histogram(crossed, edges)[0] - np.histogram(times, edges)[0]
+    lacking = np.maximum(lacking, 0)
+    share = (len(crossed) - len(times)) / max(int(lacking.sum()), 1)
+    parts = [
+        np.linspace(begin, end, n + 2)[1:-1]
+        for begin, end, n in zip(
+            edges[:-1], edges[1:], np.round(share * lacking).astype(int), strict=True
+        )
+    ]
+    return np.concatenate(parts)
+
+
+# --- as detectors of the street would have seen it ------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Unmeasured:
+    """Detectors that saw vehicles, but never measured something of them.
+
+    Attributes:
+        speeds: Those without speeds, sorted.
+        lengths: Those without lengths of vehicles, sorted.
+    """
+
+    speeds: tuple[str, ...]
+    lengths: tuple[str, ...]
+
+    @classmethod
+    def of(cls, periods: Sequence[Period]) -> Unmeasured:
+        """What no measured period tells."""
+        seen: set[str] = set()
+        speeds: set[str] = set()
+        lengths: set[str] = set()
+        for period in periods:
+            for name, passages in period.passages.items():
+                if len(passages):
+                    seen.add(name)
+                if np.isfinite(passages.speed_mps).any():
+                    speeds.add(name)
+                if np.isfinite(passages.length_m).any():
+                    lengths.add(name)
+        return cls(tuple(sorted(seen - speeds)), tuple(sorted(seen - lengths)))
+
+    def __bool__(self) -> bool:
+        return bool(self.speeds or self.lengths)
+
+    def kept_from(self, period: Period) -> Period:
+        """A simulated period as the detectors of the street would have told it."""
+        if not self:
+            return period
+        passages = {
+            name: Passages(
+                item.on_s,
+                item.off_s,
+                _blank(item.speed_mps) if name in self.speeds else item.speed_mps,
+                _blank(item.length_m) if name in self.lengths else item.length_m,
+            )
+            for name, item in period.passages.items()
+        }
+        return replace(period, passages=passages)
+
+
+def _blank(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.full_like(values, np.nan)

@@ -4,73 +4,37 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+
+import numpy as np
 
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import Tally
-from ugat_marl.diagnosis.fit import SETTLING_DAYS, WIDE, Fitter, cost_of
+from ugat_marl.diagnosis.fit import WIDE, Fitter, cost_of, uncertainty
 from ugat_marl.diagnosis.hypotheses import (
     Hypothesis,
     Members,
     a_few,
     both_ways,
+    each_left_out,
     effects_of,
     merged,
     names_of,
     settings_as_members,
 )
-from ugat_marl.diagnosis.intervals import uncertainty
-from ugat_marl.diagnosis.local import Proposer
-from ugat_marl.diagnosis.matched import Directions
-from ugat_marl.diagnosis.pruning import pruned
+from ugat_marl.diagnosis.places import Proposer
+from ugat_marl.diagnosis.propose import Ray, between, promising, propose, squared_gap
 from ugat_marl.diagnosis.records import Fitted, Located, Selected, Tested
-from ugat_marl.diagnosis.residual import Null
-from ugat_marl.diagnosis.search import Ray, between, promising, propose, squared_gap
-from ugat_marl.diagnosis.whitening import Whitener
+from ugat_marl.diagnosis.residual import Directions, Null
+from ugat_marl.diagnosis.statistics import Whitener
+from ugat_marl.diagnosis.thresholds import THRESHOLDS, Effort
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
-from ugat_marl.progress import Reporter
+from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Period
 
-ROUNDS = 4
-NEAREST, NEARER = 3, 0.8
-CANDIDATES_FITTED = 3
-KINDS_OF_PLACES = 5
-"""Kinds of effects at places of which the best is simulated."""
-TOLERANCE = 0.02
-"""Share of the first difference in a statistic that a model may leave: parameters are known, and
-simulation steps resolved, no better."""
 MOVES_OF_A_VALUE = 8
 """How often a value is moved, about, until its model is tested; a bar shows how far that is."""
-_MOST = 0.25
-"""Places and windows are looked at if effects on the whole network would leave more than this."""
-_LITTLE = 2.0
-"""Distance per statistic of the network below which nothing is to be seen in the pool."""
-_HOPEFUL = 0.9
-"""Candidates that take off less than this share of what the best one does are not fitted."""
-_HUGE = 20.0
-"""Distances per statistic beyond which several effects at once are likely from the start."""
-_PLAIN = 100.0
-"""How much rarer than the level of the tests a difference must be that its size does not show."""
-_FORESIGHT = 0.05
-"""Rays are straight and effects are not: so much of a difference is not expected to be met."""
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How many days are simulated for what.
-
-    Attributes:
-        base: For the scenario as it is.
-        bank: For each strength of each hypothesis.
-        fit: For each model that is fitted.
-        test: For the test of what is left.
-    """
-
-    base: int = 60
-    bank: int = 3
-    fit: int = 6
-    test: int = 36
 
 
 class Selector:
@@ -132,7 +96,7 @@ class Selector:
         base = best = located.base
         complete = True
         try:
-            for number in range(ROUNDS):
+            for number in range(THRESHOLDS.rounds):
                 found = self._round(best, number)
                 if found is None:
                     break
@@ -154,7 +118,7 @@ class Selector:
         """Simulates more days of a model and tests what it leaves."""
         fitter = self._fitter
         moves = len(model.values) * MOVES_OF_A_VALUE * fitter.days
-        days = SETTLING_DAYS + self._effort.test + moves
+        days = THRESHOLDS.settling_days + self._effort.test + moves
         with (
             self._reporter.task("is what is left chance", days) as advance,
             fitter.engine.watched(advance, days),
@@ -167,7 +131,7 @@ class Selector:
         days = self._days(model)
         errors, extra = uncertainty(fitter, model, days, steps=True)
         for name, difference in self._first.difference.items():
-            extra[name] = extra[name] + (TOLERANCE * difference) ** 2
+            extra[name] = extra[name] + (THRESHOLDS.tolerance * difference) ** 2
         fitted = tuple(change for change, _ in fitter.changes(model))
         directions = Directions((*self._rays, *self._places), extra, fitted)
         null = self._null(days, len(fitter.data), directions, model.effects)
@@ -188,16 +152,16 @@ class Selector:
         whitener = self._whitener(start.model, WIDE)
         gap = float(whitener.measured @ whitener.measured)
         chance = float(len(whitener.measured))
-        enough = chance + _MOST * max(gap - chance, 0.0)
+        enough = chance + THRESHOLDS.look_elsewhere * max(gap - chance, 0.0)
         proposals = propose(rays, whitener, self._fitter.price)
         chosen = [item.members for item in promising(proposals)]
-        little = gap < _LITTLE * chance  # what differs does so in single places
+        little = gap < THRESHOLDS.little * chance  # what differs does so in single places
         near = little or not proposals or proposals[0].expected > enough
         if near:
             chosen = [*chosen[:2], *self._elsewhere(start.model, rays, number)]
         if number == 0:
             chosen += self._nearest()
-            chosen += settings_as_members(self._library) if gap > _HUGE * chance else []
+            chosen += settings_as_members(self._library) if gap > THRESHOLDS.huge * chance else []
         best = self._fitted(start, chosen, f"round {number + 1}: candidates")
         if best is None and not near:  # the library promised more than it kept
             chosen = self._elsewhere(start.model, rays, number)
@@ -207,14 +171,14 @@ class Selector:
     def _fitted(self, start: Tested, chosen: Sequence[Members], title: str) -> Tested | None:
         """The best of some sets of effects on top of a model; None if none is worth its price."""
         tried = self._tried(start.model, list(dict.fromkeys(chosen)), title)
-        best = self._refined(tried, CANDIDATES_FITTED, start.model.cost)
+        best = self._refined(tried, THRESHOLDS.candidates_fitted, start.model.cost)
         if best is None:
             return None
         gain = start.model.cost - best.cost
         if gain > self._fitter.price:
             return self.test(best)
         # All statistics together may hardly notice what is plain along an effect's own direction.
-        if start.residual.p < self._alpha / _PLAIN and gain > -self._fitter.price:
+        if start.residual.p < self._alpha / THRESHOLDS.plain and gain > -self._fitter.price:
             tested = self.test(best)
             return tested if tested.residual.p > self._alpha else None
         return None
@@ -231,9 +195,9 @@ class Selector:
         for place, members in enumerate(strengths):
             with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
                 model = self._fitter.simulate(members, self._effort.bank)
-                if squared_gap(model.distance, base, periods) < NEARER * gap:
+                if squared_gap(model.distance, base, periods) < THRESHOLDS.nearer * gap:
                     found.append((model.cost, place))
-        return [strengths[place] for _, place in sorted(found)[:NEAREST]]
+        return [strengths[place] for _, place in sorted(found)[: THRESHOLDS.nearest]]
 
     def _elsewhere(self, model: Fitted, rays: Sequence[Ray], number: int) -> list[Members]:
         """Proposals with effects at places and in windows, judged by lanes and minutes too."""
@@ -253,14 +217,14 @@ class Selector:
             hypothesis = item.members[0][0]
             if hypothesis.key in places:
                 best.setdefault(hypothesis.name, item.members)
-        here = list(best.values())[:KINDS_OF_PLACES]
+        here = list(best.values())[: THRESHOLDS.kinds_of_places]
         # What the counts say may be nearer than what a straight ray makes of it.
         here += [((h, h.levels[0]),) for ((h, _),) in here if h.levels[0]]
         return [*(item.members for item in promising(proposals)), *here]
 
     def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
         data, base = self._fitter.data, self._fitter.base
-        return Whitener(model.reference, data, _FORESIGHT, base, blocks)
+        return Whitener(model.reference, data, THRESHOLDS.foresight, base, blocks)
 
     def _library_rays(self, model: Fitted, number: int) -> tuple[Ray, ...]:
         """The whole library on top of a model; upon the scenario as it is it is worked out once."""
@@ -323,7 +287,7 @@ class Selector:
         best: Fitted | None = None
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
-                if best is None or gap - model.cost > _HOPEFUL * (gap - best.cost):
+                if best is None or gap - model.cost > THRESHOLDS.hopeful * (gap - best.cost):
                     found = self._kept(self._fitter.fitted(model))
                     best = found if best is None or found.cost < best.cost else best
                 advance(note=names_of(model.members))
@@ -335,3 +299,77 @@ class Selector:
         if key not in self._seen or model.cost < self._seen[key].cost:
             self._seen[key] = model
         return model
+
+
+# --- pruning --------------------------------------------------------------------------------------
+
+
+def pruned(
+    best: Tested,
+    base: Tested,
+    fitter: Fitter,
+    kept: Callable[[Fitted], Fitted],
+    test: Callable[[Fitted], Tested],
+    alpha: float,
+    reporter: Reporter | None = None,
+) -> Tested:
+    """Drops effects that do not matter, or that the others can do without.
+
+    Of two sets that leave no more than chance, the smaller one is the explanation. Costs are
+    compared over the same days, and enough of them: with more the same model costs less, and what
+    a few cost is luck where queues are long.
+
+    Args:
+        best: The set to begin with.
+        base: The scenario as it is, which is left if every effect is fitted to nothing.
+        fitter: Simulates and fits.
+        kept: Remembers what was fitted.
+        test: Tests what a model leaves.
+        alpha: Level of the tests.
+        reporter: Shows progress.
+    """
+    reporter = reporter or Silent()
+
+    def settled(model: Fitted) -> Fitted:
+        return fitter.simulate(model.members, THRESHOLDS.settling_days)
+
+    members = tuple(item for item in best.model.members if item[0].matters(item[1]))
+    if members and len(members) < len(best.model.members):
+        best = test(fitter.refine(fitter.simulate(members), 2))
+    while len(best.model.members) > 1:
+        fewer: list[Fitted] = []
+        with reporter.task("without single effects", len(best.model.members)) as advance:
+            for part in each_left_out(best.model.members):
+                fewer.append(kept(settled(fitter.refine(fitter.simulate(part), 2))))
+                advance(note=names_of(part))
+        doubtful = [fewer[place] for place in _doubtful(best)]
+        least = min(fewer, key=cost_of)
+        if least.cost - settled(best.model).cost > THRESHOLDS.negligible:
+            if not doubtful:
+                break
+            least = min(doubtful, key=cost_of)
+        tested = test(least)
+        enough = tested.residual.p > alpha
+        # What may not be there is not named, either, where nothing suffices.
+        vain = least in doubtful and best.residual.p <= alpha
+        if least.cost > best.model.cost and not enough and not vain:
+            break
+        best = tested
+    something = merged((), best.model.members)
+    if len(something) == len(best.model.members):
+        return best
+    return test(fitter.simulate(something)) if something else base
+
+
+def _doubtful(tested: Tested) -> list[int]:
+    """Places of the effects whose intervals hold the nominal value: they may not be there."""
+    found: list[int] = []
+    first = 0
+    for place, (hypothesis, values) in enumerate(tested.model.members):
+        errors = tested.errors[first : first + len(values)]
+        first += len(values)
+        if values and hypothesis.nominal is not None:
+            away = np.abs(np.subtract(values, hypothesis.nominal))
+            if (away <= THRESHOLDS.half_interval * errors).all():
+                found.append(place)
+    return found

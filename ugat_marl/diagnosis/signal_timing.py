@@ -7,16 +7,13 @@ import math
 from collections import Counter
 
 from ugat_marl.data import Measured
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect, effect_from
 from ugat_marl.scenarios import GREEN, Network, Scenario, SignalLog
 
 IN_THE_LOG = ("yellow_time", "all_red_time")
 """Effects that the log of the signals tells by itself; a replay has them without knowing."""
 _AMBER = frozenset("yY")
-_LEAST = 20
-"""Clearances that must have been seen."""
-_USUAL = 0.8
-"""Share of them that must agree."""
 
 
 def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> tuple[Effect, ...]:
@@ -37,9 +34,9 @@ def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> 
     clearances = (yellow, control.yellow_s), (red, control.all_red_s)
     for name, (seen, now) in zip(IN_THE_LOG, clearances, strict=True):
         total = sum(seen.values())
-        if total >= _LEAST:
+        if total >= THRESHOLDS.least_clearances:
             value, count = seen.most_common(1)[0]
-            if count >= _USUAL * total and abs(value - now) > 0.05:
+            if count >= THRESHOLDS.usual_share * total and abs(value - now) > 0.05:
                 found.append(effect_from({"name": name, "seconds": value}))
     return tuple(found)
 

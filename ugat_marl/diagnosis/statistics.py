@@ -10,7 +10,7 @@ its distribution is never looked up but always simulated.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,21 +18,19 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import EVENT_FEATURES, FEATURES, SPEED_FEATURES, Tally
 from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
 
-MIN_OBSERVATIONS = 3.0
-"""Observations per period below which a mean is not used."""
-_GRAIN = 0.3
-"""A mean is not known better than to this much of a unit in one observation."""
-_EVENT = 1.0
-"""What hardly ever happens is not known better than to one event in a period."""
 SINGLE = ("lane", "time")
 """Blocks with so many statistics of single lanes and minutes that most of an effect's differences
 there are chance: those are left as they were."""
-CERTAIN = 6.0
-"""Squared standardised difference beyond which one is not chance."""
-SOFT = {"network": np.inf, "intersection": np.inf, "lane": 5.0, "time": 4.0}
+SOFT = {
+    "network": np.inf,
+    "intersection": np.inf,
+    "lane": THRESHOLDS.soft_lane,
+    "time": THRESHOLDS.soft_time,
+}
 """Standardised differences beyond this count less: queues reach a place or they do not, and single
 lanes and minutes have heavy tails."""
 
@@ -178,8 +176,7 @@ class Reference:
             variance = _smoothed(mean, variance)
         error = variance / len(sums)
         if prior is not None:
-            few = 6.0
-            scale = len(sums) / (len(sums) + few)
+            scale = len(sums) / (len(sums) + THRESHOLDS.few_days)
             variance = scale * variance + (1 - scale) * prior.variance
             error = variance / len(sums)
             if partner is not None:
@@ -191,7 +188,7 @@ class Reference:
         if timed:
             used = mean > 0.5
         else:
-            used = (weight >= MIN_OBSERVATIONS) & np.isfinite(mean)
+            used = (weight >= THRESHOLDS.least_observations) & np.isfinite(mean)
             used &= ~_constant(self._speeds)[None, :]
         if timed:
             correlation = np.eye(sums.shape[2])
@@ -286,7 +283,7 @@ def _moved(mean: Array, residual: Array, partner: Array) -> NDArray[np.bool_]:
     before, _, _, other = _moments(partner)
     days = len(partner)
     noise = ((residual - other) ** 2).sum(axis=0) / max(days - 1, 1) / days
-    return np.nan_to_num((mean - before) ** 2, nan=np.inf) > CERTAIN * noise
+    return np.nan_to_num((mean - before) ** 2, nan=np.inf) > THRESHOLDS.certain * noise
 
 
 def _controlled(
@@ -308,8 +305,13 @@ def _controlled(
 def _grain(width: int) -> Array:
     """The smallest sum that is known to be one, for every feature, or bin of time."""
     if width != len(FEATURES):
-        return np.full(width, _GRAIN)
-    return np.array([_EVENT if name in EVENT_FEATURES else _GRAIN for name, _, _ in FEATURES])
+        return np.full(width, THRESHOLDS.grain)
+    return np.array(
+        [
+            THRESHOLDS.least_events if name in EVENT_FEATURES else THRESHOLDS.grain
+            for name, _, _ in FEATURES
+        ]
+    )
 
 
 @functools.cache
@@ -375,7 +377,7 @@ def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> di
     found: dict[str, Array] = {}
     for name, values in difference.items():
         squared = np.maximum(values**2, 1e-300)
-        found[name] = values * np.maximum(1.0 - CERTAIN * variance[name] / squared, 0.0)
+        found[name] = values * np.maximum(1.0 - THRESHOLDS.certain * variance[name] / squared, 0.0)
     return found
 
 
@@ -385,6 +387,75 @@ def without_noise(
     """Differences with those of single lanes and minutes set to 0 that may be chance."""
     found: dict[str, Array] = {}
     for name, values in difference.items():
-        certain = values**2 > CERTAIN * variance[name]
+        certain = values**2 > THRESHOLDS.certain * variance[name]
         found[name] = np.where(certain, values, 0.0) if name in SINGLE else values
     return found
+
+
+# --- whitening ------------------------------------------------------------------------------------
+
+Group = tuple[NDArray[np.int64], NDArray[np.bool_], Array]
+"""Members of a block, the features they use, and what makes these independent."""
+
+
+class Whitener:
+    """Turns differences of statistics into independent numbers of unit noise, in one vector.
+
+    Args:
+        reference: Whose noise.
+        data: The data set, which decides what is used and how precise it is.
+        tolerance: Share of a measured difference that counts as noise as well: predictions by
+            interpolation are no better.
+        relative_to: Whose choice of statistics is used, so that vectors of different models fit.
+        blocks: Blocks to use; None for all.
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        data: Sequence[Tally],
+        tolerance: float,
+        relative_to: Reference | None = None,
+        blocks: Collection[str] | None = None,
+    ) -> None:
+        chosen = relative_to or reference
+        found = reference.distance(data, relative_to=chosen)
+        sums = reference.pools.pool(added(data))
+        self._parts: list[tuple[str, Array, list[Group]]] = []
+        for name, block in reference.blocks.items():
+            if blocks is not None and name not in blocks:
+                continue
+            weight = sums[name][..., 1] / len(data)
+            noise = block.noise(weight, len(data))
+            difference = found.difference[name]
+            soft = 0.0 if SOFT[name] == np.inf else 1.0 / SOFT[name]
+            scale = np.sqrt(noise + (max(tolerance, soft) * difference) ** 2)
+            used = chosen.blocks[name].used & (weight >= 1.0)
+            self._parts.append((name, scale, groups_of(used, block.correlation)))
+        self.measured = self(found.difference)
+
+    def __call__(self, differences: Mapping[str, Array]) -> Array:
+        """Whitened differences, one after the other."""
+        rows: list[Array] = []
+        for name, scale, groups in self._parts:
+            rows.append(independent(differences[name] / scale, groups))
+        return np.concatenate(rows)
+
+
+def groups_of(used: NDArray[np.bool_], correlation: Array) -> list[Group]:
+    """Members that use the same features, with what makes those independent."""
+    patterns, kind = np.unique(used, axis=0, return_inverse=True)
+    groups: list[Group] = []
+    for index, pattern in enumerate(patterns):
+        if pattern.any():
+            lower = np.linalg.cholesky(correlation[np.ix_(pattern, pattern)])
+            members = np.flatnonzero(kind.ravel() == index)
+            groups.append((members, pattern, np.asarray(np.linalg.inv(lower), np.float64)))
+    return groups
+
+
+def independent(z: Array, groups: Sequence[Group]) -> Array:
+    """Standardised differences as independent numbers, one after the other."""
+    z = np.nan_to_num(z)
+    rows = [(z[members][:, used] @ inverse.T).ravel() for members, used, inverse in groups]
+    return np.concatenate(rows) if rows else np.empty(0)

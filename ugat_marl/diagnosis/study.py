@@ -10,39 +10,24 @@ from pathlib import Path
 
 import numpy as np
 
-from ugat_marl.data import Measured, follows_traffic
-from ugat_marl.diagnosis.counted import bins_together, counts_tally, without_gaps
+from ugat_marl.data import Finding, Measured, follows_traffic
 from ugat_marl.diagnosis.engine import Engine, default_cache
-from ugat_marl.diagnosis.features import Tally
+from ugat_marl.diagnosis.features import Tally, bins_together, counts_tally, without_gaps
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, library
-from ugat_marl.diagnosis.local import Proposer
-from ugat_marl.diagnosis.matched import Directions
-from ugat_marl.diagnosis.reach import unreached
+from ugat_marl.diagnosis.places import Proposer, Routes
 from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
-from ugat_marl.diagnosis.residual import Directed, Null
-from ugat_marl.diagnosis.select import Effort, Selector
+from ugat_marl.diagnosis.residual import Directed, Directions, Null
+from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, added, shift
-from ugat_marl.diagnosis.volume import Routes
+from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, THRESHOLDS, Effort
 from ugat_marl.effects import Effect
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios import Detector, Network, Period, Scenario
-
-PRICE = 14.0
-"""What an effect must take off the distance to be worth naming."""
-EFFORTS = ((4, Effort()), (8, Effort(40, 3, 5, 32)))
-"""Numbers of days for so many intersections. With more of them every day says more, since effects
-on the whole network are seen at each, and costs more: fewer are simulated."""
-LEAST_EFFORT = Effort(24, 2, 3, 16)
-DOUBT_DAYS = 24
-"""Simulated with other vehicles than those the signals answered."""
-OPEN = 0.6
-"""Share of what other arrivals change by which a statistic may still be off with the measured ones:
-set on empty cases of seeds 11 and 12, which no blind test uses."""
+from ugat_marl.scenarios import Detector, Network, Period, Scenario, driven_routes, edge_of
 
 
 @dataclass(frozen=True)
@@ -188,7 +173,7 @@ class Study:
         with reporter.task("the scenario as it is", self.effort.base) as advance:
             days = self.engine.replicates([], range(self.effort.base), advance)
         if self.other_days is not None:
-            numbers = range(min(DOUBT_DAYS, self.effort.base))
+            numbers = range(min(THRESHOLDS.doubt_days, self.effort.base))
             with reporter.task("the same with other vehicles", len(numbers)) as advance:
                 self.other_days.replicates([], numbers, advance)  # remembered for `doubt`
         aside = self.engine.usual.set_aside
@@ -266,13 +251,15 @@ class Study:
         if self.other_days is None:
             return None
         if effects not in self._doubts:
-            numbers = range(min(DOUBT_DAYS, self.effort.base))
+            numbers = range(min(THRESHOLDS.doubt_days, self.effort.base))
             own = self.engine.ordinary(effects, numbers)
             other = self.other_days.ordinary(effects, numbers)
             both = [number for number in own if number in other]
             days = [[found[number].tally for number in both] for found in (own, other)]
             apart, _ = shift(self.pools, *days)
-            self._doubts[effects] = {name: (OPEN * values) ** 2 for name, values in apart.items()}
+            self._doubts[effects] = {
+                name: (THRESHOLDS.left_open * values) ** 2 for name, values in apart.items()
+            }
         return self._doubts[effects]
 
     @functools.cached_property
@@ -289,7 +276,7 @@ class Study:
             base.model.days,
             self.fit,
             days=self.effort.fit,
-            price=PRICE,
+            price=THRESHOLDS.price,
             speeds=self.speeds,
         )
 
@@ -331,3 +318,59 @@ def _tallies(
         return tuple(engine.measured(periods))
     whole = without_gaps(measured.counts, measured.periods)
     return tuple(counts_tally(site, period, measured.counts, whole) for period in periods)
+
+
+# --- demand that does not come where vehicles were measured ---------------------------------------
+
+_NAMED = 6
+
+
+def unreached(
+    scenario: Scenario, measured: Measured, detectors: Sequence[Detector]
+) -> tuple[Finding, ...]:
+    """A finding on edges where detectors counted vehicles, and which no route leads over.
+
+    Args:
+        scenario: The scenario as it is.
+        measured: The data.
+        detectors: Those that are compared.
+
+    Raises:
+        MeasuredDataError: No route leads over any of the measured edges.
+    """
+    edges = {item.id: edge_of(item.lane) for item in detectors}
+    counted: dict[str, int] = {}
+    for period in measured.periods:
+        for name, passages in period.passages.items():
+            if name in edges and len(passages):
+                counted[edges[name]] = counted.get(edges[name], 0) + len(passages)
+    if not measured.has_events and measured.counts is not None:
+        for name, count in measured.counts.select("detector_id", "count").iter_rows():
+            if name in edges and count:
+                counted[edges[name]] = counted.get(edges[name], 0) + int(count)
+    left = set(edges.values())
+    for way in driven_routes(scenario):
+        left.difference_update(way)
+        if not left:
+            return ()
+    if left == set(edges.values()):
+        raise MeasuredDataError(
+            f"scenario {scenario.id!r}: no vehicle of its demand comes over a measured edge "
+            f"({_few(left)}); check lane_id in detectors.csv, and the demand of the scenario"
+        )
+    missed = {edge for edge in left if counted.get(edge)}
+    if not missed:
+        return ()
+    vehicles = sum(counted[edge] for edge in missed)
+    return (
+        Finding(
+            f"scenario {scenario.id!r}: no vehicle of its demand comes over {_few(missed)}, where "
+            f"detectors counted {vehicles}; demand that is not there is no effect of the library, "
+            "so add it to the scenario first"
+        ),
+    )
+
+
+def _few(edges: set[str]) -> str:
+    named = sorted(edges)
+    return ", ".join(named[:_NAMED]) + (" ..." if len(named) > _NAMED else "")

@@ -3,9 +3,9 @@ from .loop import DecisionLog as DecisionLog
 from .loop import FieldLoop as FieldLoop
 from .loop import Summary as Summary
 from .site import Site as Site
-from .started import StartedSumo as StartedSumo
-from .street import DetectorKind as DetectorKind
+from .street import CountSource as CountSource
 from .street import LaneCount as LaneCount
+from .street import StartedSumo as StartedSumo
 from .street import Street as Street
 from .street import TraciStreet as TraciStreet
 from .watchdog import Limits as Limits

@@ -59,7 +59,7 @@ class Answering:
         return answer
 
     def close(self) -> None:
-        """Lets the thread end as soon as it is free."""
+        """Let the thread end as soon as it is free."""
         self._questions.put(None)
 
 

@@ -54,7 +54,7 @@ class Decision:
 
     @property
     def source(self) -> Source:
-        """Who decided."""
+        """Source of the decision: the policy, the fixed-time plan, or both."""
         if not self.fallback:
             return "policy"
         return "fallback" if len(self.fallback) == len(self.phases) else "both"
@@ -96,21 +96,21 @@ class DecisionLog:
         self._written = time.monotonic()
 
     def add(self, decision: Decision) -> None:
-        """Adds a line."""
+        """Add a line."""
         self._content += decision.line().encode() + b"\n"
         if time.monotonic() - self._written >= _WRITE_EVERY_S:
             with contextlib.suppress(OSError):  # a full disk does not stop the lights
                 self.write()
 
     def write(self) -> None:
-        """Writes what there is."""
+        """Write what there is."""
         write_whole(self.path, self._content)
         self._written = time.monotonic()
 
 
 @dataclass
 class Summary:
-    """What became of a run.
+    """Counts of a run: decisions, latencies, faults.
 
     Attributes:
         decisions: Decisions made.
@@ -125,7 +125,7 @@ class Summary:
     reasons: Counter[str] = field(default_factory=Counter)
 
     def add(self, decision: Decision) -> None:
-        """Counts a decision."""
+        """Count a decision."""
         self.decisions += 1
         self.latencies_ms.append(decision.latency_ms)
         self.light_decisions += len(decision.phases)
@@ -185,7 +185,7 @@ class FieldLoop:
         self._warm_up(policy)
 
     def run(self, seconds: float, on_decision: Callable[[Decision], None] | None = None) -> Summary:
-        """Drives the street for `seconds`, rounded up to whole decisions.
+        """Drive the street for `seconds`, rounded up to whole decisions.
 
         Raises:
             SimulatorError: The street is gone; the lights cannot be set any more.
@@ -203,7 +203,7 @@ class FieldLoop:
         return self.summary
 
     def decide(self) -> tuple[Decision, dict[str, list[Segment]]]:
-        """Reads, checks and decides; the street has not been touched yet.
+        """Read, check and decide; the street has not been touched yet.
 
         Returns:
             The decision, and what each light is to show in the coming interval.
@@ -228,7 +228,7 @@ class FieldLoop:
         return decision, plans
 
     def _act(self, decision: Decision, plans: Mapping[str, list[Segment]]) -> None:
-        """Shows the plans; no state is shown for less than its time, however late the street is."""
+        """Show the plans; no state is shown for less than its time, however late the street is."""
         for index, (duration, states) in enumerate(merged(plans)):
             self._street.show(states)
             until = self._street.now_s() + duration
@@ -243,11 +243,11 @@ class FieldLoop:
             self._log.add(decision)
 
     def close(self) -> None:
-        """Lets the policy's thread end; lights stay as they are."""
+        """Let the policy's thread end; lights stay as they are."""
         self._asked.close()
 
     def _look(self, now: float) -> tuple[dict[str, LaneCount], dict[str, str]]:
-        """Counts to believe, and the lights that see others or are not taken over yet."""
+        """Count to believe, and the lights that see others or are not taken over yet."""
         try:
             counts = dict(self._street.read())
             wrong = self._watchdog.faults(counts, now, self._held)

@@ -1,4 +1,4 @@
-"""What holds whatever a policy asks for: signal machines, the plan to fall back on, and trust.
+"""Safety under any request of a policy: signal machines, a fixed-time plan, and trust.
 
 No input, no output, no clock of its own. The signal machine is that of the environments
 (`ugat_marl.scenarios.signals`); here it also begins from whatever a light shows when it is taken
@@ -54,7 +54,7 @@ class Light:
 
     @property
     def taken_over(self) -> bool:
-        """Whether it shows, or clears towards, a phase of its own."""
+        """True once it shows, or clears towards, a phase of its own."""
         return self._state.phase < len(self.phases)
 
     @property
@@ -72,7 +72,7 @@ class Light:
         return mask
 
     def advance(self, requested: int, seconds: float) -> list[Segment]:
-        """What it shows in the next `seconds`, if from now on `requested` is asked for."""
+        """Return the segments of the next `seconds`, with `requested` asked for from now on."""
         shown: list[Segment] = []
         if self._ending_s > 0:
             part = min(self._ending_s, seconds)
@@ -87,7 +87,7 @@ class Light:
 
 
 class Trust:
-    """Who drives a light: the policy, until there is a fault, and again after some good decisions.
+    """Trust in the policy, per light: lost at a fault, regained after some good decisions.
 
     Args:
         lights: The lights.

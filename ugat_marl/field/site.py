@@ -1,4 +1,4 @@
-"""What a controller has to know of the place it controls, and what a policy must see of it."""
+"""The controlled place: network, timing, and the observation of a policy."""
 
 from __future__ import annotations
 

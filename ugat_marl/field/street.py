@@ -7,27 +7,41 @@ five methods of `Street` (docs/how-to/field.md has one).
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import math
+import os
+import signal
+import socket
 import subprocess
+import sys
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
 from typing import Any, Literal, NamedTuple, Protocol
 
 import traci
 import traci.constants as tc
 from traci.exceptions import FatalTraCIError, TraCIException
 
-from ugat_marl.errors import SimulatorError
+from ugat_marl.effects import late_greens
+from ugat_marl.errors import OptionError, SimulatorError
+from ugat_marl.scenarios import Scenario, sumo_program
+from ugat_marl.simulation import Trips, launch_of, read_trips
 
-DetectorKind = Literal["lanes", "areas"]
+CountSource = Literal["lanes", "areas"]
 """Where SUMO counts: on whole lanes, or on its lane-area detectors."""
 
 _RETRY_S = 0.05
 
+_PATIENCE_S = 10.0
+_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of <linux/prctl.h>
+
 
 class LaneCount(NamedTuple):
-    """What is known of one lane.
+    """Count of one lane.
 
     Attributes:
         time_s: When it was counted, on the street's clock.
@@ -41,7 +55,7 @@ class LaneCount(NamedTuple):
 
 
 class Street(Protocol):
-    """What the loop needs of a street. Only `read` may fail without ending the loop."""
+    """Interface of a street. Only `read` may fail without ending the loop."""
 
     def now_s(self) -> float:
         """The street's clock, s."""
@@ -56,11 +70,11 @@ class Street(Protocol):
         ...
 
     def show(self, states: Mapping[str, str]) -> None:
-        """Sets lights, which stay so until the next call; those left out are not touched."""
+        """Set lights, which stay so until the next call; those left out are not touched."""
         ...
 
     def wait(self, until_s: float) -> None:
-        """Returns when the clock shows at least `until_s`."""
+        """Return when the clock shows at least `until_s`."""
         ...
 
 
@@ -89,7 +103,7 @@ class TraciStreet:
         port: int,
         host: str = "localhost",
         *,
-        detectors: DetectorKind = "lanes",
+        detectors: CountSource = "lanes",
         process: subprocess.Popen[bytes] | None = None,
         patience_s: float = 10.0,
     ) -> None:
@@ -102,7 +116,7 @@ class TraciStreet:
             self.close()
             raise
 
-    def _subscribe(self, lanes: Sequence[str], detectors: DetectorKind) -> None:
+    def _subscribe(self, lanes: Sequence[str], detectors: CountSource) -> None:
         with self._told("SUMO refuses to say what it counts"):
             known = set(self._connection.lane.getIDList())
             if strange := sorted(set(lanes) - known):
@@ -131,7 +145,7 @@ class TraciStreet:
             return {name: api.getRedYellowGreenState(name) for name in api.getIDList()}
 
     def read(self) -> dict[str, LaneCount]:
-        """Counts at the end of the last step."""
+        """Count at the end of the last step."""
         sums: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
         for name, values in self._counter.getAllSubscriptionResults().items():
             row = sums[self._lane_of[name]]
@@ -140,20 +154,20 @@ class TraciStreet:
         return {lane: LaneCount(self._time_s, *row) for lane, row in sums.items()}
 
     def show(self, states: Mapping[str, str]) -> None:
-        """Sets the lights of the simulation."""
+        """Set the lights of the simulation."""
         with self._told("SUMO does not set a light"):
             for light, state in states.items():
                 self._connection.trafficlight.setRedYellowGreenState(light, state)
 
     def wait(self, until_s: float) -> None:
-        """Simulates until then."""
+        """Simulate until then."""
         if until_s > self._time_s:
             with self._told(f"the street is gone after {self._time_s:g} s"):
                 self._connection.simulationStep(until_s)
                 self._time_s = float(self._connection.simulation.getTime())
 
     def close(self) -> None:
-        """Hangs up, upon which SUMO ends; may be called again."""
+        """Hang up, upon which SUMO ends; may be called again."""
         with contextlib.suppress(TraCIException, FatalTraCIError, OSError):
             if self._amid and self._connection._socket is not None:
                 self._connection._socket.close()  # goodbye would be answered by what is under way
@@ -192,3 +206,95 @@ def _connected(
                     f"--remote-port {port}, or let --start do so"
                 ) from None
             time.sleep(_RETRY_S)
+
+
+class StartedSumo:
+    """Runs a scenario in ``sumo --remote-port``, from entering the block to leaving it.
+
+    SUMO ends when its one client hangs up, or (under Linux) when this process dies before.
+
+    Args:
+        scenario: What to run, in its domain.
+        seed: SUMO's seed.
+        port: Where it listens; None for a free port.
+
+    Attributes:
+        port: Where it listens.
+        process: The process.
+
+    Raises:
+        OptionError: The scenario's lights turn green late, which SUMO does not do by itself.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, port: int | None = None) -> None:
+        if late := late_greens(scenario):
+            raise OptionError(
+                f"scenario {scenario.id!r}: traffic light {next(iter(late))!r} turns green late, "
+                "which only the environments do; start SUMO in another domain"
+            )
+        self.port = port or _free_port()
+        self._scenario, self._seed = scenario, seed
+
+    def __enter__(self) -> StartedSumo:
+        self._directory = tempfile.TemporaryDirectory(prefix="ugat_marl-field-")
+        place = Path(self._directory.name)
+        launch = launch_of(self._scenario, self._seed, place, ())
+        launch.write()
+        self._trips = place / Path(_value_of("--tripinfo-output", launch.arguments)).name
+        self.process: subprocess.Popen[bytes] = subprocess.Popen(
+            [str(sumo_program("sumo")), *launch.arguments, "--remote-port", str(self.port)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for this process, which ends the other by itself
+            preexec_fn=_tied_to(os.getpid()) if sys.platform == "linux" else None,
+        )
+        return self
+
+    def trips(self) -> Trips:
+        """Return the trips of every vehicle due, once the client has hung up.
+
+        Raises:
+            SimulatorError: SUMO has not written it.
+        """
+        self._wait()
+        return read_trips(self._trips)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.process.kill()  # its files go with it
+        self._wait()
+        self._directory.cleanup()
+
+    def _wait(self) -> None:
+        try:
+            self.process.wait(_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def _value_of(option: str, arguments: tuple[str, ...]) -> str:
+    return arguments[arguments.index(option) + 1]
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return int(probe.getsockname()[1])
+
+
+def _tied_to(parent: int) -> Callable[[], None]:
+    """Return a function for the child: it is killed when `parent` dies."""
+    prctl: Any = ctypes.CDLL(None).prctl  # loaded before the fork, where little is allowed
+
+    def tie() -> None:
+        prctl(_DIE_WITH_PARENT, int(signal.SIGKILL))
+        if os.getppid() != parent:
+            os._exit(1)
+
+    return tie

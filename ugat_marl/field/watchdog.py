@@ -1,4 +1,4 @@
-"""What counts must be like to be believed, and which are not."""
+"""Plausibility of counts: limits, and the watchdog that holds counts to them."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class Watchdog:
             self._counted.add(lane)
 
     def _stuck(self, now_s: float) -> dict[str, str]:
-        """Counts that do not move; an empty road at night is one of them, and no fault at first."""
+        """Count that do not move; an empty road at night is one of them, and no fault at first."""
         limits, still = self._limits, now_s - self._moved_s
         if still > limits.frozen_after_s and any(vehicles for vehicles, _ in self._value.values()):
             return {

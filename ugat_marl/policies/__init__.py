@@ -1,4 +1,4 @@
-"""Policies: what chooses green phases, and what learns to.
+"""Policies choose green phases; learners improve them.
 
 `rules` holds controllers that follow a rule, `learners` the algorithms that improve a policy, and
 `export` writes trained policies for places where the suite is not installed.

@@ -1,4 +1,4 @@
-"""Where learning computes: on the processor, or on a GPU where torch sees one.
+"""Devices for learning: the processor, or a GPU that torch sees.
 
 A GPU does the sums of an update or a fit and nothing else. What is drawn at random is drawn on the
 CPU, so that a GPU learns from the same draws; transitions, policies, roll-outs and checkpoints stay
@@ -21,7 +21,7 @@ _NAMES = re.compile(r"cpu|cuda(?::(0|[1-9]\d*))?")
 
 
 def require_device_name(name: str) -> None:
-    """Refuses what is no device's name, whether this machine has the device or not.
+    """Refuse what is no device's name, whether this machine has the device or not.
 
     Raises:
         OptionError: Neither "cpu", "cuda" nor "cuda:N".
@@ -31,7 +31,7 @@ def require_device_name(name: str) -> None:
 
 
 def device_of(name: str) -> torch.device:
-    """The device of that name.
+    """Return the device of a name.
 
     Args:
         name: "cpu", "cuda" (torch's current GPU) or "cuda:N".
@@ -58,7 +58,7 @@ def device_of(name: str) -> torch.device:
 
 @contextlib.contextmanager
 def placed(device: torch.device, *modules: nn.Module) -> Iterator[None]:
-    """Has modules on a device for a while; whatever happens, they end on the CPU."""
+    """Move modules to a device, and back to the CPU at the end, also after an error."""
     try:
         for module in modules:
             module.to(device)

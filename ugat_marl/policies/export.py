@@ -46,7 +46,7 @@ Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None = None) -> Path:
-    """Writes a policy for use elsewhere, and a JSON file beside it.
+    """Write a policy for use elsewhere, and a JSON file beside it.
 
     Args:
         policy: What to export.
@@ -78,7 +78,7 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
 
 
 def layers_of(policy: NetworkPolicy) -> list[Layer]:
-    """The policy's network as affine maps with ReLU between them; of one kind, shared or not.
+    """Return the policy's network as affine maps with ReLU between them, shared or not.
 
     A ceiling c is a layer more: min(x, c) is c - ReLU(c - x).
 
@@ -106,7 +106,7 @@ def layers_of(policy: NetworkPolicy) -> list[Layer]:
 class NumpyPolicy:
     """An exported policy in numpy alone; torch is not loaded.
 
-    The same actions as the original's but where two Q-values differ by rounding errors only.
+    It takes the same actions as the original, except where two values differ by rounding only.
 
     Args:
         agents: The agents it acts for.
@@ -127,7 +127,7 @@ class NumpyPolicy:
 
     @classmethod
     def load(cls, path: Path) -> NumpyPolicy:
-        """Reads what `export_policy` wrote to an ``.npz`` and its JSON file.
+        """Read what `export_policy` wrote to an ``.npz`` and its JSON file.
 
         Raises:
             CheckpointError: Missing, damaged, not finite, or the two do not belong together.
@@ -148,10 +148,10 @@ class NumpyPolicy:
             ) from None
 
     def reset(self, seed: int) -> None:
-        """Nothing to forget."""
+        """Do nothing: the policy has no memory."""
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """The greedy action of every agent.
+        """Return the greedy action of every agent.
 
         Raises:
             OptionError: The observations are not of the agents this policy was trained for.
@@ -161,7 +161,7 @@ class NumpyPolicy:
         return self.agents.actions(values.argmax(axis=1))
 
     def values(self, stacked: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Q ``(agents, action_width)`` of padded observations ``(agents, observation_width)``."""
+        """Return Q ``(agents, action_width)`` of padded ``(agents, observation_width)``."""
         hidden = stacked[:, None, :]
         for place, (weight, bias) in enumerate(self.layers):
             hidden = (np.maximum(hidden, 0) if place else hidden) @ weight + bias
@@ -191,7 +191,7 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
 
 
 def _brief(agents: AgentSet) -> str:
-    """Agents and sizes in a few words."""
+    """Describe agents and sizes in a few words."""
     columns = (agents.names, agents.observation_sizes, agents.action_counts)
     rows = [f"{name} ({n} numbers, {m} actions)" for name, n, m in zip(*columns, strict=True)]
     return ", ".join(rows[:3]) + f" and {len(rows) - 3} more" * (len(rows) > 3)
@@ -250,7 +250,7 @@ def _torchscript(policy: NetworkPolicy) -> bytes:
 
 
 def _without_debug_files(archive: io.BytesIO) -> bytes:
-    """A TorchScript archive without its ``.debug_pkl``: they hold the paths of this machine."""
+    """Return a TorchScript archive without ``.debug_pkl``, which holds local paths."""
     slim = io.BytesIO()
     with zipfile.ZipFile(archive) as full, zipfile.ZipFile(slim, "w") as kept:
         for name in full.namelist():
@@ -260,7 +260,7 @@ def _without_debug_files(archive: io.BytesIO) -> bytes:
 
 
 def _onnx(policy: NetworkPolicy) -> bytes:
-    """The graph node by node: torch's own exporter leaves paths of this machine in the file.
+    """Build the graph by hand: torch's exporter leaves paths of this machine in the file.
 
     Raises:
         OptionError: The extra is not installed.

@@ -77,20 +77,20 @@ class NetworkPolicy:
 
     @property
     def ceiling(self) -> NDArray[np.float32] | None:
-        """What observations are held below, ``(agents, widest_observation)`` (a copy)."""
+        """Largest numbers the network reads, ``(agents, widest_observation)`` (a copy)."""
         return None if self._ceiling is None else self._ceiling.numpy().copy()
 
     def reset(self, seed: int) -> None:
-        """Nothing to forget: the policy is deterministic and has no memory."""
+        """Do nothing: the policy is deterministic and has no memory."""
 
     def q_values(self, observations: Observations) -> dict[str, NDArray[np.float32]]:
-        """Every agent's Q of every one of its actions, ``(actions,)`` (in scaled reward)."""
+        """Return every agent's values of its actions, ``(actions,)`` (Q in scaled reward)."""
         values = self._network(torch.from_numpy(self.agents.stack(observations)).unsqueeze(1))
         rows = zip(self.agents.names, self.agents.action_counts, values.squeeze(1), strict=True)
         return {name: row[:count].numpy() for name, count, row in rows}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """The greedy action of every agent.
+        """Return the greedy action of every agent.
 
         Raises:
             OptionError: The observations are not of the agents this policy was trained for, or not
@@ -101,7 +101,7 @@ class NetworkPolicy:
         return self.agents.actions(greedy_actions(self._network, stacked, allowed))
 
     def save(self, path: Path) -> None:
-        """Writes the policy to one file; `load` reads it."""
+        """Write the policy to one file; `load` reads it."""
         content = header(self.agents, self.hidden, self.env_options, self.shared, self.structure)
         content["parameters"] = torch.from_numpy(self.parameters)
         if self._ceiling is not None:
@@ -110,7 +110,7 @@ class NetworkPolicy:
 
     @classmethod
     def load(cls, path: Path) -> NetworkPolicy:
-        """Reads a saved policy.
+        """Read a saved policy.
 
         Raises:
             CheckpointError: Missing, cut short, not finite, or not a policy.
@@ -137,7 +137,7 @@ def header(
     shared: bool,
     structure: Structure | None = None,
 ) -> dict[str, Any]:
-    """What a checkpoint says about itself.
+    """Return the description of agents and network that every checkpoint holds.
 
     Raises:
         CheckpointError: An option of the environment is not plain data (a callable, say).
@@ -162,7 +162,7 @@ def header(
 def parse_header(
     content: Mapping[str, Any],
 ) -> tuple[AgentSet, tuple[int, ...], dict[str, Any], bool]:
-    """Agents, hidden sizes, environment options and `shared` out of what `header` made."""
+    """Read agents, hidden sizes, environment options and `shared` from a checkpoint."""
     agents = AgentSet(
         tuple(content["agents"]),
         tuple(content["observation_sizes"]),

@@ -1,4 +1,4 @@
-"""The two protocols of the suite: what acts, and what learns.
+"""Protocols of a policy, which acts, and of a learner, which improves a policy.
 
 The driver of UGAT, the evaluation and the conformance kit know nothing else about policies.
 """
@@ -14,7 +14,7 @@ from ugat_marl.envs import Actions, AnyParallelEnv, Infos, Observations, Traffic
 
 @runtime_checkable
 class Policy(Protocol):
-    """Chooses a green phase for every intersection.
+    """Choose a green phase for every intersection.
 
     Attributes:
         env_options: Options of `ugat_marl.parallel_env` the policy relies on, such as
@@ -24,11 +24,11 @@ class Policy(Protocol):
     env_options: Mapping[str, Any]
 
     def reset(self, seed: int) -> None:
-        """Forgets the past; called once before every episode."""
+        """Forget the past; called once before every episode."""
         ...
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Maps the observations of all agents to an action for each of them.
+        """Map the observations of all agents to an action for each of them.
 
         Args:
             observations: Agent to float32 vector, in the agent's observation space.
@@ -47,7 +47,7 @@ EpisodeCallback = Callable[[int, Mapping[str, float]], None]
 
 @runtime_checkable
 class Learner(Protocol):
-    """Improves a policy by acting in an environment; keeps its state between calls.
+    """Improve a policy by acting in an environment; keeps its state between calls.
 
     Attributes:
         episodes: Episodes it has been trained for in its life; saved with its state.
@@ -62,22 +62,22 @@ class Learner(Protocol):
         seed: int,
         on_episode: EpisodeCallback | None = None,
     ) -> Policy:
-        """Trains for a number of episodes and returns the current greedy policy.
+        """Train for a number of episodes and returns the current greedy policy.
 
         Called again, it goes on from where it was. `seed` fixes every random choice of this call.
         """
         ...
 
     def policy(self) -> Policy:
-        """The current greedy policy (a snapshot: later learning does not change it)."""
+        """Return the current greedy policy (a snapshot: later learning does not change it)."""
         ...
 
     def save(self, path: Path) -> None:
-        """Writes the whole state (networks, optimiser, replay), so that learning can go on."""
+        """Write the whole state (networks, optimiser, replay), so that learning can go on."""
         ...
 
     def load(self, path: Path) -> None:
-        """Restores what `save` wrote.
+        """Restore the state of a file that `save` wrote.
 
         Raises:
             CheckpointError: Unreadable, not finite, or of another set of agents.
@@ -86,4 +86,4 @@ class Learner(Protocol):
 
 
 PolicyFactory = Callable[[TrafficEnv], Policy]
-"""Makes a policy for an environment; controllers read the network from it."""
+"""Make a policy for an environment; controllers read the network from it."""

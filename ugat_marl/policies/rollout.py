@@ -1,4 +1,4 @@
-"""The one act-step-observe loop, and what is recorded along the way."""
+"""The loop of acting, stepping and observing, and the recording of its transitions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIMULATING = ("libsumo", "numpy", "ugat-marl")
 
 @dataclass(frozen=True)
 class Episode:
-    """What came of one roll-out.
+    """Result of one roll-out.
 
     Attributes:
         steps: Decisions made.
@@ -44,7 +44,7 @@ class Stopped(Exception):
 
 
 def until(stop: threading.Event) -> StepCallback:
-    """A callback that ends a roll-out, with `Stopped`, at the next decision after `stop` is set."""
+    """Return a callback that ends a roll-out, with `Stopped`, once `stop` is set."""
 
     def check(_step: int) -> None:
         if stop.is_set():
@@ -61,7 +61,7 @@ def roll_out(
     record: Observer | None = None,
     on_step: StepCallback | None = None,
 ) -> Episode:
-    """Plays one whole episode.
+    """Play one whole episode.
 
     Args:
         env: An environment made with the policy's `env_options`.
@@ -89,7 +89,7 @@ def roll_out(
 
 
 def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 0) -> Observer:
-    """An observer of the environment's network; by default one like the environment's own."""
+    """Make an observer of the environment's network; by default one like the environment's own."""
     base: Any = env.unwrapped
     if name is None:
         name, neighbours = base.options.observation, base.options.neighbours
@@ -98,7 +98,7 @@ def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 
 
 
 class _Recording:
-    """The transitions of one episode as an observer sees them; agents have the observer's names."""
+    """Transitions of one episode through an observer; agents have the observer's names."""
 
     def __init__(self, env: AnyParallelEnv, observer: Observer, seed: int) -> None:
         self._base: Any = env.unwrapped
@@ -123,7 +123,7 @@ class _Recording:
         return self._recorder.log()
 
     def _served(self) -> dict[str, NDArray[np.float32]] | None:
-        """The features at the last decision without the vehicles that left since, on average."""
+        """Return the last decision's features less the vehicles that left since, on average."""
         before, self._before = self._before, self._base.seen
         left = self._before.mean_left
         if not len(left) or self._observer.needs_waiting:  # who has left says nothing of waiting
@@ -141,7 +141,7 @@ class _Recording:
 
 
 def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Provenance:
-    """Where a log recorded in `env` (wrapped or not) through `observer` comes from."""
+    """Return the provenance of a log recorded in `env` (wrapped or not) through `observer`."""
     base: Any = env.unwrapped
     return Provenance(
         scenario=base.scenario.id,
@@ -157,7 +157,7 @@ def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Prove
 
 
 class Exploring:
-    """A policy that at each decision, agent by agent, takes a random permitted phase with chance ε.
+    """Policy that takes, agent by agent, a random permitted phase with chance ε.
 
     Roll-outs for D_sim and D_real need actions the policy would not take: without them h never sees
     what they do.
@@ -174,12 +174,12 @@ class Exploring:
         self._generator = numpy_generator(0)
 
     def reset(self, seed: int) -> None:
-        """Begins an episode; `seed` decides where exploration happens."""
+        """Begin an episode; `seed` decides where exploration happens."""
         self._policy.reset(seed)
         self._generator = numpy_generator(seed, "exploring")
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """The policy's actions, some of them replaced."""
+        """Return the policy's actions, some of them replaced."""
         actions = dict(self._policy.act(observations, infos))
         draws = self._generator.random(len(actions))
         for agent, draw in zip(sorted(actions), draws, strict=True):

@@ -5,8 +5,8 @@ from .demand import check_demand as check_demand
 from .importers.cityflow import from_cityflow as from_cityflow
 from .importers.counts import from_counts as from_counts
 from .importers.counts import from_od as from_od
-from .importers.making import Roads as Roads
-from .importers.making import Vehicles as Vehicles
+from .importers.making import RoadSource as RoadSource
+from .importers.making import VehicleSource as VehicleSource
 from .importers.making import make_scenario as make_scenario
 from .importers.osm import from_osm as from_osm
 from .importers.plan import Plan as Plan

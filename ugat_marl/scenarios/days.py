@@ -1,8 +1,8 @@
-"""Another day of the same expected demand: every vehicle single, drawn again with its own nature.
+"""Other days of the same expected demand, drawn by a Poisson bootstrap over vehicles.
 
-Between two days of the street the vehicles differ, and with them every count and every gap. A
-simulation that repeats one list of vehicles has less noise than the street and finds differences
-where there are none; so days are drawn from the list by a Poisson bootstrap.
+Between two days of a street the vehicles differ, and with them every count and every gap. A
+simulation that repeats one list of vehicles has less noise than the street, so that comparisons
+find differences where there are none.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NORMAL = re.compile(r"norm(c?)\(([^)]*)\)")
 
 @dataclass(frozen=True)
 class _Vehicles:
-    """The vehicles of an explicit scenario as text, ready to be written in any order."""
+    """Vehicles of a demand as text, ready to be written in any order."""
 
     types: Document
     depart_s: NDArray[np.float64]
@@ -45,7 +45,7 @@ class _Vehicles:
 
 
 def another_day(scenario: Scenario, seed: int) -> Scenario:
-    """Another day: a Poisson number of copies of every vehicle, departures jittered.
+    """Draw another day: a Poisson number of copies of every vehicle, departures jittered.
 
     The same seed gives the same vehicles, names and speedFactors, whatever effects are applied
     afterwards, so that two models can be compared on the same day.
@@ -96,7 +96,7 @@ def another_day(scenario: Scenario, seed: int) -> Scenario:
 
 @functools.lru_cache(maxsize=8)
 def _vehicles(routes: tuple[bytes, ...]) -> _Vehicles:
-    """Takes explicit route files apart; remembered, since days are drawn many times."""
+    """Take route files of single vehicles apart; cached, since days are drawn many times."""
     types = ET.Element("additional")
     depart: list[float] = []
     names: list[str] = []
@@ -133,7 +133,7 @@ def _attributes(item: ET.Element) -> str:
 
 
 def _speed_of(attributes: Mapping[str, str]) -> tuple[float, float, float, float]:
-    """Mean, deviation, least and greatest of a type's speedFactor; NaN if SUMO had better draw."""
+    """Return mean, deviation, least and greatest speedFactor of a type; NaN if SUMO draws it."""
     text, deviation = attributes.get("speedFactor"), attributes.get("speedDev")
     passenger = attributes.get("vClass", "passenger") == "passenger"
     try:

@@ -1,4 +1,4 @@
-"""What route files ask for: who departs when, over which edges; and whether it can be driven."""
+"""Checks of route files: departure times, edges, and their order."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NO_TIME = frozenset({"triggered", "containerTriggered", "split", "now", "begin"
 
 
 SPARE_S = 600.0
-"""SUMO reads route files so far ahead at most."""
+"""SUMO reads route files ahead by this time at most."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +43,14 @@ def check_demand(
     *,
     whole: bool = True,
 ) -> Demand:
-    """Reads all route files and checks that they can be driven.
+    """Read all route files and check that they can be driven.
 
     Args:
         scenario: Whose files.
         network: Its network.
         reporter: Shows progress where a file is long.
-        whole: Whether to read on behind the end of the episode; vehicles are in the order of their
-            departures, so nobody within it is missed.
+        whole: Whether to read on after the end of the episode; vehicles are in the order of their
+            departures, so no vehicle within it is missed.
 
     Raises:
         ScenarioError: A route uses an edge the network does not have, vehicles are not in the order
@@ -96,7 +96,7 @@ def check_demand(
 
 
 def edges_used(item: Tag) -> list[str]:
-    """The edges a vehicle, trip, flow or route names."""
+    """Return the edges that a vehicle, trip, flow or route names."""
     return " ".join(item.attributes.get(key, "") for key in _ROUTED).split()
 
 
@@ -125,7 +125,7 @@ def _unsorted(document: Document, item: Tag, depart: float, latest: float) -> Sc
 
 
 def _depart_s(item: Tag, document: Document, triggered_s: float) -> float:
-    """Seconds; of a departure that something else triggers, `triggered_s`."""
+    """Return the departure in s; `triggered_s` for one that something else triggers."""
     key, default = ("begin", "0") if item.name == "flow" else ("depart", "")
     text = item.attributes.get(key, default)
     return triggered_s if text in _NO_TIME else _seconds(text, key, item, document)

@@ -1,4 +1,4 @@
-"""What a controller will face in a scenario: its intersections, their phases, and the traffic."""
+"""Facts a controller will face in a scenario: intersections, phases, and traffic."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import GREEN
 
 SHORT_M = 50.0
-"""Lanes at lights that are shorter show little of a queue."""
+"""Shorter lanes at lights show little of a queue."""
 
 SATURATION_VPH = 1800.0
 """Vehicles an hour that a lane discharges in green: a headway of 2 s."""
 FILLINGS = 3.0
-"""An episode shorter than so many times the time the network needs to fill shows mostly that."""
+"""Least length of a useful episode, in multiples of the time the network needs to fill."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class PhaseFacts:
 
     Attributes:
         state: As SUMO writes it.
-        protected: Movements with green that nobody is in the way of, as ``edge turn``.
+        protected: Movements with green that need not wait, as ``edge turn``.
         permitted: Movements with green that must let others pass (``g``).
         crossings: Crossings with green.
     """
@@ -77,12 +77,11 @@ class IntersectionFacts:
         phases: What it chooses from.
         unserved_lanes: Lanes to which no phase gives green.
         unserved_links: Links that are green in no phase, as ``lane -> lane``.
-        partly_served: Lanes that some phase serves in one direction only: who waits for the other
-            blocks them.
-        lanes_behind: Lanes that are too short, so that those are counted with them who are on the
-            lanes behind.
-        short_lanes: Lanes shorter than `SHORT_M` of a road that goes on upstream, where nobody is
-            counted.
+        partly_served: Lanes that some phase serves in one direction only: a vehicle that waits for
+            the other direction blocks them.
+        lanes_behind: Short lanes with which vehicles on the lanes behind are counted.
+        short_lanes: Lanes shorter than `SHORT_M` of a road that goes on upstream, where vehicles
+            are not counted.
         always_green: Links that are green in every phase: the signal never stops them.
         right_on_red: Links that may go on red after a stop.
         u_turns: Links that turn around.
@@ -150,10 +149,10 @@ class Survey:
 
 
 def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
-    """Looks at everything that needs no simulation.
+    """Collect all facts that need no simulation.
 
     Args:
-        scenario: What to look at.
+        scenario: The scenario.
         reporter: Shows progress where a route file is long.
 
     Raises:
@@ -184,7 +183,7 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
 
 
 def _short(scenario: Scenario, network: Network) -> set[str]:
-    """Lanes with which more would be counted, did agents look as far as `SHORT_M`."""
+    """Return the lanes with which more would be counted if agents looked as far as `SHORT_M`."""
     if scenario.control.reach_m >= SHORT_M or "mesosim" in scenario.settings.sumo:
         return set()
     farther = Network.read(scenario.with_control(reach_m=SHORT_M))
@@ -250,7 +249,7 @@ def _in_part(lane: str, item: Intersection) -> bool:
 
 
 def _clashes(item: Intersection, rules: RightOfWay) -> Iterator[str]:
-    """Protected greens of vehicles across a crossing that is green."""
+    """Yield the protected greens of vehicles across a crossing that is green."""
     for number, phase in enumerate(item.phases):
         walks = [walk for walk in item.crossings if phase[walk.index] in GREEN]
         through = [link for link in item.links if phase[link.index] == "G"]
@@ -302,7 +301,7 @@ def _approaches(item: Intersection, network: Network, traffic: _Traffic) -> Sequ
 
 
 def _green_s(item: Intersection, lane: str) -> float:
-    """Green of a lane in a cycle of the programme; a lane with several links has the mean."""
+    """Return the green of a lane per cycle of the programme, s; the mean over its links."""
     indices = [link.index for link in item.links if link.from_lane == lane]
     shown = [
         sum(seconds for seconds, state in item.programme if state[index] in GREEN)
@@ -312,7 +311,7 @@ def _green_s(item: Intersection, lane: str) -> float:
 
 
 def _free_links(root: ET.Element) -> Counter[str]:
-    """Links without a light, by the junction they cross."""
+    """Count the links without a light, by the junction they cross."""
     ends = {edge.get("id", ""): edge.get("to", "") for edge in root.iter("edge")}
     return Counter(
         ends.get(item.get("from", ""), "")
@@ -324,7 +323,7 @@ def _free_links(root: ET.Element) -> Counter[str]:
 
 @dataclass(frozen=True)
 class _Traffic:
-    """What the routes bring: vehicles an hour by road, and how long they drive."""
+    """Traffic by the routes: vehicles an hour by road, and driving times."""
 
     vph: Counter[str]
     first_s: float

@@ -1,4 +1,4 @@
-"""What a ``.net.xml`` says of the ways across its junctions: links, crossings, who gives way."""
+"""Ways across the junctions of a ``.net.xml``: links, crossings, right of way."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CROSSING = "c"
 """Direction of a link for people on foot."""
 
 _ROUNDS = 50
-"""How often shares go round a roundabout; with each round what is missing is a fraction."""
+"""Rounds of the iteration for roundabouts; the error shrinks by a factor with each round."""
 
 Matrix = Mapping[str, Sequence[int]]
 """Per junction, a bit mask of other rows for each row of its right-of-way matrix."""
@@ -52,7 +52,7 @@ class Link:
 
 
 def links_of(root: ET.Element) -> dict[str, list[Link]]:
-    """The links for vehicles of every traffic light."""
+    """Return the links for vehicles of every traffic light."""
     links: dict[str, list[Link]] = defaultdict(list)
     for item in root.iter("connection"):
         tls = item.get("tl")
@@ -73,7 +73,7 @@ def links_of(root: ET.Element) -> dict[str, list[Link]]:
 
 
 def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
-    """The crossings for people on foot of every traffic light.
+    """Return the crossings for people on foot of every traffic light.
 
     Their rows are the last ones of the junction's matrix, in the order of their numbers. A crossing
     that shows a light at either end is one link with the letter of its first end.
@@ -102,19 +102,19 @@ def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
 
 
 def foes_of(root: ET.Element) -> dict[str, list[int]]:
-    """Per junction, a bit mask of conflicting rows for each row of the right-of-way matrix."""
+    """Return, per junction and row of the right-of-way matrix, a bit mask of conflicting rows."""
     return _matrix(root, "foes")
 
 
 def yields_of(root: ET.Element) -> dict[str, list[int]]:
-    """Per junction and row, a bit mask of the rows it gives way to."""
+    """Return, per junction and row, a bit mask of the rows it gives way to."""
     return _matrix(root, "response")
 
 
 def neighbours_of(
     links: Mapping[str, Sequence[Link]], root: ET.Element
 ) -> dict[str, tuple[str, ...]]:
-    """Traffic lights reached along roads without another traffic light in between."""
+    """Return the traffic lights reached along roads without another light in between."""
     enters = {link.from_edge: tls for tls, own in links.items() for link in own}
     following: dict[str, set[str]] = defaultdict(set)
     for item in root.iter("connection"):
@@ -137,7 +137,7 @@ def neighbours_of(
 
 
 def right_on_red_of(root: ET.Element) -> frozenset[str]:
-    """Junctions where right turns may go on red after a stop."""
+    """Return the junctions where right turns may go on red after a stop."""
     return frozenset(
         item.get("id", "")
         for item in root.iter("junction")
@@ -146,7 +146,7 @@ def right_on_red_of(root: ET.Element) -> frozenset[str]:
 
 
 def has_bit(a: Link, b: Link, matrix: Matrix) -> bool:
-    """Whether the matrix marks link `b` in the row of link `a`."""
+    """Return True if the matrix marks link `b` in the row of link `a`."""
     if a.junction != b.junction or a.request < 0 or b.request < 0:
         return False
     return bool(matrix[a.junction][a.request] >> b.request & 1)
@@ -164,7 +164,7 @@ def _matrix(root: ET.Element, attribute: str) -> dict[str, list[int]]:
 
 
 def _request_of(via: str) -> tuple[str, int]:
-    """Junction and matrix row of an internal lane ``:<junction>_<first row>_<lane>``."""
+    """Return junction and matrix row of an internal lane ``:<junction>_<first row>_<lane>``."""
     if not via:
         return "", -1
     junction, first, lane = via[1:].rsplit("_", 2)
@@ -173,7 +173,7 @@ def _request_of(via: str) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class Upstream:
-    """What lies upstream of a lane at a light.
+    """Lanes and roads upstream of a lane at a light.
 
     Attributes:
         lanes: Lanes inside junctions and outside to the share of their vehicles that is counted.
@@ -187,23 +187,22 @@ class Upstream:
 def behind_of(
     root: ET.Element, lengths_m: Mapping[str, float], reach_m: float, lights: Container[str]
 ) -> dict[str, Upstream]:
-    """Lanes where those stand who are on their way to a light, but not on the lane at it.
+    """Find the lanes behind short lanes at lights, whose vehicles are on their way to the light.
 
     Networks made of maps have lanes at lights that are cut off by a node of the map, some shorter
-    than a vehicle. Who waits farther back stands on the lanes behind, of which nothing would be
-    seen.
+    than a vehicle. The rest of the queue is on the lanes behind and would not be seen.
 
     Args:
         root: The ``<net>``.
         lengths_m: Length of every lane outside of junctions, m.
-        reach_m: How far upstream one looks: lanes behind are added until they begin so far from the
-            light or farther, each as a whole.
-        lights: The traffic lights that matter; others are taken for plain nodes.
+        reach_m: Distance looked upstream. Whole lanes are added until one begins so far from the
+            light or farther.
+        lights: The traffic lights that matter; others count as plain nodes.
 
     Returns:
-        For each lane at a light that is shorter, what is counted with it. The share of a lane
-        is that of its ways that lead to the lane at the light, one over their number at every
-        node; turning around is no way. Lanes at a light of their own are not behind another one.
+        For each shorter lane at a light the lanes and roads counted with it. The share of a lane is
+        the share of its ways that lead to the lane at the light: one over their number at every
+        node, U-turns not counted. Lanes at a light of their own are not behind another one.
         Where a lane begins nearer than `reach_m`, vehicles that wait to enter on its road, each on
         any of its lanes, are behind it.
     """
@@ -229,7 +228,7 @@ def behind_of(
 
 @dataclass(frozen=True)
 class _Ways:
-    """How lanes outside of junctions lead to each other.
+    """Connections between lanes outside of junctions.
 
     Attributes:
         feeds: For each lane those that lead to it without a light, with the lanes inside the
@@ -273,7 +272,7 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
 def _begins(
     lane: str, ways: _Ways, lengths_m: Mapping[str, float], reach_m: float
 ) -> dict[str, float]:
-    """How far from the light lanes begin, up to those that begin beyond the reach, by distance."""
+    """Return each lane's distance from its begin to the light, m, nearest first."""
     found: dict[str, float] = {}
     waiting = [(lengths_m.get(lane, reach_m), lane)]
     while waiting:
@@ -289,10 +288,10 @@ def _begins(
 
 
 def _shares(lane: str, near: Sequence[str], ways: _Ways) -> dict[str, float]:
-    """Share of the vehicles on each lane that come to `lane`, by all ways through `near`.
+    """Return the share of each lane's vehicles that come to `lane`, by all ways through `near`.
 
-    The shares are the solution of one equation per lane, reached by repeating it: roundabouts
-    need more than one round, and what goes round once more is a fraction each time.
+    The shares solve one linear equation per lane, by fixed-point iteration: roundabouts need more
+    than one round, and each round adds a smaller share.
     """
     shares = {lane: 1.0}
     for _ in range(_ROUNDS + len(near)):  # a chain of n lanes takes n rounds

@@ -14,7 +14,7 @@ Shares = tuple[tuple[tuple[str, float], ...], ...]
 
 
 class Behind(NamedTuple):
-    """Who is counted with lanes that end before an agent's sight does (`junctions.behind_of`).
+    """Lanes and roads counted with lanes shorter than an agent's sight (`junctions.behind_of`).
 
     Attributes:
         lanes: For each measured lane the lanes upstream of it, inside junctions and outside.
@@ -27,18 +27,18 @@ class Behind(NamedTuple):
 
 
 NOTHING_BEHIND = Behind()
-"""Nobody is counted with any lane."""
+"""No lane is counted with another."""
 
 
 @dataclass(frozen=True)
 class LaneTable:
-    """Which lanes are measured, in the order of every array of a `Snapshot`.
+    """Measured lanes, in the order of every array of a `Snapshot`.
 
     Attributes:
         ids: Lane ids of SUMO, ``(lanes,)``.
         capacity: Vehicles that fit on the lane, ``(lanes,)``, float64.
         speed_mps: Speed limit, ``(lanes,)``, float64.
-        behind: Who is counted with lanes that are too short.
+        behind: Lanes and roads counted with lanes that are too short.
     """
 
     ids: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Names of agents, whose prefix says of what kind they are, and of SUMO's lanes."""
+"""Names of agents, with a prefix per kind of agent, and of SUMO's lanes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Hashable, Mapping, Sequence
 
 
 def group_names(kinds: Sequence[Hashable]) -> dict[str, list[int]]:
-    """Groups of equal kinds, in order of appearance.
+    """Return groups of equal kinds, in order of appearance.
 
     Args:
         kinds: The kind of each item.
@@ -26,13 +26,13 @@ def group_names(kinds: Sequence[Hashable]) -> dict[str, list[int]]:
 
 
 def member_names(groups: Mapping[str, Sequence[int]]) -> tuple[str, ...]:
-    """``<group>_<n>`` for every position, in the order of the positions."""
+    """Return ``<group>_<n>`` for every position, in the order of the positions."""
     names = {place: f"{name}_{n}" for name, own in groups.items() for n, place in enumerate(own)}
     return tuple(names[place] for place in sorted(names))
 
 
 def letters(number: int) -> str:
-    """a, b, ..., z, aa, ab, ..."""
+    """Return a, b, ..., z, aa, ab, ... for 0, 1, ..."""
     text = ""
     number += 1
     while number:
@@ -42,5 +42,5 @@ def letters(number: int) -> str:
 
 
 def edge_of(lane: str) -> str:
-    """The edge of a lane, by SUMO's naming; empty if it is not a lane's name."""
+    """Return the edge of a lane, by SUMO's naming; empty if it is not a lane's name."""
     return lane.rpartition("_")[0]

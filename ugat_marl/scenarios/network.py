@@ -46,7 +46,7 @@ class Lane:
         length_m: Length.
         speed_mps: Speed limit.
         shape: Centre line, ``((x, y), ...)`` in m.
-        behind: What is counted with it, since it ends before an agent's sight does.
+        behind: Lanes and roads counted with it, where it is shorter than an agent's sight.
         room_m: Length on which vehicles are measured: lanes behind included, and the reach.
     """
 
@@ -107,7 +107,7 @@ class Network:
 
     @classmethod
     def read(cls, scenario: Scenario) -> Network:
-        """Reads and checks the network of a scenario.
+        """Read and check the network of a scenario.
 
         Raises:
             ScenarioError: Not a network, no traffic light to control, phases that cannot be shown
@@ -182,11 +182,11 @@ class Network:
         return cls(_with_room(lanes, root, agents, reach_m), pruned, tuple(uncontrolled))
 
     def intersection(self, tls: str) -> Intersection:
-        """The intersection with this SUMO id."""
+        """Return the intersection with this SUMO id."""
         return next(item for item in self.intersections if item.id == tls)
 
     def lane_table(self) -> LaneTable:
-        """All incoming and outgoing lanes of intersections, each once, in a fixed order."""
+        """Return all incoming and outgoing lanes of intersections, each once, in a fixed order."""
         names = _unique(
             lane
             for item in self.intersections
@@ -207,7 +207,7 @@ class Network:
 
 
 def within_hops(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str, tuple[str, ...]]:
-    """For each name the others at most `hops` roads away, nearest first."""
+    """Return for each name the others at most `hops` roads away, nearest first."""
     found: dict[str, tuple[str, ...]] = {}
     for name in neighbours:
         reached, frontier = [name], [name]
@@ -220,7 +220,7 @@ def within_hops(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str,
 
 
 def signal_widths(scenario: Scenario) -> dict[str, int]:
-    """How many letters the state of each traffic light has, controlled by an agent or not.
+    """Return the number of letters in the state of each traffic light, an agent's or not.
 
     Raises:
         ScenarioError: The network is not well-formed.
@@ -236,16 +236,16 @@ def signal_widths(scenario: Scenario) -> dict[str, int]:
 
 
 def _source_of(scenario: Scenario, tls: str) -> str | Sequence[str]:
-    """Where the phases of a traffic light come from; states if they are listed."""
+    """Return the source of a traffic light's phases; the states if they are listed."""
     own = scenario.settings.intersections.get(tls)
     return own.phases if own and own.phases is not None else scenario.control.phases
 
 
 def _choices(phases: Sequence[str], links: Sequence[Link], source: str | Sequence[str]) -> int:
-    """Phases between which an agent that sees vehicles can choose.
+    """Count the phases among which an agent that sees vehicles can choose.
 
-    At a light for a crossing alone it would never stop the vehicles: that keeps its programme,
-    unless its phases are listed.
+    At a light for a crossing alone an agent would never stop the vehicles. Such a light keeps its
+    programme, unless its phases are listed.
     """
     if not isinstance(source, str):
         return len(phases)
@@ -287,9 +287,9 @@ def _check_programme(
     foes: Mapping[str, Sequence[int]],
     where: str,
 ) -> int:
-    """Refuses a programme SUMO or traffic could not live with; returns the letters of its states.
+    """Refuse an impossible programme and return the number of letters of its states.
 
-    There may be more letters than links of vehicles: those of pedestrian crossings.
+    There may be more letters than links of vehicles: crossings for people on foot have letters too.
     """
     letters = len(programme[0][1])
     for index, (_, state) in enumerate(programme):
@@ -348,7 +348,7 @@ def _lanes(root: ET.Element) -> dict[str, Lane]:
 def _with_room(
     lanes: dict[str, Lane], root: ET.Element, agents: Container[str], reach_m: float
 ) -> dict[str, Lane]:
-    """The lanes, those at lights that are too short with what is counted with them."""
+    """Return the lanes; short ones at lights with the lanes that are counted with them."""
     lengths_m = {name: lane.length_m for name, lane in lanes.items()}
     for name, own in behind_of(root, lengths_m, max(reach_m, VEHICLE_SPACE_M), agents).items():
         behind = own if reach_m else Upstream(own.lanes)
@@ -364,7 +364,7 @@ def _shape(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[float, str], ...]]:
-    """The programme SUMO runs: the last one defined, additional files after the network."""
+    """Return the programmes SUMO runs: the last one defined, additional files after the network."""
     programmes: dict[str, tuple[tuple[float, str], ...]] = {}
     parts = chain.from_iterable(document.parts() for document in scenario.additional)
     for tree in chain((root,), parts):

@@ -1,4 +1,4 @@
-"""Detectors of a street, the vehicles that pass them, and what the signals show meanwhile."""
+"""Periods of measurement: detectors, the vehicles that passed them, and the signal log."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Split = Literal["fit", "heldout"]
 
 
 SignalLog = tuple[tuple[float, str], ...]
-"""What a traffic light showed: ``(since_s, state)`` at every change, in order of time."""
+"""States of a traffic light: ``(since_s, state)`` at every change, in order of time."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,12 @@ class Passages:
 
     @classmethod
     def none(cls) -> Passages:
-        """No vehicle."""
+        """Return passages of no vehicle."""
         empty = np.empty(0)
         return cls(empty, empty, empty, empty)
 
     def at(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Passages:
-        """The chosen passages."""
+        """Return the chosen passages."""
         return Passages(
             self.on_s[chosen], self.off_s[chosen], self.speed_mps[chosen], self.length_m[chosen]
         )
@@ -79,7 +79,7 @@ class Period:
         begin_s: Start on the scenario's clock.
         end_s: End on the scenario's clock.
         split: Whether models are fitted to it, or judged on it.
-        signals: Traffic light to what it showed; the first entry is at or before `begin_s`.
+        signals: Traffic light to its log; the first entry is at or before `begin_s`.
         passages: Detector to its vehicles; a detector that reported nothing is left out.
     """
 
@@ -92,5 +92,5 @@ class Period:
 
 
 def deciding_letter(states: Sequence[str]) -> str:
-    """The letter that decides what vehicles on several links do: green before yellow before red."""
+    """Return the letter that vehicles on several links obey: green before yellow before red."""
     return next((x for x in "GgYyur" if x in states), "r")

@@ -1,4 +1,4 @@
-"""Which links may be green together: phases from a programme, or derived from the conflicts.
+"""Links that may be green together: phases of a programme, or derived from the conflicts.
 
 The conflicts are those of the junction's own right-of-way matrix (``<request foes=...>``).
 """
@@ -37,7 +37,7 @@ Clash = Callable[[Link, Link], bool]
 
 
 def programme_phases(programme: Sequence[tuple[float, str]]) -> tuple[str, ...]:
-    """The green phases of a signal programme: states with green and without yellow, each once."""
+    """Return the green phases of a programme: states with green and without yellow, each once."""
     return tuple(
         dict.fromkeys(
             state for _, state in programme if set(state) & GREEN and not set(state) & YELLOW
@@ -46,12 +46,12 @@ def programme_phases(programme: Sequence[tuple[float, str]]) -> tuple[str, ...]:
 
 
 def are_foes(a: Link, b: Link, foes: Matrix) -> bool:
-    """Whether the paths of two links cross or merge, by their junction's matrix."""
+    """Return True if the paths of two links cross or merge, by their junction's matrix."""
     return has_bit(a, b, foes) or has_bit(b, a, foes)
 
 
 def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple[int, int] | None:
-    """Two links that both have protected green though their paths cross, or None.
+    """Return two links that both have protected green though their paths cross, or None.
 
     Only crossings that involve a through movement count: many networks draw opposing left turns so
     tightly that the matrix calls them foes, and give a merging right turn a standing green.
@@ -71,11 +71,11 @@ def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple
 
 @dataclass(frozen=True)
 class RightOfWay:
-    """Who is in whose way at the junctions of a network, and who waits.
+    """Right of way at the junctions of a network: conflicts, and who waits.
 
     Attributes:
         foes: Rows that cross or merge.
-        yields: Rows that each row gives way to; empty where nobody asks who waits.
+        yields: Rows that each row gives way to; empty where that is not needed.
         right_on_red: Junctions where right turns may go on red after a stop.
     """
 
@@ -84,7 +84,7 @@ class RightOfWay:
     right_on_red: frozenset[str] = frozenset()
 
     def waits(self, a: Link, b: Link) -> bool:
-        """Whether `a` must let `b` go first."""
+        """Return True if `a` must let `b` go first."""
         return bool(self.yields) and has_bit(a, b, self.yields)
 
 
@@ -97,16 +97,16 @@ def conflict_free_phases(
     crossings: Sequence[Link] = (),
     permitted: bool = False,
 ) -> tuple[str, ...]:
-    """All maximal sets of compatible movements, as SUMO states.
+    """Return all maximal sets of compatible movements, as SUMO states.
 
     A movement is a group of links with one approach and one direction; movements that share a
     letter of the state count as one. Right turns follow: they are green with every phase that gives
     green to a lane they share or that they do not conflict with.
     On a 4-arm junction with left lanes this gives the eight phases of the UGAT paper.
 
-    A crossing goes with every phase in which only turning vehicles cross it, who wait (``g``):
-    right turns if there is such a phase, left turns too if not. One that no phase can serve gets
-    green in a phase for people on foot alone.
+    A crossing is green in every phase in which only turning vehicles cross it and wait (``g``):
+    right turns if there is such a phase, else left turns too. A crossing that no phase can serve
+    gets green in a phase for people on foot alone.
 
     Args:
         links: Links of one traffic light.
@@ -145,7 +145,7 @@ def conflict_free_phases(
 
 
 def _permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
-    """Conflicts but those of left turns that wait for the approach opposite."""
+    """Return a conflict test that allows left turns to wait for the approach opposite."""
     through = [link for link in links if link.direction == "s"]
     crossing = {
         (a.from_edge, b.from_edge) for a in through for b in through if are_foes(a, b, rules.foes)
@@ -168,7 +168,7 @@ def _permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
 def _with_crossings(
     phases: list[list[Link]], crossings: Sequence[Link], foes: Matrix
 ) -> list[list[Link]]:
-    """The phases with the crossings that may be used in them, and one for those left over."""
+    """Add to each phase the crossings it can serve, and a phase for the crossings left over."""
     alone: list[Link] = []
     found = [list(phase) for phase in phases]
     for crossing in crossings:
@@ -189,7 +189,7 @@ def _with_crossings(
 
 
 def state_of(green: Sequence[Link], links: Sequence[Link], rules: RightOfWay, width: int) -> str:
-    """The state that shows green: protected, or permitted where somebody else goes first."""
+    """Return the state with green for links: protected, or permitted where a link must wait."""
     letters = ["r"] * width
     for link in links:
         if link.junction in rules.right_on_red and turn_of(link) == "r":
@@ -208,7 +208,7 @@ def _maximal_phases(
     clash: Clash,
     source: str,
 ) -> list[set[Movement]]:
-    """Maximal sets of the movements that lead, each with the right turns that may follow it."""
+    """Return maximal sets of movements, each with the right turns that may go with it."""
     main = [name for name in groups if name not in following]
     compatible = {
         a: {b for b in main if b != a and not _groups_conflict(groups[a], groups[b], clash)}
@@ -229,7 +229,7 @@ def _maximal_phases(
 
 
 def _movements(links: Sequence[Link]) -> dict[Movement, list[Link]]:
-    """Links by approach and turn; those that share a letter can only be green together."""
+    """Group links by approach and turn; links that share a letter are one group."""
     groups: dict[Movement, list[Link]] = {}
     for link in links:
         groups.setdefault((link.from_edge, _turn(link.direction)), []).append(link)
@@ -248,12 +248,12 @@ def _movements(links: Sequence[Link]) -> dict[Movement, list[Link]]:
 
 
 def _turn(direction: str) -> str:
-    """Through, left or right; partial turns and turn-arounds count as the turn they resemble."""
+    """Return s, l or r; partial turns and U-turns count as the turn they resemble."""
     return {"L": "l", "t": "l", "T": "l", "R": "r"}.get(direction, direction)
 
 
 def turn_of(link: Link) -> str:
-    """Through, left or right; partial turns and turn-arounds count as the turn they resemble."""
+    """Return s, l or r; partial turns and U-turns count as the turn they resemble."""
     return _turn(link.direction)
 
 
@@ -303,11 +303,11 @@ def _maximal_cliques(
 
 
 def suited(network: Path) -> tuple[dict[str, str], list[str]]:
-    """The lights that conflict-free phases do not suit, and what suits them.
+    """Find the lights that conflict-free phases do not suit, and a source of phases that does.
 
-    Where a lane serves straight on and left turns, a phase for one of them alone lets whoever waits
-    for the other block the lane: there left turns are permitted. A light with too many conflicts to
-    derive phases, or with one phase only by them, keeps its programme's.
+    Where a lane serves straight on and left turns, a phase for one of them alone is blocked by the
+    first vehicle that waits for the other. There left turns are permitted. A light with too many
+    conflicts to derive phases, or with a single derived phase, keeps the phases of its programme.
 
     Args:
         network: The ``.net.xml``.
@@ -349,7 +349,7 @@ def _derived(
 
 
 def _shared(links: Sequence[Link]) -> bool:
-    """Whether a lane leads both straight on and to the left."""
+    """Return True if some lane leads both straight on and to the left."""
     turns: dict[str, set[str]] = defaultdict(set)
     for link in links:
         if link.direction not in "tT":

@@ -1,4 +1,4 @@
-"""SUMO's own programs and tools, run with a list of options; what they say becomes an error."""
+"""SUMO's own programs and tools, run with a list of options; their complaints become errors."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pathlib import Path
 from ugat_marl.errors import ScenarioError
 
 _MOST_WORDS = 60
-"""Of what a program says in an error; netconvert can complain for pages."""
+"""Words kept of a program's complaint; netconvert can complain for pages."""
 
 
 def sumo_program(name: str) -> Path:
-    """A program of the installed eclipse-sumo wheel itself, not the wrapper written in Python."""
+    """Return the path of a program in the eclipse-sumo wheel, not of its wrapper in Python."""
     import sumo
 
     return Path(sumo.SUMO_HOME) / "bin" / name
 
 
 def netconvert(arguments: Sequence[str], output: Path) -> str:
-    """Makes a network, without the comment that holds date and paths.
+    """Make a network, without the comment that holds date and paths.
 
     Args:
         arguments: Options without the output.
@@ -47,7 +47,7 @@ def netconvert(arguments: Sequence[str], output: Path) -> str:
 
 
 def tool(script: str, arguments: Sequence[str]) -> None:
-    """Runs one of SUMO's tools written in Python.
+    """Run one of SUMO's tools written in Python.
 
     Args:
         script: Its name, ``routeSampler.py`` say.
@@ -61,7 +61,7 @@ def tool(script: str, arguments: Sequence[str]) -> None:
 
 
 def run_program(name: str, command: Sequence[str]) -> str:
-    """What a program says on standard error.
+    """Run a program and return its standard error.
 
     Raises:
         ScenarioError: It failed.
@@ -76,7 +76,7 @@ def run_program(name: str, command: Sequence[str]) -> str:
 
 
 def _errors(said: str) -> str:
-    """The lines that are errors; warnings stand between them."""
+    """Return the lines that are errors; there are warnings between them."""
     return "\n".join(line for line in said.splitlines() if "rror" in line)
 
 

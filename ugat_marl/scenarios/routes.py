@@ -19,7 +19,7 @@ from ugat_marl.scenarios.settings import seconds_of
 
 
 class OwnEdges:
-    """Whether a route file holds single vehicles with their own edges only, tag after tag."""
+    """Detector of route files that hold nothing but single vehicles with their own edges."""
 
     def __init__(self) -> None:
         self._holds = True
@@ -27,23 +27,23 @@ class OwnEdges:
 
     @property
     def lost(self) -> bool:
-        """Whether something else came: nothing behind it changes that."""
+        """True once something else was read; later tags cannot change that."""
         return not self._holds
 
     def read(self, item: Tag) -> None:
-        """Takes the next opening tag."""
+        """Take the next opening tag."""
         if item.name in ("vehicle", "trip", "flow", "route", "routeDistribution"):
             single = item.name == "vehicle" and "route" not in item.attributes
             self._holds &= item.name == "route" or (single and not self._waiting)
             self._waiting = single
 
     def ended(self) -> bool:
-        """The answer for the whole file."""
+        """Return True if the whole file held nothing else."""
         return self._holds and not self._waiting
 
 
 def as_vehicles(scenario: Scenario) -> Scenario:
-    """The same demand as single vehicles with routes: trips and flows are resolved by duarouter.
+    """Return the same demand as single vehicles with routes; duarouter resolves trips and flows.
 
     Raises:
         ScenarioError: duarouter refuses; its own words are in the message.
@@ -54,7 +54,7 @@ def as_vehicles(scenario: Scenario) -> Scenario:
 
 
 def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
-    """The edges of every vehicle that departs in the scenario's time, one after the other.
+    """Yield the edges of every vehicle that departs within the scenario's time.
 
     Args:
         scenario: Any scenario; `as_vehicles` is applied if need be.
@@ -72,7 +72,7 @@ def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
 def departures(
     scenario: Scenario, *, routed: bool, reporter: Reporter | None = None
 ) -> Iterator[tuple[str, float, list[str]]]:
-    """Name, departure and roads of every vehicle that departs before the end of the episode.
+    """Yield name, departure and roads of every vehicle that departs before the end.
 
     Args:
         scenario: Whose demand; it has passed `check_demand`.
@@ -94,7 +94,7 @@ def departures(
 
 
 def _is_explicit(document: Document) -> bool:
-    """Whether every vehicle of the file stands there with its own edges, and there is no flow."""
+    """Return True if the file holds nothing but single vehicles with their own edges."""
     if document.path is None or document.content is not None:
         return _explicit_content(document, 0, 0)
     state = document.path.stat()
@@ -103,7 +103,7 @@ def _is_explicit(document: Document) -> bool:
 
 @functools.lru_cache(maxsize=8)
 def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
-    """The same, remembered for a file as long as it does not change."""
+    """Do the same, cached for a file as long as it does not change."""
     del size, changed_ns
     singles = OwnEdges()
     for tag in document.scan():
@@ -114,7 +114,7 @@ def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
 
 
 def _routed(scenario: Scenario) -> Document:
-    """All demand of the scenario through duarouter."""
+    """Route all demand of the scenario with duarouter."""
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
         out = directory / "routed.rou.xml"
@@ -147,7 +147,7 @@ def _routed(scenario: Scenario) -> Document:
 
 
 def _for_sumo(document: Document, directory: Path) -> Path:
-    """Where SUMO finds a document: a plain file where it lies, else a copy in `directory`."""
+    """Return a path SUMO can read: a plain file where it lies, else a copy in `directory`."""
     path = document.path
     plain = path is not None and document.content is None and path.suffix != ".gz"
     if path is not None and plain and "," not in str(path.resolve()):  # it ends a name for SUMO

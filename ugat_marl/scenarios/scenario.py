@@ -87,18 +87,18 @@ class Scenario:
         return digest.hexdigest()
 
     def with_control(self, **changes: Any) -> Scenario:
-        """The same scenario with other signal timing (keywords of `ControlSettings`)."""
+        """Return the scenario with other signal timing (keywords of `ControlSettings`)."""
         control = {**self.control.model_dump(), **changes}
         settings = {**self.settings.model_dump(), "control": control}
         return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
 
     def with_duration(self, duration_s: float) -> Scenario:
-        """The same scenario, ending earlier or later."""
+        """Return the scenario with another duration."""
         settings = {**self.settings.model_dump(), "duration_s": duration_s}
         return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
 
     def write(self, directory: Path) -> Path:
-        """Writes a scenario directory that any SUMO and `read_scenario` can use.
+        """Write a scenario directory that any SUMO and `read_scenario` can use.
 
         Returns:
             `directory`.
@@ -122,7 +122,7 @@ class Scenario:
 
 
 def read_scenario(name: str | Path) -> Scenario:
-    """Loads a scenario; effects listed in its ``scenario.toml`` are kept in its settings.
+    """Load a scenario; effects listed in its ``scenario.toml`` are kept in its settings.
 
     Args:
         name: Id of a shipped scenario (``"grid4x4-v1"``), a directory with a ``scenario.toml``, a
@@ -153,7 +153,7 @@ def read_scenario(name: str | Path) -> Scenario:
 
 
 def shipped_scenarios() -> Iterator[tuple[str, Path]]:
-    """Ids and directories of the scenarios that come with the package."""
+    """Yield ids and directories of the scenarios that come with the package."""
     package = Path(__file__).resolve().parents[1]
     for root in (package / "_scenarios", package.parent / "scenarios"):
         if root.is_dir():
@@ -195,7 +195,7 @@ _SYNONYMS = {
     "end": ("end", "e"),
     "step-length": ("step-length",),
 }
-"""What SUMO lets the elements of a configuration be called."""
+"""Names that SUMO allows for the elements of a configuration."""
 
 
 def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
@@ -250,7 +250,7 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
 
 
 def _names(text: str, directory: Path) -> list[str]:
-    """File names separated by commas, or as of old by blanks."""
+    """Return file names; SUMO separates them by commas or blanks."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     return [
         part
@@ -260,7 +260,7 @@ def _names(text: str, directory: Path) -> list[str]:
 
 
 def resco_maps() -> dict[str, Path]:
-    """The RESCO networks of an installed sumo-rl, which is read as files and never imported."""
+    """Return the RESCO networks of an installed sumo-rl, read as files and never imported."""
     spec = importlib.util.find_spec("sumo_rl")
     roots = list(spec.submodule_search_locations or []) if spec else []
     files = [file for root in roots for file in Path(root).glob("nets/RESCO/*/*.sumocfg")]
@@ -280,7 +280,7 @@ def _resco_configuration(name: str) -> Path:
 
 
 def _quiet(document: Document) -> Document:
-    """The document without outputs: detectors and edge data would write beside the user's files."""
+    """Return the document without outputs, which would be written beside the user's files."""
     if not any("file" in tag.attributes for tag in document.scan()):
         return document
     draft = None
@@ -295,7 +295,7 @@ def _quiet(document: Document) -> Document:
 
 
 def _quoted(value: Any) -> str:
-    """A value as TOML, which agrees with JSON but for surrogates and the character DEL."""
+    """Return a value as TOML, which agrees with JSON but for the character DEL."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -304,7 +304,7 @@ def _key(name: str) -> str:
 
 
 def scenario_toml(settings: Mapping[str, Any], applied: Sequence[str] = ()) -> str:
-    """The text of a ``scenario.toml``.
+    """Return the text of a ``scenario.toml``.
 
     Args:
         settings: Its keys and values; tables are nested.

@@ -1,4 +1,4 @@
-"""What stands in a ``scenario.toml``, checked value by value."""
+"""Content of a ``scenario.toml``, checked value by value."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class ControlSettings(pydantic.BaseModel):
     min_green_s: Annotated[float, Field(ge=0, le=600)] = 5.0
     phases: PhaseSource = "programme"
     late_green_s: Annotated[float, Field(ge=0, le=60, exclude_if=lambda value: value == 0)] = 0.0
-    """Traffic on every link starts so much later than its green, to which the agent is blind."""
+    """Delay of traffic behind every green, s; agents do not see it."""
     reach_m: Annotated[float, Field(ge=0, le=2000, exclude_if=lambda value: value == 0)] = 0.0
-    """How far upstream of a stop line vehicles are counted where the lane at it is shorter."""
+    """Distance upstream of a stop line within which vehicles are counted, on shorter lanes too."""
 
 
 class IntersectionSettings(pydantic.BaseModel):
-    """What one traffic light does differently from `ControlSettings`."""
+    """Settings of one traffic light that differ from `ControlSettings`."""
 
     model_config = _STRICT
 
@@ -73,7 +73,7 @@ class ScenarioFile(pydantic.BaseModel):
 
 
 def validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
-    """Checks the content of a scenario file.
+    """Check the content of a scenario file.
 
     Args:
         raw: Keys and values.
@@ -121,13 +121,13 @@ def validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
 
 
 def may_be_given(option: str) -> bool:
-    """Whether a scenario may set this option of SUMO: not what the suite sets, reads or writes."""
+    """Return True for an option of SUMO that a scenario may set; the suite sets the others."""
     words = set(re.split("[-.]", option))
     return option not in _SET_BY_THE_SUITE and not words & _INPUT_AND_OUTPUT
 
 
 def seconds_of(text: str) -> float:
-    """Seconds of a time as SUMO writes it: ``seconds``, ``h:m:s`` or ``days:h:m:s``.
+    """Return the seconds of a time of SUMO's: ``seconds``, ``h:m:s`` or ``days:h:m:s``.
 
     Raises:
         ValueError: Not a time.
@@ -142,7 +142,7 @@ def seconds_of(text: str) -> float:
 
 
 def _explain(item: Any) -> str:
-    """One complaint of pydantic in words of the file."""
+    """Return one complaint of pydantic in words of the file."""
     names = [str(part) for part in item["loc"]]
     if "phases" in names:  # the alternatives of a union stand behind the key
         key = ".".join(names[: names.index("phases") + 1])
@@ -162,7 +162,7 @@ def _explain(item: Any) -> str:
 
 
 def _known_keys(table: list[str]) -> list[str]:
-    """The keys of the table an unknown one stands in, and where it might belong instead."""
+    """Return the keys that are allowed in the table of an unknown key."""
     if not table:
         return [*ScenarioFile.model_fields]
     if table[0] == "intersections":

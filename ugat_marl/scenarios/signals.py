@@ -46,7 +46,7 @@ class SignalTiming:
 
 
 class SignalState(NamedTuple):
-    """Where the machine of one intersection stands.
+    """State of the signal machine of one intersection.
 
     Attributes:
         phase: Green phase shown, or cleared towards.
@@ -60,21 +60,21 @@ class SignalState(NamedTuple):
 
     @property
     def clearing(self) -> bool:
-        """Whether yellow or all-red is shown."""
+        """True while yellow or all-red is shown."""
         return self.phase != self.origin
 
     def later(self, seconds: float) -> SignalState:
-        """The same light, `seconds` later."""
+        """Return the state `seconds` later, with no change in between."""
         return SignalState(self.phase, self.origin, self.elapsed_s + seconds)
 
 
 def initial_state(timing: SignalTiming) -> SignalState:
-    """Phase 0, green for long enough that any phase may follow."""
+    """Return phase 0, green for long enough that any phase may follow."""
     return SignalState(0, 0, timing.min_green_s)
 
 
 def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) -> bool:
-    """Whether a request made now is begun within the next `within_s` seconds."""
+    """Return True if a request made now is begun within the next `within_s` seconds."""
     wait = timing.min_green_s - state.elapsed_s
     if state.clearing:
         wait = timing.clearance_s - state.elapsed_s + timing.min_green_s
@@ -82,10 +82,10 @@ def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) ->
 
 
 def begins_when_asked(timing: SignalTiming, interval_s: float) -> bool:
-    """Whether every green begins within the decision that asks for it.
+    """Return True if every green begins within the decision that asks for it.
 
-    It does if clearance leaves some of an interval, and the minimum green lasts no longer than
-    that: then a light may always change at once, and has done so when the next decision is due.
+    That holds if the clearance is shorter than an interval and the minimum green no longer than
+    the rest. Then a light may change at once at every decision.
     """
     left_s = interval_s - timing.clearance_s
     return left_s > _INSTANT_S and timing.min_green_s <= left_s + _INSTANT_S
@@ -98,14 +98,14 @@ def advance(
     seconds: float,
     timing: SignalTiming,
 ) -> tuple[SignalState, list[Segment]]:
-    """Runs the machine of one intersection for `seconds` under one request.
+    """Run the machine of one intersection for `seconds` under one request.
 
     A clearance in progress is completed, the minimum green is held, and then the requested phase
     follows behind yellow and all-red. Links that are green in both phases stay green in between.
 
     Args:
         phases: Green states of the intersection, one letter per link.
-        state: Where the machine stands.
+        state: State of the machine.
         requested: Index of the phase asked for.
         seconds: Length of the decision interval.
         timing: Clearance and minimum green.
@@ -130,7 +130,7 @@ def _course(
     seconds: float,
     timing: SignalTiming,
 ) -> tuple[SignalState, tuple[Segment, ...]]:
-    """`advance`, remembered: the machine is in few states, and asked many times in each."""
+    """Do the work of `advance`, cached: the machine has few states and visits each many times."""
     shown: list[Segment] = []
     left = seconds
     while left > _INSTANT_S:
@@ -144,7 +144,7 @@ def _course(
 def _next_segment(
     phases: Sequence[str], state: SignalState, requested: int, left: float, timing: SignalTiming
 ) -> tuple[SignalState, Segment]:
-    """The longest stretch of constant state that starts now, at most `left` seconds."""
+    """Return the longest stretch of constant state from now on, at most `left` seconds."""
     green = phases[state.phase]
     if state.clearing:
         origin = phases[state.origin]
@@ -174,13 +174,13 @@ def _append(shown: list[Segment], segment: Segment) -> None:
 
 @functools.cache
 def yellow_between(origin: str, target: str) -> str:
-    """Yellow where a green ends; green where it goes on, with the weaker of the two rights."""
+    """Return yellow where a green ends; green where it goes on, with the weaker of both rights."""
     return "".join(_ending(a, b, "y") for a, b in zip(origin, target, strict=True))
 
 
 @functools.cache
 def red_between(origin: str, target: str) -> str:
-    """Red where a green ended or is about to begin; green where it goes on."""
+    """Return red where a green ended or is about to begin; green where it goes on."""
     return "".join(_ending(a, b, "r") for a, b in zip(origin, target, strict=True))
 
 
@@ -193,7 +193,7 @@ def _ending(before: str, after: str, cleared: str) -> str:
 
 
 class LateGreen(NamedTuple):
-    """What `with_late_green` has to remember about one traffic light.
+    """Memory of `with_late_green` about one traffic light.
 
     Attributes:
         commanded: State commanded last, one letter per link.
@@ -209,7 +209,7 @@ class LateGreen(NamedTuple):
 
     @classmethod
     def after(cls, state: str) -> LateGreen:
-        """A light that has shown `state` for long."""
+        """Return the memory of a light that has shown `state` for long."""
         nothing = (0.0,) * len(state)
         return cls(state, state, nothing, nothing)
 
@@ -217,21 +217,20 @@ class LateGreen(NamedTuple):
 def with_late_green(
     segments: Sequence[Segment], late_s: float, step_s: float, before: LateGreen
 ) -> tuple[LateGreen, list[Segment]]:
-    """Traffic that starts late: every link that turns green stays red for `late_s` first.
+    """Delay greens: every link that turns green stays red for `late_s` first.
 
     The time is lost at the start of the green, the end stays where it is. Greens are held back by
-    whole steps, since a simulation knows nothing in between; what is left over is added to the
-    link's next green, so that the mean over many greens is `late_s`. A green shorter than its delay
-    is not shown, nor the yellow behind it.
+    whole steps of the simulation. The rest is added to the link's next green, so that the mean over
+    many greens is `late_s`. A green shorter than its delay is not shown, nor is its yellow.
 
     Args:
-        segments: What is commanded.
+        segments: Commanded states.
         late_s: Time lost, in s.
         step_s: Length of a simulation step.
-        before: What is remembered of what was commanded before.
+        before: Memory of earlier commands.
 
     Returns:
-        What to remember, and what is shown: segments of the same total duration.
+        The new memory, and the states shown: segments of the same total duration.
     """
     shown: list[Segment] = []
     state = before
@@ -271,11 +270,11 @@ class GreenDelays:
         self._held: dict[str, LateGreen] = {}  # lights that wait, or owe a fraction of a step
 
     def ask(self, seconds: Mapping[str, float]) -> None:
-        """Traffic light to how much longer greens that begin in the next `hold` stay red, in s."""
+        """Set, per traffic light, the extra delay in s of greens that begin in the next `hold`."""
         self._asked = seconds
 
     def hold(self, plans: Mapping[str, list[Segment]]) -> dict[str, list[Segment]]:
-        """What is shown instead of `plans`, which are the same decision of every light."""
+        """Return the segments shown instead of `plans`, which are one decision of every light."""
         shown = dict(plans)
         for tls, plan in plans.items():
             late = self._late_s.get(tls, 0.0) + self._asked.get(tls, 0.0)
@@ -291,7 +290,7 @@ class GreenDelays:
 
 
 def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -> LateGreen:
-    """The memory at the moment at which `commanded` begins, `shown` holding what waits."""
+    """Return the memory when `commanded` begins; its `shown` holds the letters that wait."""
     if commanded == state.commanded:
         return state
     shown, waiting, owed = list(state.shown), list(state.waiting_s), list(state.owed_s)
@@ -313,7 +312,7 @@ def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -
 def delayed_log(
     log: Sequence[tuple[float, str]], late_s: float, step_s: float
 ) -> tuple[tuple[float, str], ...]:
-    """`with_late_green` for what a traffic light showed: ``(since_s, state)`` at every change."""
+    """Apply `with_late_green` to the log of a light, ``(since_s, state)`` at every change."""
     if len(log) < 2:
         return tuple(log)
     state = LateGreen.after(log[0][1])
@@ -332,7 +331,7 @@ def delayed_log(
 
 
 def check_phases(phases: Sequence[str], links: int, source: str) -> None:
-    """Refuses phase lists a signal cannot show.
+    """Refuse phase lists a signal cannot show.
 
     Args:
         phases: Green states.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ugat_marl.testing.behaviour import an_episode_runs
+from ugat_marl.testing.environment import an_episode_runs
 from ugat_marl.testing.episodes import (
     EnvironmentCase,
     Episode,
@@ -135,7 +135,7 @@ DETERMINISM_CHECKS = (
 
 
 def check_determinism(make_env: MakeEnv, seed: int = 1) -> list[Result]:
-    """Checks that episodes are reproducible to the bit.
+    """Check that episodes are reproducible to the bit.
 
     Plays about a dozen whole episodes; give it short ones.
 

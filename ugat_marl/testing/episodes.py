@@ -25,7 +25,7 @@ PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
 
 @dataclass(frozen=True)
 class Moment:
-    """What `reset` or one `step` gave.
+    """Values that `reset` or one `step` returned.
 
     Attributes:
         parts: Name of each of `PARTS` that was given, to a copy of it as it was at the time.
@@ -122,17 +122,17 @@ class EnvironmentCase:
         choose: Choose | None = None,
         watch: Callable[[], None] | None = None,
     ) -> Episode:
-        """Runs an episode to its end; see `play`."""
+        """Run an episode to its end; see `play`."""
         return play(env, seed, choose or random_actions(self.seed), self.max_steps, watch)
 
     def tidy(self) -> None:
-        """Closes what `make` has made; what is wrong with `close` is for a check to say."""
+        """Close what `make` has made; what is wrong with `close` is for a check to say."""
         while self._made:
             with Listening():
                 self._made.pop().close()
 
     def close(self) -> None:
-        """Closes all environments."""
+        """Close all environments."""
         self._made += self._kept
         self._kept.clear()
         self.tidy()
@@ -150,7 +150,7 @@ def play(
     max_steps: int,
     watch: Callable[[], None] | None = None,
 ) -> Episode:
-    """Runs an episode to its end.
+    """Run an episode to its end.
 
     Args:
         env: The environment.
@@ -209,7 +209,7 @@ def _moment(
 
 
 def _all_over(moment: Moment) -> bool:
-    """Whether everybody is done, even if the environment left them in `agents`."""
+    """Return True if all agents are done, even if the environment left them in `agents`."""
     ended, cut = moment.parts["terminations"], moment.parts["truncations"]
     return all(ended.get(agent) or cut.get(agent) for agent in moment.agents)
 
@@ -241,7 +241,7 @@ def _random_action(
 
 
 def allowed_actions(info: Any, count: int) -> NDArray[np.int64]:
-    """What an action mask allows; everything where there is none, or none that makes sense."""
+    """Return the actions a mask allows; all where there is no mask, or no mask that makes sense."""
     mask = np.asarray(info.get("action_mask")) if isinstance(info, Mapping) else np.empty(0)
     if mask.shape == (count,) and mask.dtype.kind in "biu" and mask.any():
         return np.flatnonzero(mask)
@@ -263,7 +263,7 @@ def replaying(episode: Episode, *, reverse: bool = False) -> Choose:
 
 
 def require_same(expected: Episode, found: Episode, what: str, cure: str) -> None:
-    """Raises a `ConformanceError` that names the first difference of two episodes.
+    """Raise a `ConformanceError` that names the first difference of two episodes.
 
     Scores are not compared; see `different`.
     """
@@ -276,7 +276,7 @@ def require_same(expected: Episode, found: Episode, what: str, cure: str) -> Non
 
 
 def different(a: Any, b: Any, path: str = "") -> str:
-    """Where two nested values first differ, in words; empty if they are equal to the bit."""
+    """Say in words where two nested values first differ; empty if they are equal to the bit."""
     if is_dataclass(a) and is_dataclass(b):
         a, b = asdict(a), asdict(b)  # pyright: ignore[reportArgumentType]
     if isinstance(a, Mapping) and isinstance(b, Mapping):

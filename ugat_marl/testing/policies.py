@@ -44,7 +44,7 @@ class PolicyCase(EnvironmentCase):
 
     @property
     def answers(self) -> Answers:
-        """What the policy answers, from `reset(seed)` on."""
+        """Return the policy's answers from `reset(seed)` on."""
         if self._speechless:
             raise NotChecked("not checked, because act() failed")
         if self._first is None:
@@ -56,7 +56,7 @@ class PolicyCase(EnvironmentCase):
 
     @property
     def second_answers(self) -> Answers:
-        """What it answers to the same questions after another `reset(seed)`."""
+        """Return its answers to the same questions after another `reset(seed)`."""
         if self._again is None:
             _ = self.answers
             self._again = self.ask(self.policy)
@@ -72,7 +72,7 @@ class PolicyCase(EnvironmentCase):
             raise NotChecked("not checked, because the policy does not repeat its answers")
 
     def ask(self, policy: Policy, order: Callable[[Any], Any] = dict) -> Answers:
-        """What a policy answers; `order` arranges the dicts it is given."""
+        """Return a policy's answer; `order` arranges the dicts it is given."""
         policy.reset(self.seed)
         found: Answers = []
         for moment in self.questions:
@@ -204,7 +204,7 @@ def what_it_is_given_stays_as_it_is(case: PolicyCase) -> None:
 
 
 def saving_keeps_its_answers(case: PolicyCase) -> None:
-    """If it has `save` and `load`, what is loaded answers like what was saved."""
+    """A loaded policy answers like the saved one, where it has `save` and `load`."""
     policy: Any = case.policy
     if not (callable(getattr(policy, "save", None)) and callable(getattr(policy, "load", None))):
         return
@@ -243,7 +243,7 @@ POLICY_CHECKS = (
 
 
 def check_policy(policy: Policy, make_env: MakeEnv, seed: int = 1) -> list[Result]:
-    """Checks a policy.
+    """Check a policy.
 
     Args:
         policy: The policy.

@@ -1,4 +1,4 @@
-"""What a check says, and how a list of checks is run and shown."""
+"""Results of checks: running a list of checks, and showing their results."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Closing(Protocol):
     """A subject under examination that cleans up after each check."""
 
     def tidy(self) -> None:
-        """Closes what the last check has made."""
+        """Close what the last check has made."""
         ...
 
 
@@ -71,7 +71,7 @@ class Listening:
 
 
 def run_checks(checks: Sequence[Callable[[AnyCase], None]], case: AnyCase) -> list[Result]:
-    """Runs every check on one case, whatever the others said."""
+    """Run every check on one case, whatever the others said."""
     results: list[Result] = []
     for check in checks:
         with Listening() as heard:
@@ -96,7 +96,7 @@ def said(error: BaseException) -> str:
 
 
 def require(condition: object, message: str) -> None:
-    """Raises a `ConformanceError` unless `condition` holds."""
+    """Raise a `ConformanceError` unless `condition` holds."""
     if not condition:
         raise ConformanceError(message)
 

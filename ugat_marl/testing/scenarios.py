@@ -103,7 +103,7 @@ class ScenarioCase:
         return env
 
     def tidy(self) -> None:
-        """Closes the environments of the last check."""
+        """Close the environments of the last check."""
         while self._envs:
             self._envs.pop().close()
 
@@ -264,7 +264,7 @@ SCENARIO_CHECKS = (
 
 
 def check_scenario(name: str | Path | Scenario, seed: int = 1) -> list[Result]:
-    """Checks a scenario; simulates a tenth of an episode, and a decision in each of V1 to V4.
+    """Check a scenario; simulate a tenth of an episode, and a decision in each of V1 to V4.
 
     Args:
         name: As for `ugat_marl.load_scenario`.

@@ -108,7 +108,7 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         return self._observe(), self._infos()
 
     def step(self, actions: Mapping[str, int]) -> Stepped:
-        """Shows the chosen phases for one interval."""
+        """Show the chosen phases for one interval."""
         if not actions and self._scores is not None:
             return {}, {}, {}, {}, {}
         if not self.agents:
@@ -160,7 +160,7 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         return np.repeat(np.where(bars, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
 
     def close(self) -> None:
-        """Ends the episode."""
+        """End the episode."""
         self.agents = []
 
     def _serve(self, agent: str, phase: int) -> None:

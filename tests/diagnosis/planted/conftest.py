@@ -17,7 +17,7 @@ import pytest
 from ugat_marl.data import Measured
 from ugat_marl.diagnosis import Diagnosis, DiagnosisConfig, diagnose
 from ugat_marl.diagnosis.hypotheses import library
-from ugat_marl.diagnosis.select import Effort
+from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Scenario

@@ -14,7 +14,7 @@ import pytest
 from ugat_marl.data import Finding, Measured
 from ugat_marl.diagnosis import DiagnosisConfig
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.select import Effort
+from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.errors import MeasuredDataError, OptionError, UnknownNameError
 
 FEW = Effort(base=24, bank=2, fit=5, test=16)

@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from studies.bench.episode import RecordingSimulator, random_actions
+from studies.bench.env import EnvBench, find_scenario, require_same_work
+from studies.bench.env_program import RecordingSimulator, random_actions
 from studies.bench.fitting import FittingBench
+from studies.bench.fresh_process import in_fresh_process
 from studies.bench.learning import LearningBench
-from studies.bench.learning_episodes import Noise, Tape
-from studies.bench.measured import in_fresh_process
+from studies.bench.learning_program import Noise, Tape
 from studies.bench.memory import MemoryBench, growth_of
-from studies.bench.memory_resets import family, look
+from studies.bench.memory_program import family, look
 from studies.bench.report import Report, Spread, Target
-from studies.bench.rival import Rival
-from studies.bench.speed import EnvBench
-from studies.bench.tasks import find_scenario, require_same_work
+from studies.bench.sumo_rl import SumoRl
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import MeasurementError, OptionError
 from ugat_marl.experiments import machine_facts
@@ -151,11 +150,11 @@ def test_impossible_options_are_refused(make: object, words: str) -> None:
 def test_resco_networks_are_found_beside_sumo_rl(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("studies.bench.tasks.find_spec", lambda _: None)
+    monkeypatch.setattr("studies.bench.env.find_spec", lambda _: None)
     configuration = tmp_path / "grid4x4" / "grid4x4.sumocfg"
     configuration.parent.mkdir()
     configuration.touch()
-    other = Rival(tmp_path / "python", tmp_path, {})
+    other = SumoRl(tmp_path / "python", tmp_path, {})
     assert find_scenario("resco:grid4x4", other) == (configuration, None)
     name, remark = find_scenario("resco:grid4x4", None)
     assert name == "grid4x4-v1"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.bench.cpu_shares import CpuShares, folder_of
+from studies.bench.scale_program import CpuShares, folder_of
 
 pytestmark = pytest.mark.skipif(
     not hasattr(signal, "setitimer"), reason="needs a system with interval timers"

@@ -10,7 +10,7 @@ import pytest
 
 import studies.bench.device as device_module
 from studies.bench.device import DeviceBench, compared, pays_from
-from studies.bench.device_rounds import LAYOUT, measure, random_log
+from studies.bench.device_program import LAYOUT, measure, random_log
 from ugat_marl.errors import OptionError
 
 

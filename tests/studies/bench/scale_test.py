@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from studies.bench.measured import in_fresh_process
+from studies.bench.fresh_process import in_fresh_process
 from studies.bench.report import Report, Spread
 from studies.bench.scale import PARTS, Figure, ScaleBench, _told
-from studies.bench.scale_work import WORK, _memory_mib, _vehicles, cycle
+from studies.bench.scale_program import WORK, _memory_mib, _vehicles, cycle
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
 
@@ -58,7 +58,7 @@ def test_memory_is_at_least_this_process_s_own() -> None:
 
 
 def ask(work: str, **request: Any) -> Any:
-    return in_fresh_process(["-m", "studies.bench.scale_work"], {"work": work, **request})
+    return in_fresh_process(["-m", "studies.bench.scale_program"], {"work": work, **request})
 
 
 @pytest.mark.slow

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.blind.busy import Busy, busy_places, telling
+from studies.blind.__main__ import LINE
 from studies.blind.cases import Case, read_label, read_plan
-from studies.blind.consequence import Consequences, differing
-from studies.blind.drawing import OUTSIDE, Drawn, Task, deck, draw_hidden, hidden_effect
-from studies.blind.generate import Blueprint, generate
-from studies.blind.outside import BusStops, Driveway
+from studies.blind.generate import Blueprint, Consequences, differing, generate
+from studies.blind.outside_effects import BusStops, Driveway
+from studies.blind.places import Busy, busy_places, telling
 from studies.blind.run import run_cases
+from studies.blind.sampling import OUTSIDE, Sample, Task, draw_effect, draw_sample, draw_tasks
 from studies.blind.strengths import KINDS
-from ugat_marl.__main__ import main
+from ugat_marl.cli import run
 from ugat_marl.data import read_measured
 from ugat_marl.diagnosis import IN_THE_LOG, Routes
 from ugat_marl.diagnosis.hypotheses import library
@@ -111,13 +111,13 @@ def test_a_test_is_gone_on_with_and_no_other_is_mixed_in(
 
 
 def test_shares_are_kept_and_nothing_hidden_is_rounded_up() -> None:
-    tasks = deck(("none", "single", "pair", "setting", "outside"), ("medium",), 50, rng())
+    tasks = draw_tasks(("none", "single", "pair", "setting", "outside"), ("medium",), 50, rng())
     counts = Counter(task.group for task in tasks)
     assert counts["none"] >= 0.25 * 50
     assert counts.total() == 50
     names = Counter(task.member for task in tasks if task.group == "single")
     assert max(names.values()) <= min(names.values()) + 1
-    tasks = deck(("headway", "none"), ("small", "large"), 7, rng())
+    tasks = draw_tasks(("headway", "none"), ("small", "large"), 7, rng())
     assert {task.strength for task in tasks if task.member == "headway"} <= {"small", "large"}
 
 
@@ -144,11 +144,11 @@ def test_places_are_busy(single: tuple[Scenario, Busy]) -> None:
 def test_what_is_outside_the_library_stays_outside(
     member: str, single: tuple[Scenario, Busy]
 ) -> None:
-    drawn = draw_hidden(Task("outside", member), *single, rng())
+    drawn = draw_sample(Task("outside", member), *single, rng())
     if member == "without gap_acceptance":  # nobody yields on this network's greens
         assert drawn is None
         return
-    assert isinstance(drawn, Drawn)
+    assert isinstance(drawn, Sample)
     unknown = {effect.name for effect in drawn.effects} & {"bus_stops", "driveway"}
     assert unknown or {effect.name for effect in drawn.effects} & set(drawn.leave_out)
 
@@ -159,8 +159,8 @@ def test_pairs_are_of_two_families_and_leaving_out_says_nothing(
     left_out = 0
     for number in range(30):
         generator = np.random.default_rng(number)
-        drawn = draw_hidden(Task("pair"), *single, generator)
-        assert isinstance(drawn, Drawn)
+        drawn = draw_sample(Task("pair"), *single, generator)
+        assert isinstance(drawn, Sample)
         names = {effect.name for effect in drawn.effects}
         assert len(names) == 2
         assert not names & set(drawn.leave_out)
@@ -218,12 +218,12 @@ def test_cases_are_diagnosed_once_and_a_failure_is_noted(
     assert seen == ["case001", "case002", "case002", "case003", "case004"]
     note = json.loads((directory / "case002" / "run.json").read_text())
     assert note["error"] == "ZeroDivisionError: a bug"
-    assert main(["blind", "grade", str(directory)]) == 0
-    assert main(["blind", "table", str(directory), "--out", str(directory / "table.md")]) == 0
+    assert run(LINE, ["grade", str(directory)]) == 0
+    assert run(LINE, ["table", str(directory), "--out", str(directory / "table.md")]) == 0
     assert "| failed | 4 | 1 of 4" in (directory / "table.md").read_text()
     # In processes of their own; one that does not even start is a failure with a reason.
     (directory / "case004" / "diagnosis.json").unlink()
-    command = ("blind", "run", str(directory), "--no-such-option")
+    command = ("run", str(directory), "--no-such-option")
     assert run_cases(directory, diagnose, jobs=2, command=command) == (0, 2)
     note = json.loads((directory / "case004" / "run.json").read_text())
     assert "no-such-option" in note["error"]
@@ -250,9 +250,9 @@ def test_unknown_classes_and_hopeless_places_are_named(
     crossing: Callable[..., Path], tmp_path: Path
 ) -> None:
     with pytest.raises(UnknownNameError, match="headway"):
-        deck(("hedway",), ("medium",), 2, rng())
+        draw_tasks(("hedway",), ("medium",), 2, rng())
     with pytest.raises(UnknownNameError, match="medium"):
-        deck(("headway",), ("medum",), 2, rng())
+        draw_tasks(("headway",), ("medum",), 2, rng())
     blueprint = Blueprint((str(crossing()),), ("turning",), cases=1)
     with pytest.raises(BlindTestError, match="'turning'"):
         generate(tmp_path / "none", blueprint)
@@ -280,7 +280,7 @@ def test_the_demand_that_is_hidden_is_what_can_be_counted(single: tuple[Scenario
     found = set[float]()
     for number in range(10):
         generator = np.random.default_rng(number)
-        effect = hidden_effect("demand_level", "medium", scenario, quiet, generator)
+        effect = draw_effect("demand_level", "medium", scenario, quiet, generator)
         assert effect is not None
         found.add(effect.record()["factor"])
     assert found == {1.3162, 0.6838}
@@ -317,7 +317,7 @@ def test_how_drivers_yield_is_hidden_where_enough_of_them_do(
     scenario = load_scenario(crossing(vehicles=vehicles, edit=yields))
     busy = busy_places(scenario, 0)
     assert busy.permitted == shown
-    drawn = draw_hidden(Task("single", "gap_acceptance", "medium"), scenario, busy, rng())
+    drawn = draw_sample(Task("single", "gap_acceptance", "medium"), scenario, busy, rng())
     assert (drawn is not None) == shown
     priority = load_scenario(crossing(vehicles=vehicles))
     assert not busy_places(priority, 0).permitted, "nobody yields there"
@@ -329,8 +329,8 @@ def test_every_effect_that_is_left_out_for_show_can_be_left_out(
     shown = set[str]()
     for number in range(300):
         generator = np.random.default_rng(number)
-        drawn = draw_hidden(Task("none"), *single, generator)
-        assert isinstance(drawn, Drawn)
+        drawn = draw_sample(Task("none"), *single, generator)
+        assert isinstance(drawn, Sample)
         assert not library(drawn.leave_out) & set(drawn.leave_out)
         shown |= set(drawn.leave_out)
     assert set(IN_THE_LOG) <= shown, "the log's effects are among them"
@@ -360,7 +360,7 @@ def test_what_changes_no_detection_is_not_hidden(crossing: Callable[..., Path]) 
 
     def has(*records: dict[str, str | float], group: str = "pair") -> bool:
         effects = tuple(effect_from(item) for item in records)
-        return consequences.has(scenario, Drawn(group, "", "", effects), "fixed-time:20")
+        return consequences.has(scenario, Sample(group, "", "", effects), "fixed-time:20")
 
     nobody_weaves = {"name": "lane_discipline", "strategic": 0.0}  # every approach has one lane
     headway = {"name": "headway", "seconds": 1.6}

@@ -57,7 +57,7 @@ BEFORE = {
     32: RED,
     33: GREEN,
 }
-"""What was shown before an event, where that is sure."""
+"""State shown before an event, where that is certain."""
 DETECTOR_OFF, DETECTOR_ON = 81, 82
 """Parameter: detector channel. Stamped after the controller's own delay and extension."""
 DETECTOR_FAULTS = (84, 85, 86, 87, 88)
@@ -83,7 +83,7 @@ _FORMATS = (
 )
 
 LOOK_BACK_S = 3600.0
-"""Events so long before a period tell what the signals showed at its begin."""
+"""Events within this time before a period give the signal state at its begin."""
 
 Source = tuple[str, int]
 """``("phase", 2)``, ``("overlap", 1)`` or ``("arrow", 5)``."""
@@ -97,7 +97,7 @@ _RANK = {RED: 0, GREEN: 1, YELLOW: 2}
 
 @dataclass(frozen=True)
 class _Event:
-    """A phase, overlap or arrow changes its colour."""
+    """Change of colour of a phase, overlap or arrow."""
 
     time_s: float
     source: Source
@@ -109,7 +109,7 @@ class _Event:
 
 
 def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Network) -> Measured:
-    """Reads a controllers' log as measured data.
+    """Read a controllers' log as measured data.
 
     Args:
         events: CSV or Parquet with TimeStamp, DeviceId, EventId and Parameter.
@@ -209,7 +209,7 @@ def _numbered(frame: pl.DataFrame) -> pl.DataFrame:
 def _in_periods(
     path: Path, log: pl.DataFrame, spans: Sequence[Span], periods: Sequence[Period]
 ) -> pl.DataFrame:
-    """The events of each period and of a while before, with ``period_id`` and ``time_s``."""
+    """Return the events of each period and of the time before, with ``period_id``, ``time_s``."""
     parts: list[pl.DataFrame] = []
     for span, period in zip(spans, periods, strict=True):
         time = (pl.col("time") - pl.lit(span.zero)).dt.total_microseconds() / 1e6
@@ -228,7 +228,7 @@ def _in_periods(
 
 
 def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, found: list[Finding]) -> None:
-    """What a log says of itself: clocks that were set, detectors that failed."""
+    """Add findings that the log itself reports: clocks that were set, detectors that failed."""
     updates = rows.filter(pl.col("event") == CLOCK_UPDATED)
     if updates.height:
         names = ", ".join(map(repr, updates["device"].unique().sort().to_list()[:6]))
@@ -252,7 +252,7 @@ def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, found: list[Fin
 
 
 def _detections(rows: pl.DataFrame, table: AtspmMapping) -> pl.DataFrame:
-    """Detector events as rows of ``detections``."""
+    """Return detector events as rows of ``detections``."""
     zones = pl.DataFrame(
         [
             (device.id, item.channel, item.id or f"{device.id}:{item.channel}", item.latency_s)
@@ -327,7 +327,7 @@ def _signals(
 def _links(
     device: Device, width: int, programme: Sequence[tuple[float, str]]
 ) -> list[list[tuple[Source, str]]]:
-    """Per link, what it follows and with which letter it is green then."""
+    """Return, per link, its sources and the letter it shows while a source is green."""
     follows: list[list[tuple[Source, str]]] = [[] for _ in range(width)]
     for kind, mapped in (("phase", device.phases), ("overlap", device.overlaps)):
         for number, links in mapped.items():
@@ -341,7 +341,7 @@ def _links(
 
 
 def _green(link: int, together: Sequence[int], programme: Sequence[tuple[float, str]]) -> str:
-    """The letter a link has in the network's programme when its phase is green."""
+    """Return a link's letter in the network's programme when its phase is green."""
     states = [state for _, state in programme]
     alike = [state for state in states if all(state[other] in "Gg" for other in together)]
     shown = [state[link] for state in alike or states]
@@ -356,7 +356,7 @@ def _events(
     sources: set[Source],
     found: list[Finding],
 ) -> list[_Event]:
-    """The changes of colour of a device up to the end of a period, in order."""
+    """Return the changes of colour of a device up to the end of a period, in order."""
     own = rows.filter(
         (pl.col("device") == device.id)
         & (pl.col("period_id") == period.id)
@@ -382,7 +382,7 @@ def _states(
     device: Device,
     period: Period,
 ) -> SignalLog:
-    """The state at the begin of the period and at every change in it."""
+    """Return the state at the begin of the period and at every change in it."""
     colours = {source: RED for own in links for source, _ in own}
     later: list[_Event] = []
     seen: set[Source] = set()
@@ -416,7 +416,7 @@ def _states(
 
 
 def read_log(path: Path, time_zone: str, found: list[Finding]) -> pl.DataFrame:
-    """The events of a log.
+    """Read the events of a log.
 
     Args:
         path: CSV or Parquet with TimeStamp, DeviceId, EventId and Parameter, in any spelling.
@@ -428,7 +428,7 @@ def read_log(path: Path, time_zone: str, found: list[Finding]) -> pl.DataFrame:
         the order of the file; rows without event or parameter are left out.
 
     Raises:
-        MeasuredDataError: Unreadable, a column missing, or times nobody can read.
+        MeasuredDataError: Unreadable, a column missing, or times of an unknown form.
     """
     if path.suffix not in (".csv", ".parquet"):
         raise MeasuredDataError(f"{path}: a log is a .csv or a .parquet file")
@@ -468,7 +468,7 @@ def read_log(path: Path, time_zone: str, found: list[Finding]) -> pl.DataFrame:
 
 
 def _times(path: Path, cells: pl.Series, time_zone: str, start: int) -> pl.Series:
-    """Local times without a time zone."""
+    """Return local times without a time zone."""
     if isinstance(cells.dtype, pl.String):
         cells = _parsed(path, cells.str.strip_chars(), start)
     if not isinstance(cells.dtype, pl.Datetime):

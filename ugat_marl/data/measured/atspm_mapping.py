@@ -1,4 +1,4 @@
-"""The table that says what the numbers in a controller's log mean on the network."""
+"""Mapping file: the meaning of the numbers in a controller's log on the network."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Text = Annotated[str, Field(min_length=1)]
 
 
 def _name(value: Any) -> Any:
-    """Numbers are names too: ``id = 1136``."""
+    """Accept numbers as names: ``id = 1136``."""
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
@@ -52,7 +52,7 @@ LinksOf = Annotated[Links, pydantic.BeforeValidator(_as_links)]
 
 
 class Channel(pydantic.BaseModel):
-    """A detector channel of a controller, and where it lies."""
+    """Detector channel of a controller, and its place."""
 
     model_config = _STRICT
 
@@ -63,11 +63,11 @@ class Channel(pydantic.BaseModel):
     kind: DetectorKind
     id: Name = ""
     latency_s: float = 0.0
-    """Delay of the detector's stamps, which is taken off them."""
+    """Delay of the detector's time stamps, s; subtracted from them."""
 
 
 class Device(pydantic.BaseModel):
-    """A controller and the traffic light it is in the network."""
+    """Controller and its traffic light in the network."""
 
     model_config = _STRICT
 
@@ -104,7 +104,7 @@ class AtspmMapping(pydantic.BaseModel):
     devices: Annotated[tuple[Device, ...], Field(min_length=1)]
 
     def spans(self) -> tuple[Span, ...]:
-        """All periods, with names."""
+        """Return all periods, with names."""
         given = self.periods or tuple(Span(zero=zero) for zero in self.zero)
         return tuple(
             span.model_copy(
@@ -121,7 +121,7 @@ class AtspmMapping(pydantic.BaseModel):
 def read_mapping(
     path: Path, widths: Mapping[str, int], driven: Mapping[str, Collection[int]]
 ) -> AtspmMapping:
-    """Reads and checks a mapping file.
+    """Read and check a mapping file.
 
     Args:
         path: TOML.

@@ -1,4 +1,4 @@
-"""What measured data lack, and which hypotheses nobody can examine without it."""
+"""Findings on gaps in measured data, and the effects that these gaps rule out."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from ugat_marl.scenarios import (
 )
 
 SHORT_S = 300.0
-"""A shorter period holds too few signal cycles to judge much."""
+"""Least length of a period with enough signal cycles."""
 SILENT_S = 1800.0
-"""A detector that says nothing for longer, while others on its road count, is probably off."""
+"""A detector silent for longer, while others on its road count, is probably off."""
 ALL_SILENT_S = 600.0
-"""So is the whole recording where no detector says anything for this long."""
+"""A recording in which all detectors are silent for longer was probably interrupted."""
 HOLE_S = 180.0
-"""And a busy one where they say nothing for longer than a signal cycle."""
+"""The same for a busy recording: longer than a signal cycle."""
 BUSY = 20
-"""Passages of its neighbours in that time that make a silent detector stand out."""
+"""Passages of neighbours during a silence from which it is reported."""
 EXPECTED = 10.0
-"""Vehicles that must be missing for a silence to be worth a word."""
+"""Vehicles expected during a silence from which it is reported."""
 MOST_ON_RED = 0.6
-"""Share of vehicles that leave the stop line on red only where something is mixed up."""
+"""Share of vehicles that leave on red from which lanes, links or clocks must be mixed up."""
 MANY_LENGTHS = 3
-"""Different lengths of one green, in whole s, that no fixed programme has."""
+"""Different lengths of one green, in whole s, from which a programme is not fixed."""
 NAMED = 6
-"""Names listed in one finding; the rest is counted."""
+"""Most names listed in one finding."""
 
 COUNTABLE = (
     "demand_level",
@@ -88,7 +88,7 @@ NEEDS_TWO_KINDS = ("undercount",)
 
 
 def coverage(measured: Measured, scenario: Scenario, network: Network) -> list[Finding]:
-    """Findings on everything that is not there, most important first."""
+    """Return findings on everything that is missing, most important first."""
     return [
         *_of_periods(measured),
         *_of_signals(measured, scenario, network),
@@ -155,7 +155,7 @@ def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Ite
 
 
 def follows_traffic(periods: Sequence[Period], tls: str) -> bool:
-    """Whether some green lasts differently long; twice in one cycle it may in a fixed programme."""
+    """Return True if some green has many lengths, more than a fixed programme can give it."""
     lengths: dict[str, set[float]] = {}
     for period in periods:
         changes = period.signals.get(tls, ())
@@ -167,7 +167,7 @@ def follows_traffic(periods: Sequence[Period], tls: str) -> bool:
 
 
 def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
-    """Whether a log has yellow, or has no green that could end in it."""
+    """Return True if a log has yellow, or no green that could end in it."""
     shown = {state for period in periods for _, state in period.signals.get(tls, ())}
     letters = set("".join(shown))
     return bool(letters & YELLOW) or not letters & GREEN or len(shown) < 2
@@ -257,7 +257,7 @@ def _of_places(detectors: Sequence[Detector], network: Network) -> Iterator[Find
 
 
 def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
-    """Traffic lights whose vehicles leave the stop line on red: a wrong table, or a wrong clock."""
+    """Find lights whose vehicles leave the stop line on red: a wrong table or a wrong clock."""
     stops: dict[str, list[str]] = {}
     for item in measured.detectors:
         if item.kind == "stop":
@@ -287,7 +287,7 @@ def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class _Silence:
-    """A detector does not change for a while, in which a neighbour counts vehicles."""
+    """Time in which a detector does not change while a neighbour counts vehicles."""
 
     period: str
     begin_s: float
@@ -331,7 +331,7 @@ def _of_silence(measured: Measured) -> Iterator[Finding]:
 
 
 def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> bool:
-    """Whether a silence is longer than a cycle and as long before and after it was busy."""
+    """Return True for a silence longer than a cycle, with as busy a time before and after it."""
     end_s = begin_s + length_s
     before = int(((times > begin_s - length_s) & (times <= begin_s)).sum()) // 2
     after = int(((times >= end_s) & (times < end_s + length_s)).sum()) // 2
@@ -339,7 +339,7 @@ def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> boo
 
 
 def _usual_rates(measured: Measured) -> dict[str, float]:
-    """Vehicles per second at each detector over all periods."""
+    """Return the vehicles per second at each detector over all periods."""
     counts: dict[str, float] = {}
     seconds = sum(period.end_s - period.begin_s for period in measured.periods)
     for period in measured.periods:
@@ -354,7 +354,7 @@ def _silent(
     period: Period,
     usual: Mapping[str, float],
 ) -> Iterator[tuple[str, str, _Silence]]:
-    """Detectors of one road that say nothing while others of it count, and they did elsewhere."""
+    """Yield detectors that are silent while others of their road count."""
     for item in group:
         begin, length = _longest_gap(times.get(item.id, np.empty(0)), period)
         if usual.get(item.id, 0.0) * length < EXPECTED:
@@ -377,12 +377,12 @@ def _times(period: Period, detector: str) -> NDArray[np.float64]:
 
 
 def _is_on(period: Period, detector: str, time_s: float) -> bool:
-    """Whether a vehicle comes over the detector at this time."""
+    """Return True if a vehicle comes over the detector at this time."""
     return detector in period.passages and bool((period.passages[detector].on_s == time_s).any())
 
 
 def _longest_gap(times: NDArray[np.float64], period: Period) -> tuple[float, float]:
-    """Begin and length of the longest time without an event."""
+    """Return begin and length of the longest time without an event."""
     marks = np.concatenate([[period.begin_s], np.sort(times), [period.end_s]])
     gaps = np.diff(marks)
     longest = int(gaps.argmax())
@@ -390,6 +390,6 @@ def _longest_gap(times: NDArray[np.float64], period: Period) -> tuple[float, flo
 
 
 def _list(what: str, names: Sequence[str]) -> str:
-    """``2 detectors ('a', 'b')``."""
+    """Return a list as in ``2 detectors ('a', 'b')``."""
     shown = ", ".join(map(repr, names[:NAMED])) + (" ..." if len(names) > NAMED else "")
     return f"{len(names)} {what}{'s' if len(names) != 1 else ''} ({shown})"

@@ -49,7 +49,7 @@ def passages_of(
     detectors: Sequence[Detector],
     found: list[Finding],
 ) -> tuple[tuple[dict[str, Passages], ...], frozenset[str]]:
-    """The vehicles over every detector.
+    """Pair on and off events to the vehicles over every detector.
 
     Args:
         path: The file.
@@ -95,7 +95,7 @@ def passages_of(
 def _known(
     path: Path, frame: pl.DataFrame, names: Sequence[str], found: list[Finding]
 ) -> pl.DataFrame:
-    """The rows of known detectors, with the number of their stream as ``key``."""
+    """Return the rows of known detectors, with the number of their stream as ``key``."""
     index = {name: i for i, name in enumerate(names)}
     code = pl.col("detector_id").replace_strict(index, default=None, return_dtype=pl.Int64)
     frame = frame.with_columns((pl.col(PERIOD).cast(pl.Int64) * len(names) + code).alias("key"))
@@ -122,7 +122,7 @@ def _known(
 def _plausible(
     path: Path, frame: pl.DataFrame, column: str, most: float, found: list[Finding]
 ) -> pl.Series:
-    """A column of speeds or lengths, NaN where it is missing or, rarely, impossible."""
+    """Return a column of speeds or lengths, NaN where missing or, rarely, impossible."""
     values = frame[column]
     refuse(
         path,
@@ -180,7 +180,7 @@ def _sorted(
 def _pair(
     path: Path, stream: _Stream, names: Sequence[str], found: list[Finding]
 ) -> tuple[tuple[NDArray[np.int64], Passages], frozenset[int]]:
-    """Passages with their streams, and the detectors that have too few of them."""
+    """Return passages with their streams, and the detectors with too many lost events."""
     key, time, is_on = stream.key, stream.time, stream.is_on
     follows = np.append(key[1:] == key[:-1], False)  # the next event is of the same stream
     leads = np.append(False, follows[:-1])
@@ -256,7 +256,7 @@ def _split(
 
 
 def _refuse_copies(path: Path, stream: _Stream, periods: Sequence[Period], detectors: int) -> None:
-    """Two periods may show the same time of two days, but not the same vehicles."""
+    """Refuse the same vehicles in two periods."""
     # One whole number per event: its time in ms, its detector, and whether it is an on.
     code = np.round(stream.time * 1000).astype(np.int64) * detectors + stream.key % detectors
     code = code * 2 + stream.is_on
@@ -296,10 +296,10 @@ def _share(some: NDArray[np.int64], many: NDArray[np.int64]) -> float:
 
 
 def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
-    """What is left of passages once they were written to a file and read again.
+    """Return the passages as a file holds them: written and read again.
 
-    Simulated detectors know more than those of a street: two vehicles on one zone, or one that
-    changed lanes beside it. Measured and simulated passages are compared in this form.
+    Simulated detectors know more than those of a street, such as two vehicles on one zone at a
+    time. Measured and simulated passages are compared in this form.
 
     Args:
         passages: In any order.
@@ -337,10 +337,10 @@ def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
 def untangled(
     key: NDArray[np.int64], time: NDArray[np.float64], is_on: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """The order of events in which an on and an off at the same moment make sense.
+    """Return an order of events in which an on and an off at the same moment alternate.
 
     Logs of tenths of a second hold pulses shorter than that, and are often sorted by event: the off
-    of such a pulse then stands before its on. After an off comes an on, and after an on an off.
+    of such a pulse then comes before its on. Ons and offs have to alternate.
 
     Args:
         key: Stream of each event ``(events,)``, sorted.

@@ -41,16 +41,16 @@ from ugat_marl.scenarios import (
 )
 
 TOLERANCE_M = 0.1
-"""How far a zone may reach beyond its lane: networks give lengths to the centimetre."""
+"""Distance by which a zone may reach beyond its lane: networks give lengths to 1 cm."""
 
 SIGNAL_GAP_S = 600.0
 """A traffic light that shows the same for longer was probably not recorded."""
 LATE_S = 120.0
-"""A log that begins later than this in its period, about a cycle, cannot be replayed."""
+"""A log that begins later than this (about a cycle) in its period cannot be replayed."""
 
 
 def read_measured(directory: Path, scenario: Scenario, network: Network) -> Measured:
-    """Reads measured data; the files are never written to.
+    """Read measured data; the files are never written to.
 
     Args:
         directory: Holds the files described in ``docs/reference/measured-data.md``.
@@ -176,7 +176,7 @@ def _counts(
     detectors: tuple[Detector, ...],
     alone: bool,
 ) -> pl.DataFrame:
-    """Counts per detector and interval, all of known detectors and within their periods."""
+    """Count per detector and interval, all of known detectors and within their periods."""
     names = [detector.id for detector in detectors]
     refuse(
         path,
@@ -218,7 +218,7 @@ def _counts(
 
 
 def _refuse_empty(path: Path, what: str, periods: list[str]) -> None:
-    """A period of which a file holds nothing is no period without vehicles."""
+    """Refuse periods of which a file holds nothing."""
     if periods:
         raise MeasuredDataError(
             f"{path}: no {what} in period {', '.join(map(repr, periods[:6]))}; was the file cut "
@@ -227,7 +227,7 @@ def _refuse_empty(path: Path, what: str, periods: list[str]) -> None:
 
 
 def periods_of(path: Path, frame: pl.DataFrame, scenario: Scenario) -> tuple[Period, ...]:
-    """The periods, still without signals and detections.
+    """Return the periods, still without signals and detections.
 
     Raises:
         MeasuredDataError: None, one twice, one that ends before it begins or that the scenario's
@@ -306,7 +306,7 @@ def _splits(path: Path, frame: pl.DataFrame) -> tuple[Split, ...]:
 
 
 def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Detector, ...]:
-    """The detectors.
+    """Return the detectors.
 
     Raises:
         MeasuredDataError: None, one twice, on a lane the network does not have, reaching beyond
@@ -361,7 +361,7 @@ def signals_of(
     widths: Mapping[str, int],
     found: list[Finding],
 ) -> tuple[dict[str, SignalLog], ...]:
-    """What every traffic light showed, one mapping per period.
+    """Return the signal log of every traffic light, one mapping per period.
 
     Args:
         path: The file.
@@ -441,7 +441,7 @@ def _check_states(path: Path, frame: pl.DataFrame, widths: Mapping[str, int]) ->
 def _log(
     entries: list[tuple[float, str]], period: Period, where: str, found: list[Finding]
 ) -> SignalLog:
-    """One log: of entries at the same time the last one counts; the first is at the begin."""
+    """Return one log that starts at the begin; of entries at the same time the last counts."""
     kept: list[tuple[float, str]] = []
     clashes = 0
     for entry in entries:

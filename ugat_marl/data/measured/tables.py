@@ -1,4 +1,4 @@
-"""The tables of measured data: which files and columns there are, read without trusting them."""
+"""Tables of measured data: files and columns, read without trusting them."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ ROW = "row"
 Kind = Literal["text", "number"]
 
 CLOCK_JUMP_S = 60.0
-"""A step back by more is a clock set back; by less, late delivery."""
+"""A step back by more is a clock set back; by less, a late delivery."""
 FEW_ROWS = 10
-"""In a stream of fewer rows nobody can tell a clock set back from rows out of order."""
+"""Fewer rows do not tell a clock set back from rows out of order."""
 MOST_OUTSIDE = 0.5
 """Share of the rows that may lie outside of their periods."""
 EPOCH = 1e8
@@ -55,7 +55,7 @@ class Table:
     suffixes: tuple[str, ...] = (".parquet", ".csv")
 
     def path(self, directory: Path) -> Path | None:
-        """The file in a directory, or None.
+        """Return the file in a directory, or None.
 
         Raises:
             MeasuredDataError: It is there twice.
@@ -68,7 +68,7 @@ class Table:
         return found[0] if found else None
 
     def names(self) -> tuple[str, ...]:
-        """The names the file may have."""
+        """Return the names the file may have."""
         return tuple(self.stem + suffix for suffix in self.suffixes)
 
     def _paths(self, directory: Path) -> Iterator[Path]:
@@ -140,7 +140,7 @@ TABLES = (PERIODS, DETECTORS, SIGNALS, DETECTIONS, LANES, TRAJECTORIES, COUNTS)
 
 
 def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
-    """The columns of `table` in a file, numbers as Float64, and `ROW`.
+    """Read the columns of `table` in a file, numbers as Float64, and `ROW`.
 
     Args:
         path: The file.
@@ -177,7 +177,7 @@ def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
 
 
 def read_raw(path: Path, found: list[Finding]) -> pl.DataFrame:
-    """All columns of a CSV or Parquet file; those of a CSV file as text.
+    """Read all columns of a CSV or Parquet file; those of a CSV file as text.
 
     Raises:
         MeasuredDataError: Unreadable, damaged or cut short.
@@ -186,7 +186,7 @@ def read_raw(path: Path, found: list[Finding]) -> pl.DataFrame:
 
 
 def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
-    """Rows with the columns of a table."""
+    """Return rows as a frame with the columns of a table."""
     kinds = {**table.columns, **table.optional}
     schema = {
         name: pl.Float64() if kind == "number" else pl.String() for name, kind in kinds.items()
@@ -195,13 +195,13 @@ def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
 
 
 def place(path: Path, row: int) -> str:
-    """How a row is called in messages."""
+    """Return the name of a row for messages."""
     what = {".csv": "line", ".parquet": "row"}.get(path.suffix, "entry")
     return f"{path}, {what} {row}"
 
 
 def refuse(path: Path, bad: pl.DataFrame, column: str, complaint: str, way_out: str) -> None:
-    """Raises an error for the first of the bad rows, if there are any.
+    """Raise an error for the first of the bad rows, if there are any.
 
     Raises:
         MeasuredDataError: `bad` has rows.
@@ -260,7 +260,7 @@ def _read_parquet(path: Path) -> pl.DataFrame:
 
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
-    """Keeps a block that fails from writing to standard error.
+    """Keep a block that fails from writing to standard error.
 
     Threads of polars print their own stack traces there before Python learns of the error.
     """
@@ -354,7 +354,7 @@ def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
 
 
 def to_texts(path: Path, cells: pl.Series) -> pl.Series:
-    """Names as text; empty cells are null.
+    """Name as text; empty cells are null.
 
     Raises:
         MeasuredDataError: A column that holds no names.
@@ -386,7 +386,7 @@ def with_period(
     *,
     early: bool = False,
 ) -> pl.DataFrame:
-    """The rows within their periods, times rounded to 1 ms, with the column `PERIOD`.
+    """Return the rows within their periods, times rounded to 1 ms, with the column `PERIOD`.
 
     Args:
         path: Where the rows come from.
@@ -465,7 +465,7 @@ def in_order(
     time: NDArray[np.float64],
     found: list[Finding],
 ) -> NDArray[np.int64]:
-    """The order by stream and time; rows of one stream at the same time stay as they are.
+    """Return the order by stream and time; rows of one stream at the same time keep theirs.
 
     Args:
         path: Where the rows come from.
@@ -488,10 +488,10 @@ def refuse_set_back(
     row: NDArray[np.int64],
     name: Callable[[int], str],
 ) -> None:
-    """Refuses streams whose clock was set back.
+    """Refuse streams whose clock was set back.
 
-    A file that is merely out of order steps back all the time; one whose pieces were put together
-    the wrong way has no time twice.
+    A file that is merely out of order steps back all the time. A file whose pieces are in the wrong
+    order has no time twice.
 
     Args:
         path: Where the rows come from.

@@ -1,4 +1,4 @@
-"""What was measured on the street, or by the same detectors in a simulation; plain values."""
+"""Measured data of a street, or of the same detectors in a simulation, as plain values."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ HELD_OUT_SHARE = 0.4
 
 @dataclass(frozen=True)
 class Finding:
-    """Something the data lack, or that looks wrong in them.
+    """Gap in the data, or something that looks wrong in them.
 
     Attributes:
         text: What, where, and how much.
-        rules_out: Hypotheses that cannot be told apart for it, by name of their effects.
+        rules_out: Names of effects that cannot be examined because of it.
     """
 
     text: str
@@ -51,17 +51,17 @@ class Measured:
     findings: tuple[Finding, ...] = field(default=())
 
     def of(self, split: Split) -> tuple[Period, ...]:
-        """The periods of one split."""
+        """Return the periods of one split."""
         return tuple(period for period in self.periods if period.split == split)
 
     @property
     def has_events(self) -> bool:
-        """Whether single vehicles were detected, and not only counted."""
+        """True if single vehicles were detected, and not only counted."""
         return any(period.passages for period in self.periods)
 
     @property
     def has_speeds(self) -> bool:
-        """Whether speeds of single vehicles were measured."""
+        """True if speeds of single vehicles were measured."""
         return any(
             bool(np.isfinite(passages.speed_mps).any())
             for period in self.periods
@@ -102,11 +102,11 @@ class Measured:
 
 
 def _canonical(numbers: NDArray[np.float64]) -> bytes:
-    """The bytes of numbers, with one way to write NaN and one to write zero."""
+    """Return the bytes of numbers, with one form of NaN and of zero."""
     return np.where(np.isnan(numbers), np.nan, numbers + 0.0).astype("<f8").tobytes()
 
 
 def split_periods(count: int) -> tuple[Split, ...]:
-    """The default split: the last 40 % are held out, and with two periods or more at least one."""
+    """Return the default split: the last 40 % are held out, of two periods or more at least one."""
     held = min(max(round(HELD_OUT_SHARE * count), 1), count - 1) if count > 1 else 0
     return ("fit",) * (count - held) + ("heldout",) * held

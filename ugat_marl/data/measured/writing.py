@@ -1,4 +1,4 @@
-"""Writes measured data as the directory that `read_measured` reads."""
+"""Writer of measured data, as the directory that `read_measured` reads."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ugat_marl.scenarios import Passages, Period
 
 
 def write_measured(measured: Measured, directory: Path, *, csv: bool = False) -> Path:
-    """Writes measured data; the directory is there whole or not at all.
+    """Write measured data; the directory is there whole or not at all.
 
     Passages are written as `as_logged` has them: to the millisecond, within their period, and one
     vehicle at a time.
@@ -79,7 +79,7 @@ def write_measured(measured: Measured, directory: Path, *, csv: bool = False) ->
 
 
 def require_replaceable(directory: Path) -> None:
-    """Refuses a directory that `write_measured` would not replace; to be asked before measuring.
+    """Refuse a directory that `write_measured` would not replace; to be asked before measuring.
 
     Raises:
         OutputError: It holds other things, or is a file.
@@ -108,7 +108,7 @@ def require_replaceable(directory: Path) -> None:
 
 
 def _put(temporary: Path, directory: Path) -> None:
-    """Moves the finished directory to its place, aside of what was there."""
+    """Move the finished directory to its place, aside of what was there."""
     umask = os.umask(0)
     os.umask(umask)
     temporary.chmod(0o777 & ~umask)
@@ -196,7 +196,7 @@ def _events(period: Period, detector: str, passages: Passages) -> pl.DataFrame:
 
 
 def _ordered(frame: pl.DataFrame, table: Table) -> pl.DataFrame:
-    """The frame as the table has it, NaN as an empty cell."""
+    """Return the frame in the columns of the table, NaN as an empty cell."""
     columns = [name for name in (*table.columns, *table.optional) if name in frame.columns]
     kinds = {**table.columns, **table.optional}
     return frame.select(

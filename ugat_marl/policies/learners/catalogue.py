@@ -24,14 +24,14 @@ from ugat_marl.policies.learners.dqn_config import DQNConfig
 from ugat_marl.policies.protocols import Learner
 
 LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
-"""Makes a fresh learner for the agents of an environment, its initial weights drawn from a seed."""
+"""Make a fresh learner for the agents of an environment, its initial weights drawn from a seed."""
 
 DQN_NAME = "dqn"
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """Where a learner is kept.
+    """Home of a learner: its file, its classes, and the library it needs.
 
     Attributes:
         file: File of baselines/, without its suffix.
@@ -98,7 +98,7 @@ def learner_factory(
     dqn: DQNConfig | None = None,
     device: str = "cpu",
 ) -> LearnerFactory:
-    """What makes the learners a user names; its library is imported here.
+    """Return the maker of the learner a user names; its library is imported here.
 
     Args:
         name: "dqn", or one of `BASELINES`.
@@ -127,7 +127,7 @@ def learner_factory(
 
 
 def settings_of(name: str) -> dict[str, Any]:
-    """The settings a learner has unless others are given.
+    """Return the default settings of a learner.
 
     Raises:
         OptionError: Its library is not installed.
@@ -144,7 +144,7 @@ def _baseline_config(name: str, settings: Sequence[str]) -> Any:
 
 
 def require_known(name: str) -> None:
-    """Refuses the name of a learner that does not exist.
+    """Refuse the name of a learner that does not exist.
 
     Raises:
         UnknownNameError: It is neither "dqn" nor one of `BASELINES`.
@@ -154,13 +154,13 @@ def require_known(name: str) -> None:
 
 
 def library_of(name: str) -> str:
-    """The library that does a learner's work, with its version; "" for the suite's own learners."""
+    """Return a learner's library with its version; "" for the suite's own learners."""
     library = _library(name)
     return library and f"{library} {version_of(library) or '-'}"
 
 
 def is_installed(name: str) -> bool:
-    """Whether a learner's library is; the suite's own learners need none."""
+    """Return true if a learner's library is installed; the suite's own learners need none."""
     return not _library(name) or bool(version_of(_library(name)))
 
 
@@ -169,7 +169,7 @@ def _library(name: str) -> str:
 
 
 def load_baseline(name: str) -> ModuleType:
-    """The module of a baseline; the same object at each call.
+    """Return the module of a baseline; the same object at each call.
 
     Raises:
         OptionError: Its library is not installed.
@@ -200,14 +200,14 @@ def load_baseline(name: str) -> ModuleType:
 
 
 def baselines_folder() -> Path:
-    """The baselines: beside the package in a checkout, inside it in a wheel."""
+    """Return the folder of baselines: beside the package in a checkout, inside it in a wheel."""
     package = Path(__file__).resolve().parents[2]
     inside = package / "_baselines"
     return inside if inside.is_dir() else package.parent / "baselines"
 
 
 def _configured(kind: Any, preset: Mapping[str, Any], given: Sequence[str], name: str) -> Any:
-    """The dataclass of settings with those of the name, then those of the user."""
+    """Make the settings of a learner: those of its name, then those of the user."""
     hints = get_type_hints(kind)
     names = [item.name for item in fields(kind) if item.name not in preset]
     values = dict(preset)

@@ -1,4 +1,4 @@
-"""What the learners of other people's libraries have in common.
+"""Base of the learners of other libraries: environment, policies, checkpoints.
 
 That is the environment they are given, the policies they are read out as, and their checkpoints.
 
@@ -35,7 +35,7 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 
 
 class LibraryLearner(abc.ABC):
-    """A learner whose work a library does: what a subclass adds are its objects and their states.
+    """A learner whose work a library does; a subclass adds the library's objects and states.
 
     Args:
         env: Its agents are learned for; nothing is played.
@@ -58,7 +58,7 @@ class LibraryLearner(abc.ABC):
         seed: int,
         on_episode: EpisodeCallback | None = None,
     ) -> NetworkPolicy:
-        """Trains for `episodes` more episodes; what it draws depends on `seed` and their number.
+        """Train for `episodes` more episodes; what it draws depends on `seed` and their number.
 
         Raises:
             OptionError: `env` has other agents or spaces than this learner.
@@ -80,7 +80,7 @@ class LibraryLearner(abc.ABC):
         return policy_of(self.agents, self._actors(), self.env_options, self.inputs.factors)
 
     def save(self, path: Path) -> None:
-        """Writes the whole state, from which `load` goes on to the same numbers."""
+        """Write the whole state, from which `load` goes on to the same numbers."""
         policy = self.policy()
         content = {
             **header(self.agents, policy.hidden, self.env_options, policy.shared),
@@ -92,7 +92,7 @@ class LibraryLearner(abc.ABC):
         write_checkpoint(path, self._kind, content)
 
     def load(self, path: Path) -> None:
-        """Restores what `save` wrote; a `CheckpointError` if that is of another learner."""
+        """Restore what `save` wrote; a `CheckpointError` if that is of another learner."""
         content = read_checkpoint(path, self._kind)
         try:
             agents, *_ = parse_header(content)
@@ -115,27 +115,27 @@ class LibraryLearner(abc.ABC):
 
     @abc.abstractmethod
     def _train(self, env: TrainingEnv, episodes: int, seed: int) -> None:
-        """Plays exactly `episodes` episodes of `env`, and learns from them."""
+        """Play exactly `episodes` episodes of `env`, and learns from them."""
 
     @abc.abstractmethod
     def _actors(self) -> Sequence[Sequence[nn.Linear]]:
-        """Layers of the networks that act, as `policy_of` wants them."""
+        """Return the layers of the acting networks, in the form `policy_of` takes."""
 
     @abc.abstractmethod
     def _networks(self) -> Mapping[str, Tensor]:
-        """All weights, by name."""
+        """Return all weights by name."""
 
     @abc.abstractmethod
     def _rest(self) -> dict[str, Any]:
-        """The rest of the state: tensors and plain values."""
+        """Return the rest of the state: tensors and plain values."""
 
     @abc.abstractmethod
     def _restore(self, networks: Mapping[str, Tensor], rest: Mapping[str, Any]) -> None:
-        """Takes up what `_networks` and `_rest` gave; the weights have the right shapes."""
+        """Take up what `_networks` and `_rest` gave; the weights have the right shapes."""
 
 
 class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
-    """An environment as a library gets it, whose calls of `reset` know no seed.
+    """Environment for a library, whose calls of `reset` have no seed.
 
     What is seen and paid comes back scaled, so that observations may leave their bounds.
 
@@ -163,7 +163,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         self._allowed: NDArray[np.bool_] | None = None
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
-        """Starts the next episode; its number decides the seed, whatever is given."""
+        """Start the next episode; its number decides the seed, whatever is given."""
         seed = derive_seed(self._seed, "learner", "episode", self._learner.episodes)
         observations, infos = self.env.reset(seed=seed, options=options)
         self._allowed = self._agents.masks(infos)
@@ -171,7 +171,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         return self._seen(observations), infos
 
     def step(self, actions: dict[str, Any]) -> Stepped:
-        """Executes actions; rewards come back centred and scaled."""
+        """Execute actions; rewards come back centred and scaled."""
         if not self.env.agents or self._allowed is None:  # the environment itself says so
             return self.env.step(actions)
         for agent, allowed in zip(self._agents.names, self._allowed, strict=True):
@@ -199,18 +199,18 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         return self._seen(observations), scaled, terminated, truncated, infos
 
     def state(self) -> NDArray[np.float32]:
-        """That of the environment, scaled."""
+        """Return the state of the environment, scaled."""
         return self.env.state() * self._learner.states.factors
 
     def _note(self, observations: dict[str, Any]) -> None:
-        """Counts observations in; not those of `reset`, which libraries call as they like."""
+        """Count observations in; not those of `reset`, which libraries call as they like."""
         learner = self._learner
         learner.inputs.note(self._agents.stack(observations), self._places)
         if learner.states.sums.size:
             learner.states.note(self.env.state()[None])
 
     def _seen(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Observations, scaled."""
+        """Return the observations, scaled."""
         rows = self._agents.stack(observations) * self._learner.inputs.factors
         sizes = zip(self._agents.names, self._agents.observation_sizes, strict=True)
         return {name: rows[row, :size] for row, (name, size) in enumerate(sizes)}
@@ -222,7 +222,7 @@ def policy_of(
     env_options: Mapping[str, Any],
     factors: NDArray[np.float32] | None = None,
 ) -> NetworkPolicy:
-    """A policy that takes the allowed action of highest output.
+    """Make a policy that takes the allowed action of highest output.
 
     Args:
         agents: The agents it acts for.
@@ -248,7 +248,7 @@ def policy_of(
 
 
 def _shared_parts(agents: AgentSet, layers: Sequence[nn.Linear]) -> list[Tensor]:
-    """As `SharedMLP` has them: the weights of the one-hot are a bias of each agent."""
+    """Order parameters as `SharedMLP` does: the weights of the one-hot are a bias of each agent."""
     width = agents.widest_observation
     first, *rest = layers
     parts = [first.weight[:, :width].T, first.weight[:, width:].T + first.bias]
@@ -258,7 +258,7 @@ def _shared_parts(agents: AgentSet, layers: Sequence[nn.Linear]) -> list[Tensor]
 
 
 def _own_parts(agents: AgentSet, actors: Sequence[Sequence[nn.Linear]]) -> list[Tensor]:
-    """As `BatchedMLP` has them: all agents' weights of a layer, then their biases."""
+    """Order parameters as `BatchedMLP` does: all agents' weights of a layer, then their biases."""
     if len(actors) != len(agents):
         raise ValueError(f"{len(actors)} networks for {len(agents)} agents")
     parts: list[Tensor] = []
@@ -276,7 +276,7 @@ def _own_parts(agents: AgentSet, actors: Sequence[Sequence[nn.Linear]]) -> list[
 
 
 def perceptron(n_in: int, hidden: Sequence[int], n_out: int) -> nn.Sequential:
-    """Affine layers with ReLU between them."""
+    """Make affine layers with ReLU between them."""
     sizes = (n_in, *hidden, n_out)
     layers: list[nn.Module] = []
     for before, after in itertools.pairwise(sizes):
@@ -285,7 +285,7 @@ def perceptron(n_in: int, hidden: Sequence[int], n_out: int) -> nn.Sequential:
 
 
 def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
-    """A layer with copies of these weights ``(n_out, n_in)``; no random number is drawn."""
+    """Make a layer with copies of weights ``(n_out, n_in)``; no random number is drawn."""
     layer: Any = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
     layer.weight.data.copy_(weight.detach())
     layer.bias.data.copy_(bias.detach())
@@ -293,12 +293,12 @@ def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
 
 
 def linear_layers(network: nn.Module) -> list[nn.Linear]:
-    """The affine layers of a network, in their order."""
+    """Return the affine layers of a network, in their order."""
     return [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
 
 
 def check_settings(config: Any, *shares: str) -> None:
-    """Refuses impossible settings: whole numbers begin at 1, others at 0, and shares end at 1.
+    """Refuse impossible settings: whole numbers begin at 1, others at 0, and shares end at 1.
 
     Args:
         config: A dataclass; what is neither a number nor a tuple of numbers is left alone.
@@ -320,7 +320,7 @@ def check_settings(config: Any, *shares: str) -> None:
 
 
 def decisions_of(env: AnyParallelEnv) -> int:
-    """Decisions in an episode: those of its scenario, or counted in an episode of random actions.
+    """Return the decisions of an episode: by its scenario, or counted with random actions.
 
     Libraries that learn from roll-outs of one length need it before the first.
     """
@@ -338,13 +338,13 @@ def decisions_of(env: AnyParallelEnv) -> int:
 
 
 def roll_out_length(decisions: int, least: int) -> int:
-    """The shortest roll-out of at least so many decisions of which an episode is a multiple."""
+    """Return the shortest roll-out of at least `least` decisions that divides an episode."""
     return next(n for n in range(min(least, decisions), decisions + 1) if decisions % n == 0)
 
 
 @contextlib.contextmanager
 def kept_generators() -> Iterator[None]:
-    """Leaves the global random generators, which libraries draw from, as they were."""
+    """Leave the global random generators, which libraries draw from, as they were."""
     before = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     try:
         yield
@@ -355,7 +355,7 @@ def kept_generators() -> Iterator[None]:
 
 
 def seed_generators(seed: int, *path: int | str) -> None:
-    """Seeds the global random generators for the stream `path` below `seed`."""
+    """Seed the global random generators for the stream `path` below `seed`."""
     derived = derive_seed(seed, *path)
     torch.manual_seed(derived)
     np.random.seed(derived)  # noqa: NPY002 - libraries draw from it
@@ -363,13 +363,13 @@ def seed_generators(seed: int, *path: int | str) -> None:
 
 
 def _state_size(env: AnyParallelEnv) -> int:
-    """Length of `state()`; 0 where there is none."""
+    """Return the length of `state()`; 0 without one."""
     space: Any = getattr(env, "state_space", None)
     return 0 if space is None else int(space.shape[0])
 
 
 def _require_like(path: Path, found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    """Compares names and shapes before anything is overwritten."""
+    """Compare names and shapes before anything is overwritten."""
     shapes = [{name: tuple(tensor.shape) for name, tensor in one.items()} for one in (found, own)]
     if shapes[0] != shapes[1]:
         differing = sorted(

@@ -1,4 +1,4 @@
-"""What the agents lived through, kept in preallocated tensors."""
+"""Replay memory: the last decisions of all agents, in preallocated tensors."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Batch:
     next_allowed: Tensor
 
     def scaled(self, factors: Tensor) -> Batch:
-        """The same with observations times ``factors``, ``(agents, 1, widest_observation)``."""
+        """Return a batch with observations times factors ``(agents, 1, widest_observation)``."""
         seen, then = self.observation * factors, self.next_observation * factors
         return replace(self, observation=seen, next_observation=then)
 
     def to(self, device: torch.device) -> Batch:
-        """The same on a device; itself if it is there."""
+        """Return the batch on a device; the batch itself if it is there."""
         if self.reward.device == device:
             return self
         return Batch(**{name: column.to(device) for name, column in vars(self).items()})
@@ -76,7 +76,7 @@ class Replay:
         next_observation: NDArray[np.float32],
         next_allowed: Mask,
     ) -> None:
-        """Stores one decision of all agents; the oldest one goes when the ring is full."""
+        """Store one decision of all agents; the oldest one goes when the ring is full."""
         at, columns = self.added % self.capacity, self._columns
         columns.observation[:, at] = torch.from_numpy(observation)
         columns.action[:, at] = torch.from_numpy(action)
@@ -87,35 +87,35 @@ class Replay:
         self.added += 1
 
     def sample(self, size: int, generator: torch.Generator) -> Batch:
-        """Draws `size` time indices with replacement; the same ones for every agent."""
+        """Draw `size` time indices with replacement; the same ones for every agent."""
         at = torch.randint(len(self), (size,), generator=generator)
         return Batch(**{name: column.index_select(1, at) for name, column in self._fields()})
 
     def rewards(self) -> Tensor:
-        """All stored rewards, ``(agents, len(self))``."""
+        """Return all stored rewards, ``(agents, len(self))``."""
         return self._columns.reward[:, : len(self)]
 
     def observations(self) -> Tensor:
-        """All stored observations, ``(agents, len(self), widest_observation)``."""
+        """Return all stored observations, ``(agents, len(self), widest_observation)``."""
         return self._columns.observation[:, : len(self)]
 
     def recent(self, decisions: int) -> Tensor:
-        """Observations of the last so many decisions, ``(agents, decisions, ...)``, or of all."""
+        """Return observations of the last decisions, ``(agents, decisions, ...)``, or of all."""
         first = max(0, self.added - min(decisions, self.capacity))
         at = torch.arange(first, self.added) % self.capacity
         return self._columns.observation.index_select(1, at)
 
     def rows(self, added: int) -> dict[str, Tensor]:
-        """Views of the rows that are in use once `added` decisions were added."""
+        """Return views of the rows in use after `added` decisions."""
         used = min(added, self.capacity)
         return {name: column[:, :used] for name, column in self._fields()}
 
     def state(self) -> dict[str, Tensor]:
-        """Copies of the rows in use, for a checkpoint."""
+        """Return copies of the rows in use, for a checkpoint."""
         return {name: rows.clone() for name, rows in self.rows(self.added).items()}
 
     def restore(self, state: Mapping[str, Tensor], added: int) -> None:
-        """Puts back what `state` gave, with the number of decisions added until then."""
+        """Put back what `state` gave, with the number of decisions added until then."""
         self.added = added
         for name, rows in self.rows(added).items():
             rows.copy_(state[name])

@@ -19,7 +19,7 @@ LEAST = 0.01
 
 
 class RewardScale:
-    """Centres and scales each agent's rewards by mean and deviation of all it had so far.
+    """Centre and scale each agent's rewards by mean and deviation of all it had so far.
 
     Args:
         agents: Their number.
@@ -32,7 +32,7 @@ class RewardScale:
         self.sums = np.zeros((3, agents))
 
     def __call__(self, rewards: NDArray[np.float32]) -> NDArray[np.float64]:
-        """The rewards of one decision, ``(agents,)``, scaled; they count themselves."""
+        """Scale the rewards of one decision, ``(agents,)``, after counting them in."""
         paid = rewards.astype(np.float64)
         self.sums += paid ** np.arange(3)[:, None]
         _, mean, square = self.sums / self.sums[0]
@@ -41,7 +41,7 @@ class RewardScale:
 
 
 class InputScale:
-    """Divides each number of a vector by the root mean square of what stood there so far.
+    """Divide each number of a vector by the root mean square of its place so far.
 
     Zero stays zero, so that padding does; and a factor can be moved into the first layer of a
     network, which then reads vectors as they are.
@@ -58,20 +58,20 @@ class InputScale:
 
     @property
     def factors(self) -> NDArray[np.float32]:
-        """What to multiply with, ``(size,)``; 1 before anything was seen."""
+        """Factors that scale a vector, ``(size,)``; 1 before the first vector."""
         count, squares = self.sums
         size = np.sqrt(squares / np.maximum(count, 1))
         return np.where(count > 0, 1 / np.maximum(size, LEAST), 1.0).astype(np.float32)
 
     def note(self, rows: NDArray[np.float32], there: NDArray[np.bool_] | None = None) -> None:
-        """Counts vectors ``(n, size)`` in, all of them or the numbers that are `there`."""
+        """Count vectors ``(n, size)`` in, all of them or the numbers that are `there`."""
         squares = rows.astype(np.float64) ** 2
         exist = np.ones(rows.shape, dtype=np.bool_) if there is None else there
         self.sums += exist.sum(0), (squares * exist).sum(0)
 
 
 def input_factors(observations: Tensor, agents: AgentSet, pooled: bool) -> Tensor:
-    """One over the root mean square of each number of the agents' observations.
+    """Return one over the root mean square of each number of the agents' observations.
 
     Args:
         observations: ``(agents, n, widest_observation)``.
@@ -89,12 +89,12 @@ def input_factors(observations: Tensor, agents: AgentSet, pooled: bool) -> Tenso
 
 
 def places(agents: AgentSet) -> NDArray[np.bool_]:
-    """Where padded observations ``(agents, widest_observation)`` hold an agent's own numbers."""
+    """Return a mask of each agent's own numbers in padded observations."""
     return np.arange(agents.widest_observation) < np.array(agents.observation_sizes)[:, None]
 
 
 def ceilings(seen: Tensor, quantile: float) -> Tensor:
-    """What each number of an observation was below in a share of the time.
+    """Return a quantile over time of each number of an observation.
 
     A number that is so rarely more than its least (a phase hardly ever chosen) is held by its
     greatest instead, since held by the quantile it would say nothing any more.

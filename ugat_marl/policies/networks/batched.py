@@ -37,7 +37,7 @@ class BatchedLinear(nn.Module):
         self.bias = nn.Parameter(bias)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Maps ``(agents, batch, n_in)`` to ``(agents, batch, n_out)``."""
+        """Map ``(agents, batch, n_in)`` to ``(agents, batch, n_out)``."""
         return torch.baddbmm(self.bias, inputs, self.weight)
 
 
@@ -64,7 +64,7 @@ class BatchedMLP(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Maps ``(agents, batch, max(fan_in))`` to ``(agents, batch, n_out)``."""
+        """Map ``(agents, batch, max(fan_in))`` to ``(agents, batch, n_out)``."""
         return self.layers(inputs)
 
 
@@ -102,7 +102,7 @@ class SharedMLP(nn.Module):
             self.rest = nn.Sequential(nn.ReLU(), BatchedMLP([first], rest[:-1], n_out, generator))
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Maps ``(agents, batch, n_in)`` to ``(agents, batch, n_out)``."""
+        """Map ``(agents, batch, n_in)`` to ``(agents, batch, n_out)``."""
         agents, batch, _ = inputs.shape
         first = inputs @ self.weight + self.agent_bias
         # the samples of all agents are one batch of the layers that follow
@@ -116,7 +116,7 @@ def mask_of(sizes: Sequence[int]) -> Tensor:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Runs torch on one thread: products this small lose by being split, sums keep their order."""
+    """Run torch on one thread: products this small lose by being split, sums keep their order."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

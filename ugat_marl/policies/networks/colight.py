@@ -61,7 +61,7 @@ class CoLight(nn.Module):
         self.readout = BatchedLinear([joint], agents.most_actions, generator)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Maps ``(agents, batch, widest_observation)`` to Q ``(agents, batch, most_actions)``."""
+        """Map ``(agents, batch, widest_observation)`` to Q ``(agents, batch, most_actions)``."""
         agents, batch, _ = inputs.shape
         embedded = self.embedding(inputs).relu().view(1, agents * batch, -1)
         query, key, value = self.heads(embedded).view(agents, batch, 3, HEADS, HEAD_SIZE).unbind(2)
@@ -72,7 +72,7 @@ class CoLight(nn.Module):
         return self.readout(joint).view(agents, batch, -1)
 
     def _around(self, own: Tensor) -> Tensor:
-        """What each agent and its neighbours have, ``(agents, 1 + most neighbours, ...)``.
+        """Gather rows of each agent and its neighbours, ``(agents, 1 + most neighbours, ...)``.
 
         Rows without a neighbour hold somebody's numbers; their share is zero.
         """

@@ -61,7 +61,7 @@ class FRAP(nn.Module):
         self.level = nn.Parameter(torch.zeros(1))
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Maps ``(agents, batch, widest_observation)`` to Q ``(agents, batch, most_actions)``."""
+        """Map ``(agents, batch, widest_observation)`` to Q ``(agents, batch, most_actions)``."""
         pairs = self.pairs(inputs)
         agents, phases, batch, _, _ = pairs.shape
         weights = self.relation[self.shared] * self.rivals.unsqueeze(3)

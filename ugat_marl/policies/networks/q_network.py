@@ -1,4 +1,4 @@
-"""The networks behind Q: one for every agent, or one that all agents share."""
+"""Networks by their names: a network for every agent, or one that all agents share."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def q_network(
     generator: torch.Generator,
     structure: Structure | None = None,
 ) -> nn.Module:
-    """Observations ``(agents, batch, widest_observation)`` to the values of actions, padded."""
+    """Build the network from ``(agents, batch, widest_observation)`` to values of actions."""
     if structure is not None and structure.network == "colight":
         return CoLight(agents, structure.neighbours, hidden, generator)
     if structure is not None:
@@ -35,7 +35,7 @@ def q_network(
 
 
 class Held(nn.Module):
-    """Networks that are told of no number more than its ceiling, ``(agents, width)``."""
+    """Networks that read every number capped at its ceiling, ``(agents, width)``."""
 
     ceiling: Tensor
 
@@ -45,19 +45,19 @@ class Held(nn.Module):
         self.register_buffer("ceiling", ceiling.unsqueeze(1))
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Values of observations ``(agents, batch, width)``, as of the networks themselves."""
+        """Return the values of observations ``(agents, batch, width)``."""
         return self.network(torch.minimum(observations, self.ceiling))
 
 
 def greedy_actions(network: nn.Module, stacked: Tensor, allowed: Tensor) -> NDArray[np.int64]:
-    """Allowed action of highest value for one observation of every agent, ``(agents,)``."""
+    """Return the allowed action of highest value for one observation of every agent."""
     with torch.no_grad():
         values = network(stacked.unsqueeze(1)).squeeze(1)
         return values.masked_fill(~allowed, -torch.inf).argmax(dim=1).numpy()
 
 
 def flatten_parameters(module: nn.Module) -> nn.Parameter:
-    """Moves all parameters of `module`, and their gradients, into one vector each.
+    """Move all parameters of `module`, and their gradients, into one vector each.
 
     The module computes on views of the vector, so that the optimiser and the target network's
     update are single operations over all agents and layers.
@@ -75,7 +75,7 @@ def flatten_parameters(module: nn.Module) -> nn.Parameter:
 
 
 def reading_unscaled(network: nn.Module, factors: Tensor) -> Tensor:
-    """Parameters with which `network` computes from x what its own make of ``x * factors``.
+    """Return parameters for unscaled inputs: the output for x is that for ``x * factors`` now.
 
     Args:
         network: Its first weights, ``(..., n_in, n_out)``, are those that observations meet.

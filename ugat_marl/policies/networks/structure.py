@@ -1,4 +1,4 @@
-"""What networks with structure know of the intersections: movements and phases, or neighbours.
+"""Facts about intersections for FRAP and CoLight: movements and phases, or neighbours.
 
 Plain numbers, so that a saved policy needs neither network file nor environment.
 """
@@ -60,7 +60,7 @@ class Structure:
 
     @classmethod
     def of(cls, env: AnyParallelEnv, network: NetworkName) -> Structure | None:
-        """The intersections of an environment of the suite; None for "mlp".
+        """Read the intersections of an environment of the suite; return None for "mlp".
 
         Raises:
             OptionError: Another environment, or observations put together by a wrapper where
@@ -93,7 +93,7 @@ class Structure:
         return cls(network, tuple(_junction(item, layout, halves) for item, layout in rows))
 
     def checked(self, agents: AgentSet) -> Structure:
-        """Itself.
+        """Return the structure itself if it fits the agents.
 
         Raises:
             ValueError: It is not one of these agents.
@@ -134,7 +134,7 @@ class Structure:
                 raise ValueError(f"{junction} is none of {size} numbers and {actions} phases")
 
     def written(self) -> dict[str, Any]:
-        """As plain lists, for a checkpoint."""
+        """Return plain lists, for a checkpoint."""
         return asdict(self)
 
 
@@ -143,7 +143,7 @@ _READ: Mapping[NetworkName, str] = {"frap": "movements and phases", "colight": "
 
 
 def structure_in(content: Mapping[str, Any], agents: AgentSet) -> Structure | None:
-    """What `Structure.written` left in a checkpoint; None if there is none.
+    """Read the structure in a checkpoint; return None if it holds none.
 
     Raises:
         ValueError: Broken, or of other agents.
@@ -156,7 +156,7 @@ def structure_in(content: Mapping[str, Any], agents: AgentSet) -> Structure | No
 def _neighbours(
     agents: AgentSet, light_of: Mapping[str, str], roads: Network
 ) -> tuple[Places, ...]:
-    """The nearest intersections one road away from each agent's, as positions of agents."""
+    """Return the nearest intersections one road away from each agent's, as positions of agents."""
     if {*light_of} != {*agents.names}:
         raise OptionError(
             f"network 'colight' does not know the intersections of {', '.join(agents.names[:4])}; "
@@ -195,7 +195,7 @@ def _junction(item: Intersection, layout: AgentLayout, halves: bool) -> Junction
 
 
 def _places(item: Intersection, links: Sequence[Link], halves: bool) -> tuple[Places, ...]:
-    """Where in the features the lanes of a movement are."""
+    """Return the places of the lanes of a movement in the features."""
     incoming = tuple(sorted({item.incoming_lanes.index(link.from_lane) for link in links}))
     if not halves:
         return (incoming,)

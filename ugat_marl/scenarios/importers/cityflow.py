@@ -30,7 +30,7 @@ from ugat_marl.scenarios.importers.cityflow_roadnet import (
     read_roadnet,
 )
 from ugat_marl.scenarios.importers.long_files import objects
-from ugat_marl.scenarios.importers.making import NETWORK, ROUTES, Draft, Roads
+from ugat_marl.scenarios.importers.making import NETWORK, ROUTES, RoadFiles, RoadSource
 from ugat_marl.scenarios.importers.turning_shares import MOST_VEHICLES, Drive, write_drives
 from ugat_marl.scenarios.junctions import foes_of, links_of, yields_of
 from ugat_marl.scenarios.phases import RightOfWay, state_of
@@ -45,8 +45,8 @@ _VEHICLE = ("length", "width", "maxPosAcc", "maxNegAcc", "usualPosAcc", "usualNe
 
 def from_cityflow(
     roadnet: Path, flow: Path, duration_s: float | None, *, own_vehicles: bool, exact: bool
-) -> Roads:
-    """A ``roadnet.json`` with its ``flow.json``.
+) -> RoadSource:
+    """Return a source of the roads and vehicles in a ``roadnet.json`` and its ``flow.json``.
 
     Args:
         roadnet: The roads.
@@ -57,7 +57,7 @@ def from_cityflow(
         exact: Whether headways are CityFlow's too, and nothing is left to chance.
     """
 
-    def roads(folder: Path, reporter: Reporter) -> Draft:
+    def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         net = read_roadnet(roadnet)
         notes = write_network(net, folder / NETWORK)
         length_s, routes = duration_s or 3600.0, ()
@@ -65,7 +65,7 @@ def from_cityflow(
             found = write_routes(flow, net, folder / ROUTES, duration_s, reporter, exact=exact)
             routes = (ROUTES,)
             length_s = duration_s or max(3600.0, 600.0 * (math.floor(found.last_s / 600) + 1))
-        return Draft(
+        return RoadFiles(
             f"CityFlow network {roadnet.name}",
             f"Turned from CityFlow's `{roadnet.name}` and `{flow.name}`: lanes, stop lines, turns "
             "and light phases are theirs, phase n being the n-th green one of the file. Who made "
@@ -79,14 +79,14 @@ def from_cityflow(
 
 
 def write_network(net: Roadnet, out: Path) -> list[str]:
-    """Makes the SUMO network.
+    """Make the SUMO network.
 
     Args:
         net: The roads.
         out: The ``.net.xml`` to write.
 
     Returns:
-        What was noticed on the way.
+        Notes for the user.
 
     Raises:
         ScenarioError: netconvert refused.
@@ -113,7 +113,7 @@ def write_network(net: Roadnet, out: Path) -> list[str]:
 
 
 def has_light(crossing: Crossing) -> bool:
-    """Whether an intersection has a traffic light: two phases that differ."""
+    """Return True for an intersection with a traffic light: two phases that differ."""
     return not crossing.virtual and len({frozenset(links) for _, links in crossing.phases}) > 1
 
 
@@ -167,7 +167,7 @@ def _connections(net: Roadnet) -> ET.Element:
 
 
 def _lights(net: Roadnet) -> ET.Element:
-    """Which letter belongs to which way; the states come later, when the conflicts are known."""
+    """Map letters to ways; states follow later, once the conflicts are known."""
     root = ET.Element("tlLogics")
     for crossing in filter(has_light, net.crossings.values()):
         ways = list(_ways(crossing, net))
@@ -181,7 +181,7 @@ def _lights(net: Roadnet) -> ET.Element:
 
 
 def _ways(crossing: Crossing, net: Roadnet) -> Iterator[tuple[int, dict[str, str]]]:
-    """Every way across with the number of its road link, in the order of the file."""
+    """Yield every way across with the number of its road link, in the order of the file."""
     for number, link in enumerate(crossing.links):
         before, behind = net.roads[link.start], net.roads[link.end]
         for a, b in link.lanes:
@@ -197,7 +197,7 @@ def _ways(crossing: Crossing, net: Roadnet) -> Iterator[tuple[int, dict[str, str
 
 
 def _stop_lines(crossing: Crossing, net: Roadnet) -> str:
-    """A polygon through the ends of all stop lines; empty if roads begin at the centre."""
+    """Return a polygon through the ends of all stop lines; empty if roads begin at the centre."""
     if crossing.width_m <= 0:
         return ""
     corners: list[Point] = []
@@ -214,7 +214,7 @@ def _stop_lines(crossing: Crossing, net: Roadnet) -> str:
 def _corners(
     road: Road, points: tuple[Point, ...], distance_m: float, *, backwards: bool
 ) -> list[Point]:
-    """Both ends of the line across a road at a distance from the intersection's centre."""
+    """Return the ends of the line across a road at a distance from the intersection's centre."""
     left = distance_m
     for (ax, ay), (bx, by) in pairwise(points):
         length = math.hypot(bx - ax, by - ay)
@@ -237,7 +237,7 @@ def _shape(points: tuple[Point, ...] | list[Point]) -> str:
 
 
 def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
-    """Writes the light phases into the network, now that it is known who has to wait for whom."""
+    """Write the light phases into the network, now that it is known who has to wait for whom."""
     links = links_of(root)
     rules = RightOfWay(foes_of(root), yields_of(root))
     without: list[str] = []
@@ -273,7 +273,7 @@ def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
 def _split(
     crossing: Crossing,
 ) -> tuple[list[tuple[float, frozenset[int]]], float, frozenset[int]]:
-    """The green phases, the seconds between two of them, and what goes all the time.
+    """Return the green phases, the seconds between two of them, and the links always green.
 
     CityFlow's files hold the time between two greens as a phase of its own, usually the first, in
     which only those may go who may always go.
@@ -297,7 +297,7 @@ def _letters(number_of: dict[int, int], numbers: frozenset[int]) -> set[int]:
 def _clearing(
     state: str, following: str, clearance_s: float, always: set[int]
 ) -> Iterator[tuple[float, str]]:
-    """Yellow and red between two greens; who may always go stops first, while all is red."""
+    """Yield yellow and red between two greens; always-green links stop while all is red."""
     if not any(a in "Gg" and b not in "Gg" for a, b in zip(state, following, strict=True)):
         return
     length_s = clearance_s or YELLOW_S + ALL_RED_S
@@ -311,7 +311,7 @@ def _clearing(
 
 @dataclass(frozen=True)
 class Flows:
-    """What was written.
+    """Vehicles that were written.
 
     Attributes:
         vehicles: How many.
@@ -331,7 +331,7 @@ def write_routes(
     *,
     exact: bool,
 ) -> Flows:
-    """Turns a ``flow.json`` into a route file.
+    """Turn a ``flow.json`` into a route file.
 
     Vehicles keep their size, gap, accelerations and speed. How they follow each other is SUMO's
     unless `exact` is set: the headway of 1 s and the chance in driving that its models are tuned
@@ -369,7 +369,7 @@ def write_routes(
 
 
 def _departures(flow: Mapping[str, Any], end_s: float, where: str) -> Iterator[float]:
-    """From ``startTime`` to ``endTime``, both included, every ``interval``; -1 is the end."""
+    """Yield a flow's departures, ``startTime`` to ``endTime`` inclusive; -1 is the end."""
     start, end, interval = (
         _number(flow, key, where, least=least)
         for key, least in (("startTime", 0.0), ("endTime", -1.0), ("interval", 0.0))
@@ -427,14 +427,14 @@ def _number(raw: Mapping[str, Any], key: str, where: str, *, least: float) -> fl
 
 
 class _Routes:
-    """The roads from anchor to anchor; where they do not touch, the shortest way between them."""
+    """Routes from anchor to anchor, on the shortest way where anchors do not touch."""
 
     def __init__(self, net: Roadnet) -> None:
         self._net = net
         self._known: dict[tuple[str, ...], tuple[str, ...]] = {}
 
     def through(self, raw: Any, where: str) -> tuple[str, ...]:
-        """The whole route."""
+        """Return the whole route."""
         if not isinstance(raw, list) or not raw or not all(isinstance(name, str) for name in raw):
             raise ScenarioError(f"{where}: 'route' is missing or not a list of roads")
         anchors = tuple(raw)
@@ -462,7 +462,7 @@ class _Routes:
         return {name: _length(road.points) for name, road in self._net.roads.items()}
 
     def _between(self, start: str, goal: str, where: str) -> list[str]:
-        """The roads after `start` up to and with `goal` (Dijkstra)."""
+        """Return the roads after `start` up to and with `goal` (Dijkstra)."""
         best = {start: 0.0}
         came: dict[str, str] = {}
         heap = [(0.0, start)]

@@ -1,4 +1,4 @@
-"""CityFlow's road networks: what stands in a ``roadnet.json``, checked value by value."""
+"""CityFlow's road networks: the content of a ``roadnet.json``, checked value by value."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Roadnet:
 
 
 def read_roadnet(path: Path) -> Roadnet:
-    """Reads and checks a ``roadnet.json``.
+    """Read and check a ``roadnet.json``.
 
     Raises:
         ScenarioError: Not one, or something in it names what does not exist; with the line.
@@ -137,14 +137,14 @@ def _check_links(crossing: Crossing, net: Roadnet, reader: _Reader) -> None:
 
 
 class _Reader:
-    """Takes values out of a parsed file; what is missing or of another kind is an error."""
+    """Reader of a parsed file; a missing value, or one of another type, is an error."""
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
         self._text = text
 
     def error(self, name: str, complaint: str) -> ScenarioError:
-        """An error at the line where an object of this name is defined."""
+        """Return an error with the line where an object of this name is defined."""
         place = max(self._text.find(f'"id": "{name}"'), self._text.find(f'"id":"{name}"'))
         line = f", line {self._text.count(chr(10), 0, place) + 1}" if place >= 0 else ""
         return ScenarioError(f"{self._path}{line}: {complaint}")

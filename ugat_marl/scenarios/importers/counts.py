@@ -1,4 +1,4 @@
-"""Demand from what was counted on roads and turns, or from origins and destinations."""
+"""Demand from counts on roads and turns, or from origins and destinations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.long_files import lines
-from ugat_marl.scenarios.importers.making import ROUTES, Fleet, Vehicles
+from ugat_marl.scenarios.importers.making import ROUTES, VehicleFiles, VehicleSource
 from ugat_marl.scenarios.importers.streets import Streets
 from ugat_marl.scenarios.importers.turning_shares import (
     CAR,
@@ -49,7 +49,7 @@ class Row:
         count: Vehicles.
         begin_s: Start of the time they belong to.
         end_s: Its end.
-        line: Where it stands.
+        line: Its line in the file.
     """
 
     roads: tuple[str, ...]
@@ -62,7 +62,7 @@ class Row:
 def read_rows(
     path: Path, begin_s: float, end_s: float, reporter: Reporter, *, pairs: bool
 ) -> list[Row]:
-    """A CSV file with the columns ``count`` and ``edge``, or ``from`` and ``to``.
+    """Read a CSV file with the columns ``count`` and ``edge``, or ``from`` and ``to``.
 
     The columns ``begin_s`` and ``end_s`` may be added; without them a row is for the whole episode.
 
@@ -136,13 +136,13 @@ def _number(text: str | None, key: str, where: str) -> float:
     return value
 
 
-def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehicles:
-    """Vehicles that come by as often as was counted, by SUMO's routeSampler.
+def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
+    """Return a source of vehicles that meet counts, by SUMO's routeSampler.
 
     It chooses among random drives through the network; every counted road has to lie on one.
     """
 
-    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=False)
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         _require_roads(rows, streets, path, network)
@@ -163,7 +163,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         if not sampled:
             raise ScenarioError(f"{path}: SUMO's routeSampler found no vehicle for these counts")
         write_drives(folder / ROUTES, sorted(sampled, key=lambda d: (d.depart_s, d.id)))
-        return Fleet((ROUTES,), (_fit(rows, sampled, path),))
+        return VehicleFiles((ROUTES,), (_fit(rows, sampled, path),))
 
     return vehicles
 
@@ -190,7 +190,7 @@ def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -
 
 
 def _counts_for_sumo(rows: Sequence[Row], work: Path) -> list[str]:
-    """Writes the counts as routeSampler reads them; returns its options."""
+    """Write the counts as routeSampler reads them and return its options."""
     turns = any(len(row.roads) > 1 for row in rows)
     by_time: dict[tuple[float, float], list[Row]] = defaultdict(list)
     for row in rows:
@@ -221,7 +221,7 @@ def _sampled(path: Path) -> Iterator[Drive]:
 
 
 def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
-    """How well the counts are met, by the traffic engineers' GEH."""
+    """Say in one sentence how many counts are met, by the GEH of traffic engineering."""
     good = 0
     passed = _passages(drives)
     for row in rows:
@@ -235,7 +235,7 @@ def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
 
 
 def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
-    """Roads, and turns from one to the next, to the departures of all that come by, in order."""
+    """Map roads, and turns between two, to the departures of the vehicles there, in order."""
     found: dict[tuple[str, ...], list[float]] = defaultdict(list)
     for drive in sorted(drives, key=lambda drive: drive.depart_s):
         for passed in chain(zip(drive.route, strict=True), pairwise(drive.route)):
@@ -243,10 +243,10 @@ def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
     return found
 
 
-def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> Vehicles:
-    """Vehicles from origins to destinations, on the fastest ways through the empty network."""
+def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
+    """Return a source of vehicles from origins to destinations, on the fastest free routes."""
 
-    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=True)
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         _require_roads(rows, streets, path, network)
@@ -258,7 +258,7 @@ def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> Vehicles:
                     f"{row.roads[1]!r}"
                 )
         _route(_trips(rows, seed), network, folder / ROUTES, seed)
-        return Fleet((ROUTES,))
+        return VehicleFiles((ROUTES,))
 
     return vehicles
 

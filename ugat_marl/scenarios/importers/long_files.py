@@ -14,14 +14,14 @@ from ugat_marl.files import Tag, chunks_of, read_bytes, scan_xml
 from ugat_marl.progress import Reporter
 
 _MOST = 32 << 20
-"""Characters of a single object; more are a file that is broken in the middle."""
+"""Most characters of a single object; more mean a file that is broken in the middle."""
 _BEFORE, _BETWEEN = re.compile(r"[ \t\r\n]*"), re.compile(r"[ \t\r\n,]*")
 
 Pieces = Iterable[bytes]
 
 
 def scan(path: Path, reporter: Reporter) -> Iterator[Tag]:
-    """The elements of an XML file of any length.
+    """Yield the elements of an XML file of any length.
 
     Raises:
         ScenarioError: As for `ugat_marl.files.scan_xml`.
@@ -30,7 +30,7 @@ def scan(path: Path, reporter: Reporter) -> Iterator[Tag]:
 
 
 def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], int]]:
-    """The objects of a JSON file that holds one list of them, each with its line.
+    """Yield the objects of a JSON file that holds one list of them, each with its line.
 
     Raises:
         ScenarioError: Not JSON, or not a list of objects.
@@ -71,7 +71,7 @@ def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], in
 
 
 def lines(path: Path, reporter: Reporter) -> Iterator[str]:
-    """The lines of a text file of any length, with what ends them.
+    """Yield the lines of a text file of any length, with their ends.
 
     Raises:
         ScenarioError: Not UTF-8, or a line no table has.
@@ -91,7 +91,7 @@ def lines(path: Path, reporter: Reporter) -> Iterator[str]:
 
 
 def read_json(path: Path) -> tuple[Any, str]:
-    """A JSON file as a whole, and its text.
+    """Return the content of a JSON file, and its text.
 
     Raises:
         ScenarioError: Not JSON.
@@ -111,13 +111,13 @@ def read_json(path: Path) -> tuple[Any, str]:
 
 
 def _strange(where: str, error: Exception) -> ScenarioError:
-    """What Python's reader gives up on although it is JSON."""
+    """Return the error for JSON on which Python's reader gives up."""
     what = "nested too deeply" if isinstance(error, RecursionError) else "a number is far too long"
     return ScenarioError(f"{where}: {what}; no file of CityFlow's is like that")
 
 
 def _texts(pieces: Pieces, path: Path) -> Iterator[str]:
-    """What the pieces say, never nothing."""
+    """Decode the pieces as UTF-8 and yield those that are not empty."""
     decoder = codecs.getincrementaldecoder("utf-8-sig")()
     try:
         for piece in pieces:

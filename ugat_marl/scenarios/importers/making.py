@@ -24,8 +24,8 @@ NETWORK, ROUTES = "network.net.xml", "demand.rou.xml"
 
 
 @dataclass(frozen=True)
-class Draft:
-    """What a source of roads has put into the folder.
+class RoadFiles:
+    """Files that a source of roads has put into the folder.
 
     Attributes:
         description: One line.
@@ -35,7 +35,7 @@ class Draft:
         additional: Its additional files, likewise.
         settings: Further values of its ``scenario.toml``.
         derive: Whether the phases of each light are derived as its lanes allow.
-        notes: What was noticed on the way, for the README and for whoever waits.
+        notes: Notes for the README and the user.
         copied: Files in the folder that are copies, to where they come from.
     """
 
@@ -50,17 +50,17 @@ class Draft:
     copied: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
 
-Roads = Callable[[Path, Reporter], Draft]
+RoadSource = Callable[[Path, Reporter], RoadFiles]
 """Puts a network into a folder."""
 
 
 @dataclass(frozen=True)
-class Fleet:
-    """What a source of vehicles has put into the folder.
+class VehicleFiles:
+    """Files that a source of vehicles has put into the folder.
 
     Attributes:
         routes: Its route files: names in the folder, or absolute paths of files left in place.
-        notes: What was noticed on the way.
+        notes: Notes for the user.
         copied: Files in the folder that are copies, to where they come from.
     """
 
@@ -69,7 +69,7 @@ class Fleet:
     copied: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
 
-Vehicles = Callable[[Path, Path, Reporter], Fleet]
+VehicleSource = Callable[[Path, Path, Reporter], VehicleFiles]
 """Puts route files for the network (the second path) into a folder."""
 
 
@@ -81,7 +81,7 @@ class Made:
         scenario: As it lies in its directory.
         network: Its network.
         demand: Its demand.
-        notes: What was noticed on the way.
+        notes: Notes for the user.
     """
 
     scenario: Scenario
@@ -92,34 +92,34 @@ class Made:
 
 def make_scenario(
     target: Path,
-    roads: Roads,
-    vehicles: Vehicles | None,
+    roads: RoadSource,
+    vehicles: VehicleSource | None,
     *,
     settings: Mapping[str, Any],
     command: str,
     force: bool,
     reporter: Reporter,
 ) -> Made:
-    """Makes a scenario directory, whole or not at all.
+    """Make a scenario directory, whole or not at all.
 
     Args:
         target: The directory.
         roads: Where the roads come from.
         vehicles: Where the vehicles come from; None if the roads come with vehicles.
         settings: Values for ``scenario.toml`` that go before those of the source.
-        command: What makes it again, for the README.
+        command: The command that makes it again, for the README.
         force: Whether a scenario of this name is replaced.
         reporter: Shows progress.
 
     Raises:
         OutputError: It exists, or cannot be written.
-        ScenarioError: What was made is no sound scenario.
+        ScenarioError: The result is no sound scenario.
     """
     with new_folder(target, force=force) as folder:
         draft = roads(folder, reporter)
         copied = dict(draft.copied)
         with _errors_about(copied, folder):
-            fleet = Fleet(draft.routes)
+            fleet = VehicleFiles(draft.routes)
             if vehicles:
                 fleet = vehicles(folder, folder / draft.network, reporter)
                 copied |= fleet.copied
@@ -133,9 +133,9 @@ def make_scenario(
 
 
 def _write_settings(
-    folder: Path, draft: Draft, fleet: Fleet, settings: Mapping[str, Any]
+    folder: Path, draft: RoadFiles, fleet: VehicleFiles, settings: Mapping[str, Any]
 ) -> tuple[str, ...]:
-    """Writes ``scenario.toml``; returns all that was noticed."""
+    """Write ``scenario.toml`` and return all notes."""
     own = dict(draft.settings)
     notes = (*draft.notes, *fleet.notes)
     if draft.derive and "phases" not in settings.get("control", {}):
@@ -159,7 +159,7 @@ def _write_settings(
 
 @contextlib.contextmanager
 def _errors_about(copied: Mapping[str, Path], folder: Path) -> Iterator[None]:
-    """Errors name the files the user has, not copies that are gone when they are read."""
+    """Make errors name the user's files, not copies that are gone when the error is read."""
     try:
         yield
     except ScenarioError as error:
@@ -169,7 +169,7 @@ def _errors_about(copied: Mapping[str, Path], folder: Path) -> Iterator[None]:
         raise ScenarioError(text) from None
 
 
-def _readme(made: Made, draft: Draft, command: str) -> str:
+def _readme(made: Made, draft: RoadFiles, command: str) -> str:
     settings = made.scenario.settings
     phases = [len(item.phases) for item in made.network.intersections]
     spread = f"{min(phases)} to {max(phases)}" if len(set(phases)) > 1 else f"{phases[0]}"
@@ -202,7 +202,7 @@ def _readme(made: Made, draft: Draft, command: str) -> str:
 
 @contextlib.contextmanager
 def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
-    """Yields an empty folder beside `target`, which becomes `target` if the block ends normally.
+    """Yield an empty folder beside `target` that becomes `target` if the block ends normally.
 
     Args:
         target: The directory to be.
@@ -242,7 +242,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _stopped_in_order() -> Iterator[None]:
-    """Whoever ends the program (``kill``, a system that shuts down) finds nothing left behind."""
+    """Turn SIGTERM into an exception, so that a killed program leaves nothing behind."""
 
     def stop(number: int, _: object) -> None:
         raise SystemExit(128 + number)
@@ -270,7 +270,7 @@ def _put(made: Path, target: Path, before: Path) -> None:
 
 
 def require_free(target: Path, *, force: bool) -> None:
-    """Refuses a place that holds something.
+    """Refuse a place that holds something.
 
     Raises:
         OutputError: As for `new_folder`.

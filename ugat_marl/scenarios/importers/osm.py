@@ -20,7 +20,7 @@ from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import Tag, parse_xml, read_bytes, scratch, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.long_files import scan
-from ugat_marl.scenarios.importers.making import NETWORK, Draft, Roads
+from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
 from ugat_marl.scenarios.importers.osm_crossings import crossings_for, has_light
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, links_of
 from ugat_marl.scenarios.phases import are_foes
@@ -53,7 +53,7 @@ _KINDS = frozenset({"highway", "railway"})
 
 @dataclass(frozen=True)
 class _Extract:
-    """What an extract holds for us.
+    """Facts about an extract that its conversion needs.
 
     Attributes:
         roads: Ways for cars.
@@ -72,8 +72,8 @@ class _Extract:
     nodes: frozenset[str] = frozenset()
 
 
-def from_osm(path: Path, *, guess: bool) -> Roads:
-    """The streets of an extract.
+def from_osm(path: Path, *, guess: bool) -> RoadSource:
+    """Return a source of the streets of an extract.
 
     Args:
         path: ``.osm``, ``.osm.gz`` or ``.pbf``.
@@ -85,7 +85,7 @@ def from_osm(path: Path, *, guess: bool) -> Roads:
     if not path.name.lower().endswith(_ENDINGS):
         raise OptionError(f"--osm {str(path)!r}: give a file that ends in {', '.join(_ENDINGS)}")
 
-    def roads(folder: Path, reporter: Reporter) -> Draft:
+    def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             source = _as_xml(path, Path(name), reporter)
             extract = _look(source, path, reporter)
@@ -109,7 +109,7 @@ def from_osm(path: Path, *, guess: bool) -> Roads:
                     f"{path}: none of its lights is at a road for cars; --guess-signals puts some "
                     "at large junctions"
                 )
-        return Draft(
+        return RoadFiles(
             f"OpenStreetMap extract {path.name}",
             f"Converted from `{path.name}` by SUMO's netconvert. © OpenStreetMap contributors; the "
             "data are available under the Open Database Licence (openstreetmap.org/copyright).",
@@ -122,7 +122,7 @@ def from_osm(path: Path, *, guess: bool) -> Roads:
 
 
 def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
-    """The extract as XML."""
+    """Return the path of the extract as XML."""
     if not path.name.lower().endswith(".pbf"):
         return path
     unpack(path, work / "unpacked.osm", reporter)
@@ -130,7 +130,7 @@ def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
 
 
 def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
-    """Counts roads and lights; refuses entities before any other program sees the file."""
+    """Count roads and lights; refuse entities before any other program sees the file."""
     roads = signals = unlit = 0
     walks: set[str] = set()
     nodes: set[str] = set()
@@ -188,7 +188,7 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
 
 
 def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
-    """Crossings at lights, and programmes that have green for them."""
+    """Add crossings at lights, and programmes that have green for them."""
     root = parse_xml(read_bytes(made), str(made))
     if not (content := crossings_for(root, extract.crossings)):
         return
@@ -200,7 +200,7 @@ def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
 
 
 def _idle_lights(network: Path, walks: Iterable[str]) -> list[str]:
-    """Junctions of lights that no two streams contend for, without those at crossings."""
+    """Return the junctions of lights without conflicting streams, crossings excepted."""
     root = parse_xml(read_bytes(network), str(network))
     foes = foes_of(root)
     kept = set(walks)
@@ -228,13 +228,13 @@ class Item(NamedTuple):
 
     @property
     def tags(self) -> dict[str, str]:
-        """Its keys and values."""
+        """Keys and values of its tags."""
         found = (tag.attributes for tag in self.inside if tag.name == "tag")
         return {tag.get("k", ""): tag.get("v", "") for tag in found}
 
     @property
     def way_nodes(self) -> list[str]:
-        """The nodes of a road or railway; none of anything else."""
+        """Nodes, if it is a road or railway."""
         if self.start.name != "way" or not _KINDS & self.tags.keys():
             return []
         return [tag.attributes.get("ref", "") for tag in self.inside if tag.name == "nd"]
@@ -278,7 +278,7 @@ def unpack(path: Path, out: Path, reporter: Reporter) -> None:
 
 
 def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
-    """All items of an extract of any length.
+    """Yield all items of an extract of any length.
 
     Args:
         source: The extract as XML, packed or not.
@@ -311,7 +311,7 @@ def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
 def write_roads(
     source: Path, path: Path, nodes: Collection[str], out: Path, reporter: Reporter
 ) -> None:
-    """Writes what netconvert looks at; it holds all it is given in memory, most of it buildings.
+    """Write roads and railways; netconvert would hold all else, mostly buildings, in memory.
 
     Args:
         source: The extract as XML, packed or not.
@@ -343,7 +343,7 @@ def _open(tag: Tag) -> str:
 
 
 def place_of(node: Tag, path: Path) -> tuple[float, float]:
-    """Longitude and latitude of a node, degrees.
+    """Return longitude and latitude of a node, degrees.
 
     Raises:
         ScenarioError: It has none; names the line.

@@ -1,4 +1,4 @@
-"""Where an OpenStreetMap extract has people cross at lights, on the roads netconvert made of it.
+"""Crossings at lights of an OpenStreetMap extract, on the roads netconvert made of it.
 
 Crossings are nodes of the roads they cross. netconvert leaves them out unless footways are mapped
 without a gap, so they are found here by their place and handed to it as a list.
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from ugat_marl.files import xml_bytes
 
 _NEAR_M = 8.0
-"""A crossing lies so near to the road it crosses."""
+"""Greatest distance of a crossing from the road it crosses."""
 _REACH_M = 40.0
-"""And so far along the road from the junction whose lights it has."""
+"""Greatest distance along the road from the junction whose light it has."""
 _BESIDE_M = 2.0
-"""Roads that are farther apart at a crossing are carriageways with a node for each."""
+"""Roads farther apart at a crossing are carriageways, each with a node of its own."""
 _SAME_ARM_DEG = 25.0
 _WITHOUT_LIGHT = frozenset({"uncontrolled", "zebra", "unmarked", "marked", "no"})
 
@@ -38,7 +38,7 @@ class _Arm:
 
 
 def has_light(tags: Mapping[str, str]) -> bool:
-    """Whether a node is a crossing that may belong to a traffic light.
+    """Return True for a node that is a crossing and may belong to a traffic light.
 
     Args:
         tags: Of the node.
@@ -52,7 +52,7 @@ def has_light(tags: Mapping[str, str]) -> bool:
 
 
 def crossings_for(root: ET.Element, places: Iterable[tuple[float, float]]) -> bytes | None:
-    """The crossings at lights as a connection file of netconvert.
+    """Return the crossings at lights as a connection file of netconvert.
 
     Args:
         root: A network with sidewalks.
@@ -80,7 +80,7 @@ def crossings_for(root: ET.Element, places: Iterable[tuple[float, float]]) -> by
 def _crossed(
     place: Point, arms: Mapping[str, Sequence[_Arm]]
 ) -> tuple[str, tuple[str, ...]] | None:
-    """The junction and the roads of the arm that a crossing is on."""
+    """Return the junction and the roads of the arm that a crossing is on."""
     best_m, best = math.inf, None
     for junction, around in arms.items():
         for arm in around:
@@ -129,7 +129,7 @@ def _arms_at_lights(root: ET.Element) -> dict[str, list[_Arm]]:
 
 
 def _join(arms: list[_Arm], name: str, line: Point) -> None:
-    """Puts a road, drawn from its junction outwards, to the arm of its direction."""
+    """Add a road, drawn from its junction outwards, to the arm of its direction."""
     away = line[-1] - line[0]
     bearing = math.degrees(math.atan2(away[1], away[0]))
     for arm in arms:
@@ -145,7 +145,7 @@ def _line(shape: str) -> Point | None:
 
 
 def _first_metres(line: Point) -> Point:
-    """The beginning of a line, `_REACH_M` long."""
+    """Return the beginning of a line, `_REACH_M` long."""
     kept = [line[0]]
     left = _REACH_M
     for a, b in zip(line, line[1:], strict=False):
@@ -166,7 +166,7 @@ def _distance_m(place: Point, line: Point) -> float:
 
 
 def _projection(root: ET.Element) -> Callable[[float, float], Point] | None:
-    """Longitude and latitude to the metres of a network in UTM; None for another projection."""
+    """Return the projection from degrees to a network's metres if that is UTM, else None."""
     place = root.find("location")
     words = (place.get("projParameter", "") if place is not None else "").split()
     zone = next((word.removeprefix("+zone=") for word in words if word.startswith("+zone=")), "")
@@ -183,7 +183,7 @@ def _projection(root: ET.Element) -> Callable[[float, float], Point] | None:
 
 
 def utm(longitude: float, latitude: float, zone: int) -> tuple[float, float]:
-    """Easting and northing north of the equator, m, to a millimetre (Krüger's series, WGS84).
+    """Return easting and northing, m, north of the equator (Krüger's series, WGS84, to 1 mm).
 
     Args:
         longitude: Degrees.

@@ -19,7 +19,7 @@ from typing import Any
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import write_whole, xml_bytes
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.importers.making import NETWORK, Draft, Roads
+from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
 from ugat_marl.scenarios.programs import netconvert
 
 TURNS = {"l": "left", "s": "straight", "r": "right"}
@@ -34,7 +34,7 @@ _NETCONVERT = {
     "tls.yellow.time": 3, "tls.allred.time": 2,
 }  # fmt: skip
 MOST = 2500
-"""Intersections in a grid."""
+"""Most intersections in a grid."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Road:
-    """One carriageway; `lanes` holds the turns of each lane, kerb first."""
+    """Carriageway; `lanes` holds the turns of each lane, kerb first."""
 
     start: str
     end: str
@@ -63,7 +63,7 @@ class Road:
 
 @dataclass(frozen=True)
 class Plan:
-    """Nodes and roads; everything that netconvert is told and the demand walks over."""
+    """Nodes and roads, from which the network and its demand are made."""
 
     nodes: dict[str, Node]
     roads: dict[str, Road]
@@ -113,7 +113,7 @@ class Plan:
 
 
 def read_plan(source: Mapping[str, Any]) -> Plan:
-    """The plan in a parsed `source.toml`, from its table ``grid`` or ``junctions``/``roads``."""
+    """Return the plan in a parsed `source.toml`: its table ``grid`` or ``junctions``/``roads``."""
     if "grid" in source:
         return grid(**source["grid"])
     nodes = {
@@ -140,7 +140,7 @@ def grid(
     east_west: Sequence[str],
     north_south: Sequence[str],
 ) -> Plan:
-    """Junctions A1 (south-west), B1, ... A2, ...; ends west1, east1, ..., southA, northA, ...
+    """Return a grid: junctions A1 (south-west), B1, ..., A2, ...; ends west1, east1, southA, ...
 
     Args:
         columns: Junctions from west to east.
@@ -178,13 +178,13 @@ def grid(
 
 
 def _column(number: int) -> str:
-    """A to Z, then AA, AB, ..., as in a spreadsheet."""
+    """Return A to Z, then AA, AB, ..., as in a spreadsheet."""
     rest, last = divmod(number, 26)
     return (_column(rest - 1) if rest else "") + chr(ord("A") + last)
 
 
 def plain_xml(plan: Plan, speed_mps: float) -> dict[str, bytes]:
-    """The three plain-XML documents netconvert reads, by the option that takes them."""
+    """Return the three plain-XML documents of netconvert, by the option that takes them."""
     nodes, edges, connections = ET.Element("nodes"), ET.Element("edges"), ET.Element("connections")
     for node in plan.nodes.values():
         kind = "traffic_light" if node.signal else "dead_end"
@@ -207,7 +207,7 @@ def plain_xml(plan: Plan, speed_mps: float) -> dict[str, bytes]:
 
 
 def build_network(documents: Mapping[str, bytes], options: Mapping[str, Any]) -> bytes:
-    """The .net.xml that netconvert makes, without the comment that holds date and paths.
+    """Return the .net.xml that netconvert makes, without its comment of date and paths.
 
     Args:
         documents: From `plain_xml`.
@@ -234,8 +234,8 @@ def build_network(documents: Mapping[str, bytes], options: Mapping[str, Any]) ->
         return output.read_bytes()
 
 
-def rectangle(text: str, spacing_m: float, speed_mps: float) -> Roads:
-    """A grid.
+def rectangle(text: str, spacing_m: float, speed_mps: float) -> RoadSource:
+    """Return a source of a grid of roads.
 
     Args:
         text: ``RxC``, rows and columns.
@@ -257,8 +257,8 @@ def rectangle(text: str, spacing_m: float, speed_mps: float) -> Roads:
     return _drawn(plan, speed_mps, f"A grid of {words}")
 
 
-def arterial(count: int, spacing_m: float, speed_mps: float) -> Roads:
-    """A main road from west to east with side streets.
+def arterial(count: int, spacing_m: float, speed_mps: float) -> RoadSource:
+    """Return a source of a main road from west to east with side streets.
 
     Args:
         count: Intersections.
@@ -283,11 +283,11 @@ def _check(spacing_m: float, speed_mps: float) -> None:
         raise OptionError(f"--speed-mps {speed_mps:g} is not within 1 to 60 m/s")
 
 
-def _drawn(plan: Plan, speed_mps: float, description: str) -> Roads:
-    def roads(folder: Path, reporter: Reporter) -> Draft:
+def _drawn(plan: Plan, speed_mps: float, description: str) -> RoadSource:
+    def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         del reporter
         write_whole(folder / NETWORK, build_network(plain_xml(plan, speed_mps), _NETCONVERT))
-        return Draft(
+        return RoadFiles(
             description,
             "Drawn by the suite and built by SUMO's netconvert: every approach has a lane for left "
             f"turns beside those straight on and right; the speed limit is {speed_mps:g} m/s, and "

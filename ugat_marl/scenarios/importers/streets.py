@@ -1,4 +1,4 @@
-"""Where cars may drive: entries, exits, and the way on from every road of a network."""
+"""Roads for cars: entries, exits, and the roads ahead of every road of a network."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Streets:
 
     @classmethod
     def of(cls, root: ET.Element) -> Streets:
-        """Those of a ``<net>``."""
+        """Return the roads for cars of a ``<net>``."""
         start: dict[str, str] = {}
         end: dict[str, str] = {}
         for edge in root.iter("edge"):

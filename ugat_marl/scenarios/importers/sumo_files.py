@@ -1,4 +1,4 @@
-"""A network, or a whole configuration, that SUMO reads already: copied, or used where it lies."""
+"""Networks and configurations of SUMO, copied or used where they lie."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ugat_marl.files import Tag, parse_xml, read_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.demand import edges_used
 from ugat_marl.scenarios.importers.long_files import scan
-from ugat_marl.scenarios.importers.making import Draft, Fleet, Roads, Vehicles
+from ugat_marl.scenarios.importers.making import RoadFiles, RoadSource, VehicleFiles, VehicleSource
 from ugat_marl.scenarios.scenario import Document, read_scenario
 
 _CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
 
 
-def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
-    """Roads, and perhaps vehicles, of SUMO's own files.
+def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
+    """Return a source of roads, and perhaps vehicles, from SUMO's own files.
 
     Args:
         path: A ``.sumocfg`` or a ``.net.xml``, packed or not.
@@ -34,11 +34,11 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
     if not configuration and not path.name.removesuffix(".gz").endswith(".xml"):
         raise OptionError(f"--sumo {str(path)!r}: give a .sumocfg or a .net.xml")
 
-    def roads(folder: Path, reporter: Reporter) -> Draft:
+    def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         if not configuration:
             _require_root(path, ("net",), "SUMO network", reporter)
             name = _placed(path, folder, link)
-            return Draft(
+            return RoadFiles(
                 f"SUMO network {path.name}",
                 _origin([path], link),
                 network=name,
@@ -49,10 +49,10 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> Roads:
     return roads
 
 
-def from_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
-    """Route files the user has."""
+def from_routes(paths: Sequence[Path], *, link: bool) -> VehicleSource:
+    """Return a source of vehicles from the user's route files."""
 
-    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         leads = _leads(network)
         for path in paths:
             for tag in _rooted(path, ("routes", "additional"), "route file", reporter):
@@ -61,14 +61,14 @@ def from_routes(paths: Sequence[Path], *, link: bool) -> Vehicles:
                 if tag.name == "route":
                     _require_connected(tag, leads, path, network)
         placed = tuple(_placed(path, folder, link) for path in paths)
-        return Fleet(placed, copied={path.name: path for path in paths})
+        return VehicleFiles(placed, copied={path.name: path for path in paths})
 
     return vehicles
 
 
 def _configured(
     path: Path, folder: Path, link: bool, own_vehicles: bool, reporter: Reporter
-) -> Draft:
+) -> RoadFiles:
     if own_vehicles:
         scenario = read_scenario(path)
         network, routes, additional = scenario.network, scenario.routes, scenario.additional
@@ -82,7 +82,7 @@ def _configured(
     def placed(documents: Sequence[Document]) -> tuple[str, ...]:
         return tuple(_put(item, folder, link) for item in documents)
 
-    return Draft(
+    return RoadFiles(
         f"SUMO configuration {path.name}",
         _origin([path], link),
         network=placed([network])[0],
@@ -117,7 +117,7 @@ def _put(document: Document, folder: Path, link: bool) -> str:
 
 
 def _placed(path: Path, folder: Path, link: bool) -> str:
-    """The name under which the scenario finds the file: in its folder, or where it is."""
+    """Copy the file, unless it is linked; return the name by which the scenario finds it."""
     if link:
         return str(path.resolve())
     _require_new(folder / path.name)
@@ -133,7 +133,7 @@ def _require_new(path: Path) -> None:
 
 
 def _leads(network: Path) -> dict[str, set[str]]:
-    """The edges that every edge of a network leads to."""
+    """Return the edges that every edge of a network leads to."""
     root = parse_xml(read_bytes(network), str(network))
     found: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
     for item in root.iter("connection"):
@@ -142,7 +142,7 @@ def _leads(network: Path) -> dict[str, set[str]]:
 
 
 def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
-    """Refuses edges that do not exist, by the file the user has, not the copy to be."""
+    """Refuse edges that do not exist, by the file the user has, not the copy to be."""
     used = edges_used(tag)
     if leads and not leads.keys() >= set(used):  # a network without roads has its own message
         edge = next(edge for edge in used if edge not in leads)
@@ -153,7 +153,7 @@ def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
 
 
 def _require_connected(tag: Tag, leads: Mapping[str, set[str]], path: Path, network: Path) -> None:
-    """Refuses a route that jumps."""
+    """Refuse a route that jumps."""
     for a, b in pairwise(tag.attributes.get("edges", "").split()):
         if a in leads and b in leads and b not in leads[a]:
             raise ScenarioError(
@@ -168,7 +168,7 @@ def _require_root(path: Path, tags: Sequence[str], what: str, reporter: Reporter
 
 
 def _rooted(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> Iterator[Tag]:
-    """All elements of a file, if its first one is what it should be."""
+    """Yield all elements of a file; refuse another root than `tags`."""
     for number, tag in enumerate(scan(path, reporter)):
         if not number and tag.name not in tags:
             raise ScenarioError(

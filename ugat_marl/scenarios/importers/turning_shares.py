@@ -18,7 +18,7 @@ import numpy as np
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, replacing
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.importers.making import ROUTES, Fleet, Vehicles
+from ugat_marl.scenarios.importers.making import ROUTES, VehicleFiles, VehicleSource
 from ugat_marl.scenarios.importers.streets import Streets
 from ugat_marl.seeding import numpy_generator
 
@@ -30,9 +30,9 @@ CAR = {
 """SUMO's passenger car, spelled out."""
 
 MOST_VEHICLES = 5_000_000
-"""More make no scenario that anybody could drive."""
+"""Most vehicles of a scenario."""
 _TRIES = 200
-"""Walks that may end in a circle before a vehicle is given up."""
+"""Walks that may end in a circle before a vehicle is left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Drive:
 def walked(
     streets: Streets, vph: float, shares: tuple[float, float, float], length_s: float, seed: int
 ) -> list[Drive]:
-    """Vehicles at every entry of a network.
+    """Draw vehicles at every entry of a network.
 
     Args:
         streets: Where.
@@ -65,7 +65,7 @@ def walked(
         shares: Of left turns, straight on and right turns; where one of them is not possible,
             the others keep their proportion.
         length_s: For how long vehicles enter.
-        seed: Decides everything.
+        seed: Seed of all draws.
 
     Returns:
         The vehicles in the order of their departures.
@@ -116,7 +116,7 @@ def walked(
 def _walk(
     streets: Streets, entry: str, shares: Mapping[str, float], random: np.random.Generator
 ) -> tuple[str, ...]:
-    """Roads from an entry to an exit, passing no junction twice; empty if none was found."""
+    """Draw roads from an entry to an exit, no junction twice; empty if none was found."""
     for _ in range(_TRIES):
         road, route, passed = entry, [entry], {streets.start[entry]}
         while road not in streets.exits and streets.end[road] not in passed:
@@ -137,7 +137,7 @@ def _walk(
 def poisson_arrivals(
     random: np.random.Generator, rate_per_s: float, length_s: float
 ) -> list[float]:
-    """Poisson arrivals in [0, length_s)."""
+    """Draw Poisson arrivals in [0, length_s)."""
     found: list[float] = []
     moment = 0.0
     while rate_per_s > 0:
@@ -149,7 +149,7 @@ def poisson_arrivals(
 
 
 def weighted_choice(shares: Mapping[str, float], random: np.random.Generator) -> str:
-    """A key of `shares`, with probability proportional to its value."""
+    """Draw a key of `shares`, with probability proportional to its value."""
     mark = float(random.random()) * sum(shares.values())
     for name, share in shares.items():
         mark -= share
@@ -161,7 +161,7 @@ def weighted_choice(shares: Mapping[str, float], random: np.random.Generator) ->
 def write_drives(
     path: Path, drives: Iterable[Drive], types: Iterable[Mapping[str, str]] = (CAR,)
 ) -> None:
-    """Writes the vehicles as a route file, one after the other.
+    """Write the vehicles as a route file, one after the other.
 
     Args:
         path: The file.
@@ -193,15 +193,15 @@ def _attributes(values: Mapping[str, str]) -> str:
 
 def from_turns(
     vph: float, shares: tuple[float, float, float], begin_s: float, length_s: float, seed: int
-) -> Vehicles:
-    """Vehicles by turning shares, as `walked` draws them, from `begin_s` on."""
+) -> VehicleSource:
+    """Return a source of vehicles by turning shares, as `walked` draws them, from `begin_s` on."""
 
-    def vehicles(folder: Path, network: Path, reporter: Reporter) -> Fleet:
+    def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         del reporter
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         drives = walked(streets, vph, shares, length_s, seed)
         later = (replace(drive, depart_s=begin_s + drive.depart_s) for drive in drives)
         write_drives(folder / ROUTES, later)
-        return Fleet((ROUTES,))
+        return VehicleFiles((ROUTES,))
 
     return vehicles

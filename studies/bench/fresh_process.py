@@ -1,0 +1,81 @@
+"""Run one measured program in a fresh process, so that no measurement warms up another.
+
+A program is called as ``python program request.json result.json``. It has a temporary folder of its
+own, and everything it prints is kept for the case that it fails.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.errors import MeasurementError
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+def in_fresh_process(
+    program: Sequence[str | Path],
+    request: Mapping[str, Any],
+    *,
+    python: str | Path = sys.executable,
+    variables: Mapping[str, str] | None = None,
+    timeout_s: float = 3600.0,
+) -> dict[str, Any]:
+    """Run a program and returns its result.
+
+    Args:
+        program: Arguments of Python: ``["-m", module]`` or ``[path]``.
+        request: What the program is told, JSON-able.
+        python: Interpreter.
+        variables: Environment variables to add; one thread per process is the default.
+        timeout_s: Patience.
+
+    Raises:
+        MeasurementError: The program failed, took too long or left no result.
+    """
+    name = " ".join(str(part) for part in program)
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-bench-") as folder:
+        asked, found = Path(folder, "request.json"), Path(folder, "result.json")
+        scratch = Path(folder, "tmp")
+        scratch.mkdir()
+        asked.write_text(json.dumps(dict(request)))
+        command = [str(python), "-P", *map(str, program), str(asked), str(found)]
+        try:
+            finished = subprocess.run(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                env=_variables(scratch, variables or {}),
+                timeout=timeout_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise MeasurementError(f"{name}: no result after {timeout_s:g} s") from None
+        if finished.returncode or not found.exists():
+            words = " ".join(finished.stdout.decode(errors="replace").split())
+            said = words[-2000:] or "nothing"
+            raise MeasurementError(
+                f"{name}: failed with status {finished.returncode}; it said: {said}"
+            )
+        return json.loads(found.read_text())
+
+
+def _variables(scratch: Path, more: Mapping[str, str]) -> dict[str, str]:
+    # The checkout comes last, so that an installed suite is the one that is measured.
+    entries = [entry or str(Path.cwd()) for entry in sys.path]
+    path = os.pathsep.join(dict.fromkeys([*entries, str(CHECKOUT)]))
+    return {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": path,
+        "TMPDIR": str(scratch),
+        **more,
+    }

@@ -1,0 +1,157 @@
+"""Places of a scenario with enough traffic to show a hidden effect."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+from ugat_marl.diagnosis import Routes
+from ugat_marl.effects import places_of
+from ugat_marl.experiments import policy_factory, record
+from ugat_marl.scenarios import Detector, Network, Scenario
+from ugat_marl.seeding import derive_seed
+
+TURN_PER_HOUR = 60.0
+"""A turn to which vehicles are diverted is already taken by so many."""
+BUSY_PER_HOUR = 120.0
+"""What an origin, a detector or a lane needs to count as busy."""
+YIELDING_PER_HOUR = 200.0
+"""A turn that shows how drivers yield: fewer find their gap, or the green that protects them."""
+LONG_M = 50.0
+"""A lane to close or to park on is at least so long."""
+
+
+@dataclass(frozen=True)
+class Busy:
+    """Places at which effects can be hidden.
+
+    Attributes:
+        lights: Traffic lights that agents control.
+        origins: Edges where vehicles start, and how many per hour tell of them (`telling`).
+        turns: ``(from, to)`` edges of turns at traffic lights.
+        closable: Lanes before a traffic light with a lane beside them.
+        lanes: Lanes before a traffic light.
+        edges: Edges before a traffic light.
+        detectors: Detectors.
+        pairs: Detectors of one kind on neighbouring lanes that count differently.
+        permitted: Whether drivers have to yield on some green, and enough of them do.
+        several_lanes: Whether an approach has more than one lane.
+    """
+
+    lights: tuple[str, ...]
+    origins: Mapping[str, float]
+    turns: tuple[tuple[str, str], ...]
+    closable: tuple[str, ...]
+    lanes: tuple[str, ...]
+    edges: tuple[str, ...]
+    detectors: tuple[str, ...]
+    pairs: tuple[tuple[str, str], ...]
+    permitted: bool
+    several_lanes: bool
+
+
+def busy_places(scenario: Scenario, seed: int) -> Busy:
+    """Count the demand, and plays one day to see which lanes it takes.
+
+    Args:
+        scenario: The simulation.
+        seed: Root of the seed of that day.
+    """
+    network = Network.read(scenario)
+    rates, detectors = _detected(scenario, seed)
+    routes = Routes.of(scenario)
+    turns = {(edge, other): n for edge, far in routes.turns.items() for other, n in far.items()}
+    incoming = {lane for item in network.intersections for lane in item.incoming_lanes}
+    approaches = {network.lanes[lane].edge for lane in incoming}
+    lanes = [
+        lane
+        for lane in sorted(incoming)
+        if rates.get(f"stop:{lane}", 0.0) >= BUSY_PER_HOUR
+        and network.lanes[lane].length_m >= LONG_M
+    ]
+    places = places_of(scenario)
+    counted = {network.lanes[item.lane].edge for item in detectors}
+    cars = Counter(item.edge for item in places.lanes.values() if item.cars)
+    ways = {
+        (edge, other) for edge in sorted(approaches) for other in places.following.get(edge, ())
+    }
+    return Busy(
+        lights=tuple(item.id for item in network.intersections),
+        origins={
+            origin: rate
+            for origin in sorted(routes.origins)
+            if (rate := telling(routes, origin, counted)) >= BUSY_PER_HOUR
+        },
+        turns=tuple(
+            sorted(
+                (edge, other)
+                for edge, other in ways
+                if (turning := turns.get((edge, other), 0.0)) >= TURN_PER_HOUR
+                and routes.joint[edge][edge] - turning >= BUSY_PER_HOUR
+            )
+        ),
+        closable=tuple(x for x in lanes if cars[network.lanes[x].edge] > 1),
+        lanes=tuple(lanes),
+        edges=tuple(sorted({network.lanes[x].edge for x in lanes})),
+        detectors=tuple(item.id for item in detectors if rates.get(item.id, 0.0) >= BUSY_PER_HOUR),
+        pairs=_pairs(detectors, rates, network),
+        permitted=any(turns.get(way, 0.0) >= YIELDING_PER_HOUR for way in _yielding(network)),
+        several_lanes=any(cars[edge] > 1 for edge in approaches),
+    )
+
+
+def telling(routes: Routes, origin: str, counted: Collection[str]) -> float:
+    """Vehicles per hour that would tell as much of an origin if they were counted alone.
+
+    A share of `own` vehicles among `all` is told with the error of all: as by ``own**2 / all``
+    alone. The edge that tells most counts.
+
+    Args:
+        routes: Of the scenario.
+        origin: Where vehicles start.
+        counted: Edges with detectors.
+    """
+    told = (
+        own**2 / routes.joint[edge][edge]
+        for edge, own in routes.passing[origin].items()
+        if edge in counted
+    )
+    return max(told, default=0.0)
+
+
+def _yielding(network: Network) -> set[tuple[str, str]]:
+    """Edges of the turns that have to yield on some green."""
+    return {
+        (network.lanes[link.from_lane].edge, network.lanes[link.to_lane].edge)
+        for item in network.intersections
+        for link in item.links
+        if any(phase[link.index] == "g" for phase in item.phases)
+    }
+
+
+def _detected(scenario: Scenario, seed: int) -> tuple[dict[str, float], tuple[Detector, ...]]:
+    """Vehicles per hour at every detector on one ordinary day."""
+    day = record(
+        scenario,
+        "sim",
+        policy_factory("fixed-time:30"),
+        periods=1,
+        seed=derive_seed(seed, "blind", "survey"),
+    )
+    hours = (day.periods[0].end_s - day.periods[0].begin_s) / 3600.0
+    return {x: len(seen) / hours for x, seen in day.periods[0].passages.items()}, day.detectors
+
+
+def _pairs(
+    detectors: tuple[Detector, ...], rates: Mapping[str, float], network: Network
+) -> tuple[tuple[str, str], ...]:
+    found: list[tuple[str, str]] = []
+    for one in detectors:
+        for two in detectors:
+            same = network.lanes[one.lane].edge == network.lanes[two.lane].edge
+            if one.id < two.id and one.kind == two.kind and same:
+                low, high = sorted((rates.get(one.id, 0.0), rates.get(two.id, 0.0)))
+                if high >= BUSY_PER_HOUR and low <= 0.7 * high:
+                    found.append((one.id, two.id))
+    return tuple(found)

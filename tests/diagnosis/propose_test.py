@@ -1,0 +1,224 @@
+"""Which effects are proposed for a difference that was put together by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ugat_marl.diagnosis import Hypothesis, Reference, Tally
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
+from ugat_marl.diagnosis.propose import Ray, between, propose
+from ugat_marl.diagnosis.records import Proposed
+from ugat_marl.diagnosis.statistics import Pools, Whitener
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
+
+Array = NDArray[np.float64]
+
+POOLS = Pools({"network": np.ones((1, 1))})
+WIDTH = 30
+NO_TIME = np.zeros((len(BIN_FEATURES), 1))
+PRICE = 14.0
+
+NAMES = ("headway", "min_gap", "acceleration", "deceleration", "imperfection", "startup_delay",
+         "desired_speed", "heavy_share")  # fmt: skip
+FIELDS = ("seconds", "metres", "mps2", "mps2", "sigma", "seconds", "factor", "share")
+NOMINAL = (1.0, 2.5, 2.6, 4.5, 0.5, 0.0, 1.0, 0.0)
+LEVEL = (1.5, 3.5, 1.6, 3.0, 0.8, 0.6, 0.85, 0.1)
+
+
+def day(values: Array) -> Tally:
+    sums = np.zeros((len(FEATURES), 1, 2))
+    sums[:WIDTH, 0] = np.stack([100.0 * values, np.full(WIDTH, 100.0)], axis=-1)
+    return Tally(sums, np.zeros((len(BIN_FEATURES), 1, 1)))
+
+
+@pytest.fixture(scope="module")
+def reference() -> Reference:
+    noise = np.random.default_rng(1).standard_normal((400, WIDTH))
+    return Reference(POOLS, [day(20.0 + values) for values in noise])
+
+
+def rays(seed: int = 2, size: float = 12.0) -> list[Ray]:
+    """Hypotheses that move the statistics in directions of their own."""
+    generator = np.random.default_rng(seed)
+    found: list[Ray] = []
+    for name, field, nominal, level in zip(NAMES, FIELDS, NOMINAL, LEVEL, strict=True):
+        direction = np.zeros((1, len(FEATURES)))
+        direction[0, :WIDTH] = generator.standard_normal(WIDTH)
+        direction *= size / np.linalg.norm(direction)
+        hypothesis = Hypothesis(name, (), (field,), ((level,),), (nominal,), 0.0)
+        nothing = np.zeros_like(direction)
+        found.append(
+            Ray(
+                hypothesis,
+                (level,),
+                {"network": direction, "time": NO_TIME},
+                {"network": nothing, "time": NO_TIME},
+                (nominal,),
+            )
+        )
+    return found
+
+
+def whitener(
+    reference: Reference, planted: dict[str, float], among: Sequence[Ray], noise: int | None = None
+) -> Whitener:
+    """For data in which these hypotheses are present, at multiples of their rays."""
+    values = reference.blocks["network"].mean[0, :WIDTH].copy()
+    for ray in among:
+        strength = planted.get(ray.hypothesis.name, 0.0)
+        values = values + strength * ray.difference["network"][0, :WIDTH]
+    rows = np.tile(values, (5, 1))
+    if noise is not None:
+        rows = rows + np.random.default_rng(noise).standard_normal(rows.shape)
+    return Whitener(reference, [day(row) for row in rows], 0.0)
+
+
+def values(proposal: Proposed) -> dict[str, float]:
+    return {hypothesis.name: found[0] for hypothesis, found in proposal.members}
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        {"headway": 0.7},
+        {"min_gap": 1.2, "desired_speed": 0.5},
+        {"acceleration": 1.0, "deceleration": 0.6, "startup_delay": 0.9},
+        {"headway": 0.4, "imperfection": 0.3, "heavy_share": 1.3},
+    ],
+)
+def test_planted_combinations_are_recovered_exactly(
+    reference: Reference, planted: dict[str, float]
+) -> None:
+    among = rays()
+    best = propose(among, whitener(reference, planted, among), PRICE)[0]
+    expected = {
+        name: NOMINAL[NAMES.index(name)]
+        + strength * (LEVEL[NAMES.index(name)] - NOMINAL[NAMES.index(name)])
+        for name, strength in planted.items()
+    }
+    assert values(best) == pytest.approx(expected, abs=2e-3)
+    # The ridge leaves next to nothing; what remains is the price.
+    assert best.expected == pytest.approx(PRICE * len(planted), abs=1.0)
+
+
+def test_effects_that_hide_each_other_are_proposed_together(reference: Reference) -> None:
+    # Two rays that nearly cancel: neither alone helps much, both together explain all.
+    among = rays()[:4]
+    other = among[1]
+    hidden = {
+        "network": -0.95 * among[0].difference["network"] + 0.3 * other.difference["network"],
+        "time": NO_TIME,
+    }
+    among[1] = Ray(other.hypothesis, other.level, hidden, other.variance, other.origin)
+    target = whitener(reference, {"headway": 1.0, "min_gap": 1.0}, among)
+    best = propose(among, target, PRICE)[0]
+    assert set(values(best)) == {"headway", "min_gap"}
+    assert best.expected == pytest.approx(2 * PRICE, abs=1.0)
+
+
+def test_a_price_keeps_spurious_effects_out(reference: Reference) -> None:
+    among = rays()
+    sizes: list[int] = []
+    for seed in range(40):
+        best = propose(among, whitener(reference, {"headway": 0.8}, among, noise=seed), PRICE)[0]
+        assert "headway" in values(best)
+        sizes.append(len(best.members))
+    assert np.mean(np.array(sizes) > 1) <= 0.05
+
+
+def test_of_nothing_but_noise_nothing_is_worth_its_price(reference: Reference) -> None:
+    among = rays()
+    tempted = 0
+    for seed in range(100, 140):
+        target = whitener(reference, {}, among, noise=seed)
+        found = propose(among, target, PRICE)
+        tempted += bool(found) and found[0].expected < float(target.measured @ target.measured)
+    assert tempted <= 2
+
+
+def test_no_effect_works_backwards(reference: Reference) -> None:
+    among = rays()[:3]
+    found = propose(among, whitener(reference, {"headway": -0.8}, among), PRICE)
+    assert all("headway" not in values(item) for item in found)
+
+
+def test_rays_are_followed_only_so_far(reference: Reference) -> None:
+    among = rays()[:1]
+    best = propose(among, whitener(reference, {"headway": 5.0}, among), PRICE)[0]
+    assert values(best)["headway"] == pytest.approx(1.0 + THRESHOLDS.farthest * 0.5)
+
+
+def test_two_strengths_of_one_hypothesis_never_stand_in_one_model(reference: Reference) -> None:
+    among = rays()[:2]
+    first = among[0]
+    among.append(Ray(first.hypothesis, (1.9,), rays(9)[0].difference, first.variance, (1.0,)))
+    target = whitener(reference, {"headway": 0.8, "min_gap": 0.6}, among)
+    for item in propose(among, target, 0.0):
+        names = [hypothesis.name for hypothesis, _ in item.members]
+        assert len(names) == len(set(names))
+    assert len(propose(among, target, 0.0)) == 3  # each alone, and both
+
+
+def test_a_hypothesis_without_numbers_is_there_or_not(reference: Reference) -> None:
+    among = rays()[:2]
+    model = Hypothesis("driver_model", (("model", "IDM"),), (), ((),), None)
+    among.append(Ray(model, (), rays(5)[0].difference, among[0].variance, None))
+    # Its ray alone makes the difference.
+    values_ = (
+        reference.blocks["network"].mean[0, :WIDTH] + among[2].difference["network"][0, :WIDTH]
+    )
+    target = Whitener(reference, [day(values_)] * 5, 0.0)
+    best = propose(among, target, PRICE)[0]
+    assert [(hypothesis.name, found) for hypothesis, found in best.members] == [
+        ("driver_model", ())
+    ]
+
+
+def test_no_rays_no_proposals(reference: Reference) -> None:
+    assert propose([], whitener(reference, {}, []), PRICE) == []
+
+
+def test_many_rays_are_searched_in_good_time(reference: Reference) -> None:
+    among = [
+        Ray(
+            Hypothesis("headway", (("place", str(i)),), ("seconds",), ((1.5,),), (1.0,)),
+            (1.5,),
+            rays(100 + i)[0].difference,
+            rays()[0].variance,
+            (1.0,),
+        )
+        for i in range(60)
+    ]
+    target = Whitener(
+        reference,
+        [
+            day(
+                reference.blocks["network"].mean[0, :WIDTH]
+                + 0.8 * among[7].difference["network"][0, :WIDTH]
+                + 0.9 * among[50].difference["network"][0, :WIDTH]
+            )
+        ]
+        * 5,
+        0.0,
+    )
+    best = propose(among, target, PRICE)[0]
+    assert {dict(h.fixed)["place"] for h, _ in best.members} == {"7", "50"}
+
+
+def test_rays_between_two_strengths_of_one_effect() -> None:
+    one, other = rays(3)[0], rays(4)[0]
+    strong = Ray(one.hypothesis, (2.0,), other.difference, one.variance, one.origin)
+    weak = Ray(one.hypothesis, (0.7,), other.difference, one.variance, one.origin)
+    found = between([one, strong])
+    assert found[:2] == [one, strong]
+    assert [item.level[0] for item in found[2:]] == pytest.approx([1.665, 1.835])
+    middle = found[2].difference["network"]
+    straight = 0.67 * one.difference["network"] + 0.33 * other.difference["network"]
+    assert middle == pytest.approx(straight)
+    # Nothing lies between shorter and longer than nominal, nor between two effects.
+    assert len(between([weak, one])) == 2
+    assert len(between(rays()[:2])) == 2

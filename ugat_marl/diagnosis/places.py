@@ -1,0 +1,730 @@
+"""Proposes effects at places and in windows: by what is left over there, before any simulation.
+
+Counts tell where demand and turning differ: see `volume`. Time tells windows: the stretch of
+minutes in which a place departs most from the model, found by a scan over all stretches. Detectors
+tell their own faults.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX
+from ugat_marl.diagnosis.hypotheses import CLOCK_S, DRIFT, LATE_STEP_S, Hypothesis, Members
+from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.statistics import Distance, Reference
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.scenarios import Passages, Period, Scenario, driven_routes, edge_of
+
+Array = NDArray[np.float64]
+
+_FLOW = (
+    "gap_long", "occupied_in_green", "gap9+", "free_speed", "queue_over", "platoon_gap",
+    "count_advance", "count_stop",
+)  # fmt: skip
+_AVOIDED = ("count_advance", "count_stop")
+
+
+class Proposer:
+    """Finds places and windows.
+
+    Args:
+        site: Lanes and detectors.
+        routes: Of the scenario.
+        allowed: Names of effects to examine.
+    """
+
+    def __init__(self, site: Site, routes: Routes, allowed: Collection[str]) -> None:
+        self._site = site
+        self._routes = routes
+        self.allowed = frozenset(allowed)
+        self._edges = [edge for _, edge, _ in site.places]
+        self._volume = Volume(site, routes)
+
+    def hypotheses(
+        self, reference: Reference, distance: Distance, periods: Sequence[Period]
+    ) -> list[Hypothesis]:
+        """What may be wrong at some place, strongest first within each kind.
+
+        Args:
+            reference: The model so far.
+            distance: Of the data from it.
+            periods: The data.
+        """
+        found: list[Hypothesis] = []
+        found += self._volume.hypotheses(distance)
+        found += self._timing(reference, distance)
+        found += self._windows(reference, distance, periods)
+        found += self._places(reference, distance)
+        found += fault_hypotheses(self._site, reference, distance, periods)
+        return [item for item in found if item.name in self.allowed]
+
+    def everywhere(self) -> list[Hypothesis]:
+        """What may be wrong at any of the places, if there are few: parking on each lane.
+
+        A lane on which vehicles stand is avoided; its neighbour takes what it loses, so that
+        neither pools nor single statistics show it, and no other effect leads there.
+        """
+        lanes = self._site.lanes
+        if len(lanes) > THRESHOLDS.most_lanes or "parking" not in self.allowed:
+            return []
+        return [_parking(lane.id) for lane in lanes]
+
+    def directed(self, distance: Distance) -> dict[str, float]:
+        """What the best origin, turn and stretch would explain: few counts, but the right ones."""
+        return self._volume.directed(distance) | largest_stretches(self._edges, distance)
+
+    # --- time ---------------------------------------------------------------------------------
+
+    def _timing(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
+        """Origins whose profile over time would fit if it came sooner or later."""
+        z, difference = distance.z["time"], distance.difference["time"]
+        block = reference.blocks["time"]
+        found: list[tuple[float, str, float]] = []
+        first = BIN_FEATURES.index("count_advance") * len(self._edges)
+        width = THRESHOLDS.bin_s * reference.pools.together
+        for origin in self._routes.passing:
+            rows = [
+                first + index
+                for index, lane in enumerate(self._site.lanes)
+                if self._routes.share(origin, lane.edge) > THRESHOLDS.mostly
+            ]
+            known = z[rows] != 0
+            if not known.any():
+                continue
+            mean = np.where(np.isfinite(block.mean[rows]), block.mean[rows], 0.0)
+            noise = np.where(known, difference[rows] / np.where(known, z[rows], 1.0), np.inf)
+            for shift in THRESHOLDS.shifts_s:
+                ray = (_later(mean, shift / width) - mean) / np.abs(noise)
+                size = float((ray**2).sum())
+                strength = float((ray * z[rows]).sum()) / max(size, 1e-9)
+                if 0.5 < strength < 2.0 and strength**2 * size > THRESHOLDS.suspect_timing:
+                    found.append((strength**2 * size, origin, shift))
+        chosen: dict[str, float] = {}
+        for _, origin, shift in sorted(found, reverse=True):
+            chosen.setdefault(origin, shift)
+        return [
+            Hypothesis(
+                "demand_timing", (("edge", origin),), ("seconds",), ((shift,),), (0.0,), 45.0
+            )
+            for origin, shift in list(chosen.items())[:2]
+        ]
+
+    def _windows(
+        self, reference: Reference, distance: Distance, periods: Sequence[Period]
+    ) -> list[Hypothesis]:
+        """Surges and closures in the stretches that depart most."""
+        if len({(p.begin_s, p.end_s) for p in periods}) > 1:
+            return []
+        found: list[tuple[float, Hypothesis]] = []
+        for origin in self._routes.passing:
+            members = [i for i, edge in enumerate(self._edges) if edge == origin]
+            window = self._scan(
+                reference, distance, periods, members, "count_advance", "count_exit"
+            )
+            if window is not None:
+                z, begin, end, factor = window
+                fixed = (("edge", origin), ("begin_s", begin), ("end_s", end))
+                level = float(np.clip(factor, 0.1, 4.0))
+                surge = Hypothesis("demand_surge", fixed, ("factor",), ((level,),), (1.0,), 0.1)
+                found.append((z, surge))
+        for index, lane in enumerate(self._site.lanes):
+            # What comes after a closure, the queue that is let go, is more unusual than itself.
+            for kind, side in (("occupied", 1), ("count_stop", -1), ("count_advance", -1)):
+                option = self._scan(reference, distance, periods, [index], kind, kind, side)
+                if option is not None:
+                    z, begin, end, _ = option
+                    fixed = (("lane", lane.id), ("begin_s", begin), ("end_s", end))
+                    found.append((z, Hypothesis("lane_closure", fixed, (), ((),), None)))
+        found.sort(key=lambda item: -item[0])
+        chosen: list[Hypothesis] = []
+        for kind, most in (("demand_surge", 2), ("lane_closure", 4)):
+            chosen += list(dict.fromkeys(item for _, item in found if item.name == kind))[:most]
+        return chosen
+
+    def _scan(
+        self,
+        reference: Reference,
+        distance: Distance,
+        periods: Sequence[Period],
+        members: Sequence[int],
+        kind: str,
+        other: str,
+        side: int = 0,
+    ) -> tuple[float, float, float, float] | None:
+        """The stretch in which counts depart most from their ratio over the rest of the period.
+
+        Returns:
+            Standardised size, begin, end, ratio to the expected; or None if all is chance.
+        """
+        block = reference.blocks["time"]
+        places = len(self._edges)
+        rows: list[int] = []
+        for index in members:
+            name = kind if index < len(self._site.lanes) else other
+            row = BIN_FEATURES.index(name) * places + index
+            if block.used[row].any():
+                rows.append(row)
+        if not rows:
+            return None
+        begin, end = periods[0].begin_s, periods[0].end_s
+        minutes = max(int((end - begin) / THRESHOLDS.scan_s), 1)
+        bins = block.mean.shape[1]
+        which = np.minimum((np.arange(minutes) * bins) // minutes, bins - 1)
+        per_bin = np.bincount(which, minlength=bins)
+        expected = (block.mean[rows].sum(axis=0) / np.maximum(per_bin, 1))[which]
+        variance = (block.variance[rows].sum(axis=0) / np.maximum(per_bin, 1))[which] / len(periods)
+        if any(period.passages for period in periods):
+            measured = self._minutes(periods, members, kind, other, minutes)
+        else:  # counts alone say no more than how many came in each bin
+            more = distance.difference["time"][rows].sum(axis=0) / np.maximum(per_bin, 1)
+            measured = expected + more[which]
+        return most_unusual(measured, expected, variance, begin, side)
+
+    def _minutes(
+        self, periods: Sequence[Period], members: Sequence[int], kind: str, other: str, minutes: int
+    ) -> Array:
+        """Counts, or occupied seconds, per minute: the mean over the periods."""
+        total = np.zeros(minutes)
+        for period in periods:
+            edges = np.linspace(period.begin_s, period.end_s, minutes + 1)
+            for index in members:
+                passages = self._passages(
+                    period, index, kind if index < len(self._site.lanes) else other
+                )
+                if passages is None or not len(passages):
+                    continue
+                on = np.where(np.isfinite(passages.on_s), passages.on_s, passages.off_s)
+                if kind == "occupied":
+                    off = np.where(np.isfinite(passages.off_s), passages.off_s, period.end_s)
+                    total += occupied_between(on, np.maximum(off, on), edges)
+                else:
+                    total += np.histogram(on[np.isfinite(on)], edges)[0]
+        return total / len(periods)
+
+    def _passages(self, period: Period, index: int, kind: str) -> Passages | None:
+        lanes = self._site.lanes
+        if index >= len(lanes):
+            names = self._site.exits[index - len(lanes)][2]
+        else:
+            names = lanes[index].detectors.get("stop" if kind == "count_stop" else "advance", ())
+        return next((period.passages[n] for n in names if n in period.passages), None)
+
+    # --- places -------------------------------------------------------------------------------
+
+    def _places(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
+        """Lanes for parking, edges for slow roads, traffic lights for lost time and clocks."""
+        found: list[Hypothesis] = []
+        lanes = self._site.lanes
+        found += [_parking(lane) for lane in self._disturbed(distance)]
+        speed = distance.z["lane"][: len(lanes), INDEX["free_speed"]]
+        by_edge: dict[str, float] = defaultdict(float)
+        for lane, value in zip(lanes, speed, strict=True):
+            by_edge[lane.edge] += float(value)
+        if len(by_edge) > 1:
+            typical = float(np.median(list(by_edge.values())))
+            ranked = sorted(by_edge, key=lambda edge: -abs(by_edge[edge] - typical))
+            found += [
+                Hypothesis(
+                    "local_speed",
+                    (("edge", edge),),
+                    ("factor",),
+                    ((self._speed_ratio(reference, distance, edge),),),
+                    (1.0,),
+                    0.02,
+                    both=True,
+                )
+                for edge in ranked[:2]
+            ]
+        if len(self._site.intersections) > 1:
+            found += self._traffic_lights(distance)
+        return found
+
+    def _disturbed(self, distance: Distance) -> list[str]:
+        """Lanes on which something may stand: traffic does not flow there, or avoids the lane."""
+        lanes = self._site.lanes
+        z = np.clip(distance.z["lane"][: len(lanes)], -15, 15)
+        unusual = np.abs(z[:, [INDEX[name] for name in _FLOW]]).sum(axis=1)
+        fewer = z[:, [INDEX[name] for name in _AVOIDED]].sum(axis=1)
+        by_edge: dict[str, list[int]] = defaultdict(list)
+        for index, lane in enumerate(lanes):
+            by_edge[lane.edge].append(index)
+        edges = sorted(by_edge.values(), key=lambda members: -max(unusual[members]))
+        found: list[str] = []
+        for members in edges[:2]:
+            avoided = sorted(members, key=lambda index: fewer[index])[:1]
+            stuck = sorted(members, key=lambda index: -unusual[index])[:1]
+            found += [lanes[index].id for index in dict.fromkeys((*avoided, *stuck))]
+        return found
+
+    def _speed_ratio(self, reference: Reference, distance: Distance, edge: str) -> float:
+        """Free speed on an edge, as a multiple of the simulated one."""
+        rows = [index for index, name in enumerate(self._edges) if name == edge]
+        mean = reference.blocks["lane"].mean[rows, INDEX["free_speed"]]
+        difference = distance.difference["lane"][rows, INDEX["free_speed"]]
+        known = np.isfinite(mean) & (difference != 0) & (mean > 0)
+        if not known.any():
+            return 0.8
+        ratio = float(np.mean(1.0 + difference[known] / mean[known]))
+        return float(np.clip(ratio, 0.2, 2.0)) if abs(ratio - 1.0) > 0.03 else 0.8
+
+    def _traffic_lights(self, distance: Distance) -> list[Hypothesis]:
+        """The two traffic lights whose starts of green differ most from the others'."""
+        lost = distance.z["intersection"][:, INDEX["lost"]]
+        lost = lost - np.median(lost)
+        drift = distance.z["intersection"][:, INDEX["lost_trend"]]
+        drift = drift - np.median(drift)
+        names = self._site.intersections
+        found: list[Hypothesis] = []
+        for index in np.argsort(-np.abs(lost))[:2]:
+            place = (("place", names[int(index)]),)
+            found.append(
+                Hypothesis("late_green", place, ("seconds",), ((2.0,),), (0.0,), 0.3, LATE_STEP_S)
+            )
+            sign = 1.0 if lost[index] > 0 else -1.0
+            levels = tuple((sign * level,) for level in CLOCK_S)
+            found.append(Hypothesis("signal_clock", place, ("seconds",), levels, (0.0,), 0.2))
+        for index in np.argsort(-np.abs(drift))[:1]:
+            sign = 1.0 if drift[index] > 0 else -1.0
+            levels = tuple((sign * level,) for level in DRIFT)
+            place = (("place", names[int(index)]),)
+            found.append(
+                Hypothesis("clock_drift", place, ("seconds_per_hour",), levels, (0.0,), 0.5)
+            )
+        return found
+
+
+def _parking(lane: str) -> Hypothesis:
+    fixed = (("lane", lane), ("dwell_s", THRESHOLDS.dwell_s))
+    return Hypothesis("parking", fixed, ("per_hour",), ((20.0,),), (0.0,), 3.0)
+
+
+def _later(counts: Array, bins: float) -> Array:
+    """Counts ``(rows, bins)`` so many bins later; nobody comes from before the first bin."""
+    moved = np.zeros_like(counts)
+    whole = int(np.floor(bins))
+    for part, step in ((1.0 - (bins - whole), whole), (bins - whole, whole + 1)):
+        if step >= 0:
+            moved[:, step:] += part * counts[:, : counts.shape[1] - step]
+        else:
+            moved[:, :step] += part * counts[:, -step:]
+    return moved
+
+
+# --- counts: demand and turning -------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Routes:
+    """Which edges vehicles use: per pair of edges, vehicles per hour of the scenario.
+
+    Attributes:
+        origins: Vehicles per hour by first edge.
+        passing: ``passing[origin][edge]``, vehicles per hour that start there and pass here.
+        turns: ``turns[edge][next edge]``, vehicles per hour.
+        joint: ``joint[edge][other]``, vehicles per hour that pass both.
+    """
+
+    origins: dict[str, float]
+    passing: dict[str, dict[str, float]]
+    turns: dict[str, dict[str, float]]
+    joint: dict[str, dict[str, float]]
+
+    def share(self, origin: str, edge: str) -> float:
+        """Share of the vehicles that pass an edge which start at an origin."""
+        own = self.passing[origin].get(edge, 0.0)
+        return own / self.joint[edge][edge] if own else 0.0
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Routes:
+        """Counts the routes of all vehicles."""
+        origins: dict[str, float] = defaultdict(float)
+        passing: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        turns: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        joint: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        rate = 3600.0 / scenario.settings.duration_s
+        for edges in driven_routes(scenario):
+            origins[edges[0]] += rate
+            passed = dict.fromkeys(edges)
+            for edge in passed:
+                passing[edges[0]][edge] += rate
+                for other in passed:
+                    joint[edge][other] += rate
+            for edge, following in pairwise(edges):
+                turns[edge][following] += rate
+        return cls(
+            dict(origins),
+            {k: dict(v) for k, v in passing.items()},
+            {k: dict(v) for k, v in turns.items()},
+            {k: dict(v) for k, v in joint.items()},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Counts:
+    """Measured minus expected vehicles per hour, by edge.
+
+    Attributes:
+        place: Edge to its index.
+        whiten: Turns differences into independent ones of unit noise, ``(edges, edges)``.
+        measured: The differences, whitened.
+    """
+
+    place: dict[str, int]
+    whiten: Array
+    measured: Array
+
+    def weighed(self, change: dict[str, float]) -> tuple[float, float, float]:
+        """A change of vehicles per hour, by edge: strength, squared z, and z of strength 1."""
+        ray = np.zeros(len(self.place))
+        for edge, value in change.items():
+            if edge in self.place:
+                ray[self.place[edge]] += value
+        ray = self.whiten @ ray
+        size = float(ray @ ray)
+        strength = float(ray @ self.measured) / max(size, 1e-9)
+        return strength, strength**2 * size, size
+
+
+class Volume:
+    """Finds origins and turns.
+
+    Args:
+        site: Lanes and detectors.
+        routes: Of the scenario.
+    """
+
+    def __init__(self, site: Site, routes: Routes) -> None:
+        self._site = site
+        self._routes = routes
+        self._edges = [edge for _, edge, _ in site.places]
+
+    def directed(self, distance: Distance) -> dict[str, float]:
+        """Squared standardised size of the best origin and of the best turn."""
+        counts = self._counts(distance)
+        return {
+            "demand": max((item[0] for item in self._origins(counts)), default=0.0),
+            "turning": max((item[0] for item in self._turns(counts, distance)), default=0.0),
+        }
+
+    def hypotheses(self, distance: Distance) -> list[Hypothesis]:
+        """The most suspicious origins and turns, with the strength the counts suggest."""
+        counts = self._counts(distance)
+        found: list[Hypothesis] = []
+        if len(self._routes.passing) > 1:
+            for gain, origin, factor in sorted(self._origins(counts), reverse=True)[
+                : THRESHOLDS.places_of_a_kind
+            ]:
+                level = float(np.clip(factor, 0.3, 3.0))
+                fixed = (("edge", origin),)
+                if gain > THRESHOLDS.suspect_change:
+                    found.append(
+                        Hypothesis(
+                            "demand_level", fixed, ("factor",), ((level,),), (1.0,), 0.03, both=True
+                        )
+                    )
+        for gain, origin, target, share in sorted(self._turns(counts, distance), reverse=True)[
+            : THRESHOLDS.places_of_a_kind
+        ]:
+            fixed = (("from_edge", origin), ("to_edge", target))
+            if gain > THRESHOLDS.suspect_change:
+                found.append(Hypothesis("turning", fixed, ("share",), ((share,),), (0.0,), 0.03))
+        return found
+
+    def _counts(self, distance: Distance) -> _Counts:
+        hour = 60.0
+        lanes = len(self._site.lanes)
+        place: dict[str, int] = {}
+        differences: list[float] = []
+        errors: list[float] = []
+        for edge in dict.fromkeys(self._edges):
+            members = [i for i, name in enumerate(self._edges) if name == edge]
+            kinds = ("count_stop", "count_advance") if members[0] < lanes else ("count_exit",)
+            for kind in kinds:
+                row = INDEX[kind]
+                difference = distance.difference["lane"][members, row]
+                z = distance.z["lane"][members, row]
+                known = (difference != 0) & (z != 0)
+                if known.any():
+                    place[edge] = len(place)
+                    differences.append(hour * float(difference.sum()))
+                    error = np.abs(difference[known] / z[known])
+                    errors.append(max(hour * float(np.sqrt((error**2).sum())), 1e-6))
+                    break
+        lower = np.linalg.cholesky(self._correlation(tuple(place)))
+        whiten = np.asarray(np.linalg.inv(lower) / np.array(errors)[None, :], np.float64)
+        return _Counts(place, whiten, whiten @ np.array(differences))
+
+    def _correlation(self, edges: tuple[str, ...]) -> Array:
+        """Of the counts of edges if vehicles come by chance: what they share."""
+        joint = self._routes.joint
+        shared = np.array([[joint.get(a, {}).get(b, 0.0) for b in edges] for a in edges])
+        shared = shared.reshape(len(edges), len(edges))
+        size = np.sqrt(np.maximum(np.diag(shared), 1e-9))
+        alone = np.where(np.diag(shared) > 0, THRESHOLDS.alone, 1.0)
+        return (1 - THRESHOLDS.alone) * shared / np.outer(size, size) + np.diag(alone)
+
+    def _origins(self, counts: _Counts) -> list[tuple[float, str, float]]:
+        """Squared z, origin and factor of every origin that can be told."""
+        found: list[tuple[float, str, float]] = []
+        for origin, reached in self._routes.passing.items():
+            strength, gain, size = counts.weighed(reached)
+            if size > THRESHOLDS.suspect_change:
+                found.append((gain, origin, 1.0 + strength))
+        return found
+
+    def _turns(self, counts: _Counts, distance: Distance) -> list[tuple[float, str, str, float]]:
+        """Squared z, edges and share of every pair of edges between which vehicles may move.
+
+        What arrives says where to, and hardly where from; that is told by the lanes vehicles left.
+        """
+        found: list[tuple[float, str, str, float]] = []
+        approaches = {lane.edge for lane in self._site.lanes}
+        for origin in sorted(approaches & set(self._routes.turns)):
+            leaving = self._routes.turns[origin]
+            total = sum(leaving.values())
+            for target in leaving:
+                change = {other: -rate for other, rate in leaving.items()}
+                change[target] += total
+                strength, gain, size = counts.weighed(change)
+                if size > 4.0 and strength > 0.02:
+                    gain += self._lanes_left(origin, target, distance)
+                    found.append((gain, origin, target, min(strength, 0.9)))
+        return found
+
+    def _lanes_left(self, origin: str, target: str, distance: Distance) -> float:
+        """Squared z of vehicles that moved to those lanes of an edge that lead to another."""
+        rates = self._routes.turns[origin]
+        row = INDEX["count_stop"]
+        ray: list[float] = []
+        z: list[float] = []
+        errors: list[float] = []
+        lanes = [(i, lane) for i, lane in enumerate(self._site.lanes) if lane.edge == origin]
+        for index, lane in lanes:
+            difference = float(distance.difference["lane"][index, row])
+            score = float(distance.z["lane"][index, row])
+            if not difference or not score:
+                continue
+            change = 0.0
+            for edge in sorted(rates.keys() & lane.following):
+                alike = sum(edge in other.following for _, other in lanes)
+                come = sum(rates.values()) if edge == target else 0.0
+                change += (come - rates[edge]) / alike
+            ray.append(change)
+            z.append(score)
+            errors.append(60.0 * abs(difference / score))
+        if len(ray) < 2:
+            return 0.0
+        scaled = np.array(ray) / np.array(errors)
+        scaled -= scaled.mean()  # how many came in all is counted already
+        found = float(scaled @ np.array(z))
+        return max(found, 0.0) ** 2 / max(float(scaled @ scaled), 1e-9)
+
+
+# --- stretches of time ----------------------------------------------------------------------------
+
+_COUNTS = 3
+"""Kinds of counts in time that are counts of vehicles; they come first."""
+
+
+def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, float]:
+    """The largest squared departure over any stretch of bins: of an edge's counts, of a lane's.
+
+    Args:
+        edges: Edge of every place.
+        distance: Of the data from a model.
+    """
+    z, difference = distance.z["time"], distance.difference["time"]
+    variance = np.where(z != 0, (difference / np.where(z != 0, z, 1.0)) ** 2, 0.0)
+    places = len(edges)
+    groups = [
+        [kind * places + index for index, name in enumerate(edges) if name == edge]
+        for edge in dict.fromkeys(edges)
+        for kind in range(_COUNTS)
+    ]
+    of_edges = np.stack([difference[rows].sum(axis=0) for rows in groups])
+    noise = np.stack([variance[rows].sum(axis=0) for rows in groups])
+    return {"window": _largest(of_edges, noise), "lane window": _largest(difference, variance)}
+
+
+def _largest(difference: Array, variance: Array) -> float:
+    """Over all rows and all stretches of bins; both ``(rows, bins)``."""
+    sums, noise = (
+        np.concatenate((np.zeros((len(item), 1)), np.cumsum(item, axis=1)), axis=1)
+        for item in (difference, variance)
+    )
+    largest = 0.0
+    for length in range(1, sums.shape[1]):
+        part = noise[:, length:] - noise[:, :-length]
+        squared = (sums[:, length:] - sums[:, :-length]) ** 2 / np.maximum(part, 1e-9)
+        largest = max(largest, float(np.where(part > 0, squared, 0.0).max()))
+    return largest
+
+
+def most_unusual(
+    measured: Array, expected: Array, variance: Array, begin_s: float, side: int = 0
+) -> tuple[float, float, float, float] | None:
+    """Scans all stretches for the largest standardised departure from a constant ratio.
+
+    Args:
+        measured: Per minute.
+        expected: Per minute.
+        variance: Of what is expected, per minute.
+        begin_s: Of the first minute.
+        side: -1 or 1 for departures to that side only.
+    """
+    minutes = len(measured)
+    if expected.sum() <= 0 or minutes * THRESHOLDS.scan_s <= THRESHOLDS.shortest_stretch_s:
+        return None
+    sums = [np.concatenate(([0.0], np.cumsum(row))) for row in (measured, expected, variance)]
+    shortest = int(THRESHOLDS.shortest_stretch_s / THRESHOLDS.scan_s)
+    best: tuple[float, int, int, float] | None = None
+    for length in range(shortest, max(int(THRESHOLDS.longest_stretch * minutes), shortest) + 1):
+        inside = [row[length:] - row[:-length] for row in sums]
+        rest = (sums[0][-1] - inside[0]) / np.maximum(sums[1][-1] - inside[1], 1e-9)
+        excess = inside[0] - rest * inside[1]
+        share = inside[1] / np.maximum(sums[1][-1] - inside[1], 1e-9)
+        noise = np.sqrt(np.maximum(inside[2] * (1 + share), 1e-6))
+        z = excess / noise
+        size = side * z if side else np.abs(z)
+        place = int(np.argmax(size))
+        if best is None or size[place] > best[0]:
+            ratio = float(inside[0][place] / max(rest[place] * inside[1][place], 1e-9))
+            best = (float(size[place]), place, place + length, ratio)
+    if best is None or best[0] < THRESHOLDS.unusual_stretch:
+        return None
+    z, first, last, ratio = best
+    return z, begin_s + THRESHOLDS.scan_s * first, begin_s + THRESHOLDS.scan_s * last, ratio
+
+
+def occupied_between(on: Array, off: Array, edges: Array) -> Array:
+    """Occupied seconds between edges of time."""
+    filled = np.zeros(len(edges))
+    for index, edge in enumerate(edges):
+        filled[index] = np.clip(np.minimum(off, edge) - on, 0.0, None).sum()
+    return np.diff(filled)
+
+
+# --- faults of detectors --------------------------------------------------------------------------
+
+
+def fault_hypotheses(
+    site: Site, reference: Reference, distance: Distance, periods: Sequence[Period]
+) -> list[Hypothesis]:
+    """Detectors that count too few, stick, fall silent, or have each other's place."""
+    found: list[Hypothesis] = []
+    places = {name: (place, INDEX[kind]) for name, (kind, place) in site.counted.items()}
+    z = {name: float(distance.z["lane"][row]) for name, row in places.items()}
+    mean = {name: float(reference.blocks["lane"].mean[row]) for name, row in places.items()}
+    difference = {n: float(distance.difference["lane"][r]) for n, r in places.items()}
+    for name in sorted(z, key=lambda name: z[name])[:3]:
+        if z[name] < -2.5 and mean[name] > 0:
+            share = float(np.clip(-difference[name] / mean[name], 0.03, 0.9))
+            found.append(
+                Hypothesis("undercount", (("place", name),), ("share",), ((share,),), (0.0,), 0.02)
+            )
+    stuck = _stuck(periods)
+    on = {dict(item.fixed)["detector"] for item in stuck}
+    silent = [x for x in _silent(periods, mean) if dict(x.fixed)["detector"] not in on]
+    found += stuck + silent
+    kinds = {item.id: item.kind for item in site.detectors}
+    found += _swapped(kinds, mean, difference, z)
+    return found
+
+
+def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:
+    """Detectors that were on for minutes at the same time of every period."""
+    found: list[Hypothesis] = []
+    for name in sorted(set.intersection(*(set(p.passages) for p in periods))):
+        windows: list[tuple[float, float]] = []
+        for period in periods:
+            item = period.passages[name]
+            time = np.nan_to_num(item.off_s, nan=period.end_s) - np.nan_to_num(
+                item.on_s, nan=period.begin_s
+            )
+            longest = int(np.argmax(time))
+            if time[longest] < THRESHOLDS.stuck_s:
+                break
+            on, off = float(item.on_s[longest]), float(item.off_s[longest])
+            on = period.begin_s if np.isnan(on) else on
+            windows.append((on, period.end_s if np.isnan(off) else off))
+        if len(windows) == len(periods):
+            begin = float(np.median([w[0] for w in windows]))
+            end = float(np.median([w[1] for w in windows]))
+            if max(w[0] for w in windows) < min(w[1] for w in windows):
+                fixed = (("detector", name), ("begin_s", begin), ("end_s", end))
+                found.append(Hypothesis("stuck", fixed, (), ((),), None))
+    return found[:3]
+
+
+def _silent(periods: Sequence[Period], rate: Mapping[str, float]) -> list[Hypothesis]:
+    """Detectors that saw nothing at the same time of every period, though vehicles came."""
+    found: list[tuple[float, Hypothesis]] = []
+    for name, expected in rate.items():
+        begin, end = -np.inf, np.inf
+        for period in periods:
+            item = period.passages.get(name, Passages.none())
+            times = np.concatenate((item.on_s, item.off_s))
+            times = np.sort(times[np.isfinite(times)])
+            times = np.concatenate(([period.begin_s], times, [period.end_s]))
+            longest = int(np.argmax(np.diff(times)))
+            begin, end = max(begin, float(times[longest])), min(end, float(times[longest + 1]))
+        missing = expected * (end - begin) / 60.0 * len(periods)
+        if end > begin and missing > THRESHOLDS.silent:
+            fixed = (("detector", name), ("begin_s", round(begin, 1)), ("end_s", round(end, 1)))
+            found.append((missing, Hypothesis("dropout", fixed, (), ((),), None)))
+    found.sort(key=lambda item: -item[0])
+    return [item for _, item in found[:3]]
+
+
+def _swapped(
+    kinds: Mapping[str, str],
+    mean: Mapping[str, float],
+    difference: Mapping[str, float],
+    z: Mapping[str, float],
+) -> list[Hypothesis]:
+    """Pairs of detectors of one kind whose counts fit once they are exchanged."""
+    found: list[tuple[float, Hypothesis]] = []
+    suspects = [name for name in mean if abs(z[name]) > 4.0]
+    for first in suspects:
+        for second in suspects:
+            if first < second and kinds[first] == kinds[second]:
+                error = abs(difference[first] / z[first]) + abs(difference[second] / z[second])
+                change = mean[second] - mean[first]
+                before = difference[first] ** 2 + difference[second] ** 2
+                after = (difference[first] - change) ** 2 + (difference[second] + change) ** 2
+                if after < 0.3 * before and abs(change) > 3 * error:
+                    fixed = (("detector", first), ("other", second))
+                    found.append((before - after, Hypothesis("swapped", fixed, (), ((),), None)))
+    found.sort(key=lambda item: -item[0])
+    return [item for _, item in found[:2]]
+
+
+def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None:
+    """Two detectors of one stream that are both said to miss vehicles, in its direction.
+
+    One detector of a stream that counts too few stands against the others. Where those behind it
+    count too few as well, the vehicles may have left the road.
+    """
+    short = [dict(item.fixed)["place"] for item, _ in members if item.name == "undercount"]
+    known = {item.id: item for item in site.detectors}
+    lanes = {lane.id: lane for lane in site.lanes}
+    found = [known[str(name)] for name in short if name in known]
+    for one in found:
+        for other in found:
+            lane, edge = lanes.get(one.lane), edge_of(other.lane)
+            if lane is None:
+                continue
+            if other.kind == "exit":
+                behind = one.kind != "exit" and edge in lane.following
+            else:
+                behind = (one.kind, other.kind) == ("advance", "stop") and edge == lane.edge
+            if behind:
+                return one.id, other.id
+    return None

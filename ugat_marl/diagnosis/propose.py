@@ -1,0 +1,196 @@
+"""Proposes models: which effects, at which strengths, would make the measured difference.
+
+Every hypothesis is simulated at a few strengths; each is a ray in the space of statistics. Subsets
+of up to three rays are fitted to the measured difference by least squares, all of them, which costs
+no simulation: so effects that hide each other are proposed together and not one after the other.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.diagnosis.hypotheses import Hypothesis
+from ugat_marl.diagnosis.records import Proposed
+from ugat_marl.diagnosis.statistics import Distance, Reference, Whitener, softened, without_noise
+from ugat_marl.diagnosis.thresholds import THRESHOLDS
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Ray:
+    """What a hypothesis does at one strength.
+
+    Attributes:
+        hypothesis: Which.
+        level: Values of its free fields.
+        difference: Change of the statistics, per block.
+        variance: Variance of that change.
+        origin: Values at which nothing changes: the nominal ones, or those of the model so far.
+    """
+
+    hypothesis: Hypothesis
+    level: tuple[float, ...]
+    difference: dict[str, Array]
+    variance: dict[str, Array]
+    origin: tuple[float, ...] | None
+
+    def at(self, strength: float) -> tuple[float, ...]:
+        """Values of the free fields at a multiple of the simulated strength."""
+        if self.origin is None:
+            return self.level
+        values = [n + strength * (x - n) for n, x in zip(self.origin, self.level, strict=True)]
+        return self.hypothesis.clipped(values)
+
+
+def between(rays: Sequence[Ray]) -> list[Ray]:
+    """The rays, and further ones half-way between strengths of the same hypothesis.
+
+    What an effect does is not in proportion to its strength; between two strengths that were
+    simulated it nearly is.
+    """
+    found = list(rays)
+    for first, second in itertools.pairwise(rays):
+        near = first.hypothesis == second.hypothesis and first.origin is not None
+        if not near or not first.level or _side(first) != _side(second):
+            continue
+        for share in (0.33, 0.67):
+            level = tuple(
+                (1 - share) * a + share * b for a, b in zip(first.level, second.level, strict=True)
+            )
+            mixed = {
+                name: (1 - share) * first.difference[name] + share * second.difference[name]
+                for name in first.difference
+            }
+            noise = {
+                name: (1 - share) ** 2 * first.variance[name] + share**2 * second.variance[name]
+                for name in first.variance
+            }
+            found.append(Ray(first.hypothesis, level, mixed, noise, first.origin))
+    return found
+
+
+def _side(ray: Ray) -> bool:
+    assert ray.origin is not None
+    return ray.level > ray.origin
+
+
+def propose(
+    rays: Sequence[Ray], whitener: Whitener, price: float, largest: int = 3
+) -> list[Proposed]:
+    """Sets of effects in order of what they would leave.
+
+    Args:
+        rays: What hypotheses do.
+        whitener: The measured difference and its noise.
+        price: What every further effect must gain.
+        largest: Size of the largest sets.
+
+    Returns:
+        Each set of hypotheses once, at its best strengths.
+    """
+    if not rays:
+        return []
+    target = whitener.measured
+    basis = np.stack([whitener(without_noise(ray.difference, ray.variance)) for ray in rays])
+    gram = basis @ basis.T
+    match = basis @ target
+    start = float(target @ target)
+    best: dict[tuple[object, ...], Proposed] = {}
+    kept = list(range(len(rays)))
+    for size in range(1, largest + 1):
+        if size == 3 and len(kept) > 40:  # the strongest alone or in pairs
+            kept = _useful(best, rays, 40)
+        for chosen in itertools.combinations(kept, size):
+            keys = tuple(sorted(str(rays[index].hypothesis.key) for index in chosen))
+            if len(set(keys)) < size:
+                continue
+            signs = tuple(rays[index].hypothesis.both for index in chosen)
+            found = _least_squares(gram, match, chosen, signs)
+            if found is None:
+                continue
+            left = start - float(
+                found @ (2 * match[list(chosen)] - gram[np.ix_(chosen, chosen)] @ found)
+            )
+            cost = left + price * size
+            if keys not in best or cost < best[keys].expected:
+                members = tuple(
+                    (rays[index].hypothesis, rays[index].at(float(strength)))
+                    for index, strength in zip(chosen, found, strict=True)
+                )
+                if all(_is_something(hypothesis, values) for hypothesis, values in members):
+                    best[keys] = Proposed(members, cost)
+    return sorted(best.values(), key=lambda item: item.expected)
+
+
+def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
+    """Whether the values differ from nominal once they are on the hypothesis's grid."""
+    return hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
+
+
+def _least_squares(
+    gram: Array, match: Array, chosen: tuple[int, ...], both: tuple[bool, ...]
+) -> Array | None:
+    """Strengths along the rays, within reach; None if one of them does not help."""
+    part = gram[np.ix_(chosen, chosen)]
+    try:
+        found = np.linalg.solve(
+            part + 1e-6 * np.trace(part) * np.eye(len(chosen)), match[list(chosen)]
+        )
+    except np.linalg.LinAlgError:
+        return None
+    size = np.where(both, np.abs(found), found)
+    if (size < THRESHOLDS.least_strength).any():
+        return None
+    return np.clip(found, -THRESHOLDS.farthest, THRESHOLDS.farthest)
+
+
+def _useful(best: dict[tuple[object, ...], Proposed], rays: Sequence[Ray], count: int) -> list[int]:
+    """Rays of the hypotheses in the best sets so far."""
+    keys: list[str] = []
+    for item in sorted(best.values(), key=lambda item: item.expected):
+        keys += [str(hypothesis.key) for hypothesis, _ in item.members]
+    wanted = list(dict.fromkeys(keys))
+    found: list[int] = []
+    for key in wanted:
+        found += [i for i, ray in enumerate(rays) if str(ray.hypothesis.key) == key]
+        if len(found) >= count:
+            break
+    return found[:count]
+
+
+def promising(proposals: Sequence[Proposed]) -> list[Proposed]:
+    """The best sets of each size, if a larger one promises more than a smaller one."""
+    if not proposals:
+        return []
+    chosen = [item for item in proposals if len(item.members) == 1][:1]
+    least = math.inf
+    for size in (1, 2, 3):
+        own = [item for item in proposals if len(item.members) == size]
+        if own and own[0].expected < 0.95 * least - 20.0:  # more effects must be worth it
+            near = [item for item in own if item.expected <= 1.3 * own[0].expected + 50.0]
+            chosen += near[: THRESHOLDS.candidates[size - 1]]
+            least = own[0].expected
+    return list(dict.fromkeys(chosen))
+
+
+def squared_gap(distance: Distance, base: Reference, periods: int) -> float:
+    """Squared differences in units of the noise of the scenario as it is, whatever the model's is.
+
+    Args:
+        distance: Of a data set from a model.
+        base: The scenario as it is.
+        periods: Periods in the data set.
+    """
+    total = 0.0
+    for name, difference in distance.difference.items():
+        block = base.blocks[name]
+        noise = block.noise(block.weight, periods)
+        total += float((softened(name, np.nan_to_num(difference / np.sqrt(noise))) ** 2).sum())
+    return total
