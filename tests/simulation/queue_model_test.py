@@ -22,7 +22,7 @@ from ugat_marl.effects import (
 )
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.scenarios import Network
-from ugat_marl.simulation.mesoscopic import QueueLook
+from ugat_marl.simulation.mesoscopic import MesoscopicLanes
 from ugat_marl.testing.episodes import play, random_actions
 
 
@@ -78,64 +78,64 @@ LIMITS = np.full(6, 10.0)
 
 def test_vehicles_count_where_their_routes_lead() -> None:
     api = FakeApi()
-    look = QueueLook(api, LANES, 100.0)
+    measured = MesoscopicLanes(api, LANES, 100.0)
     for name, following in (("a", "right"), ("b", "on"), ("c", "left"), ("d", "left")):
         api.enter(name, "in", following)
-    assert look.look(0.0, LIMITS)[0].tolist() == [1, 3, 0, 0, 0, 0]
-    assert look.look(0.0, LIMITS)[2].tolist() == [8, 8, 10, 10, 10, 10], (
+    assert measured.measure(0.0, LIMITS)[0].tolist() == [1, 3, 0, 0, 0, 0]
+    assert measured.measure(0.0, LIMITS)[2].tolist() == [8, 8, 10, 10, 10, 10], (
         "an empty lane has its limit"
     )
 
 
 def test_where_two_lanes_lead_on_the_queue_decides_and_then_the_shorter_one() -> None:
     api = FakeApi()
-    look = QueueLook(api, LANES, 100.0)
+    measured = MesoscopicLanes(api, LANES, 100.0)
     for name in "abc":
         api.enter(name, "wide", "on")
-    assert look.look(0.0, LIMITS)[0].tolist() == [0, 0, 2, 1, 0, 0]
+    assert measured.measure(0.0, LIMITS)[0].tolist() == [0, 0, 2, 1, 0, 0]
     api.enter("d", "wide", "on")
-    assert look.look(10.0, LIMITS)[0].tolist() == [0, 0, 2, 2, 0, 0], "nobody changes over"
+    assert measured.measure(10.0, LIMITS)[0].tolist() == [0, 0, 2, 2, 0, 0], "nobody changes over"
     api.queue, api.at = dict.fromkeys("abcd", 1), dict.fromkeys("abcd", 100.0)
-    assert look.look(20.0, LIMITS)[0].tolist() == [0, 0, 0, 4, 0, 0]
+    assert measured.measure(20.0, LIMITS)[0].tolist() == [0, 0, 0, 4, 0, 0]
     for name in "efg":
         api.enter(name, "one", "on")
         api.queue[name] = 0
-    found = look.look(30.0, LIMITS)[0].tolist()
+    found = measured.measure(30.0, LIMITS)[0].tolist()
     assert found == [0, 0, 0, 4, 2, 1], "one queue for both lanes says nothing"
 
 
 def test_who_stays_longer_than_the_way_takes_halts() -> None:
     """Two segments of 100 m, 10 s each: who has not moved on after that is in a queue."""
     api = FakeApi()
-    look = QueueLook(api, LANES, 100.0)
+    measured = MesoscopicLanes(api, LANES, 100.0)
     api.enter("a", "in", "right")
-    rows = [look.look(time_s, LIMITS)[:, 0] for time_s in (0.0, 8.0, 16.0, 24.0)]
+    rows = [measured.measure(time_s, LIMITS)[:, 0] for time_s in (0.0, 8.0, 16.0, 24.0)]
     assert [row[1] for row in rows] == [0, 1, 1, 1], "5 s before the first look"
     assert rows[3][3] - rows[2][3] == 8.0 and rows[2][2] == 0
     api.at["a"] = 100.0
-    assert look.look(32.0, LIMITS)[:, 0].tolist() == [1, 0, 8, 0], "it has moved on"
+    assert measured.measure(32.0, LIMITS)[:, 0].tolist() == [1, 0, 8, 0], "it has moved on"
     api.held_s["a"] = 3.0
-    assert look.look(33.0, LIMITS)[:, 0].tolist() == [1, 1, 0, 3], "SUMO says so"
+    assert measured.measure(33.0, LIMITS)[:, 0].tolist() == [1, 1, 0, 3], "SUMO says so"
     del api.routes["a"]
-    assert not look.look(40.0, LIMITS)[:2].any()
+    assert not measured.measure(40.0, LIMITS)[:2].any()
 
 
 def test_of_a_queue_that_drives_off_as_many_move_as_have_left() -> None:
     """Six wait, SUMO lists them from the end of the queue; the first of them is held up or not."""
     api = FakeApi()
-    look = QueueLook(api, LANES, 500.0)
+    measured = MesoscopicLanes(api, LANES, 500.0)
     for name in "fedcba":
         api.enter(name, "in", "right")
     api.held_s["a"] = 30.0
-    look.look(0.0, LIMITS)
-    assert look.look(50.0, LIMITS)[:, 0].tolist() == [6, 6, 0, 6 * 40.0], "in since -10 s"
+    measured.measure(0.0, LIMITS)
+    assert measured.measure(50.0, LIMITS)[:, 0].tolist() == [6, 6, 0, 6 * 40.0], "in since -10 s"
     for gone, halting in (("ab", 2), ("c", 0)):
         api.held_s = {}
         for name in gone:
             del api.routes[name]
-        assert look.look(50.0, LIMITS)[1, 0] == halting
+        assert measured.measure(50.0, LIMITS)[1, 0] == halting
     api.held_s["d"] = 1.0
-    assert look.look(51.0, LIMITS)[1, 0] == 3, "red again: all of them stand"
+    assert measured.measure(51.0, LIMITS)[1, 0] == 3, "red again: all of them stand"
 
 
 # --- in the running simulation

@@ -1,8 +1,8 @@
-"""Looks at single vehicles, where what SUMO tells of lanes is not enough.
+"""Measured lanes in SUMO's mesoscopic model, which has neither lanes nor positions.
 
-In its mesoscopic model there are no lanes and no positions. An edge is a chain of segments, and a
-vehicle knows its segment, its route, and for how long it has been kept from leaving. From these
-follow the same numbers as lanes have in car following, so that observations mean the same in both.
+There an edge is a chain of segments, and a vehicle knows its segment, its route, and for how long
+it has been kept from leaving. From these follow the same numbers as lanes have in car following, so
+that observations mean the same in both.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import Behind, edge_of
+from ugat_marl.scenarios import edge_of
 from ugat_marl.simulation.snapshots import HALTING_MPS
 
 
@@ -27,9 +27,9 @@ class _Stay:
 
     Attributes:
         position_m: Where the segment begins on its edge.
-        since_s: About when the vehicle got there.
-        lanes: Positions of the lanes that lead where it goes next.
-        lane: The one it counts on; -1 while that is not known.
+        since_s: Time at which the vehicle got there, about.
+        lanes: Positions of the lanes that lead to its next edge.
+        lane: Position of the lane it counts on; -1 while that is not known.
     """
 
     position_m: float
@@ -48,7 +48,7 @@ class _Road:
         towards: Following edge to the positions of the lanes that lead there.
         segment_s: Time through a segment at the speed limit.
         last_m: Segments that begin after this are the last one.
-        stays: Who was there at the last look.
+        stays: Vehicles that were there at the last measurement.
     """
 
     edge: str
@@ -59,21 +59,22 @@ class _Road:
     stays: dict[str, _Stay]
 
 
-class QueueLook:
-    """Looks at the vehicles of a running mesoscopic simulation.
+class MesoscopicLanes:
+    """Measures the lanes of a running mesoscopic simulation, from its single vehicles.
 
     A vehicle counts on the lane that leads to the next edge of its route; where several do, on the
     one in whose queue SUMO has it, or else on the one with the fewest vehicles. It waits when it
     has been in its segment for longer than that takes at the speed limit: as SUMO counts it, only
-    the first of a queue is held up. When it got there is known to within the time of two looks.
+    the first of a queue is held up. When it got there is known to within the time
+    between two measurements.
 
-    Who waits halts, but for those near the stop line while the queue drives off. In car following a
-    queue starts at about one vehicle in the second that drivers keep, and serves one in two: so
-    many move behind the line as have left since the first one was last seen held up.
+    A waiting vehicle halts, except near the stop line while the queue drives off. In car following
+    a queue starts at about one vehicle per second and serves one every two seconds: as many
+    vehicles move behind the line as have left since the first one was last seen held up.
 
-    A call to SUMO takes longer than all else here, so a vehicle is asked for what may have changed
-    alone: its route when it enters an edge, its queue when it enters a segment, nothing more while
-    it waits in the last one.
+    A call to SUMO takes longer than everything else here. A vehicle is therefore asked only for
+    what may have changed: its route when it enters an edge, its queue when it enters a segment,
+    nothing more while it waits in the last one.
 
     Args:
         api: The module `libsumo`, with a simulation under way.
@@ -95,11 +96,11 @@ class QueueLook:
                 road.towards[following].append(place)
             road.segment_s = length / segments / api.lane.getMaxSpeed(lane)
             road.last_m = length * (1 - 1.5 / segments)
-        self._looked_s = -math.inf
+        self._measured_s = -math.inf
         self._left = [0] * self._count  # since the first vehicle of the lane was last held up
 
-    def look(self, time_s: float, limits: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Vehicles, halting ones, mean speed and waiting time of all lanes, ``(4, lanes)``.
+    def measure(self, time_s: float, limits: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return vehicles, halting ones, mean speed and waiting time of all lanes, ``(4, lanes)``.
 
         Args:
             time_s: Now.
@@ -108,7 +109,7 @@ class QueueLook:
         vehicles, halting, speeds, waits = ([0.0] * self._count for _ in range(4))
         names_on, api = self._api.edge.getLastStepVehicleIDs, self._api.vehicle
         position_m, waiting_s, speed_mps = api.getLanePosition, api.getWaitingTime, api.getSpeed
-        passed_s = time_s - self._looked_s
+        passed_s = time_s - self._measured_s
         for road in self._roads.values():
             segment_s, last_m = road.segment_s, road.last_m
             entered_s = time_s - min(passed_s, segment_s) / 2
@@ -146,7 +147,7 @@ class QueueLook:
                 waits[lane] += sum(waited_s[:standing])
                 for waited in waited_s[standing:]:
                     speeds[lane] += limits[lane] * segment_s / (segment_s + waited)
-        self._looked_s = time_s
+        self._measured_s = time_s
         measured = np.array([vehicles, halting, speeds, waits])
         there = measured[0] > 0
         measured[2] = np.where(there, measured[2] / np.maximum(measured[0], 1.0), limits)
@@ -174,31 +175,7 @@ class QueueLook:
         return min(stay.lanes, key=lambda place: vehicles[place])
 
 
-def near_the_end(
-    api: Any, lanes: Sequence[str], taken: Sequence[str], zone_m: float
-) -> NDArray[np.float64]:
-    """Return vehicles, halting ones and waiting time at the end of each lane, ``(3, lanes)``.
-
-    Args:
-        api: The module `libsumo`.
-        lanes: All lanes.
-        taken: Those of them with vehicles.
-        zone_m: How many metres; 0 for nothing, an empty array.
-    """
-    if not zone_m:
-        return np.empty(0)
-    near = np.zeros((3, len(lanes)))
-    places = {lane: place for place, lane in enumerate(lanes)}
-    for lane in taken:
-        begins = api.lane.getLength(lane) - zone_m
-        for name in api.lane.getLastStepVehicleIDs(lane):
-            if api.vehicle.getLanePosition(name) >= begins:
-                halts = float(api.vehicle.getSpeed(name) < HALTING_MPS)
-                near[:, places[lane]] += (1.0, halts, api.vehicle.getWaitingTime(name))
-    return near
-
-
-def refuse_in_queues(scenario: str, **asked: bool) -> None:
+def refuse_in_queues(scenario: str, **requested: bool) -> None:
     """Refuse what needs positions on lanes.
 
     Raises:
@@ -209,53 +186,9 @@ def refuse_in_queues(scenario: str, **asked: bool) -> None:
         "zone": "who is near a stop line (detection_zone)",
         "gui": 'pictures of vehicles (render_mode "human")',
     }
-    for name, wanted in asked.items():
+    for name, wanted in requested.items():
         if wanted:
             raise OptionError(
                 f"scenario {scenario!r} runs in SUMO's mesoscopic model, in which vehicles have no "
                 f"position on a lane: it cannot tell {words[name]}; leave out queue_model"
             )
-
-
-def add_those_behind(
-    api: Any,
-    behind: Behind,
-    measured: tuple[
-        NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
-    ],
-) -> None:
-    """Count vehicles behind a lane that is too short for them as if they were on it.
-
-    Those that wait to enter the network halt; their waiting time is that since they were due.
-
-    Args:
-        api: The module `libsumo`, with a simulation under way.
-        behind: As in `ugat_marl.scenarios.lanes.LaneTable`.
-        measured: Vehicles, halting vehicles, mean speed in m/s and waiting times in s (may be
-            empty) per lane, each ``(lanes,)``; changed in place.
-    """
-    vehicles, halting, speed_mps, waiting_s = measured
-    lanes, roads = behind
-    for index, shares in enumerate(lanes):
-        for lane, share in shares:
-            count = share * api.lane.getLastStepVehicleNumber(lane)
-            if not count:
-                continue
-            total = vehicles[index] + count
-            own = vehicles[index] * speed_mps[index] if vehicles[index] else 0.0
-            speed_mps[index] = (own + count * api.lane.getLastStepMeanSpeed(lane)) / total
-            vehicles[index] = total
-            halting[index] += share * api.lane.getLastStepHaltingNumber(lane)
-            if waiting_s.size:
-                waiting_s[index] += share * api.lane.getWaitingTime(lane)
-    for index, shares in enumerate(roads):
-        for road, share in shares:
-            outside = api.edge.getPendingVehicles(road)
-            if not outside:
-                continue
-            count = share * len(outside)
-            speed_mps[index] *= vehicles[index] / (vehicles[index] + count)
-            vehicles[index] += count
-            halting[index] += count
-            if waiting_s.size:
-                waiting_s[index] += share * sum(map(api.vehicle.getDepartDelay, outside))

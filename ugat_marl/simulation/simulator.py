@@ -21,13 +21,8 @@ from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.files import write_whole
 from ugat_marl.scenarios import NOTHING_BEHIND, Behind, Document, Scenario, Segment, edge_of
 from ugat_marl.simulation.host import one_line
-from ugat_marl.simulation.mesoscopic import (
-    QueueLook,
-    add_those_behind,
-    near_the_end,
-    refuse_in_queues,
-)
-from ugat_marl.simulation.snapshots import Snapshot, Trips
+from ugat_marl.simulation.mesoscopic import MesoscopicLanes, refuse_in_queues
+from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
 from ugat_marl.simulation.trips import measuring_options, read_trips
 
 Plans = Mapping[str, Sequence[Segment]]
@@ -228,7 +223,7 @@ class LibsumoSimulator:
         self._shown: dict[str, str] = {}
         self._time_s = 0.0
         self._limits = np.empty(0)
-        self._queues: QueueLook | None = None
+        self._mesoscopic: MesoscopicLanes | None = None
         self._on: dict[str, tuple[int, str]] = {}
         self._owner = 0
 
@@ -261,9 +256,9 @@ class LibsumoSimulator:
         self._shown, self._on = {}, {}
         self._time_s = launch.begin_s
         self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
-        self._queues = None
+        self._mesoscopic = None
         if launch.segment_m:
-            self._queues = QueueLook(libsumo, launch.lanes, launch.segment_m)
+            self._mesoscopic = MesoscopicLanes(libsumo, launch.lanes, launch.segment_m)
         return self._snapshot()
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
@@ -280,16 +275,16 @@ class LibsumoSimulator:
                 changes[offset].append((tls, state))
                 offset += duration
         begin = self._time_s
-        looks = [float(k) for k in range(1, int(seconds) + 1)] if self._launch.crossings else []
+        instants = [float(k) for k in range(1, int(seconds) + 1)] if self._launch.crossings else []
         left = np.zeros(len(self._launch.lanes))
         mean_left = left.copy()
         try:
-            for offset in sorted({*changes, *looks}):
+            for offset in sorted({*changes, *instants}):
                 if offset > 0:
                     libsumo.simulation.step(begin + offset)
-                if offset in looks:
+                if offset in instants:
                     self._count_left(left)
-                    mean_left += left / len(looks)
+                    mean_left += left / len(instants)
                 for tls, state in changes.get(offset, ()):
                     if self._shown.get(tls) != state:
                         libsumo.trafficlight.setRedYellowGreenState(tls, state)
@@ -299,7 +294,7 @@ class LibsumoSimulator:
             self._fail(f"SUMO failed after {begin:g} s", error)
         self._time_s = begin + seconds
         snapshot = self._snapshot()
-        return replace(snapshot, mean_left=mean_left) if looks else snapshot
+        return replace(snapshot, mean_left=mean_left) if instants else snapshot
 
     def vehicles(self) -> VehiclePicture:
         """Positions of all vehicles now."""
@@ -349,8 +344,8 @@ class LibsumoSimulator:
         statistic = libsumo.simulation.getParameter
         departed = int(statistic("", "stats.vehicles.inserted"))
         backlog = int(statistic("", "stats.vehicles.waiting"))
-        if self._queues is not None:
-            rows = self._queues.look(self._time_s, self._limits)
+        if self._mesoscopic is not None:
+            rows = self._mesoscopic.measure(self._time_s, self._limits)
             waiting = rows[3] if self._launch.waiting else np.empty(0)
             return Snapshot(self._time_s, rows[0], rows[1], rows[2], waiting, departed, backlog)
         lanes, api = self._launch.lanes, libsumo.lane
@@ -368,7 +363,7 @@ class LibsumoSimulator:
         halting = measure(api.getLastStepHaltingNumber, none)
         speed_mps = measure(api.getLastStepMeanSpeed, self._limits)
         waiting_s = measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0)
-        add_those_behind(libsumo, self._launch.behind, (vehicles, halting, speed_mps, waiting_s))
+        _add_those_behind(self._launch.behind, (vehicles, halting, speed_mps, waiting_s))
         return Snapshot(
             time_s=self._time_s,
             vehicles=vehicles,
@@ -377,7 +372,7 @@ class LibsumoSimulator:
             waiting_s=waiting_s,
             departed=departed,
             backlog=backlog,
-            near=near_the_end(libsumo, lanes, names, self._launch.zone_m),
+            near=_near_the_end(lanes, names, self._launch.zone_m),
         )
 
     def _fail(self, what: str, error: Exception) -> None:
@@ -385,6 +380,69 @@ class LibsumoSimulator:
         said = _errors_of(Path(self._launch.directory)) or str(error)
         self.close()
         raise SimulatorError(f"{what}: {said}") from None
+
+
+def _near_the_end(lanes: Sequence[str], taken: Sequence[str], zone_m: float) -> NDArray[np.float64]:
+    """Return vehicles, halting ones and waiting time at the end of each lane, ``(3, lanes)``.
+
+    Args:
+        lanes: All lanes.
+        taken: Those of them with vehicles.
+        zone_m: How many metres; 0 for nothing, an empty array.
+    """
+    if not zone_m:
+        return np.empty(0)
+    near = np.zeros((3, len(lanes)))
+    places = {lane: place for place, lane in enumerate(lanes)}
+    for lane in taken:
+        begins = libsumo.lane.getLength(lane) - zone_m
+        for name in libsumo.lane.getLastStepVehicleIDs(lane):
+            if libsumo.vehicle.getLanePosition(name) >= begins:
+                halts = float(libsumo.vehicle.getSpeed(name) < HALTING_MPS)
+                near[:, places[lane]] += (1.0, halts, libsumo.vehicle.getWaitingTime(name))
+    return near
+
+
+def _add_those_behind(
+    behind: Behind,
+    measured: tuple[
+        NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
+    ],
+) -> None:
+    """Count vehicles behind a lane that is too short for them as if they were on it.
+
+    Those that wait to enter the network halt; their waiting time is that since they were due.
+
+    Args:
+        behind: As in `ugat_marl.scenarios.lanes.LaneTable`.
+        measured: Vehicles, halting vehicles, mean speed in m/s and waiting times in s (may be
+            empty) per lane, each ``(lanes,)``; changed in place.
+    """
+    vehicles, halting, speed_mps, waiting_s = measured
+    lanes, roads = behind
+    for index, shares in enumerate(lanes):
+        for lane, share in shares:
+            count = share * libsumo.lane.getLastStepVehicleNumber(lane)
+            if not count:
+                continue
+            total = vehicles[index] + count
+            own = vehicles[index] * speed_mps[index] if vehicles[index] else 0.0
+            speed_mps[index] = (own + count * libsumo.lane.getLastStepMeanSpeed(lane)) / total
+            vehicles[index] = total
+            halting[index] += share * libsumo.lane.getLastStepHaltingNumber(lane)
+            if waiting_s.size:
+                waiting_s[index] += share * libsumo.lane.getWaitingTime(lane)
+    for index, shares in enumerate(roads):
+        for road, share in shares:
+            outside = libsumo.edge.getPendingVehicles(road)
+            if not outside:
+                continue
+            count = share * len(outside)
+            speed_mps[index] *= vehicles[index] / (vehicles[index] + count)
+            vehicles[index] += count
+            halting[index] += count
+            if waiting_s.size:
+                waiting_s[index] += share * sum(map(libsumo.vehicle.getDepartDelay, outside))
 
 
 def _errors_of(directory: Path) -> str:
