@@ -1,4 +1,6 @@
-"""Named domains, by the gap they open between simulation and street.
+"""Domains: lists of effects by name, V1 to V4 of the UGAT paper among them.
+
+Each named domain opens a gap between simulation and street.
 
 The counterparts are settings of Sim2Signal (Al Rafi et al. 2026, arXiv:2609.01676), by the names of
 its repository, whose files of settings and tables of phases were read for the numbers here. That
@@ -9,7 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from ugat_marl.effects.base import Effect
+from ugat_marl.effects.sensors import DetectionZone
+from ugat_marl.effects.table import EFFECTS, apply_effects, effect_from_text, load_scenario
+from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
+from ugat_marl.scenarios import Scenario
+
+Domain = str | Sequence[Effect]
+"""``"sim"``, a named domain or its alias, ``"effect=value+effect=value"``, a scenario directory or
+``.sumocfg`` on the same road network, or effects."""
 
 Gap = Literal["observation", "action", "transition", "reward"]
 
@@ -181,6 +194,14 @@ NAMED: dict[str, NamedDomain] = {
 TO_TRAIN_IN = frozenset({"meso"})
 """Named domains that stand for a simulation, and for no street."""
 
+ALIASES: dict[str, str] = {
+    "light-loads": "V1",
+    "heavy-loads": "V2",
+    "rain": "V3",
+    "snow": "V4",
+}
+"""Other names of the paper's domains."""
+
 
 def spelled_out(names: Sequence[str]) -> list[str]:
     """Return domains with ``"all"`` and names of gaps replaced by lists, each domain once.
@@ -199,3 +220,124 @@ def spelled_out(names: Sequence[str]) -> list[str]:
         else:
             found.append(name)
     return list(dict.fromkeys(found))
+
+
+def parse_domain(domain: Domain) -> tuple[Effect, ...]:
+    """Return the effects that make `domain` out of a scenario; none for ``"sim"``.
+
+    Raises:
+        UnknownNameError: No such setting or effect.
+        OptionError: An effect has an impossible value.
+    """
+    if not isinstance(domain, str):
+        given: Sequence[Any] = domain
+        for item in given:
+            if not isinstance(item, Effect):
+                raise OptionError(
+                    f"domain {domain!r}: {item!r} is not an effect; give a name such as 'V1' on "
+                    "its own, or a list of effects such as [StartupDelay(0.5)]"
+                )
+        return tuple(domain)
+    parts = _parts(domain)
+    if len(parts) > 1:
+        return tuple(effect for part in parts for effect in parse_domain(part))
+    name = parts[0].lower()
+    if name == "sim":
+        return ()
+    if name in _names():
+        return parse_domain(NAMED[_names()[name]].effects)
+    if "=" in name:
+        return (effect_from_text(parts[0]),)
+    near = nearest(name, ("sim", *NAMED, *ALIASES))
+    raise UnknownNameError(
+        "domain",
+        domain,
+        ("sim", *SETTINGS, *ALIASES, *([near] if near else [])),
+        "ugat-marl domains lists all names. Effects (startup_delay=0.5+acceleration=1.0) and the "
+        "directory of another scenario on the same network work as well.",
+    )
+
+
+def _names() -> dict[str, str]:
+    """Return the name of a domain by each of its names in lower case."""
+    return {name.lower(): name for name in NAMED} | ALIASES
+
+
+def _parts(domain: str) -> list[str]:
+    """Split a domain at its plus signs, except those in the id of an edge or lane."""
+    parts: list[str] = []
+    for part in domain.split("+"):
+        name = parts[-1].partition("=")[0].strip().lower() if parts else ""
+        kind = EFFECTS.get(name)
+        new = "=" in part or part.strip().lower() in {"", "sim", *_names()}
+        if kind is not None and kind.texts and not new:
+            parts[-1] += f"+{part}"
+        else:
+            parts.append(part)
+    return [part.strip() for part in parts]
+
+
+def describe(domain: Domain) -> str:
+    """Return a short name for a domain, as tables show it."""
+    if isinstance(domain, str):
+        return _names().get(domain.strip().lower(), domain)
+    return "+".join(map(str, domain)) or "sim"
+
+
+def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
+    """Return the scenario as it is in `domain`.
+
+    Args:
+        scenario: What `load_scenario` returned.
+        domain: Effects, or the name of some, or the path of another scenario on the same network.
+
+    Raises:
+        UnknownNameError: No such setting or effect.
+        OptionError: An effect has an impossible value, or two of them exclude each other.
+        ScenarioError: A scenario named as a domain cannot be read or has other roads.
+    """
+    if (path := scenario_of(domain)) is not None:
+        other = load_scenario(path)
+        if _signals(other) != _signals(scenario):
+            raise ScenarioError(
+                f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "
+                "a domain must be on the same network, or a policy means nothing in it"
+            )
+        return _checked(other)
+    return _checked(apply_effects(scenario, parse_domain(domain)))
+
+
+def _checked(scenario: Scenario) -> Scenario:
+    """Return the scenario; refuse a detection zone together with a reach."""
+    zones = (item for item in scenario.settings.effects if item.get("name") == DetectionZone.name)
+    if scenario.control.reach_m and any(zones):
+        raise OptionError(
+            f"scenario {scenario.id!r}: a detection_zone shows vehicles on the lane at the light "
+            "alone, a reach (control.reach_m) those upstream of it, too; leave out one of the two"
+        )
+    return scenario
+
+
+def scenario_of(domain: Domain) -> Path | None:
+    """Return the other scenario that a domain names, or None; a file called V4 is none."""
+    if not isinstance(domain, str):
+        return None
+    path = Path(domain).expanduser()
+    return path if path.suffix == ".sumocfg" or (path / "scenario.toml").is_file() else None
+
+
+def _signals(scenario: Scenario) -> set[tuple[str, ...]]:
+    """Return the connection that each letter of each signal belongs to."""
+    keys = ("tl", "linkIndex", "from", "fromLane", "to", "toLane")
+    return {
+        tuple(item.get(key, "") for key in keys)
+        for item in scenario.network.parse().iter("connection")
+        if "tl" in item.attrib
+    }
+
+
+SETTINGS: dict[str, tuple[Effect, ...]] = {
+    name: parse_domain(NAMED[name].effects) for name in ("V1", "V2", "V3", "V4")
+}
+"""Da et al. (2023), table "Real-world Configurations": accel, decel, emergencyDecel (m/s^2) and
+startupDelay (s). The default, our ``sim``, is 2.60 / 4.50 / 9.00 / 0.00."""

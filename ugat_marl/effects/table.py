@@ -1,0 +1,171 @@
+"""Table of all effects by name, and effects from the records of a scenario file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import fields, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from ugat_marl.effects.actuators import ACTING
+from ugat_marl.effects.base import Effect
+from ugat_marl.effects.demand import DemandLevel, DemandSurge, DemandTiming
+from ugat_marl.effects.detectors import (
+    ClockDrift,
+    Dropout,
+    SignalClock,
+    Stuck,
+    Swapped,
+    Undercount,
+)
+from ugat_marl.effects.engine import BlockerPatience, QueueModel, Reach
+from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
+from ugat_marl.effects.objectives import JUDGING
+from ugat_marl.effects.roads import Incident, LaneClosure, LocalSpeed, Parking
+from ugat_marl.effects.sensors import OBSERVING
+from ugat_marl.effects.signals import AllRedTime, LateGreen, YellowTime
+from ugat_marl.effects.turning import Turning
+from ugat_marl.effects.vehicles import (
+    Acceleration,
+    Deceleration,
+    DriverModel,
+    EmergencyDeceleration,
+    GapAcceptance,
+    Headway,
+    Imperfection,
+    LaneDiscipline,
+    MinGap,
+    ReactionStep,
+    RedRunning,
+    StartupDelay,
+    YellowRunning,
+)
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.scenarios import Scenario, read_scenario
+
+_MEASURABLE: dict[str, type[Effect]] = {
+    kind.name: kind
+    for kind in (
+        Acceleration, Deceleration, EmergencyDeceleration, StartupDelay, Headway, MinGap,
+        Imperfection, ReactionStep, DesiredSpeed, SpeedSpread, YellowRunning, RedRunning,
+        GapAcceptance, LaneDiscipline, HeavyShare, DriverModel,
+        LateGreen, YellowTime, AllRedTime,
+        DemandLevel, DemandSurge, DemandTiming, Turning,
+        LaneClosure, Parking, LocalSpeed,
+        Undercount, SignalClock, ClockDrift, Stuck, Dropout, Swapped,
+    )
+}  # fmt: skip
+
+
+_ON_CONTROLLERS: dict[str, type[Effect]] = {
+    kind.name: kind for kind in (*OBSERVING, *ACTING, *JUDGING)
+}
+_OTHERS: dict[str, type[Effect]] = {
+    kind.name: kind for kind in (Incident, QueueModel, BlockerPatience, Reach)
+}
+
+EFFECTS: dict[str, type[Effect]] = {**_MEASURABLE, **_ON_CONTROLLERS, **_OTHERS}
+"""Effects by name."""
+
+
+def known_effects() -> Mapping[str, type[Effect]]:
+    """Return the effects that measured data may show, by name: traffic, signals, detectors."""
+    return dict(_MEASURABLE)
+
+
+def effects_on_controllers() -> Mapping[str, type[Effect]]:
+    """Return the effects on controllers by name; no diagnosis looks for them."""
+    return dict(_ON_CONTROLLERS)
+
+
+def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
+    """Return an effect from its name and parameters, as in ``[[effects]]`` of a scenario file.
+
+    Args:
+        record: ``{"name": ..., parameter: value, ...}``.
+        where: Where it stands, for errors.
+
+    Raises:
+        UnknownNameError: No effect of this name, or no parameter of this name.
+        OptionError: A parameter is missing or outside its range.
+    """
+    values = dict(record)
+    name = str(values.pop("name", ""))
+    if name not in EFFECTS:
+        raise UnknownNameError("effect", name, EFFECTS, where and f"It stands{where}.")
+    kind = EFFECTS[name]
+    parameters = [item.name for item in fields(kind)]
+    for key in values:
+        if key not in parameters:
+            raise UnknownNameError(
+                f"parameter of effect {name!r}:", key, parameters, where and f"It stands{where}."
+            )
+    if missing := [key for key in parameters if key not in values]:
+        raise OptionError(f"effect {name!r}{where}: parameter {missing[0]!r} is missing")
+    return kind(**values)
+
+
+def effect_from_text(text: str) -> Effect:
+    """Return the effect ``name=value,value,...``, as `str` of an effect writes it.
+
+    Raises:
+        UnknownNameError: No effect of this name.
+        OptionError: Too many or too few values, or an impossible one.
+    """
+    name, _, values = (part.strip() for part in text.partition("="))
+    name = name.lower()
+    if name not in EFFECTS:
+        raise UnknownNameError("effect", name, EFFECTS)
+    kind = EFFECTS[name]
+    parameters = [item.name for item in fields(kind)]
+    parts = [part.strip() for part in values.split(",")]
+    if len(parts) != len(parameters):
+        raise OptionError(
+            f"effect {name!r} takes {len(parameters)} value(s), {', '.join(parameters)}; "
+            f"got {values!r}"
+        )
+    given: dict[str, Any] = {}
+    for parameter, part in zip(parameters, parts, strict=True):
+        try:
+            given[parameter] = part if parameter in kind.texts else float(part)
+        except ValueError:
+            raise OptionError(f"effect {name!r}: {part!r} is not a number") from None
+    return kind(**given)
+
+
+def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
+    """Apply effects one after the other."""
+    for apply_all, group in groupby(effects, lambda effect: effect.apply_all):
+        scenario = apply_all(scenario, list(group))
+    return scenario
+
+
+def load_scenario(name: str | Path | Scenario) -> Scenario:
+    """Load a scenario and apply the effects its own file lists (see `read_scenario`).
+
+    Those on controllers stay listed in its settings, for the environment to keep.
+    """
+    scenario = name if isinstance(name, Scenario) else read_scenario(name)
+    where = f" in scenario {scenario.id!r}"
+    effects = [effect_from(record, where) for record in scenario.settings.effects]
+    plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
+    return apply_effects(plain, effects)
+
+
+def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:
+    """Return the effects on detectors that were applied to a scenario.
+
+    They leave its files as they are, so that the code that measures it has to ask for them.
+    """
+    names = (text.partition("=")[0] for text in scenario.applied)
+    return tuple(
+        effect_from_text(text)  # undoes str(effect)
+        for name, text in zip(names, scenario.applied, strict=True)
+        if name in _MEASURABLE and _MEASURABLE[name].on_detectors
+    )
+
+
+def controller_effects(scenario: Scenario) -> tuple[Effect, ...]:
+    """Return the effects on controllers that were applied to a scenario."""
+    return tuple(map(effect_from, scenario.settings.effects))
