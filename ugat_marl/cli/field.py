@@ -33,7 +33,7 @@ Log = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: n
 
 @dataclass(frozen=True)
 class Field:
-    """Drives the lights of a SUMO that runs elsewhere, as if it were the street.
+    """Drive the lights of a SUMO that runs elsewhere, as if it were the street.
 
     Counts are read once per decision. Minimum green and clearance are kept
     whatever the policy asks for; where counts are stale, missing or absurd, or

@@ -19,7 +19,7 @@ from ugat_marl.progress import Bars
 
 @dataclass(frozen=True)
 class Record:
-    """Measures a simulated world as a street is measured: detections and signals.
+    """Measure a simulated world as a street is measured: detections and signals.
 
     Examples:
         ugat-marl record single-v1 --domain V4 --out measured

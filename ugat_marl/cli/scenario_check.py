@@ -1,4 +1,4 @@
-"""``ugat-marl scenario check``: what a controller will face, and whether all of it is sound."""
+"""``ugat-marl scenario check``: facts about a scenario, and checks of it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ MOST_APPROACHES = 8
 
 @dataclass(frozen=True)
 class ScenarioCheck:
-    """Says what a controller will face; leaves with 1 if something has to be mended.
+    """Show what a controller will face; exit with 1 if something has to be mended.
 
     It plays an episode under the network's own programme and one under a good rule.
 
@@ -135,7 +135,7 @@ def show(
     rows: Sequence[Row] | None,
     wrong: Sequence[str],
 ) -> None:
-    """Prints everything as tables that fit 80 columns."""
+    """Print everything as tables that fit 80 columns."""
 
     def say(text: str) -> None:
         console.print(text, markup=False, soft_wrap=True)
@@ -182,7 +182,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _intersections(agents: Sequence[IntersectionFacts]) -> Table:
-    """One row for intersections that are alike."""
+    """Return one row for intersections that are alike."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for item in agents:
         groups.setdefault(_row(item), []).append(item.id)

@@ -17,7 +17,7 @@ _UNREADABLE = (
     OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
     AssertionError, UnpicklingError, zipfile.BadZipFile,
 )  # fmt: skip
-"""What torch raises on files that are not what it wrote."""
+"""Errors that torch raises on files it did not write."""
 
 
 def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
@@ -77,12 +77,12 @@ def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> N
 def tensors_like(
     path: Path, found: Mapping[str, torch.Tensor], own: Mapping[str, torch.Tensor]
 ) -> dict[str, torch.Tensor]:
-    """Tensors of a checkpoint with the names, shapes and types of one's own.
+    """Return the tensors of a checkpoint, checked against the learner's own.
 
     Args:
         path: The checkpoint, for messages.
-        found: What it holds; what is not among one's own is left out.
-        own: What is needed.
+        found: The tensors it holds; those not needed are left out.
+        own: The learner's tensors, with the names, shapes and types needed.
 
     Raises:
         CheckpointError: One is of another shape or type.

@@ -1,4 +1,4 @@
-"""The folder of a training run: what is measured, what is saved, and how it is taken up again.
+"""Folder of a training run: metrics, checkpoints, and how a run is resumed.
 
 A checkpoint is a folder that appears by one rename, so that a killed run has lost at most the stage
 in progress. Metrics are rewritten whole at every checkpoint; a resumed run drops the rows of the
@@ -71,11 +71,11 @@ class Metrics:
 
 
 class Run:
-    """One folder of one training run.
+    """Folder of one training run.
 
     Args:
-        directory: Where it lies.
-        identity: What must be the same for the run to be taken up again: settings, scenario, seed.
+        directory: The folder.
+        identity: Values that must be equal to resume the run: settings, scenario, seed.
         resume: Go on from the checkpoint in the folder, if there is one.
         reporter: Shows progress.
 
@@ -115,7 +115,7 @@ class Run:
         """Make the next checkpoint.
 
         Args:
-            state: Plain values that say where the run stands.
+            state: Plain values: the progress of the run.
             write: Writes everything else into the folder it is given.
         """
         fresh = self.directory / f".{CHECKPOINT}.new"
@@ -133,7 +133,7 @@ class Run:
             self._board.flush()
 
     def restore(self, read: Callable[[Path], None]) -> dict[str, Any]:
-        """Take up the checkpoint.
+        """Restore the checkpoint.
 
         Args:
             read: Reads what `write` wrote.
@@ -181,7 +181,7 @@ class Run:
 
 
 def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
-    """Keep all options of a run, and the versions it is made with, for readers.
+    """Write all options of a run, and the versions it is made with, for readers.
 
     ``run.json`` holds only what must be the same for `--resume`.
     """
@@ -190,7 +190,7 @@ def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
 
 
 def locked(directory: Path) -> IO[str]:
-    """A file that stays locked as long as it is open, also by a process that is killed.
+    """Return a file that stays locked while it is open; a killed process releases it.
 
     Raises:
         OptionError: Another process has locked the folder.
@@ -241,9 +241,9 @@ def _remove_remains(directory: Path) -> None:
 
 
 def remove_temporaries(directory: Path) -> None:
-    """Clear files that were being written (`files.replacing`) when their process was killed.
+    """Remove files that were being written (`files.replacing`) when their process was killed.
 
-    For whoever has locked the folder: nobody else may be writing there.
+    Only the process that has locked the folder may call it.
     """
     for remains in directory.glob(".*.tmp"):
         remains.unlink(missing_ok=True)

@@ -56,7 +56,7 @@ MEASURES: dict[str, str] = {
 }
 """The five measures of the paper and delay in seconds, with their headings."""
 MORE_IS_BETTER = ("throughput", "reward")
-"""Those of which more is better."""
+"""Measures of which more is better."""
 
 
 def relative_slowness(
@@ -68,7 +68,7 @@ def relative_slowness(
 
 @dataclass
 class EpisodeRecorder:
-    """Adds up, decision by decision, what `Scores` needs.
+    """Sums, decision by decision, from which `Scores` are made.
 
     Args:
         lanes: The measured lanes.
@@ -94,7 +94,7 @@ class EpisodeRecorder:
         )
 
     def scores(self, trips: Trips) -> Scores:
-        """The scores of the episode that ended with `trips`."""
+        """Return the scores of the episode that ended with `trips`."""
         n = max(self._decisions, 1)
         return Scores(
             att_s=_mean(trips.travel_time_s),

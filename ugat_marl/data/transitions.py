@@ -1,10 +1,9 @@
-"""Transition logs: what roll-outs write and grounding reads.
+"""Transition logs: written by roll-outs, read by grounding.
 
-A log holds one row per (episode, step, agent): what the intersection observed, which phase its
-policy asked for, which phase really was served and how long its green was held back, the reward,
-and what it observed next. Simulated
-and measured logs are the same thing, told apart by their provenance, which travels in the metadata
-of the Parquet file.
+A log holds one row per (episode, step, agent): the observation of the intersection, the phase its
+policy asked for, the phase that was served, the delay of its green, the reward, and the next
+observation. Simulated and measured logs have the same form; their provenance, in the metadata of
+the Parquet file, tells them apart.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ OPTIONAL: Mapping[str, pl.Expr] = {
     "delay_s": pl.lit(0.0, pl.Float32()),
     "served_features": pl.lit([], pl.List(pl.Float32())),
 }
-"""Columns that may be missing, and what they hold then."""
+"""Columns that may be missing, with their default."""
 VECTORS = ("observation", "next_observation")
 CHOICES = ("action", "executed")
 
@@ -124,12 +123,12 @@ class Provenance:
             raise LogError("provenance: layouts is empty; name at least one agent")
 
     def to_json(self) -> str:
-        """The provenance as a JSON object."""
+        """Return the provenance as a JSON object."""
         return json.dumps({"format": FORMAT, **dataclasses.asdict(self)})
 
     @classmethod
     def from_json(cls, text: str) -> Provenance:
-        """Inverse of `to_json`.
+        """Read what `to_json` wrote.
 
         Raises:
             LogError: Not JSON, of a newer format, or fields missing, unknown or of the wrong type.
@@ -177,7 +176,7 @@ class Transitions:
 
 
 class TransitionLog:
-    """A checked table of transitions with its provenance.
+    """Checked table of transitions with its provenance.
 
     Args:
         provenance: Where the rows come from.
@@ -213,7 +212,7 @@ class TransitionLog:
         return self.frame.height
 
     def transitions(self, agent: str) -> Transitions:
-        """The rows of one agent, ordered by episode and step.
+        """Return the rows of one agent, ordered by episode and step.
 
         Raises:
             LogError: The log knows no such agent.
@@ -247,7 +246,7 @@ class TransitionLog:
 
     @staticmethod
     def concatenate(logs: Sequence[TransitionLog]) -> TransitionLog:
-        """One log after the other, episodes renumbered from 0 so that none are confused.
+        """Return the logs as one, with episodes renumbered from 0.
 
         Raises:
             LogError: No logs, or logs of different scenarios, domains, observations or layouts.
@@ -299,7 +298,7 @@ _NONE = np.zeros(0, np.float32)
 
 
 class TransitionRecorder:
-    """Collects transitions while an episode runs; cheap per step, a table only at the end."""
+    """Collector of transitions while an episode runs; cheap per step, a table at the end."""
 
     def __init__(self, provenance: Provenance) -> None:
         self._provenance = provenance
@@ -353,7 +352,7 @@ class TransitionRecorder:
             kept.append(row)
 
     def log(self) -> TransitionLog:
-        """Everything recorded so far as a checked log."""
+        """Return everything recorded so far as a checked log."""
         frames = [
             self._agent_frame(agent, layout, rows)
             for (agent, layout), rows in zip(
@@ -414,7 +413,7 @@ def _refuse_difference(first: Provenance, other: Provenance) -> None:
 
 
 def read_parquet(path: Path) -> tuple[pl.DataFrame, dict[str, str]]:
-    """The table in a Parquet file and the file's metadata.
+    """Return the table in a Parquet file and the file's metadata.
 
     Raises:
         LogError: Missing, unreadable, cut short or damaged.
@@ -434,7 +433,7 @@ def checked(
     phases: Mapping[str, int],
     features: Mapping[str, int],
 ) -> pl.DataFrame:
-    """The frame with exactly the columns and types of `SCHEMA`, every value possible.
+    """Return the frame in the columns and types of `SCHEMA`; refuse impossible values.
 
     Args:
         frame: Any table; wider number types are converted where nothing is lost.
@@ -519,7 +518,7 @@ def _refuse_rows(frame: pl.DataFrame, bad: pl.Expr, column: str, complaint: str)
 
 
 def _refuse_half_file(path: Path) -> None:
-    """A Parquet file begins and ends with its magic number; half a file does not."""
+    """Refuse a file that does not begin and end with the magic number of Parquet."""
     try:
         with path.open("rb") as file:
             head = file.read(4)

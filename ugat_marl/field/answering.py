@@ -1,4 +1,4 @@
-"""An answer within a time, or none: functions that are asked in a thread of their own."""
+"""Calls with a deadline: functions run in a thread of their own."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Late(NoAnswer):
 
 
 class Answering:
-    """Asks functions, one at a time, and waits no longer than it is told to.
+    """Caller of functions, one at a time, that waits for each until a deadline.
 
-    A thread cannot be ended from outside: a function that is late is left to finish, its answer is
-    thrown away, and nothing is asked before. The thread does not keep the program alive.
+    A thread cannot be ended from outside. A late function is left to finish, its answer is thrown
+    away, and no other is called before. The thread does not keep the program alive.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Answering:
         threading.Thread(target=_serve, args=arguments, daemon=True, name="policy").start()
 
     def ask(self, function: Callable[..., Answer], *arguments: Any, within_s: float) -> Answer:
-        """The function's answer.
+        """Call a function and return its answer.
 
         Raises:
             Late: None within `within_s`, or the last question has not been answered yet.

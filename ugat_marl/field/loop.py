@@ -1,7 +1,7 @@
-"""The field loop: once per decision it reads, checks, decides and acts.
+"""Field loop: once per decision it reads counts, checks them, decides and acts.
 
-A decision is ready within `Limits.answer_ms`, whether the policy answers or not; whatever it
-answers goes through the signal machines of `ugat_marl.field.safety`.
+A decision is ready within `Limits.answer_ms`, with or without an answer of the policy. Every answer
+goes through the signal machines of `ugat_marl.field.safety`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Decision:
         return "fallback" if len(self.fallback) == len(self.phases) else "both"
 
     def line(self) -> str:
-        """The decision as a line of JSON."""
+        """Return the decision as a line of JSON."""
         return json.dumps(
             {
                 "time_s": self.time_s,
@@ -74,7 +74,7 @@ class Decision:
 
 
 class DecisionLog:
-    """A file with one line of JSON per decision, whole at any moment.
+    """File with one line of JSON per decision, whole at any moment.
 
     It is written anew beside its place and renamed, after a decision and at most once a second, so
     that a killed loop leaves all lines but those of its last second. Lines that are there stay.
@@ -137,21 +137,21 @@ class Summary:
         return sum(self.reasons.values()) / max(self.light_decisions, 1)
 
     def latency_ms(self, quantile: float) -> float:
-        """A quantile of the latencies; NaN before the first decision."""
+        """Return a quantile of the latencies; NaN before the first decision."""
         if not self.latencies_ms:
             return float("nan")
         return float(np.quantile(self.latencies_ms, quantile))
 
 
 class FieldLoop:
-    """Drives the lights of a street by a policy, as long as that can be trusted.
+    """Control of a street's lights by a policy, as long as counts and policy can be trusted.
 
     Args:
         site: The place, with the policy's observation.
-        policy: Who decides; it is asked in a thread of its own.
-        street: What is read and set.
-        limits: What is believed, and for how long.
-        log: Where decisions are written; None for nowhere.
+        policy: The policy; it runs in a thread of its own.
+        street: The street that is read and set.
+        limits: Limits of trust.
+        log: Log of the decisions, or None.
 
     Raises:
         OptionError: The street lacks a light, or shows what none of its lights can show.
@@ -266,7 +266,7 @@ class FieldLoop:
     def _ask(
         self, counts: Mapping[str, LaneCount], now: float, begun: float
     ) -> tuple[list[int], str]:
-        """The policy's phases in the order of the lights, or what is wrong with it."""
+        """Return the policy's phases in the order of the lights, or the reason for none."""
         limits = self._limits
         phases = [light.phase for light in self.lights.values()]
         observations = self._site.observe(counts, now, phases)
@@ -292,7 +292,7 @@ class FieldLoop:
         }
 
     def _warm_up(self, policy: Policy) -> None:
-        """The first answer of a network takes longer than all others; it is not for the street."""
+        """Ask the policy once before it counts: the first answer of a network takes longest."""
         try:
             nothing = self._site.observe({}, self._street.now_s(), [0] * len(self.lights))
             for function, arguments in (
@@ -306,7 +306,7 @@ class FieldLoop:
 
 
 def _answer_of(policy: Policy, site: Site) -> Callable[..., list[int]]:
-    """The policy, with the check of its answer, which takes time too."""
+    """Return a function that asks the policy and checks its answer."""
     agents, spaces = site.observer.agents, site.spaces
 
     def answer(observations: Any, infos: Any) -> list[int]:
@@ -316,7 +316,7 @@ def _answer_of(policy: Policy, site: Site) -> Callable[..., list[int]]:
 
 
 def _without_green(site: Site, plans: Mapping[str, list[Segment]]) -> frozenset[str]:
-    """Lanes in front of lights that have no green in these plans."""
+    """Return the lanes in front of lights that have no green in these plans."""
     held: set[str] = set()
     for item in site.network.intersections:
         states = [state for _, state in plans[item.id]]

@@ -23,14 +23,13 @@ _NOT_GREEN = str.maketrans("yYoOu", "rrrrr")
 
 
 class Light:
-    """The signal machine of one traffic light.
+    """Signal machine of one traffic light.
 
     Args:
         phases: The green phases it may show.
         timing: Minimum green and clearance.
-        shown: What it shows when it is taken over, any state of SUMO's. If that is none of the
-            phases it is held for the minimum green, as nobody knows since when it has been shown,
-            and cleared like one.
+        shown: Its state when it is taken over, any state of SUMO's. A state that is none of the
+            phases is held for the minimum green, since its begin is unknown, and cleared like one.
 
     Raises:
         OptionError: `shown` is of another light.
@@ -63,7 +62,7 @@ class Light:
         return self._state.phase if self.taken_over else 0
 
     def free(self, within_s: float) -> NDArray[np.int8]:
-        """1 for every phase that would begin to be shown within `within_s`, ``(phases,)``."""
+        """Return 1 for every phase that would begin within `within_s`, else 0, ``(phases,)``."""
         mask = np.ones(len(self.phases), dtype=np.int8)
         left = within_s - self._ending_s
         if self.taken_over and not signals.free_to_change(self._state, self._timing, left):
@@ -100,7 +99,7 @@ class Trust:
         self._last: dict[str, str] = {}
 
     def judge(self, faults: Mapping[str, str]) -> dict[str, str]:
-        """Lights that follow the plan in this decision, and why.
+        """Return the lights that follow the plan in this decision, and why.
 
         Args:
             faults: Light to what is wrong with its data or the policy, ``<kind>: <details>``.
@@ -122,10 +121,10 @@ class Trust:
 def fixed_time(
     network: Network, decision_interval_s: float, clearance_s: float, green_s: float
 ) -> FixedTime:
-    """The plan to fall back on: a smallest set of phases that serves every link, in turn.
+    """Return the fallback plan: a smallest set of phases that serves every link, in turn.
 
-    Its answers are by traffic light. It is a clock for all lights, so that it is the same whenever
-    a light joins.
+    Its answers are by traffic light. One clock drives all lights, so that the plan is the same
+    whenever a light joins.
     """
     streets = ControlledNetwork(
         {item.id: item for item in network.intersections},
@@ -138,7 +137,7 @@ def fixed_time(
 
 
 def merged(plans: Mapping[str, Sequence[Segment]]) -> list[tuple[float, dict[str, str]]]:
-    """The plans of all lights as one: durations in s, and the lights that change at their start."""
+    """Merge the plans of all lights: durations in s, and the lights that change at their start."""
     changes: dict[float, dict[str, str]] = {}
     end = 0.0
     for light, segments in plans.items():

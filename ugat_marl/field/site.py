@@ -23,7 +23,7 @@ _HALTING = ("queue", "movements")
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """The intersections, their timing, and the observation of one policy.
+    """Intersections, their timing, and the observation of one policy.
 
     Attributes:
         network: Static facts.
@@ -43,7 +43,7 @@ class Site:
 
     @classmethod
     def of(cls, scenario: Scenario, env_options: Mapping[str, Any]) -> Site:
-        """The site of a scenario, for a policy that relies on `env_options`.
+        """Return the site of a scenario, for a policy that relies on `env_options`.
 
         Raises:
             OptionError: The policy needs what no detector tells, or does not choose phases.
@@ -109,11 +109,11 @@ class Site:
     def observe(
         self, counts: Mapping[str, LaneCount], now_s: float, phases: list[int]
     ) -> dict[str, NDArray[np.float32]]:
-        """The observations of all agents.
+        """Return the observations of all agents.
 
         Args:
-            counts: Counts to believe; a lane without one is taken to be empty, so whoever sees it
-                must not be obeyed.
+            counts: Trusted counts. A lane without one is taken to be empty; agents that see it must
+                not be obeyed.
             now_s: The street's clock.
             phases: Phase each light shows or clears towards.
         """

@@ -1,7 +1,7 @@
-"""The street as a controller meets it: counts with their time, lights to set, a clock.
+"""Interface of a street: counts with their time, lights to set, a clock.
 
-`TraciStreet` lets a SUMO that runs elsewhere stand in for it; another street is a class with the
-five methods of `Street` (docs/how-to/field.md has one).
+`TraciStreet` puts a SUMO that runs elsewhere in its place, `StartedSumo` a SUMO of this process.
+Another street is a class with the five methods of `Street` (docs/how-to/field.md has one).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class LaneCount(NamedTuple):
     Attributes:
         time_s: When it was counted, on the street's clock.
         vehicles: Vehicles on the lane; an estimate need not be whole.
-        halting: Of these, standing; NaN where nobody measures it.
+        halting: Standing vehicles among them; NaN where that is not measured.
     """
 
     time_s: float
@@ -58,7 +58,7 @@ class Street(Protocol):
     """Interface of a street. Only `read` may fail without ending the loop."""
 
     def now_s(self) -> float:
-        """The street's clock, s."""
+        """Return the street's clock, s."""
         ...
 
     def shown(self) -> Mapping[str, str]:
@@ -79,14 +79,14 @@ class Street(Protocol):
 
 
 class TraciStreet:
-    """A running ``sumo --remote-port PORT`` in place of the street.
+    """Running ``sumo --remote-port PORT`` in place of the street.
 
     Counts are subscribed to, so that they come with every step, as detectors send them, and
     `read` costs no round trip. The simulation goes on when the loop waits, and only then.
 
     Args:
         lanes: Lanes to count on.
-        port: Where SUMO listens.
+        port: Port of SUMO.
         host: The machine it runs on.
         detectors: Whether to count on whole lanes, as the environments do, or on the simulation's
             lane-area detectors (E2), several on a lane added up; lanes without one are not counted.
@@ -94,7 +94,7 @@ class TraciStreet:
         patience_s: How long to wait for SUMO to listen.
 
     Raises:
-        SimulatorError: Nobody listens, or what runs there is another network.
+        SimulatorError: No SUMO listens, or it runs another network.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class TraciStreet:
             self._time_s = float(self._connection.simulation.getTime())
 
     def now_s(self) -> float:
-        """The simulation's time, s."""
+        """Return the simulation's time, s."""
         return self._time_s
 
     def shown(self) -> dict[str, str]:
@@ -191,7 +191,7 @@ _COUNTED = (tc.LAST_STEP_VEHICLE_NUMBER, tc.LAST_STEP_VEHICLE_HALTING_NUMBER)
 def _connected(
     port: int, host: str, process: subprocess.Popen[bytes] | None, patience_s: float
 ) -> Any:
-    """A connection of its own, outside of traci's pool, which belongs to the user."""
+    """Return a connection outside of traci's pool, which belongs to the user."""
     connect: Callable[..., Any] = traci.connect
     until = time.monotonic() + patience_s
     while True:
@@ -209,18 +209,18 @@ def _connected(
 
 
 class StartedSumo:
-    """Runs a scenario in ``sumo --remote-port``, from entering the block to leaving it.
+    """Scenario in a ``sumo --remote-port`` that runs while its block does.
 
     SUMO ends when its one client hangs up, or (under Linux) when this process dies before.
 
     Args:
-        scenario: What to run, in its domain.
+        scenario: The scenario, in its domain.
         seed: SUMO's seed.
-        port: Where it listens; None for a free port.
+        port: Port to listen on; None for a free one.
 
     Attributes:
-        port: Where it listens.
-        process: The process.
+        port: Its port.
+        process: Its process.
 
     Raises:
         OptionError: The scenario's lights turn green late, which SUMO does not do by itself.

@@ -11,23 +11,24 @@ from ugat_marl.field.street import LaneCount
 
 _MAY_BE_ENDLESS = ("frozen_after_s", "silent_after_s", "over_capacity")
 _FULL = 0.8
-"""Share of its capacity from which a lane may be full: as many come as leave, or nobody can."""
+"""Share of its capacity from which a lane may be full, so that its count may stand still."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """From when on counts and policy are not believed, and for how long.
+    """Limits beyond which counts and policy are not trusted.
 
     Attributes:
-        answer_ms: Within so many ms of reading the counts every light has its plan.
-        reserve_ms: Part of that kept for what follows the policy; the policy has the rest.
+        answer_ms: Time from reading the counts until every light has its plan, ms.
+        reserve_ms: Part of it that is kept for the steps after the policy; the policy has the rest.
         stale_after_s: Counts older than this are not used.
-        frozen_after_s: A lane whose count, not 0, stands still for so long while it has green; or
-            all counts, whatever the lights show. A queue at red is still, and so is a full lane.
-        silent_after_s: A lane that counts nobody for so long, after it has counted somebody and
-            while others move; inf where roads are empty for hours.
-        over_capacity: More than so many times the vehicles that fit on the lane is absurd; not 1,
-            since motorcycles need less room than what the capacity is counted in.
+        frozen_after_s: Time after which an unchanged count, not 0, of a lane with green is a fault,
+            and after which unchanged counts of all lanes are. Queues at red do not move, nor do
+            full lanes.
+        silent_after_s: Time after which a lane that counts no vehicle is at fault, if it has
+            counted one before and others move; inf where roads are empty for hours.
+        over_capacity: Multiple of the vehicles that fit on a lane from which a count is absurd; not
+            1, since motorcycles need less room than the vehicles that capacity is counted in.
         return_after: Good decisions in a row before the policy drives a light again.
         green_s: Time of a phase of the fixed-time plan, s, its clearance included.
     """
@@ -54,12 +55,12 @@ class Limits:
 
 
 class Watchdog:
-    """Looks at the counts of every decision.
+    """Check of the counts of every decision.
 
     Args:
         capacity: Lane that must be counted to the vehicles that fit on it.
         halting: Whether the number of standing vehicles must be known as well.
-        limits: What is believed.
+        limits: Limits of trust.
     """
 
     def __init__(self, capacity: Mapping[str, float], halting: bool, limits: Limits) -> None:
@@ -75,12 +76,12 @@ class Watchdog:
     def faults(
         self, counts: Mapping[str, LaneCount], now_s: float, held: Collection[str] = ()
     ) -> dict[str, str]:
-        """Lanes that are not to be believed, and why: ``<kind>: <details>``.
+        """Return the lanes whose counts are not trusted, and why: ``<kind>: <details>``.
 
         Args:
-            counts: What was read.
+            counts: The counts.
             now_s: The street's clock.
-            held: Lanes that had no green since the last look: nobody could leave them.
+            held: Lanes without green since the last look, which no vehicle could leave.
         """
         found: dict[str, str] = {}
         elapsed, self._looked_s = now_s - self._looked_s, now_s

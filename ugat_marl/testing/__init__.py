@@ -1,4 +1,4 @@
-"""The conformance kit: is an environment, a policy or a scenario what the suite takes it to be?
+"""Conformance kit: checks of environments, policies and scenarios against the suite's rules.
 
 ``check_...`` run all checks and return their results; ``..._CHECKS`` are the checks one by one. A
 check is a function of a case that raises `ConformanceError`; `report` shows results.

@@ -64,7 +64,7 @@ class Episode:
 
 
 class EnvironmentCase:
-    """An environment under examination; what several checks need is done once.
+    """Environment under examination; work that several checks need is done once.
 
     Args:
         make_env: Makes the environment.
@@ -83,7 +83,7 @@ class EnvironmentCase:
         self._failed = False
 
     def make(self) -> AnyParallelEnv:
-        """A new environment, which `tidy` closes."""
+        """Return a new environment, which `tidy` closes."""
         env = self._make_env()
         self._made.append(env)
         return env
@@ -108,7 +108,7 @@ class EnvironmentCase:
         return self._episode
 
     def need_episode(self) -> None:
-        """For checks that make no sense where no episode can be run.
+        """Skip a check where no episode can be run.
 
         Raises:
             NotChecked: It cannot.
@@ -183,13 +183,13 @@ def play(
 
 
 def begin(env: AnyParallelEnv, seed: int | None) -> Moment:
-    """Resets."""
+    """Reset the environment."""
     given = env.reset() if seed is None else env.reset(seed=seed)
     return _moment(env, ("observations", "infos"), given, None)
 
 
 def proceed(env: AnyParallelEnv, actions: Actions) -> Moment:
-    """Steps."""
+    """Step the environment."""
     return _moment(env, PARTS, env.step(dict(actions)), dict(actions))
 
 

@@ -19,7 +19,7 @@ Answers = list[Mapping[str, Any]]
 
 
 class PolicyCase(EnvironmentCase):
-    """A policy under examination, and an episode (of other actions) for it to answer to.
+    """Policy under examination, and an episode (of other actions) for it to answer to.
 
     Args:
         policy: The policy.
@@ -63,7 +63,7 @@ class PolicyCase(EnvironmentCase):
         return self._again
 
     def need_repeatable(self) -> None:
-        """For checks that make no sense where the policy does not repeat its answers.
+        """Skip a check where the policy does not repeat its answers.
 
         Raises:
             NotChecked: It does not.
@@ -86,7 +86,7 @@ class PolicyCase(EnvironmentCase):
         return found
 
     def actions(self, agent: str) -> int:
-        """Number of actions of an agent."""
+        """Return the number of actions of an agent."""
         return int(getattr(self.fresh.action_space(agent), "n", 0))
 
 

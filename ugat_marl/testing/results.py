@@ -24,7 +24,7 @@ class NotChecked(ConformanceError):
 
 @dataclass(frozen=True)
 class Result:
-    """The outcome of one check.
+    """Outcome of one check.
 
     Attributes:
         name: Name of the check's function.
@@ -49,7 +49,7 @@ AnyCase = TypeVar("AnyCase", bound=Closing)
 
 
 class Listening:
-    """Keeps what a foreign subject raises in its body, whatever it is; Ctrl-C goes on.
+    """Context that keeps any exception raised by a foreign subject in its body, but Ctrl-C.
 
     Attributes:
         error: The exception, or None.
@@ -87,7 +87,7 @@ def run_checks(checks: Sequence[Callable[[AnyCase], None]], case: AnyCase) -> li
 
 
 def said(error: BaseException) -> str:
-    """An exception in one line: our own by their message, others with kind and place."""
+    """Return an exception in one line: our own by message, others with type and place."""
     if isinstance(error, UgatMarlError):
         return str(error)
     frames = traceback.extract_tb(error.__traceback__)
@@ -102,12 +102,12 @@ def require(condition: object, message: str) -> None:
 
 
 def failures(results: Sequence[Result]) -> list[Result]:
-    """The checks that did not pass, those that could not be made included."""
+    """Return the checks that did not pass, including those that could not be made."""
     return [result for result in results if not result.passed]
 
 
 def report(results: Sequence[Result]) -> Text:
-    """One line per check and a count, for `rich` to print (`.plain` is the bare text)."""
+    """Return one line per check and a count, for `rich` to print (`.plain` is the text)."""
     words = {
         True: ("ok     ", "green"),
         False: ("FAILED ", "bold red"),

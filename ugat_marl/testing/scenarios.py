@@ -29,7 +29,7 @@ Change = Callable[[Scenario, str], Scenario]
 
 
 class ScenarioCase:
-    """A scenario under examination.
+    """Scenario under examination.
 
     Args:
         name: As for `ugat_marl.load_scenario`.
@@ -75,13 +75,13 @@ class ScenarioCase:
         return self._once("_demand", "its routes do not exist")
 
     def in_domain(self, domain: str) -> Scenario:
-        """The scenario in a domain."""
+        """Return the scenario in a domain."""
         if domain not in self._domains:
             self._domains[domain] = self._change(self.scenario, domain)
         return self._domains[domain]
 
     def need_demand(self) -> None:
-        """For checks that simulate.
+        """Skip a check that simulates where demand or network are broken.
 
         Raises:
             NotChecked: The scenario cannot be simulated.
@@ -97,7 +97,7 @@ class ScenarioCase:
         return found
 
     def environment(self, scenario: Scenario) -> TrafficEnv:
-        """An environment of the scenario as it is."""
+        """Return an environment of the scenario as it is."""
         env = parallel_env(scenario)
         self._envs.append(env)
         return env
@@ -169,7 +169,7 @@ def _foes(scenario: Scenario) -> dict[str, list[int]]:
 
 
 def its_routes_exist(case: ScenarioCase) -> None:
-    """All routes use edges of the network, and somebody departs."""
+    """All routes use edges of the network, and some vehicle departs."""
     require(case.demand.vehicles or case.demand.flows, "nobody departs within the episode")
 
 
@@ -201,7 +201,7 @@ def _routes(root: ET.Element) -> list[tuple[str, list[str]]]:
 
 
 def vehicles_enter_early(case: ScenarioCase) -> None:
-    """Somebody enters within the first tenth of the episode."""
+    """Some vehicle enters within the first tenth of the episode."""
     case.need_demand()
     decisions = max(1, case.scenario.decisions // 10)
     seconds = decisions * case.scenario.control.decision_interval_s

@@ -1,4 +1,4 @@
-"""A small environment without SUMO that keeps every rule of `ugat_marl.testing`.
+"""Small environment without SUMO that keeps every rule of `ugat_marl.testing`.
 
 For fast tests of learners and wrappers, and the good subject that the kit's own tests break in one
 place each. Unequal intersections: queues grow by random arrivals, the green phase serves its lanes.
@@ -84,17 +84,17 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         self._scores: Scores | None = None
 
     def observation_space(self, agent: str) -> Box:
-        """The space of an agent's observations."""
+        """Return the space of an agent's observations."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Discrete:
-        """The space of an agent's actions."""
+        """Return the space of an agent's actions."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
-        """Empties the roads."""
+        """Empty the roads."""
         if seed is not None:
             self._generator = np.random.default_rng(seed)
         self._traffic = np.random.default_rng(int(self._generator.integers(2**31)))
@@ -142,19 +142,19 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         return result
 
     def state(self) -> NDArray[np.float32]:
-        """All observations, one after the other."""
+        """Return all observations, one after the other."""
         if not hasattr(self, "_queue"):
             raise EpisodeError("state() has no meaning before the first reset()")
         return np.concatenate(list(self._vectors().values()))
 
     def scores(self) -> Scores:
-        """The measures of the episode that has ended; times are counted in decisions."""
+        """Return the measures of the episode that has ended; times are counted in decisions."""
         if self._scores is None:
             raise EpisodeError("scores() needs a whole episode")
         return self._scores
 
     def render(self) -> NDArray[np.uint8]:
-        """The queues as bars of pixels."""
+        """Return the queues as bars of pixels."""
         lanes = np.concatenate(list(self._queue.values()))
         bars = np.arange(CAPACITY)[:, None] >= lanes[None, :]
         return np.repeat(np.where(bars, 255, 0).astype(np.uint8)[..., None], 3, axis=2)

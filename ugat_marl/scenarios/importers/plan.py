@@ -74,7 +74,7 @@ class Plan:
         return math.degrees(math.atan2(end.y - start.y, end.x - start.x))
 
     def exits(self, approach: Road) -> dict[str, Road]:
-        """The road behind each turn (``l``, ``s``, ``r``) at the end of `approach`."""
+        """Return the road after each turn (``l``, ``s``, ``r``) at the end of `approach`."""
         found: dict[str, Road] = {}
         for road in self.roads.values():
             if road.start != approach.end or road.end == approach.start:
