@@ -22,12 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 import ugat_marl.experiments.transfers as transfer_module
-<<<<<<< 9de2347
-import ugat_marl.grounding.ugat as ugat_module
 from studies.bench.learning_program import Noise
-=======
-from studies.bench.learning_episodes import Noise
->>>>>>> 18bc32a
 from ugat_marl.__main__ import main
 from ugat_marl.data import SETTINGS as SETTINGS_FILE
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
