@@ -3,7 +3,7 @@
 #   make demo       trains a policy across the gap on a shipped network and prints the table
 #   make test       builds the wheel, installs it into .venv and tests it
 #   make test-all   the same, and small versions of the paper's tables (an hour)
-#   make check      format, lint, types, architecture, tests
+#   make check      format, lint, types, architecture, words, tests
 #   make compat     the learners of other libraries: what runs where (LATEST=1: their newest releases)
 #   make bench      the figures of docs/, measured on this machine
 #   make scenarios  builds the shipped scenarios again from their sources
@@ -51,7 +51,7 @@ test-all: environment-dev
 check: static
 	@$(MAKE) --no-print-directory test
 
-static: format lint types architecture
+static: format lint types architecture words
 
 format: environment-dev
 	$(BIN)/python -m ruff format --check .

@@ -40,7 +40,7 @@ PROBE_DEV = "import hatchling, hypothesis, osmium, pytest, pytest_timeout, sklea
 
 
 class Record(TypedDict):
-    """What lies in `.venv`: where it was made, from which files, with which extras."""
+    """Contents of `.venv`: where it was made, from which files, with which extras."""
 
     root: str
     requirements: str
@@ -150,7 +150,7 @@ def create() -> None:
 
 
 def build_requirements() -> list[str]:
-    """What pyproject.toml asks for to build the wheel."""
+    """Return what pyproject.toml asks for to build the wheel."""
     with (ROOT / "pyproject.toml").open("rb") as file:
         return tomllib.load(file)["build-system"]["requires"]
 
@@ -181,13 +181,13 @@ def replace_package(wheel: Path) -> None:
 
 
 def runs() -> bool:
-    """Whether `.venv` holds a Python that starts, is new enough and has pip."""
+    """Return whether `.venv` holds a Python that starts, is new enough and has pip."""
     check = f"import pip, sys; sys.exit(sys.version_info < {OLDEST})"
     return PYTHON.exists() and run(PYTHON, "-c", check, quiet=True)
 
 
 def imports(goal: Record, *, quiet: bool) -> bool:
-    """Whether what was installed can be imported."""
+    """Return whether what was installed can be imported."""
     probe = PROBE + (PROBE_DEV if "dev" in goal["extras"] else "")
     return run(PYTHON, "-P", "-c", probe, quiet=quiet)
 

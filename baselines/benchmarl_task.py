@@ -111,7 +111,7 @@ class TrafficTask(TaskClass):
 
     @staticmethod
     def env_name() -> str:
-        """Where the task comes from."""
+        """Return the name of the package the task comes from."""
         return "ugat_marl"
 
     def get_env_fun(
@@ -145,15 +145,15 @@ class TrafficTask(TaskClass):
         return Composite({"state": env.observation_spec["state"].clone()})
 
     def observation_spec(self, env: Any) -> Any:
-        """What agents see."""
+        """Return the spaces of observations."""
         return self._only(env, "observation")
 
     def action_mask_spec(self, env: Any) -> Any:
-        """What they may do."""
+        """Return the spaces of action masks."""
         return self._only(env, "action_mask")
 
     def info_spec(self, env: Any) -> Any:
-        """What else is told; nothing here learns from it."""
+        """Return None: nothing here learns from infos."""
         return None
 
     def action_spec(self, env: Any) -> Any:
@@ -274,7 +274,7 @@ class BenchMARL(LibraryLearner):
         self._explorer().step(len(played))
 
     def _explorer(self) -> Any:
-        """What replaces greedy actions by random ones."""
+        """Return the module that replaces greedy actions by random ones."""
         return self._experiment.group_policies[_GROUP][-1]
 
     def _actors(self) -> Sequence[Sequence[nn.Linear]]:

@@ -1,4 +1,4 @@
-"""Which learner runs where: equal and unequal intersections, with and without masks, on roads.
+"""Matrix of learners and environments: equal and unequal intersections, with and without masks, on roads.
 
 Every learner trains a little in each of the environments below, in a process of its own, so that
 one that hangs or dies says so and harms no other. The matrix has what was found, the versions it
@@ -121,7 +121,7 @@ def tried(learner: str, column: str) -> str:
 
 
 def in_a_process(learner: str) -> dict[str, str]:
-    """What a learner does in each environment."""
+    """Train a learner in each environment and return what came of it."""
     command = [sys.executable, "-P", __file__, "--only", learner]
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
     try:

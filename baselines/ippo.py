@@ -110,7 +110,7 @@ def gae(rewards: Tensor, values: Tensor, discount: float, gae_lambda: float) -> 
 
 
 class Decision(NamedTuple):
-    """What actor and critic saw, what was chosen, what came of it; all ``(agents, ...)``."""
+    """A decision of all agents: inputs, choice and outcome, all ``(agents, ...)``."""
 
     observation: Tensor
     viewed: Tensor
@@ -230,7 +230,7 @@ class IPPO:
         return {"return": total} | told
 
     def _look(self, env: Env, observations: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """What the actors see, and what the critics see, scaled by all they have seen so far."""
+        """Return the inputs of actors and critics, scaled by all they have seen so far."""
         rows = self.agents.stack(observations)
         self._seen.note(rows, places(self.agents))
         seen = torch.from_numpy(rows * self._seen.factors)
@@ -241,7 +241,7 @@ class IPPO:
         return seen, torch.from_numpy(state * self._stated.factors).expand(len(self.agents), -1)
 
     def _log_probabilities(self, seen: Tensor, allowed: Tensor) -> Tensor:
-        """Of all actions; one that is not allowed has probability 0."""
+        """Return the log-probabilities of all actions; a forbidden one has probability 0."""
         return self._actor(seen).masked_fill(~allowed, -1e8).log_softmax(-1)
 
     def _draw(self, seen: Tensor, allowed: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:

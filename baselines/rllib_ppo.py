@@ -80,16 +80,16 @@ class Spaces:
         """Nothing is open."""
 
     def observation_space(self, agent: str) -> Any:
-        """What the agent would see."""
+        """Return the space of what the agent sees."""
         return self.observations[agent]
 
     def action_space(self, agent: str) -> Any:
-        """What it could do."""
+        """Return the space of its actions."""
         return self.actions[agent]
 
 
 class Seat(ParallelPettingZooEnv):
-    """Where RLlib's runner expects its environment; `par_env` changes with each call of `learn`."""
+    """Place where RLlib's runner expects its environment; `par_env` changes with each call of `learn`."""
 
     def __init__(self, context: Mapping[str, Any]) -> None:
         super().__init__(context["spaces"])
@@ -199,7 +199,7 @@ class RLlib(LibraryLearner):
         self._give_weights()
 
     def _give_weights(self) -> None:
-        """What plays gets the weights of what learns."""
+        """Copy the weights of the learning modules into the playing ones."""
         with torch.no_grad():
             for group in set(self._groups.values()):
                 learned = self._learner.module[group].unwrapped().state_dict()

@@ -99,7 +99,7 @@ class TorchRLMAPPO(LibraryLearner):
         self._adam = torch.optim.Adam(self._loss.parameters(), lr=config.learning_rate, eps=1e-5)
 
     def _parts(self) -> tuple[Any, Any]:
-        """What acts, and the loss."""
+        """Return the acting module and the loss."""
         config, logits = self.config, (_GROUP, "logits")
         policy = ProbabilisticActor(
             TensorDictModule(self._actor, [(_GROUP, "observation")], [logits]),

@@ -27,7 +27,7 @@ BESIDE = ("there", "*matched*")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a way to come to a policy has in one domain.
+    """Outcome of one setting in one domain.
 
     Attributes:
         att_s: Travel time there in s, mean over training seeds.

@@ -112,14 +112,14 @@ OF_THE_RUN = frozenset(
 
 
 class NotInstalled(Exception):
-    """What a part needs is not there."""
+    """Something that a part needs is not installed."""
 
 
 # --- episodes -----------------------------------------------------------------------------------
 
 
 class Watched:
-    """What is seen of an episode: bytes into digests, sums into lists.
+    """Record of an episode: bytes into digests, sums into lists.
 
     Args:
         label: What its values are called.
