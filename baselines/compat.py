@@ -1,4 +1,4 @@
-"""Matrix of learners and environments: equal and unequal intersections, with and without masks, on roads.
+"""Matrix of learners and environments: equal and unequal intersections, masks, real roads.
 
 Every learner trains a little in each of the environments below, in a process of its own, so that
 one that hangs or dies says so and harms no other. The matrix has what was found, the versions it

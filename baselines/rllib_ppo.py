@@ -89,7 +89,7 @@ class Spaces:
 
 
 class Seat(ParallelPettingZooEnv):
-    """Place where RLlib's runner expects its environment; `par_env` changes with each call of `learn`."""
+    """Environment in the form RLlib's runner wants; `par_env` changes with each `learn`."""
 
     def __init__(self, context: Mapping[str, Any]) -> None:
         super().__init__(context["spaces"])
