@@ -16,7 +16,7 @@ from .gap_tables import hidden_tables as hidden_tables
 from .gap_tables import matrix_table as matrix_table
 from .learning_curves import curves_as_csv as curves_as_csv
 from .learning_curves import curves_page as curves_page
-from .network_drawing import draw as draw
+from .phase_diagrams import draw_network as draw_network
 from .run_records import RunRecord as RunRecord
 from .run_records import TableRecord as TableRecord
 from .run_records import read_records as read_records

@@ -14,7 +14,7 @@ from typing import Any
 
 LIGHT = {
     "paper": "#ffffff", "ink": "#1b2430", "soft": "#5a6675", "line": "#d9dfe6",
-    "card": "#f5f7f9", "road": "#d3d9e1",
+    "card": "#f5f7f9", "road": "#d3d9e1", "stop": "#b4bcc6",
     "c0": "#0072b2", "c1": "#d55e00", "c2": "#009e73", "c3": "#cc79a7", "c4": "#1c2430",
     "c5": "#7711dd",
     "q0": "#eaf1f8", "q1": "#c9ddf0", "q2": "#9dc4e3", "q3": "#63a3d0", "q4": "#3580bb",
@@ -25,7 +25,7 @@ LIGHT = {
 """Colours of light pages and of files, each used by one name alone."""
 DARK = {
     "paper": "#12161b", "ink": "#e5eaf0", "soft": "#9ba8b6", "line": "#2d3640",
-    "card": "#1a2027", "road": "#333d48",
+    "card": "#1a2027", "road": "#333d48", "stop": "#5a6672",
     "c0": "#56b4e9", "c1": "#f0833a", "c2": "#2fc79b", "c3": "#e3a3c6", "c4": "#e5eaf0",
     "c5": "#bb33ee",
     "q0": "#1d2a38", "q1": "#1f3f5f", "q2": "#21578a", "q3": "#3176b5", "q4": "#5f9cd3",

@@ -1,4 +1,4 @@
-"""Every intersection with its phases, as SVG and PNG, for people with any eyesight."""
+"""The network and every intersection with its phases, as SVG and PNG."""
 
 from __future__ import annotations
 
@@ -12,32 +12,38 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.files import replacing
 from ugat_marl.progress import Reporter
+from ugat_marl.reporting.figures import Picture, printable, shortened
+from ugat_marl.reporting.style import LIGHT, styled
 from ugat_marl.scenarios import Intersection, Link, Network, Scenario
 
-# Okabe and Ito's colours, which stay apart for every kind of colour blindness; line styles say the
-# same again for those who print in black and white.
 STYLES: dict[str, tuple[str, Literal["solid", "dashed", "dotted"], str]] = {
-    "G": ("#0072B2", "solid", "protected green"),
-    "g": ("#D55E00", "dashed", "permitted: lets others pass"),
-    "s": ("#CC79A7", "dotted", "on red after a stop"),
-    "r": ("#b4bcc6", "solid", "red"),
+    "G": (LIGHT["c0"], "solid", "protected green"),
+    "g": (LIGHT["c1"], "dashed", "permitted: lets others pass"),
+    "s": (LIGHT["c3"], "dotted", "on red after a stop"),
+    "r": (LIGHT["stop"], "solid", "red"),
 }
-_ROAD, _INK, _WALK = "#e9edf1", "#1b2430", "#009E73"
+"""Colour, line and meaning of each signal; lines say the same again in black and white."""
+_ROAD, _INK, _WALK = LIGHT["line"], LIGHT["ink"], LIGHT["c2"]
 _COLUMNS, _PER_PAGE = 4, 15
 _PANEL_IN = 2.45
 _ARM_M = 16.0
-_UNDER_TEXT = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+_UNDER_TEXT = {
+    "boxstyle": "round,pad=0.1",
+    "facecolor": LIGHT["paper"],
+    "edgecolor": "none",
+    "alpha": 0.8,
+}
 _NAMED = 80
 """With more intersections than this the overview leaves out their names."""
 
 
-def draw(scenario: Scenario, out: Path, reporter: Reporter) -> list[Path]:
-    """Draws the network of a scenario and all its intersections.
+@styled()
+def draw_network(scenario: Scenario, out: Path, reporter: Reporter) -> list[Path]:
+    """Draw the network of a scenario and all its intersections.
 
     Args:
-        scenario: What to draw.
+        scenario: The scenario.
         out: Folder to write to: ``network`` and a picture for every intersection (several if it has
             more than 15 phases), each as ``.svg`` and ``.png``.
         reporter: Shows progress.
@@ -51,19 +57,19 @@ def draw(scenario: Scenario, out: Path, reporter: Reporter) -> list[Path]:
     """
     network = Network.read(scenario)
     walks = _crossing_shapes(scenario)
-    written = _save(_overview(network, scenario.id), out / "network")
+    written = _overview(network, scenario.id).write(out)
     taken = {"network"}
     with reporter.task("drawing intersections", len(network.intersections)) as advance:
-        for item in network.intersections:
-            name = _file_name(item.id, taken)
-            place = _Place(item, network, walks, _frame(item, network))
+        for intersection in network.intersections:
+            name = _file_name(intersection.id, taken)
+            place = _Place(intersection, network, walks, _frame(intersection, network))
+            count = len(intersection.phases)
             pages = [
-                range(first, min(first + _PER_PAGE, len(item.phases)))
-                for first in range(0, len(item.phases), _PER_PAGE)
+                range(first, min(first + _PER_PAGE, count)) for first in range(0, count, _PER_PAGE)
             ]
             for number, phases in enumerate(pages, 1):
                 page = f"{name}-{number}" if len(pages) > 1 else name
-                written += _save(_sheet(place, scenario.id, phases), out / page)
+                written += _sheet(page, place, scenario.id, phases).write(out)
             advance()
     return written
 
@@ -102,42 +108,25 @@ def _file_name(tls: str, taken: set[str]) -> str:
     return name
 
 
-def _save(figure: Any, path: Path) -> list[Path]:
-    from matplotlib import rc_context
-
-    files = [path.with_name(f"{path.name}{suffix}") for suffix in (".svg", ".png")]
-    for file in files:
-        # Text stays text in the SVG, and the same drawing gives the same bytes.
-        with (
-            replacing(file) as temporary,
-            rc_context({"svg.fonttype": "none", "svg.hashsalt": "u"}),
-        ):
-            kind = file.suffix[1:]
-            figure.savefig(
-                temporary, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else None
-            )
-    return files
-
-
-def _figure(width_in: float, height_in: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def _picture(name: str, title: str, width_in: float, height_in: float) -> Picture:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width_in, height_in), facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
+    picture = Picture(name, title, Figure(figsize=(width_in, height_in)))
+    picture.figure.text(
+        0.02, 1 - 0.1 / height_in, printable(title), size=12, va="top", weight="bold"
+    )  # fmt: skip
+    return picture
 
 
-def _sheet(place: _Place, title: str, phases: range) -> Any:
+def _sheet(name: str, place: _Place, scenario: str, phases: range) -> Picture:
     """The plan of an intersection and its phases, four panels in a row."""
     item = place.item
     rows = math.ceil((len(phases) + 1) / _COLUMNS)
     columns = min(_COLUMNS, len(phases) + 1)
     width = max(columns, 3) * _PANEL_IN
     height = rows * (_PANEL_IN + 0.35) + 1.0
-    figure = _figure(width, height)
-    figure.text(0.02, 1 - 0.12 / height, f"{title}: {_short(item.id, 40)}", size=12, va="top",
-                color=_INK, weight="bold")  # fmt: skip
+    picture = _picture(name, f"{scenario}: {shortened(item.id, 40)}", width, height)
+    figure = picture.figure
     figure.text(0.02, 1 - 0.42 / height, _caption(item), size=8.5, va="top", color=_INK)
     for panel in range(len(phases) + 1):
         row, column = divmod(panel, _COLUMNS)
@@ -146,14 +135,14 @@ def _sheet(place: _Place, title: str, phases: range) -> Any:
         axes = figure.add_axes((left, bottom, 0.92 / max(columns, 3), _PANEL_IN * 0.92 / height))
         _roads(axes, place)
         if panel == 0:
-            axes.set_title("plan: roads, and the letters of their links", size=7.5, color=_INK)
+            axes.set_title("plan: roads, and the numbers of their links", size=7.5, loc="center")
             _names(axes, place)
             continue
         state = item.phases[phases[panel - 1]]
-        axes.set_title(f"phase {phases[panel - 1]}", size=9, color=_INK, weight="bold")
+        axes.set_title(f"phase {phases[panel - 1]}", size=9, weight="bold", loc="center")
         _ways(axes, place, state)
     _legend(figure, item, height)
-    return figure
+    return picture
 
 
 def _caption(item: Intersection) -> str:
@@ -304,10 +293,8 @@ def _names(axes: Any, place: _Place) -> None:
         point = np.clip(point, [left + 0.17 * width, bottom + 0.05 * height],
                         [left + 0.83 * width, bottom + 0.95 * height])  # fmt: skip
         indices = sorted({link.index for link in item.links if link.from_edge == edge})
-        axes.text(
-            *point, f"{_short(edge, 16)}\n{_ranges(indices)}", size=6.5, ha="center", va="center",
-            color=_INK, bbox=_UNDER_TEXT, zorder=6,
-        )  # fmt: skip
+        text = f"{printable(shortened(edge, 16))}\n{_ranges(indices)}"
+        axes.text(*point, text, size=6.5, ha="center", va="center", bbox=_UNDER_TEXT, zorder=6)
     for link in item.links:
         _arrow(axes, _curve(link, network), "r")
     _crossings(axes, place)
@@ -324,11 +311,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return ", ".join(f"{p[0]}-{p[-1]}" if len(p) > 1 else f"{p[0]}" for p in parts)
 
 
-def _short(text: str, most: int) -> str:
-    return text if len(text) <= most else f"{text[: most - 1]}…"
-
-
-def _overview(network: Network, title: str) -> Any:
+def _overview(network: Network, scenario: str) -> Picture:
     """The whole network with the names of its agents."""
     from matplotlib.collections import LineCollection
 
@@ -337,25 +320,24 @@ def _overview(network: Network, title: str) -> Any:
     width, height = np.maximum(high - low, 1.0)
     wide = 9.0
     tall = float(np.clip(wide * height / width, 3.0, 12.0))
-    figure = _figure(wide, tall + 0.5)
-    axes = figure.add_axes((0.01, 0.01, 0.98, tall / (tall + 0.5) - 0.02))
+    count = len(network.intersections)
+    picture = _picture("network", f"{scenario}: {count} agents", wide, tall + 0.5)
+    axes = picture.figure.add_axes((0.01, 0.01, 0.98, tall / (tall + 0.5) - 0.02))
     axes.set_aspect("equal", adjustable="datalim")
     axes.axis("off")
-    axes.add_collection(LineCollection(shapes, colors="#aab4c0", linewidths=1.0))
+    axes.add_collection(LineCollection(shapes, colors=LIGHT["stop"], linewidths=1.0))
     axes.set_xlim(low[0] - 0.02 * width, high[0] + 0.02 * width)
     axes.set_ylim(low[1] - 0.02 * height, high[1] + 0.02 * height)
     places = np.array([item.position for item in network.intersections])
     axes.plot(*places.T, "o", color=STYLES["G"][0], markersize=6, zorder=3)
-    figure.text(0.02, 1 - 0.1 / (tall + 0.5), f"{title}: {len(places)} agents", size=12, va="top",
-                color=_INK, weight="bold")  # fmt: skip
-    if len(places) <= _NAMED:
+    if count <= _NAMED:
         for item in network.intersections:
             axes.annotate(
-                _short(item.id, 18), item.position, xytext=(5, 5), textcoords="offset points",
+                shortened(item.id, 18), item.position, xytext=(5, 5), textcoords="offset points",
                 size=7.5, color=_INK, zorder=4,
                 bbox=_UNDER_TEXT,
             )  # fmt: skip
-    return figure
+    return picture
 
 
 def _bounds(
