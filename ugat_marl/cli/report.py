@@ -26,7 +26,7 @@ _FLAT = ("ugat",)
 
 @dataclass(frozen=True)
 class Report:
-    """Puts trainings on one page of HTML that needs no network: open it, print it, send it.
+    """Put trainings on one page of HTML that needs no network: open it, print it, send it.
 
     Folders of `ugat-marl train`, jobs and tables of `ugat-marl paper`, or folders of these. A
     training may be under way or broken; the page says what is missing.
@@ -57,7 +57,7 @@ class Report:
     ] = None
 
     def run(self, console: Console) -> int:
-        """Reads, writes the page, says what is missing."""
+        """Read the folders, write the page, and say what is missing."""
         if not self.runs:
             raise OptionError("name at least one folder of a run, such as runs/first")
         records = read_records(self.runs)
@@ -79,7 +79,7 @@ class Report:
 
 
 def again(record: RunRecord | TableRecord) -> list[str]:
-    """How to run something again, and what to do with it next."""
+    """Return the commands that run something again, and what to do with it next."""
     if isinstance(record, TableRecord):
         return [record.command] if record.command else []
     folder = str(record.directory)

@@ -134,7 +134,7 @@ def _heldout(heldout: Record) -> list[tuple[str, str]]:
 
 
 def _changed(record: Record, table: str, before: str, after: str) -> bool:
-    """Whether there is a model beside the scenario as it is."""
+    """Return whether there is a model beside the scenario as it is."""
     return any(row[before] != row[after] for row in record.get(table) or ())
 
 

@@ -38,7 +38,7 @@ MEANINGS = {
 
 
 def meaning(record: Record) -> str:
-    """What the verdict means; of a search that was cut short the sentence says it all."""
+    """Return the meaning of the verdict; nothing if the search was cut short."""
     if not record.get("complete", True):
         return ""
     text = MEANINGS.get(str(record["verdict"]), "")
@@ -48,23 +48,23 @@ def meaning(record: Record) -> str:
 
 
 def effect_name(item: Record) -> str:
-    """The name of an effect with spaces."""
+    """Return the name of an effect with spaces."""
     return str(item["name"]).replace("_", " ")
 
 
 def place(item: Record) -> str:
-    """Where an effect is."""
+    """Return the place of an effect."""
     where = item.get("place")
     return "everywhere" if where in (None, "*", "") else str(where).replace(">", " → ")
 
 
 def window(span: Sequence[float] | None) -> str:
-    """A stretch of time on the scenario's clock, as h:mm:ss."""
+    """Return a stretch of time on the scenario's clock, as h:mm:ss."""
     return "" if span is None else f"{clock(span[0])} – {clock(span[1])}"
 
 
 def values(item: Record, *, intervals: bool = True) -> str:
-    """The parameters of an effect, with their intervals if wanted."""
+    """Return the parameters of an effect, with their intervals if wanted."""
     found = [_parameter(name, given, intervals) for name, given in item["parameters"].items()]
     return "; ".join(found) or "as such"
 
@@ -87,7 +87,7 @@ def _rounded(value: float, width: float) -> str:
 
 
 def disagreement_place(item: Record) -> str:
-    """Where data and model disagree: the narrowest place that is known."""
+    """Return the narrowest place that is known of a disagreement."""
     for key in ("lane", "approach", "tls"):
         if item.get(key) is not None:
             return str(item[key])
@@ -95,7 +95,7 @@ def disagreement_place(item: Record) -> str:
 
 
 def strongest(record: Record, count: int) -> list[Record]:
-    """The first disagreements by size, one per statistic and the broadest place first."""
+    """Return the first disagreements by size, one per statistic and the broadest place first."""
     found: list[Record] = []
     seen: set[str] = set()
     for item in record.get("where") or ():
@@ -107,7 +107,7 @@ def strongest(record: Record, count: int) -> list[Record]:
 
 
 def partial(record: Record) -> str | None:
-    """What to say of a diagnosis that is not complete; None if it is."""
+    """Return the warning that a diagnosis is not complete; None if it is."""
     if record.get("complete", True):
         return None
     untried = list(record.get("untried") or ())
@@ -120,7 +120,7 @@ def partial(record: Record) -> str | None:
 
 
 def geh_line(record: Record) -> str | None:
-    """What the usual criterion on counts says of the gap; None without counts."""
+    """Return the judgement of the usual criterion on counts; None without counts."""
     tables = record.get("courtesy") or {}
     before = (tables.get("before") or {}).get("geh_below_5")
     after = (tables.get("after") or {}).get("geh_below_5")
@@ -133,5 +133,5 @@ def geh_line(record: Record) -> str | None:
 
 
 def joined(names: Iterable[str]) -> str:
-    """Names as a list in a sentence."""
+    """Return names as a list in a sentence."""
     return ", ".join(str(name).replace("_", " ") for name in names)

@@ -1,4 +1,4 @@
-"""Controllers x gaps, and what a domain's objective measures, as tables of 80 columns."""
+"""Tables of 80 columns: controllers by gaps, and measures of a domain's objective."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ugat_marl.reporting.tables import number
 
 
 def matrix_table(found: Evaluation) -> RenderableType:
-    """What each gap costs each controller, and below it the travel time in every domain."""
+    """Return the cost of each gap for each controller, then travel times by domain."""
     gaps = gaps_of(found)
     first = found.domains[0]
     table = _table(f"{found.scenario}: what each gap costs each controller")
@@ -45,7 +45,7 @@ def matrix_table(found: Evaluation) -> RenderableType:
 
 
 def hidden_tables(found: Evaluation) -> list[RenderableType]:
-    """What domains with an objective measure beside the usual; nothing where none has one."""
+    """Return the measures of domains with an objective; nothing where none has one."""
     told = {result.domain for result in found.results if result.scores.hidden}
     domains = [domain for domain in found.domains if domain in told]
     if not domains:
@@ -76,7 +76,7 @@ _SHORT = {
 
 
 def _measured(found: Evaluation, domains: Sequence[str]) -> list[Table]:
-    """What the costs are made of, once for domains with the same traffic."""
+    """Parts of the costs, once for domains with the same traffic."""
     alike: dict[tuple[float, ...], list[str]] = {}
     for domain in domains:
         values = [

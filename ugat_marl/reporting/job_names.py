@@ -1,4 +1,4 @@
-"""What a job of ``ugat-marl paper`` is called in its tables, told by its settings alone."""
+"""Names of the jobs of ``ugat-marl paper`` in its tables, by their settings alone."""
 
 from __future__ import annotations
 

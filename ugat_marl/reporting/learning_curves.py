@@ -1,4 +1,4 @@
-"""What trainings reached on a scenario, beside rules: a page in Markdown, and a table of all."""
+"""Results of trainings on a scenario beside rules: a page in Markdown, and a table of all."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def curves_page(
     best: str,
     facts: Mapping[str, Any],
 ) -> str:
-    """What was reached on a scenario, as Markdown.
+    """Return the results on a scenario as Markdown.
 
     Args:
         scenario: Its id.

@@ -34,7 +34,7 @@ class Grid:
 
     @property
     def many(self) -> bool:
-        """Whether the table has many columns."""
+        """True if the table has many columns."""
         return len(self.headings) > _MANY
 
 

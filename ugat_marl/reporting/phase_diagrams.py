@@ -80,7 +80,7 @@ Frame = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class _Place:
-    """What is drawn again and again on a sheet."""
+    """An intersection with all that each panel of a sheet shows."""
 
     item: Intersection
     network: Network

@@ -39,7 +39,7 @@ class Group:
 
 
 def groups(records: Sequence[RunRecord]) -> list[Group]:
-    """All groups with more than one training."""
+    """Return all groups with more than one training."""
     found: list[Group] = []
     for own in _parted(records, _common).values():
         trials, left_out = _trials(own)
@@ -58,7 +58,7 @@ def groups(records: Sequence[RunRecord]) -> list[Group]:
 
 
 def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
-    """Trainings that differ in nothing but their seed, whose curves are drawn as one."""
+    """Return trainings that differ in nothing but their seed, whose curves are drawn as one."""
     return list(
         _parted(records, lambda r: (*_common(r), r.real, _ugat(r), job_name(r.settings))).values()
     )
@@ -83,7 +83,7 @@ def _parted(records: Iterable[RunRecord], key: Any) -> dict[Any, list[RunRecord]
 
 
 def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], tuple[str, ...]]:
-    """What was scored in both domains; and the names of records that were not."""
+    """Trials that were scored in both domains, and names of records that were not."""
     names = job_labels(records)
     trials: list[Trial] = []
     left_out: list[str] = []

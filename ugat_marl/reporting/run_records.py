@@ -1,4 +1,6 @@
-"""What folders of trainings hold, read as far as it can be: what is missing is named, never raised.
+"""Records of trainings, read from their folders as far as possible.
+
+Missing and broken files are named in the record; they raise nothing.
 
 A folder is one of three things: a run of ``ugat-marl train``, a job of ``ugat-marl paper``, or a
 finished table of it. A folder of such folders stands for all of them.
@@ -65,7 +67,7 @@ class RunRecord:
 
     @property
     def scenario(self) -> str:
-        """As its user named it; "" where that is not known."""
+        """Name that the user gave; "" if it is not known."""
         found = self.settings.get("scenario") or (self.evaluation and self.evaluation.scenario)
         return str(found or "")
 
@@ -94,16 +96,16 @@ class RunRecord:
 
     @property
     def finished(self) -> bool:
-        """Whether there is a final evaluation."""
+        """True if there is a final evaluation."""
         return self.evaluation is not None
 
     def series(self, stage: str, name: str) -> list[tuple[int, float]]:
-        """What was logged under a name, by episode or iteration; the last value of each counts."""
+        """Return the values logged under a name, the last of each episode or iteration."""
         rows = self.metrics.rows if self.metrics is not None else []
         return sorted({step: v for s, step, n, v in rows if (s, n) == (stage, name)}.items())
 
     def agents(self, name: str) -> dict[str, list[tuple[int, float]]]:
-        """The same per agent: what was logged of an iteration under ``name/agent``."""
+        """Return by agent the values logged by iteration under ``name/agent``."""
         found: dict[str, dict[int, float]] = {}
         for stage, step, key, value in self.metrics.rows if self.metrics is not None else []:
             if stage == "iteration" and key.startswith(f"{name}/"):
@@ -132,13 +134,13 @@ class TableRecord:
 
 @dataclass
 class _Reader:
-    """Reads files of one folder and keeps what went wrong."""
+    """A reader of the files of one folder, with a list of what went wrong."""
 
     directory: Path
     missing: list[str] = field(default_factory=list)
 
     def read(self, name: str, how: Callable[[Path], T], without: str) -> T | None:
-        """A file's content, or None and a sentence.
+        """Return a file's content, or None after noting a sentence.
 
         Args:
             name: Of the file.
@@ -160,7 +162,7 @@ class _Reader:
 
 
 def read_records(paths: Sequence[Path]) -> list[RunRecord | TableRecord]:
-    """Everything in the folders, in their order, each once.
+    """Return the records of all folders, in their order, each once.
 
     Raises:
         OptionError: A path is no folder, or nothing of the suite lies in it.
@@ -308,7 +310,7 @@ def _state(reader: _Reader) -> dict[str, int] | None:
 
 
 def _written(directory: Path) -> float:
-    """When the newest of the files that say how things stand was written."""
+    """Time at which the newest of the files that tell the state was written."""
     times: list[float] = []
     for name in (RUN, JOB, TABLE, SCORES, METRICS, f"{CHECKPOINT}/state.json"):
         with contextlib.suppress(OSError):

@@ -16,7 +16,7 @@ from ugat_marl.experiments import Estimate, Evaluation, Tuned
 
 
 def transfer_table(found: Evaluation) -> RenderableType:
-    """ATT of every policy in the simulation and the real domains, with gap and regret."""
+    """Return ATT of every policy in the simulation and the real domains, with gap and regret."""
     first, *others = found.domains
     table = Table(
         box=box.SIMPLE_HEAD,
@@ -44,7 +44,7 @@ def transfer_table(found: Evaluation) -> RenderableType:
 
 
 def measures_table(found: Evaluation) -> RenderableType:
-    """One block per domain: all measures, their intervals, and gaps against the first domain."""
+    """Return a block per domain: measures, intervals, and gaps against the first domain."""
     blocks: list[RenderableType] = []
     for domain in found.domains:
         table = Table(
@@ -75,7 +75,7 @@ def measures_table(found: Evaluation) -> RenderableType:
 
 
 def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
-    """The best settings of each rule, the best rule first."""
+    """Return the best settings of each rule, the best rule first."""
     table = Table(
         box=box.SIMPLE_HEAD,
         title=Text(f"{title}: rules at their best"),
@@ -106,7 +106,7 @@ def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
 def policy_gap_table(
     title: str, gap: Mapping[str, Mapping[str, Any]], seeds: int
 ) -> RenderableType:
-    """How far the simulation and the corrected one are off the real world, policy by policy.
+    """Return distances of both simulations from the real world, policy by policy.
 
     Args:
         title: What the table is of.
@@ -148,7 +148,7 @@ def _limits(att: Mapping[str, float | None]) -> str:
 
 
 def _backlog(found: Evaluation, domain: str) -> list[str]:
-    """Who kept vehicles out of the network, which throughput and queue do not show."""
+    """Vehicles kept out of the network, which throughput and queue do not show."""
     waiting = {name: found.estimate(name, domain, "backlog").mean for name in found.policies}
     kept_out = [f"{name} {number(mean)}" for name, mean in waiting.items() if mean >= 0.5]
     return [f"vehicles due that never entered: {', '.join(kept_out)}"] if kept_out else []
@@ -208,7 +208,7 @@ def _signed(estimate: Estimate) -> str:
 
 
 def number(value: float) -> str:
-    """Three significant digits, or whole numbers above a hundred."""
+    """Return three significant digits, or a whole number above a hundred."""
     if math.isnan(value):
         return "-"
     if abs(value) >= 99.95:

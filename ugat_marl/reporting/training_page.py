@@ -131,7 +131,7 @@ def _status(record: RunRecord) -> tuple[str, str]:
 
 
 def _progress(record: RunRecord) -> str:
-    """How far an unfinished training is; "" for a finished one."""
+    """Progress of an unfinished training; "" for a finished one."""
     if record.finished:
         return ""
     state, parts = record.state or {}, list[str]()
@@ -478,7 +478,7 @@ def _of_gate(key: str, value: float) -> str:
 
 
 def _worst(page: Page, record: RunRecord, places: Places | None) -> dict[str, Any] | None:
-    """Where and when vehicles stood, in the real domain."""
+    """Places and minutes in which vehicles stood, in the real domain."""
     if record.queues is None or record.evaluation is None:
         return None
     domain, known = record.evaluation.domains[-1], record.evaluation.policies

@@ -54,7 +54,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Film:
-    """What was filmed, and how it is announced.
+    """A filmed episode with its caption.
 
     Attributes:
         title: Name of the policy.
@@ -209,7 +209,7 @@ def require_video(path: Path) -> None:
 
 
 def write_video(pictures: Iterable[Frame], path: Path, per_second: float) -> None:
-    """Writes frames of one size as a video, whole or not at all.
+    """Write frames of one size as a video, whole or not at all.
 
     Args:
         pictures: uint8 ``(height, width, 3)``, both even.
@@ -229,7 +229,7 @@ def write_video(pictures: Iterable[Frame], path: Path, per_second: float) -> Non
 
 
 class _Captions:
-    """Writes above each picture whose it is, what time it is and how many vehicles stand."""
+    """Write above each picture whose it is, what time it is and how many vehicles stand."""
 
     def __init__(self) -> None:
         import matplotlib as mpl
