@@ -46,15 +46,15 @@ class Field:
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         policy: A rule or the file of a trained policy.
-        port: Where SUMO listens (its --remote-port).
+        port: Port of SUMO (its --remote-port).
         host: The machine SUMO runs on.
         start: Start a SUMO with the scenario, for a demonstration.
         domain: Domain of the SUMO that is started.
         seed: Seed of the SUMO that is started.
-        seconds: How long to drive, in s.
+        seconds: Time to drive, s.
         detectors: Count on whole lanes, or on SUMO's lane-area detectors.
         log: File of JSON lines, one for each decision; lines are added.
-        limits: What is believed, and for how long.
+        limits: Limits beyond which counts and policy are not trusted.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]

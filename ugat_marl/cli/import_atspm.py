@@ -16,11 +16,11 @@ from ugat_marl.scenarios import Network
 
 @dataclass(frozen=True)
 class ImportAtspm:
-    """Turns a high-resolution log of signal controllers (ATSPM) into measured data.
+    """Turn a high-resolution log of signal controllers (ATSPM) into measured data.
 
     The log has the columns TimeStamp, DeviceId, EventId and Parameter.
 
-    The mapping says which lights and lanes they mean (docs/reference/measured-data.md).
+    The mapping names lights and lanes (docs/reference/measured-data.md).
 
     Examples:
         ugat-marl import-atspm my-scenario events.parquet mapping.toml --out street

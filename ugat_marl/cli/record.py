@@ -30,13 +30,13 @@ class Record:
         out: Directory to write (docs/reference/measured-data.md); measured data in it are replaced.
         domain: World to measure: sim, V1 to V4, effects (headway=1.4+acceleration=1), or the
             directory of another scenario on the same network.
-        policy: Who controls the signals: a rule (fixed-time:30, largest-queue:20,
+        policy: Controller of the signals: a rule (fixed-time:30, largest-queue:20,
             max-pressure:10, programme, random) or the file of a trained policy.
         periods: Number of days. The last 40 % are marked as held out: a diagnosis is judged on
             them.
         seed: Root of the seeds of all days.
         duration_s: Length of a day in s.
-        same_demand: Every day has the scenario's own vehicles; without it they are drawn again.
+        same_demand: Use the scenario's own vehicles on every day; else each day is drawn anew.
         detector_length_m: Length of the detection zones in m; 0 for points.
         speeds: Whether the detectors measure speeds and lengths.
         lanes: Also vehicles, halting and mean speed per lane and second.

@@ -48,7 +48,7 @@ class ScenarioCheck:
 
     It plays an episode under the network's own programme and one under a good rule.
 
-    With --conformance it runs the conformance kit instead (docs/reference/conformance.md).
+    With --conformance it runs the conformance kit (docs/reference/conformance.md).
 
     Examples:
         ugat-marl scenario check single-v1

@@ -17,7 +17,7 @@ from ugat_marl.reporting import draw_network
 
 @dataclass(frozen=True)
 class ScenarioDraw:
-    """Draws the network and every intersection with its phases, as SVG and PNG.
+    """Draw the network and every intersection with its phases, as SVG and PNG.
 
     Examples:
         ugat-marl scenario draw mixed-v1 --out pictures

@@ -1,4 +1,4 @@
-"""``ugat-marl scenario list``: what networks there are."""
+"""``ugat-marl scenario list``: the networks and domains by name."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ugat_marl.scenarios import Network, check_demand, resco_maps, shipped_scena
 
 @dataclass(frozen=True)
 class ScenarioList:
-    """Lists the scenarios and domains that can be named.
+    """List the scenarios and domains that can be named.
 
     Examples:
         ugat-marl scenario list
     """
 
     def run(self, console: Console) -> int:
-        """Prints the lists."""
+        """Print the lists."""
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         table.add_column("scenario")
         for heading in ("agents", "phases", "vehicles"):

@@ -39,7 +39,7 @@ def _none(metavar: str) -> Any:
 
 @dataclass(frozen=True)
 class ScenarioNew:
-    """Makes a scenario directory: roads with demand, ready for all other commands.
+    """Make a scenario directory: roads with demand, ready for all other commands.
 
     Name one source of roads and one of vehicles.
 
@@ -54,22 +54,22 @@ class ScenarioNew:
         name: Directory to write; its last part is the scenario's name.
         grid: Rows and columns of a grid, as in 4x4.
         arterial: Intersections along a main road.
-        osm: OpenStreetMap extract that you have: .osm, .osm.gz or .osm.pbf.
+        osm: OpenStreetMap extract that you have: .osm, .osm.gz, or .osm.pbf (extra osm).
         guess_signals: Put lights at large junctions of --osm that have none.
         sumo: SUMO configuration (with its vehicles) or network.
         cityflow: CityFlow's roadnet.json and flow.json (with its vehicles).
-        exact_drivers: Keep CityFlow's headways, and leave nothing to chance in driving; without
-            it vehicles keep their size, accelerations and speed, and follow each other as SUMO's.
+        exact_drivers: Keep CityFlow's headways, and drive without chance; without it vehicles keep
+            their size, accelerations and speed, and follow each other as SUMO's do.
         routes: Route files for the network.
         vph: Vehicles an hour at every road into the network.
         turns: Shares of left turns, straight on and right turns, for --vph.
-        counts: CSV file of what was counted: edge,count or from,to,count; also begin_s,end_s.
+        counts: CSV file of counts: edge,count or from,to,count; also begin_s,end_s.
         od: CSV file of origins and destinations: from,to,count; also begin_s,end_s.
-        seed: Decides the vehicles of --vph, --counts and --od.
+        seed: Seed of the vehicles of --vph, --counts and --od.
         spacing_m: Between intersections of a grid or arterial, m.
         speed_mps: Speed limit of a grid or arterial, m/s.
-        phases: Green phases: as the source wants it; the programme's own; derived from the
-            conflicts; the same, with left turns that let the traffic opposite pass.
+        phases: Green phases: those of the source; those of the programme; derived from the
+            conflicts; the same with permitted left turns.
         begin_s: Start of an episode on the clock of the routes, s.
         duration_s: Length of an episode, s.
         link: Leave the files of --sumo and --routes where they are.

@@ -247,7 +247,7 @@ class FieldLoop:
         self._asked.close()
 
     def _look(self, now: float) -> tuple[dict[str, LaneCount], dict[str, str]]:
-        """Count to believe, and the lights that see others or are not taken over yet."""
+        """Return trusted counts, and the lights that see others or are not taken over yet."""
         try:
             counts = dict(self._street.read())
             wrong = self._watchdog.faults(counts, now, self._held)

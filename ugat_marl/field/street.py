@@ -145,7 +145,7 @@ class TraciStreet:
             return {name: api.getRedYellowGreenState(name) for name in api.getIDList()}
 
     def read(self) -> dict[str, LaneCount]:
-        """Count at the end of the last step."""
+        """Return the counts at the end of the last step."""
         sums: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
         for name, values in self._counter.getAllSubscriptionResults().items():
             row = sums[self._lane_of[name]]

@@ -131,7 +131,7 @@ class Watchdog:
             self._counted.add(lane)
 
     def _stuck(self, now_s: float) -> dict[str, str]:
-        """Count that do not move; an empty road at night is one of them, and no fault at first."""
+        """Return counts that do not move; an empty road at night is no fault at first."""
         limits, still = self._limits, now_s - self._moved_s
         if still > limits.frozen_after_s and any(vehicles for vehicles, _ in self._value.values()):
             return {

@@ -562,7 +562,7 @@ def environments_can_be_sent(case: EnvironmentCase) -> None:
     """Before `reset` an environment can be pickled, and its copy works."""
     case.need_episode()
     env = case.make()
-    # What a worker process does. The bytes were made one line before: nothing foreign is unpickled.
+    # A worker process does this. The bytes were made one line before: nothing foreign is unpickled.
     copy: AnyParallelEnv | None = None
     with Listening() as heard:
         copy = ForkingPickler.loads(ForkingPickler.dumps(env))  # pyright: ignore[reportAttributeAccessIssue]

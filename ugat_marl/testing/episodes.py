@@ -102,7 +102,7 @@ class EnvironmentCase:
             raise NotChecked("not checked, because no whole episode could be run")
         if self._episode is None:
             self._failed = True
-            # Its episode over, it holds no simulation, but the process that forks new ones.
+            # After its episode it holds no simulation, but the process that forks new ones.
             self._episode = self.play(self._keep(), self.seed)
             self._failed = False
         return self._episode

@@ -91,7 +91,7 @@ Source = tuple[str, int]
 _CODES = {"phase": PHASE_EVENTS, "overlap": OVERLAP_EVENTS, "arrow": ARROW_EVENTS}
 _KIND = {code: kind for kind, codes in _CODES.items() for code in codes}
 _COLOUR = PHASE_EVENTS | OVERLAP_EVENTS | ARROW_EVENTS
-# Of events at one moment the end of the old comes before the begin of the new.
+# Among events at one moment, the end of the old colour comes before the begin of the new one.
 _RANK = {RED: 0, GREEN: 1, YELLOW: 2}
 
 
@@ -391,7 +391,7 @@ def _states(
             colours[event.source] = event.colour
             continue
         if event.source not in seen:
-            # The log may have a gap before the period: what ends now was shown until now.
+            # The log may have a gap before the period: a colour that ends now was shown until now.
             colours[event.source] = BEFORE.get(event.code, colours[event.source])
             seen.add(event.source)
         later.append(event)

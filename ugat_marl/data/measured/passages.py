@@ -319,7 +319,7 @@ def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
     order = order[~outside[order]]
     on, off = on[order], off[order]
     starts = on[np.isfinite(on)]
-    # A leaving without an entering counts where nothing can have come before it.
+    # An off without an on counts only where no passage can have come before it.
     stray = np.isnan(on) & (
         (np.arange(len(on)) > 0) | (off > (starts[0] if len(starts) else np.inf))
     )
@@ -327,7 +327,7 @@ def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
     following = np.append(on[1:], np.inf)
     off = np.where(following - on <= IMPUTED_S, np.fmin(off, following), np.minimum(off, following))
     lost = np.isnan(off) & np.isfinite(following)
-    # Two ons, or two offs, at one moment are one for a detector.
+    # A detector reports two ons, or two offs, at one moment as one.
     twice = (following == on) | (np.append(np.nan, off[:-1]) == off)
     kept = ~lost & ~(off < on) & ~twice
     chosen = order[kept]

@@ -176,7 +176,7 @@ def _counts(
     detectors: tuple[Detector, ...],
     alone: bool,
 ) -> pl.DataFrame:
-    """Count per detector and interval, all of known detectors and within their periods."""
+    """Return counts per detector and interval, all of known detectors and within periods."""
     names = [detector.id for detector in detectors]
     refuse(
         path,

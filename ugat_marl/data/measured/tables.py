@@ -354,7 +354,7 @@ def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
 
 
 def to_texts(path: Path, cells: pl.Series) -> pl.Series:
-    """Name as text; empty cells are null.
+    """Return names as text; empty cells are null.
 
     Raises:
         MeasuredDataError: A column that holds no names.

@@ -108,7 +108,7 @@ def require_replaceable(directory: Path) -> None:
 
 
 def _put(temporary: Path, directory: Path) -> None:
-    """Move the finished directory to its place, aside of what was there."""
+    """Move the finished directory to its place, in place of an earlier one."""
     umask = os.umask(0)
     os.umask(umask)
     temporary.chmod(0o777 & ~umask)

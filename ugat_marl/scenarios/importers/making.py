@@ -227,7 +227,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
             require_free(target, force=force)  # it may have appeared meanwhile
             _put(made, target, folder / "before")
     except ScenarioError as error:
-        # Files are checked where they are made; what is said of them is about where they belong.
+        # Files are checked where they are made; errors name the place where they belong.
         if str(made) not in str(error):
             raise
         raise ScenarioError(str(error).replace(str(made), str(target))) from None

@@ -161,8 +161,8 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
         arguments.append("--sidewalks.guess.from-permissions")
     made = work / "made.net.xml"
     netconvert(arguments, made)
-    # What is left of lights on plain roads, far from the junction they belong to, stops nobody's
-    # foes; those at crossings do stop the traffic for people on foot.
+    # Lights left on plain roads, far from their junction, separate no conflicting streams. Lights
+    # at crossings stop the traffic for people on foot and stay.
     if idle := _idle_lights(made, extract.walks):
         netconvert([*arguments, "--tls.unset", ",".join(idle)], made)
     if extract.crossings:
