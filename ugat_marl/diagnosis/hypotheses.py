@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.effects import SETTINGS, Effect, known_effects
+from ugat_marl.effects import EVERYWHERE, SETTINGS, Effect, Examined, known_effects
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
 
@@ -83,60 +83,13 @@ class Hypothesis:
 Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
 """A set of effects: hypotheses and the values of their free fields."""
 
-LATE_STEP_S = 0.1
-"""Lost time is fitted in tenths: fractions of a simulation step are spread over many greens."""
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A global effect of the library: one number for the whole network."""
-
-    field: str
-    levels: tuple[float, ...]
-    nominal: float
-    least: float
-    place: str = ""
-    attribute: str = ""
-    both: bool = False
-    step: float = 0.0
-    extreme: tuple[float, ...] = ()
-
-
-CLOCK_S = (0.7, 1.4, 2.2, 3.1, 4.3)
-DRIFT = (1.5, 3.1, 5.2, 7.5)
-"""Strengths at which clocks are looked at, s and s/h."""
-
-
-def _both_sides(*levels: float) -> tuple[float, ...]:
-    return (*(-level for level in reversed(levels)), *levels)
-
-
-_GLOBAL: dict[str, _Entry] = {
-    "acceleration": _Entry("mps2", (0.8, 1.6), 2.6, 0.1, attribute="accel", both=True),
-    "deceleration": _Entry("mps2", (2.0, 3.2), 4.5, 0.2, attribute="decel", both=True),
-    "emergency_deceleration": _Entry("mps2", (3.0, 6.0), 9.0, 0.5, attribute="emergencyDecel"),
-    "startup_delay": _Entry(
-        "seconds", (0.3, 0.6, 0.8, 1.2), 0.0, 0.05, attribute="startupDelay", extreme=(2.4,)
-    ),
-    "headway": _Entry("seconds", (1.3, 1.7), 1.0, 0.05, attribute="tau"),
-    "min_gap": _Entry("metres", (1.2, 1.8, 3.1, 3.8, 4.7), 2.5, 0.2, attribute="minGap"),
-    "imperfection": _Entry("sigma", (0.15, 0.85), 0.5, 0.05, attribute="sigma"),
-    "desired_speed": _Entry("factor", (0.87,), 1.0, 0.01, both=True),
-    "speed_spread": _Entry("deviation", (0.03, 0.2), 0.1, 0.01, attribute="speedDev"),
-    "reaction_step": _Entry("seconds", (2.0,), 1.0, 0.5, attribute="actionStepLength"),
-    "yellow_running": _Entry("seconds", (3.0,), 0.0, 0.3, attribute="jmDriveAfterYellowTime"),
-    "red_running": _Entry("seconds", (2.0,), 0.0, 0.3, attribute="jmDriveAfterRedTime"),
-    "gap_acceptance": _Entry("seconds", (0.4, 2.5), 1.0, 0.2, attribute="jmTimegapMinor"),
-    "lane_discipline": _Entry("strategic", (0.1, 5.0), 1.0, 0.2, attribute="lcStrategic"),
-    "heavy_share": _Entry("share", (0.12,), 0.0, 0.01),
-    "late_green": _Entry("seconds", (2.0,), 0.0, 0.3, place="place", step=LATE_STEP_S),
-    # What a clock moves across the start of green is not in proportion; faults cost no simulation.
-    "signal_clock": _Entry("seconds", _both_sides(*CLOCK_S), 0.0, 0.2, place="place"),
-    "clock_drift": _Entry("seconds_per_hour", _both_sides(*DRIFT), 0.0, 0.5, place="place"),
-    "undercount": _Entry("share", (0.15,), 0.0, 0.02, place="place"),
-    "demand_level": _Entry("factor", (1.15,), 1.0, 0.03, place="edge", both=True),
-    "demand_timing": _Entry("seconds", (300.0,), 0.0, 45.0, place="edge", both=True),
-}
+GLOBAL = (
+    "acceleration", "deceleration", "emergency_deceleration", "startup_delay", "headway", "min_gap",
+    "imperfection", "desired_speed", "speed_spread", "reaction_step", "yellow_running",
+    "red_running", "gap_acceptance", "lane_discipline", "heavy_share", "late_green", "signal_clock",
+    "clock_drift", "undercount", "demand_level", "demand_timing",
+)  # fmt: skip
+"""Effects with one number for the whole network, in the order in which they are simulated."""
 
 LOCAL = frozenset(
     {
@@ -156,7 +109,7 @@ def library(without: Collection[str] = ()) -> frozenset[str]:
     Raises:
         UnknownNameError: A name in `without` is not in the library.
     """
-    names = frozenset(_GLOBAL) | LOCAL | {"driver_model"}
+    names = frozenset(GLOBAL) | LOCAL | {"driver_model"}
     for name in without:
         if name not in known_effects():
             raise UnknownNameError("effect of the library", name, known_effects())
@@ -172,21 +125,22 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
     """
     found: list[Hypothesis] = []
     step = scenario.settings.step_length_s
-    for name, entry in _GLOBAL.items():
+    for name in GLOBAL:
         if name not in allowed:
             continue
-        nominal = _nominal(scenario, entry)
+        kind, entry = known_effects()[name], examined(name)
+        nominal = _nominal(scenario, kind.attribute, entry.nominal)
         extreme = tuple((level,) for level in entry.extreme)
         levels = tuple((level,) for level in entry.levels if abs(level - nominal) > entry.least)
         if name == "reaction_step":
             nominal, levels = max(nominal, step), ((2 * max(nominal, step),),)
-        fixed = ((entry.place, "*"),) if entry.place else ()
+        fixed = tuple((place, EVERYWHERE) for place in kind.texts)
         grid = step if name == "reaction_step" else entry.step
         found.append(
             Hypothesis(
                 name,
                 fixed,
-                (entry.field,),
+                tuple(kind.ranges),
                 levels + extreme,
                 (nominal,),
                 entry.least,
@@ -240,15 +194,22 @@ def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     return tuple(sorted(effects, key=rank))
 
 
-def _nominal(scenario: Scenario, entry: _Entry) -> float:
-    """The number in the scenario's vehicle types if they agree, their mean, or SUMO's default."""
+def examined(name: str) -> Examined:
+    """Return the strengths at which an effect of `GLOBAL` is first simulated."""
+    strengths = known_effects()[name].examined
+    assert strengths is not None, name
+    return strengths
+
+
+def _nominal(scenario: Scenario, attribute: str, default: float) -> float:
+    """Return the number in the scenario's vehicle types: the mean, or SUMO's default."""
     values: list[float] = []
-    for text in _attribute(scenario, entry.attribute) if entry.attribute else ():
+    for text in _attribute(scenario, attribute) if attribute else ():
         try:
             values.append(float(text))
         except ValueError:
-            return entry.nominal
-    return float(np.mean(values)) if values else entry.nominal
+            return default
+    return float(np.mean(values)) if values else default
 
 
 def _attribute(scenario: Scenario, name: str) -> set[str]:

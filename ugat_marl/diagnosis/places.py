@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX
-from ugat_marl.diagnosis.hypotheses import CLOCK_S, DRIFT, LATE_STEP_S, Hypothesis, Members
+from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Distance, Reference
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.effects import Examined
 from ugat_marl.scenarios import Passages, Period, Scenario, driven_routes, edge_of
 
 Array = NDArray[np.float64]
@@ -284,15 +285,16 @@ class Proposer:
         found: list[Hypothesis] = []
         for index in np.argsort(-np.abs(lost))[:2]:
             place = (("place", names[int(index)]),)
+            late_step_s = examined("late_green").step
             found.append(
-                Hypothesis("late_green", place, ("seconds",), ((2.0,),), (0.0,), 0.3, LATE_STEP_S)
+                Hypothesis("late_green", place, ("seconds",), ((2.0,),), (0.0,), 0.3, late_step_s)
             )
             sign = 1.0 if lost[index] > 0 else -1.0
-            levels = tuple((sign * level,) for level in CLOCK_S)
+            levels = _towards(sign, examined("signal_clock"))
             found.append(Hypothesis("signal_clock", place, ("seconds",), levels, (0.0,), 0.2))
         for index in np.argsort(-np.abs(drift))[:1]:
             sign = 1.0 if drift[index] > 0 else -1.0
-            levels = tuple((sign * level,) for level in DRIFT)
+            levels = _towards(sign, examined("clock_drift"))
             place = (("place", names[int(index)]),)
             found.append(
                 Hypothesis("clock_drift", place, ("seconds_per_hour",), levels, (0.0,), 0.5)
@@ -728,3 +730,8 @@ def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None
             if behind:
                 return one.id, other.id
     return None
+
+
+def _towards(sign: float, strengths: Examined) -> tuple[tuple[float, ...], ...]:
+    """Return the levels of one sign, the weakest first."""
+    return tuple((sign * level,) for level in strengths.levels if level > 0)

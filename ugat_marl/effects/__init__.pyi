@@ -6,6 +6,7 @@ from .actuators import PhaseOrder as PhaseOrder
 from .base import EVERYWHERE as EVERYWHERE
 from .base import ControllerEffect as ControllerEffect
 from .base import Effect as Effect
+from .base import Examined as Examined
 from .base import Parameter as Parameter
 from .base import Text as Text
 from .base import draw as draw

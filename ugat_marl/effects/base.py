@@ -57,6 +57,27 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Examined:
+    """Strengths of an effect on a whole network that a diagnosis first simulates.
+
+    Attributes:
+        levels: Values of its number.
+        nominal: Value that changes nothing; where vehicle types hold the number, theirs counts.
+        least: Distance from nominal below which the effect does not matter in practice.
+        both: True if values on the other side of nominal have the opposite effect.
+        step: The number is a multiple of it, if not 0.
+        extreme: Values that are simulated as well, and are no plausible world.
+    """
+
+    levels: tuple[float, ...]
+    nominal: float
+    least: float
+    both: bool = False
+    step: float = 0.0
+    extreme: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
 class Effect:
     """A physical effect; subclasses are frozen dataclasses whose fields are its parameters.
 
@@ -68,6 +89,8 @@ class Effect:
         name: Name in files, on the command line and in verdicts.
         ranges: Unit and plausible range of each field that is a number.
         texts: Kind of name that each other field holds.
+        attribute: Attribute of vehicle types that holds its number, or "".
+        examined: Strengths a diagnosis tries on a whole network; None if it tries none.
         on_detectors: True if it changes what detectors report, and no traffic.
         on_departures: True if it changes which vehicles depart or when, and not how they drive.
 
@@ -79,6 +102,8 @@ class Effect:
     name: ClassVar[str]
     ranges: ClassVar[dict[str, Parameter]] = {}
     texts: ClassVar[dict[str, Text]] = {}
+    attribute: ClassVar[str] = ""
+    examined: ClassVar[Examined | None] = None
     on_detectors: ClassVar[bool] = False
     on_departures: ClassVar[bool] = False
 

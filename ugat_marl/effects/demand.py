@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Parameter, Text, draw
+from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Parameter, Text, draw
 from ugat_marl.effects.documents import (
     depart_s,
     edit_scenario,
@@ -102,6 +102,7 @@ class DemandLevel(Effect):
     on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, Parameter]] = {"factor": _FACTOR}
     texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
+    examined: ClassVar[Examined] = Examined((1.15,), 1.0, 0.03, both=True)
     edge: str
     factor: float
 
@@ -147,6 +148,7 @@ class DemandTiming(Effect):
     on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -7200.0, 7200.0)}
     texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
+    examined: ClassVar[Examined] = Examined((300.0,), 0.0, 45.0, both=True)
     edge: str
     seconds: float
 

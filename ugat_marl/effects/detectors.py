@@ -9,13 +9,18 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Owner, Parameter, Text, draw
+from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Owner, Parameter, Text, draw
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Detector, Passages, Period, Scenario
 
 _TIME = Parameter("s", 0.0, 1e7)
 _CLOCK = Text("traffic light", everywhere=True)
+
+
+def _both_sides(*levels: float) -> tuple[float, ...]:
+    """Return levels of both signs: the effect of a clock is not in proportion to its error."""
+    return (*(-level for level in reversed(levels)), *levels)
 
 
 def owners(scenario: Scenario, detectors: Sequence[Detector]) -> dict[str, str]:
@@ -61,6 +66,7 @@ class Undercount(DetectorEffect):
     name: ClassVar[str] = "undercount"
     ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
     texts: ClassVar[dict[str, Text]] = {"place": Text("detector", everywhere=True)}
+    examined: ClassVar[Examined] = Examined((0.15,), 0.0, 0.02)
     place: str
     share: float
 
@@ -86,6 +92,7 @@ class SignalClock(DetectorEffect):
     name: ClassVar[str] = "signal_clock"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -60.0, 60.0)}
     texts: ClassVar[dict[str, Text]] = {"place": _CLOCK}
+    examined: ClassVar[Examined] = Examined(_both_sides(0.7, 1.4, 2.2, 3.1, 4.3), 0.0, 0.2)
     place: str
     seconds: float
 
@@ -103,6 +110,7 @@ class ClockDrift(DetectorEffect):
     name: ClassVar[str] = "clock_drift"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds_per_hour": Parameter("s/h", -60.0, 60.0)}
     texts: ClassVar[dict[str, Text]] = {"place": _CLOCK}
+    examined: ClassVar[Examined] = Examined(_both_sides(1.5, 3.1, 5.2, 7.5), 0.0, 0.5)
     place: str
     seconds_per_hour: float
 
