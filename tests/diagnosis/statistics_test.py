@@ -282,7 +282,6 @@ def test_null_data_are_seldom_rejected() -> None:
         beyond += [item.distance > item.floor for item in found]
         mean = float(np.mean([item.distance for item in found]))
         assert mean == pytest.approx(null.expected, rel=0.3)
-        assert null.quantile(0.95) < null.quantile(0.99)
     p = np.array(chances)
     assert (p < 0.05).mean() <= 0.05
     assert (p < 0.01).mean() <= 0.02
@@ -303,7 +302,7 @@ def test_one_broken_day_of_five_is_no_discrepancy(null: Null) -> None:
     values = gaussian(23, 5, 3)
     assert null.test(days_of(values)).p > 0.05
     values[2] += 30.0
-    assert null.test(days_of(values)).distance > null.quantile(0.99)
+    assert null.test(days_of(values)).distance > null.floor
     assert null.test(days_of(values)).p > 0.05
 
 

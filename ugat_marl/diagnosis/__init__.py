@@ -1,7 +1,28 @@
-"""Diagnosis: where simulation and measured data disagree, and which effect is missing.
+"""Diagnosis of a gap: places where simulation and data disagree, and the effects that are missing.
 
-The stages are locate, propose, fit, select and verify; `workflow` runs them from data to a
-corrected scenario.
+The stages hand records on: Located, Proposed, Fitted, Selected, Verified; a `Diagnosis` is what is
+written of them. `diagnose` runs all stages from data to a corrected scenario.
+
+    records        the records, and the form of ``diagnosis.json``
+    thresholds     every number of the method, with its unit and its reason
+    site           measured lanes, their signals and their detectors
+    features       features of one period, from detections or from counts
+    statistics     statistics of several periods, their noise, distances, whitening
+    replay         simulated days under the measured signals, with measured arrivals
+    engine         simulated days in parallel, remembered, within a budget
+    hypotheses     the library of effects, and sets of them
+    locate         disagreements by place, regime and window
+    propose        sets of effects along simulated directions
+    places         effects at places, in windows and of detectors
+    fit            values of a set of effects, and their errors
+    residual       the test of what a model leaves
+    select         the search, round by round
+    verify         both models on held-out periods, side by side
+    criteria       GEH and the criteria of FHWA
+    verdict        one of five verdicts, in words
+    signal_timing  yellow and all-red times, read off the signal log
+    study          scenario, data and engine of one diagnosis
+    workflow       all stages in their order
 """
 
 import lazy_loader

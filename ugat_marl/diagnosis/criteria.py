@@ -1,4 +1,4 @@
-"""The usual criteria on counts: GEH, and the four of FHWA.
+"""Usual criteria on counts: GEH, and the four of FHWA.
 
 GEH below 5 on 85 % of the counts is a common criterion (UK TAG unit M3.1). Those of the Traffic
 Analysis Toolbox, volume III (FHWA-HOP-18-036, 2019, chapter 5) compare the simulation with one
@@ -22,7 +22,7 @@ _COUNTED = ("count_stop", "count_exit")
 
 @dataclass(frozen=True)
 class Criteria:
-    """How the counts of a simulation fare; shares are those of detectors or of their intervals.
+    """Criteria met by the counts of a simulation: shares of detectors or of their intervals.
 
     Attributes:
         within_2_sigma: Share of intervals within 1.96 standard deviations of the representative
@@ -41,20 +41,20 @@ class Criteria:
 
 
 def hourly(item: Tally) -> Array:
-    """Vehicles per hour at every stop and exit detector, 0 where there is none."""
+    """Return vehicles per hour at every stop and exit detector, 0 where there is none."""
     sums = item.sums[[INDEX[name] for name in _COUNTED]].reshape(-1, 2)
     return 60.0 * sums[:, 0] / np.maximum(sums[:, 1], 1e-9)
 
 
 def geh(measured: Array, simulated: Array) -> Array:
-    """``sqrt(2 (m - c)^2 / (m + c))`` of hourly counts, where there are any."""
+    """Return ``sqrt(2 (m - c)^2 / (m + c))`` of hourly counts, where there are any."""
     some = measured + simulated > 1.0
     m, c = simulated[some], measured[some]
     return np.sqrt(2 * (m - c) ** 2 / (m + c))
 
 
 def fhwa(measured: Sequence[Tally], simulated: Sequence[Tally], together: int) -> Criteria | None:
-    """The four criteria on the counts of stop and exit detectors.
+    """Compute the four criteria on the counts of stop and exit detectors.
 
     Args:
         measured: The measured days, at least `LEAST_DAYS`.
@@ -88,7 +88,7 @@ def fhwa(measured: Sequence[Tally], simulated: Sequence[Tally], together: int) -
 
 
 def representative(days: Array) -> int:
-    """The day that differs least, in relative terms, from the mean of all.
+    """Find the day that differs least, in relative terms, from the mean of all.
 
     Args:
         days: Counts, ``(days, detectors, intervals)``.
@@ -99,7 +99,7 @@ def representative(days: Array) -> int:
 
 
 def _intervals(day: Tally, bins: int, count: int) -> tuple[Array, NDArray[np.bool_]]:
-    """The first counts and whether they are complete, ``(detectors, intervals)``."""
+    """Return the first counts, and if they are complete, ``(detectors, intervals)``."""
     rows = [BIN_FEATURES.index(name) for name in _COUNTED]
     sums, known = (values[rows, :, :count].reshape(-1, count) for values in day.gathered(bins))
     return sums, known > 0

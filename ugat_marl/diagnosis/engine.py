@@ -59,13 +59,13 @@ class Usual:
 
 
 def day_to_day(tallies: Sequence[Tally]) -> float:
-    """Robust standard deviation of the vehicles counted on a day."""
+    """Return the robust standard deviation of the vehicles counted on a day."""
     counts = _counts(tallies)
     return 1.4826 * float(np.median(np.abs(counts - np.median(counts)))) + 1e-9
 
 
 def locked_up(tallies: Sequence[Tally], usual: float = 0.0) -> list[int]:
-    """Places of the few days on which traffic came to a standstill and on others did not.
+    """Find the few days on which traffic came to a standstill, as on no other day of a model.
 
     One of them widens the noise of everything. Where they are common they are part of the model.
 
@@ -100,7 +100,7 @@ class OutOfTime(UgatMarlError):
 
 @dataclass(frozen=True, eq=False)
 class Replicate:
-    """What is kept of a simulated day.
+    """Features of a simulated day.
 
     Attributes:
         tally: Its features.
@@ -116,7 +116,7 @@ class Replicate:
 
 
 class Engine:
-    """Simulates days of models and reduces them.
+    """Simulator of days of models, which it reduces and remembers.
 
     Args:
         scenario: The scenario without effects.
@@ -171,12 +171,12 @@ class Engine:
         return len(self._known)
 
     def measured(self, periods: Sequence[Period]) -> list[Tally]:
-        """Tallies of measured periods."""
+        """Return the tallies of measured periods."""
         return [tally(self.site, period, self.site.greens(period)) for period in periods]
 
     @contextlib.contextmanager
     def watched(self, advance: Callable[[], None], most: int) -> Iterator[None]:
-        """Tells of days as they become known, for work of which nobody knows how many it takes.
+        """Report days as they become known, for work that takes an unknown number of them.
 
         Args:
             advance: Called after each of them.
@@ -215,7 +215,7 @@ class Engine:
         numbers: Sequence[int],
         advance: Callable[[], None] | None = None,
     ) -> dict[int, Replicate]:
-        """Simulated days of a model by number, but for a few on which traffic stood still.
+        """Return simulated days of a model by number, without the few on which traffic stood still.
 
         Args:
             effects: The model.
@@ -233,7 +233,7 @@ class Engine:
         numbers: Sequence[int],
         advance: Callable[[], None] | None = None,
     ) -> list[Replicate]:
-        """Simulated days of a model, in the order of `numbers`.
+        """Return simulated days of a model, in the order of `numbers`.
 
         Args:
             effects: The model.
@@ -259,7 +259,7 @@ class Engine:
         models: Sequence[tuple[Sequence[Effect], Sequence[int]]],
         advance: Callable[[], None] | None = None,
     ) -> None:
-        """Simulates days of many models at once, so that no core waits for the end of each model.
+        """Simulate days of many models at once, so that no core waits for the end of each model.
 
         What SUMO refuses is left for `replicates` to report.
 
@@ -284,7 +284,7 @@ class Engine:
         groups: Sequence[Sequence[Job]],
         advance: Callable[[], None] | None = None,
     ) -> list[list[Done]]:
-        """Does groups of jobs on all workers; the first failure stops what was not begun.
+        """Do groups of jobs on all workers; the first failure stops what was not begun.
 
         Args:
             work: Does one.
@@ -321,7 +321,7 @@ class Engine:
         return found
 
     def _counted(self, effects: tuple[Effect, ...], number: int) -> Replicate:
-        """A simulated day, counted."""
+        """Simulate a day and count it."""
         day = self._day(effects, number)
         period = self._unmeasured.kept_from(day.period)
         counted = tally(self.site, period, self._greens[number % len(self.periods)])
@@ -330,7 +330,7 @@ class Engine:
         return self._with_due(counted, day.travel_time_s, day.due)
 
     def _asked_for(self, given: Replicate, effects: tuple[Effect, ...], number: int) -> Replicate:
-        """The same simulated day, of a model that asks for other vehicles."""
+        """Return the same simulated day for a model that asks for other vehicles."""
         if given.counted is None or given.due is None:
             return self._counted(effects, number)
         physics = [effect for effect in effects if not effect.on_detectors]
@@ -345,7 +345,7 @@ class Engine:
         return Replicate(corrected(counted, self.site, due), travel_time_s, counted, due)
 
     def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
-        """A day as the detectors saw it; faults of detectors cost no further simulation."""
+        """Return a day as the detectors saw it; faults of detectors cost no further simulation."""
         faults = tuple(effect for effect in effects if effect.on_detectors)
         physics = tuple(effect for effect in effects if not effect.on_detectors)
         key = self._key(physics, number)
@@ -415,12 +415,12 @@ class Engine:
 
 
 def default_cache() -> Path:
-    """Where tallies are remembered between runs: the user's cache folder."""
+    """Return the user's cache folder, in which tallies are remembered between runs."""
     return user_cache("replicates")
 
 
 def _signals_hash(period: Period, answering: bool) -> str:
-    """Of what a simulated day takes from a measured one."""
+    """Return a digest of what a simulated day takes from a measured one."""
     content = (period.begin_s, period.end_s, sorted(period.signals.items()))
     digest = hashlib.sha256(repr(content).encode())
     if answering:

@@ -1,4 +1,4 @@
-"""What detectors tell by regime: sums of features, per lane, of one period.
+"""Features of detector data by regime: their sums, per lane, of one period.
 
 Every statistic is a mean: a sum and the number of observations behind it. So lanes pool to
 intersections and to the network, and periods pool to data sets, by adding. Queue discharge is
@@ -110,11 +110,11 @@ class Tally:
 
     @property
     def counted(self) -> Array:
-        """In how many periods every one of the bins was counted."""
+        """Number of periods in which each bin was counted."""
         return np.full_like(self.bins, self.days) if self.known is None else self.known
 
     def gathered(self, together: int) -> tuple[Array, Array]:
-        """Bins put together, and in how many periods all of each were counted.
+        """Put bins together, and count the periods in which all of each were counted.
 
         Args:
             together: How many bins make one; what is left at the end is not used.
@@ -142,12 +142,12 @@ class Tally:
 
 
 def bins_of(period: Period) -> int:
-    """Number of bins of time in a period."""
+    """Return the number of bins of time in a period."""
     return max(1, round((period.end_s - period.begin_s) / THRESHOLDS.bin_s))
 
 
 def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
-    """Reduces a period to its features.
+    """Reduce a period to its features.
 
     Args:
         site: Lanes and detectors.
@@ -185,7 +185,7 @@ def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
 
 @dataclass
 class _Counter:
-    """Where features are added up, for the lane at hand."""
+    """Sums of features, for one lane after the other."""
 
     sums: Array
     bins: Array
@@ -209,7 +209,7 @@ class _Counter:
 
 
 def _passages(period: Period, lane: SiteLane, kind: str) -> Passages | None:
-    """What the lane's detectors of a kind saw; None if it has none."""
+    """Return what the lane's detectors of a kind saw; None if it has none."""
     names = lane.detectors.get(kind)  # pyright: ignore[reportArgumentType,reportCallIssue]
     return None if not names else _merged(period, names)
 
@@ -274,7 +274,7 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
 
 
 def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
-    """Crossings in yellow and at the beginning of red, per change of signal."""
+    """Count crossings in yellow and at the beginning of red, per change of signal."""
     cycles = float(len(greens.start_s))
     crossed = stop.off_s[np.isfinite(stop.off_s)]
     if not cycles:
@@ -295,7 +295,7 @@ def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
 
 
 def _lengths(counter: _Counter, passages: Passages) -> None:
-    """Lengths as measured, or else from speed and time over the detector."""
+    """Count lengths as measured, or else from speed and time over the detector."""
     quick = (passages.speed_mps > 5.0) & np.isfinite(passages.on_s)
     length = np.where(quick, passages.speed_mps * (passages.off_s - passages.on_s), np.nan)
     length = np.where(np.isfinite(passages.length_m), passages.length_m, length)
@@ -304,7 +304,7 @@ def _lengths(counter: _Counter, passages: Passages) -> None:
 
 
 def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: float) -> None:
-    """Moving platoons, free vehicles, and those that see red."""
+    """Count moving platoons, free vehicles, and those that see red."""
     known = np.isfinite(advance.on_s)
     advance = advance.at(known)
     if len(advance) < 2:
@@ -341,7 +341,7 @@ def _share(values: Array, limit: float) -> Array:
 
 
 def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
-    """Occupancy of the advance detector by signal, and how often the queue stands on it."""
+    """Sum the occupancy of the advance detector by signal, and queues that stand on it."""
     period = counter.period
     on = np.where(np.isfinite(advance.on_s), advance.on_s, period.begin_s)
     off = np.where(np.isfinite(advance.off_s), advance.off_s, period.end_s)
@@ -371,7 +371,7 @@ def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
 
 
 def _conserved(counter: _Counter, site: Site, advances: Array, stops: Array, exits: Array) -> None:
-    """Vehicles that came and were seen again, by approach and by intersection."""
+    """Count vehicles that came and were seen again, by approach and by intersection."""
     approaches: dict[str, list[int]] = {}
     for index, lane in enumerate(site.lanes):
         if "stop" in lane.detectors and "advance" in lane.detectors:
@@ -391,7 +391,7 @@ def _conserved(counter: _Counter, site: Site, advances: Array, stops: Array, exi
 
 
 def bins_together(counts: pl.DataFrame | None) -> int:
-    """How many bins a count covers: within it nobody knows when vehicles came.
+    """Return the number of bins that one count covers; within it, times are unknown.
 
     Args:
         counts: ``begin_s, end_s`` and others; None where single vehicles were detected.
@@ -403,7 +403,7 @@ def bins_together(counts: pl.DataFrame | None) -> int:
 
 
 def without_gaps(counts: pl.DataFrame, periods: Sequence[Period]) -> frozenset[str]:
-    """Detectors that were counted in every period from begin to end."""
+    """Find detectors that were counted in every period from begin to end."""
     length = pl.col("end_s").cast(pl.Float64) - pl.col("begin_s").cast(pl.Float64)
     found = set(counts["detector_id"].to_list())
     for period in periods:
@@ -415,7 +415,7 @@ def without_gaps(counts: pl.DataFrame, periods: Sequence[Period]) -> frozenset[s
 
 
 def counts_tally(site: Site, period: Period, counts: pl.DataFrame, whole: Collection[str]) -> Tally:
-    """Puts counts where the counts of detected vehicles would be; all else stays empty.
+    """Put counts where the counts of detected vehicles would be; all else stays empty.
 
     Args:
         site: Lanes and detectors.

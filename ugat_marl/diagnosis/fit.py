@@ -1,4 +1,4 @@
-"""Fits the free numbers of a set of effects by simulation."""
+"""Fit of the free numbers of a set of effects, by simulation."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ tell of them."""
 
 
 def cost_of(model: Fitted) -> float:
-    """What models are ranked by."""
+    """Return the cost, by which models are ranked."""
     return model.cost
 
 
 class Fitter:
-    """Simulates and fits models against one data set.
+    """Simulator and fitter of models against one data set.
 
     Args:
         engine: Simulates.
@@ -64,7 +64,7 @@ class Fitter:
         self.speeds = speeds
 
     def simulate(self, members: Members, days: int | None = None) -> Fitted:
-        """Simulates a set of effects and measures its distance from the data."""
+        """Simulate a set of effects and measure its distance from the data."""
         numbers = list(self.base_days)[: days or self.days]
         found = self.engine.ordinary(effects_of(members), numbers)
         reference = Reference(
@@ -80,7 +80,7 @@ class Fitter:
         return Fitted(members, known, reference, distance, cost)
 
     def refine(self, start: Fitted, rounds: int = 3) -> Fitted:
-        """Gauss-Newton steps from a simulated model, with derivatives by finite differences."""
+        """Take Gauss-Newton steps from a simulated model; derivatives are finite differences."""
         best = start
         jacobian: Array | None = None
         for number in range(rounds):
@@ -110,7 +110,7 @@ class Fitter:
         return best
 
     def settled(self, model: Fitted, errors: Array) -> Fitted:
-        """A last step with more days: the search stops as soon as it hardly gains any more.
+        """Take a last step with more days: the search stops as soon as it hardly gains any more.
 
         Args:
             model: The model.
@@ -127,7 +127,7 @@ class Fitter:
         return moved if moved.cost < precise.cost else precise
 
     def fitted(self, start: Fitted) -> Fitted:
-        """The best values, and the best window where there is one."""
+        """Fit the values, and the window where there is one."""
         best = self.refine(start)
         if any(set(WINDOW) <= dict(h.fixed).keys() for h, _ in best.members):
             moved = self._windows(best)
@@ -135,7 +135,7 @@ class Fitter:
         return best
 
     def _windows(self, best: Fitted) -> Fitted:
-        """Moves begin and end in ever smaller steps, and on as long as that helps.
+        """Move begin and end in ever smaller steps, and on as long as that helps.
 
         The same few days before and after a move tell whether it helps.
         """
@@ -158,7 +158,7 @@ class Fitter:
         return found if found.cost < best.cost else best
 
     def whitener(self, model: Fitted) -> Whitener:
-        """Residuals of a model: on all lanes and minutes only if an effect has a place."""
+        """Return residuals of a model: on all lanes and minutes only if an effect has a place."""
         places = [
             value
             for hypothesis, _ in model.members
@@ -169,11 +169,11 @@ class Fitter:
         return Whitener(model.reference, self.data, THRESHOLDS.interpolation, self.base, blocks)
 
     def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
-        """Derivatives of the whitened statistics, ``(free values, statistics)``."""
+        """Return derivatives of the whitened statistics, ``(free values, statistics)``."""
         return derivatives(self.changes(model), whitener)
 
     def changes(self, model: Fitted) -> list[Change]:
-        """For every free value: what moving it does to the statistics, and how far it was moved.
+        """Move every free value; return the change of the statistics and the length of the move.
 
         It is moved so far that what this does is more than chance.
         """
@@ -193,14 +193,14 @@ class Fitter:
         return found
 
     def _change(self, model: Fitted, place: int, index: int, share: float) -> Change:
-        """What moving one value by a share of its distance from nominal does; how far it went."""
+        """Move one value by a share of its distance from nominal."""
         hypothesis, values = model.members[place]
         moved = _moved_a_little(hypothesis, values, index, share)
         members = replaced(model.members, place, moved)
         return shrunk(*self.difference(model, members)), (moved[index] - values[index]) or 1.0
 
     def window_changes(self, model: Fitted) -> list[Change]:
-        """What it does to begin and to end a minute nearer to the middle, in models with numbers.
+        """Move begin and end of windows a minute towards the middle, in models with free values.
 
         How strong an effect was is only known together with how long it lasted.
         """
@@ -218,14 +218,14 @@ class Fitter:
     def difference(
         self, model: Fitted, members: Members, days: int | None = None
     ) -> tuple[dict[str, Array], dict[str, Array]]:
-        """What other members change in the statistics on the same days; its variances."""
+        """Return the change of the statistics that other members make on the same days."""
         numbers = list(model.days)[: days or self.days]
         found = self.engine.ordinary(effects_of(members), numbers)
         before = [model.days[number] for number in found]
         return shift(self.pools, [day.tally for day in found.values()], before)
 
     def _moved(self, model: Fitted, step: Array) -> Members:
-        """The model's values after a step, in range and not too far at once."""
+        """Return the model's values after a step, in range and not too far at once."""
         moved: list[tuple[Hypothesis, tuple[float, ...]]] = []
         place = 0
         for hypothesis, values in model.members:
@@ -242,7 +242,7 @@ class Fitter:
 def _moved_a_little(
     hypothesis: Hypothesis, values: tuple[float, ...], index: int, share: float
 ) -> tuple[float, ...]:
-    """The values with one of them moved for a derivative, to the side that is in range."""
+    """Return the values with one of them moved for a derivative, to the side that is in range."""
     nominal = hypothesis.nominal[index] if hypothesis.nominal else 0.0
     delta = max(share * abs(values[index] - nominal), hypothesis.least, 1e-3)
     changed = list(values)
@@ -255,7 +255,7 @@ def _moved_a_little(
 
 
 def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
-    """The hypothesis with another window, if it has one and something is left of it."""
+    """Return the hypothesis with another window, if it has one and something is left of it."""
     known = dict(hypothesis.fixed)
     if not set(WINDOW) <= known.keys():
         return hypothesis
@@ -267,13 +267,18 @@ def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
 
 
 def replaced(members: Members, place: int, values: tuple[float, ...]) -> Members:
-    """The members with other values of one of them."""
+    """Return the members with other values of one of them."""
     hypothesis = members[place][0]
     return (*members[:place], (hypothesis, values), *members[place + 1 :])
 
 
 def _solve(jacobian: Array, residual: Array) -> Array:
-    """Least squares with a touch of ridge, each value on its own scale."""
+    """Solve least squares with a touch of ridge, each value on its own scale.
+
+    Not `scipy.optimize.least_squares`: it asks for residuals at points of its own choice,
+    each of which is a set of simulated days here, and it knows neither grids of values nor days
+    that differ by model. A fit takes one to three steps, each of which is judged by its cost.
+    """
     scale = np.sqrt((jacobian**2).sum(axis=1)) + 1e-12
     scaled = jacobian / scale[:, None]
     normal = scaled @ scaled.T + THRESHOLDS.ridge * np.eye(len(scaled))
@@ -281,7 +286,7 @@ def _solve(jacobian: Array, residual: Array) -> Array:
 
 
 def derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
-    """Changes as derivatives of the whitened statistics, ``(changes, statistics)``."""
+    """Return changes as derivatives of the whitened statistics, ``(changes, statistics)``."""
     return np.stack([whitener(change) / delta for change, delta in changes])
 
 
@@ -291,7 +296,7 @@ def derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
 def _crookedness(
     fitter: Fitter, model: Fitted, errors: Array, response: Callable[[dict[str, Array]], Array]
 ) -> Array:
-    """By how much an estimate is off, squared, since statistics do not follow a value straight.
+    """Return the squared error of estimates that comes from statistics that bend.
 
     Args:
         fitter: Simulates.
@@ -325,7 +330,7 @@ def _crookedness(
 def uncertainty(
     fitter: Fitter, model: Fitted, days: Sequence[Tally] = (), *, steps: bool = False
 ) -> tuple[Array, dict[str, Array]]:
-    """Standard errors of the free values, and what they make uncertain in the statistics.
+    """Estimate standard errors of the free values, and the variances they give the statistics.
 
     The parts of the distance depend on each other, so the errors come from how much the estimate
     would move between simulated days (a sandwich estimate), not from the curvature alone. Where

@@ -1,4 +1,4 @@
-"""The library: which effects may be missing, at which strengths they are first tried."""
+"""Library of the effects that may be missing, with the strengths at which they are first tried."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ORDER = (
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """An effect with what is not known of it left open.
+    """An effect whose unknown numbers are left open.
 
     Attributes:
         name: Of the effect.
@@ -48,22 +48,22 @@ class Hypothesis:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What may stand in a model only once."""
+        """Name and place: a model holds each such pair once."""
         return (self.name, tuple(item for item in self.fixed if isinstance(item[1], str)))
 
     @property
     def faults_only(self) -> bool:
-        """Whether it concerns detectors and not traffic."""
+        """True if it concerns detectors and not traffic."""
         return known_effects()[self.name].on_detectors
 
     def effect(self, values: Sequence[float]) -> Effect:
-        """The effect with these values of the free fields, brought into range."""
+        """Make the effect with these values of the free fields, brought into range."""
         given = dict(self.fixed)
         given |= dict(zip(self.free, self.clipped(values), strict=True))
         return known_effects()[self.name](**given)
 
     def clipped(self, values: Sequence[float]) -> tuple[float, ...]:
-        """The values inside the effect's plausible ranges, and on its grid."""
+        """Return the values inside the effect's plausible ranges, and on its grid."""
         ranges = known_effects()[self.name].ranges
         found: list[float] = []
         for name, value in zip(self.free, values, strict=True):
@@ -74,7 +74,7 @@ class Hypothesis:
         return tuple(found)
 
     def matters(self, values: Sequence[float]) -> bool:
-        """Whether the effect is strong enough to be named."""
+        """Return True if the effect is strong enough to be named."""
         if not self.free or self.nominal is None:
             return True
         return abs(values[0] - self.nominal[0]) >= self.least
@@ -104,7 +104,7 @@ MODELS = ("IDM", "EIDM", "W99")
 
 
 def library(without: Collection[str] = ()) -> frozenset[str]:
-    """Names of all effects that are examined.
+    """Return the names of all effects that are examined.
 
     Raises:
         UnknownNameError: A name in `without` is not in the library.
@@ -117,7 +117,7 @@ def library(without: Collection[str] = ()) -> frozenset[str]:
 
 
 def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypothesis]:
-    """Hypotheses about the whole network.
+    """Make the hypotheses about the whole network.
 
     Args:
         scenario: Its vehicle types say where each number is now.
@@ -162,7 +162,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
 def settings_as_members(
     hypotheses: Sequence[Hypothesis],
 ) -> list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]]:
-    """The settings of the paper (loads, rain, snow) as starting points of a fit.
+    """Return the settings of the paper (loads, rain, snow) as starting points of a fit.
 
     Where drivers are sluggish in several ways at once, no single effect leads there.
     """
@@ -180,7 +180,7 @@ def settings_as_members(
 
 
 def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The order in which effects are applied: a truck keeps its own acceleration, say."""
+    """Effects into the order in which they are applied: a truck keeps its own acceleration, say."""
 
     def rank(effect: Effect) -> tuple[int, str]:
         if effect.on_detectors:
@@ -213,7 +213,7 @@ def _nominal(scenario: Scenario, attribute: str, default: float) -> float:
 
 
 def _attribute(scenario: Scenario, name: str) -> set[str]:
-    """What the vehicle types of a scenario say."""
+    """Return the values of an attribute in the vehicle types of a scenario."""
     found: set[str] = set()
     for document in (*scenario.additional, *scenario.routes):
         if b"<vType" in document.read():
@@ -224,7 +224,7 @@ def _attribute(scenario: Scenario, name: str) -> set[str]:
 
 
 def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:
-    """The values of the free fields in an effect."""
+    """Return the values of the free fields in an effect."""
     known = {item.name for item in fields(effect)}
     if missing := [name for name in hypothesis.free if name not in known]:
         raise OptionError(f"effect {effect.name!r} has no {missing[0]!r}")
@@ -234,7 +234,7 @@ def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:
 def both_ways(
     hypothesis: Hypothesis, values: tuple[float, ...]
 ) -> list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...]]]:
-    """Both ways in which an effect of the model may change: less, to nothing, and more."""
+    """Return both ways in which an effect of the model may change: to nothing, and to more."""
     if not values or hypothesis.nominal is None:
         return []
     away = tuple(1.4 * v - 0.4 * n for v, n in zip(values, hypothesis.nominal, strict=True))
@@ -244,7 +244,7 @@ def both_ways(
 
 
 def a_few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
-    """One strength on each side of nominal: enough to see what is still missing."""
+    """Return one strength on each side of nominal: enough to see what is still missing."""
     levels, nominal = hypothesis.levels, hypothesis.nominal
     if nominal is None or len(levels) < 2:
         return levels
@@ -254,17 +254,17 @@ def a_few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
 
 
 def effects_of(members: Members) -> tuple[Effect, ...]:
-    """Effects of a set, in order."""
+    """Return the effects of a set, in order."""
     return ordered([hypothesis.effect(values) for hypothesis, values in members])
 
 
 def each_left_out(members: Members) -> list[Members]:
-    """The set without each of its effects."""
+    """Return the set without each of its effects."""
     return [_without(members, index) for index in range(len(members))]
 
 
 def merged(members: Members, new: Members) -> Members:
-    """A model with further effects, or with other values; those at nothing are left out."""
+    """Return a model with further effects, or with other values; those at nothing are left out."""
     found = {hypothesis.key: (hypothesis, values) for hypothesis, values in members}
     for hypothesis, values in new:
         found[hypothesis.key] = (hypothesis, values)
@@ -280,5 +280,5 @@ def _without(members: Members, place: int) -> Members:
 
 
 def names_of(members: Members) -> str:
-    """Names of the effects, for progress and notes."""
+    """Return the names of the effects, for progress and notes."""
     return "+".join(hypothesis.name for hypothesis, _ in members)

@@ -1,4 +1,4 @@
-"""Where data and model disagree: place, regime, size and window, with few false discoveries."""
+"""Disagreements of data and model: place, regime, size and window, with few false discoveries."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy import special, stats
 
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
 from ugat_marl.diagnosis.records import Disagreement
@@ -45,17 +46,30 @@ def locate(
         found += _stretches(site, reference, distance, span)
     tested = sum(int(block.used.sum()) for block in reference.blocks.values())
     found.sort(key=lambda item: item.p)
-    kept = 0
-    for rank, item in enumerate(found, start=1):
-        if item.p <= alpha * rank / max(tested, 1):
-            kept = rank
+    kept = discoveries([item.p for item in found], tested, alpha)
     return tuple(_gathered(found[:kept])[:SHOWN])
 
 
-def _chance(z: float) -> float:
-    """Two-sided tail; beyond a few deviations heavier than normal, as the null draws are."""
+def discoveries(chances: Sequence[float], tested: int, alpha: float) -> int:
+    """Return how many of some chances are discoveries (Benjamini and Hochberg 1995).
+
+    Args:
+        chances: The smallest ones, in order.
+        tested: How many were tested in all; the others count as 1.
+        alpha: Share of false discoveries.
+    """
+    others = [1.0] * (tested - len(chances))
+    every = np.array([*chances, *others])
+    return int((stats.false_discovery_control(every)[: len(chances)] <= alpha).sum())
+
+
+def two_sided(z: float) -> float:
+    """Return the two-sided tail of a standardised difference.
+
+    Beyond a few deviations it is heavier than the normal one, as draws of the null are.
+    """
     soft = 6.0 * math.asinh(abs(z) / 6.0)
-    return max(math.erfc(soft / math.sqrt(2)), 1e-300)
+    return max(2.0 * float(special.ndtr(-soft)), 1e-300)
 
 
 def _statistics(site: Site, pool: str, z: Array, difference: Array) -> list[Disagreement]:
@@ -66,7 +80,9 @@ def _statistics(site: Site, pool: str, z: Array, difference: Array) -> list[Disa
         value = float(z[member, feature])
         size = float(difference[member, feature])
         found.append(
-            Disagreement(tls, approach, lane, regime, name, None, size, unit, value, _chance(value))
+            Disagreement(
+                tls, approach, lane, regime, name, None, size, unit, value, two_sided(value)
+            )
         )
     return found
 
@@ -83,7 +99,7 @@ def _place(site: Site, pool: str, member: int) -> tuple[str | None, str | None, 
 def _stretches(
     site: Site, reference: Reference, distance: Distance, span: tuple[float, float]
 ) -> list[Disagreement]:
-    """The most unusual stretch of every kind of count at every place."""
+    """Find the most unusual stretch of every kind of count at every place."""
     z, difference = distance.z["time"], distance.difference["time"]
     used = reference.blocks["time"].used
     places = len(site.places)
@@ -113,14 +129,14 @@ def _stretches(
                 size,
                 "s" if kind == 3 else "vehicles",
                 value,
-                min(1.0, stretches * _chance(value)),
+                min(1.0, stretches * two_sided(value)),
             )
         )
     return found
 
 
 def _stretch(z: Array) -> tuple[float, int, int] | None:
-    """The contiguous bins with the largest standardised sum."""
+    """Find the contiguous bins with the largest standardised sum."""
     sums = np.concatenate(([0.0], np.cumsum(np.clip(z, -15, 15))))
     best: tuple[float, int, int] | None = None
     for length in range(1, max(int(THRESHOLDS.longest_stretch * len(z)), 1) + 1):
@@ -132,7 +148,7 @@ def _stretch(z: Array) -> tuple[float, int, int] | None:
 
 
 def _gathered(found: Sequence[Disagreement]) -> list[Disagreement]:
-    """The strongest statistic of each place, regime and kind of window."""
+    """Keep the strongest statistic of each place, regime and kind of window."""
     best: dict[tuple[Any, ...], Disagreement] = {}
     for item in found:
         key = (item.tls, item.approach, item.lane, item.regime, item.window is None)

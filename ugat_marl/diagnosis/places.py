@@ -1,4 +1,4 @@
-"""Proposes effects at places and in windows: by what is left over there, before any simulation.
+"""Effects proposed at places and in windows, from what a model leaves there; nothing is simulated.
 
 Counts tell where demand and turning differ: see `volume`. Time tells windows: the stretch of
 minutes in which a place departs most from the model, found by a scan over all stretches. Detectors
@@ -33,7 +33,7 @@ _AVOIDED = ("count_advance", "count_stop")
 
 
 class Proposer:
-    """Finds places and windows.
+    """Finder of places and windows.
 
     Args:
         site: Lanes and detectors.
@@ -51,7 +51,7 @@ class Proposer:
     def hypotheses(
         self, reference: Reference, distance: Distance, periods: Sequence[Period]
     ) -> list[Hypothesis]:
-        """What may be wrong at some place, strongest first within each kind.
+        """Propose effects at places, strongest first within each kind.
 
         Args:
             reference: The model so far.
@@ -67,7 +67,7 @@ class Proposer:
         return [item for item in found if item.name in self.allowed]
 
     def everywhere(self) -> list[Hypothesis]:
-        """What may be wrong at any of the places, if there are few: parking on each lane.
+        """Propose what may be at any of the places, if there are few: parking on each lane.
 
         A lane on which vehicles stand is avoided; its neighbour takes what it loses, so that
         neither pools nor single statistics show it, and no other effect leads there.
@@ -78,13 +78,13 @@ class Proposer:
         return [_parking(lane.id) for lane in lanes]
 
     def directed(self, distance: Distance) -> dict[str, float]:
-        """What the best origin, turn and stretch would explain: few counts, but the right ones."""
+        """Return the sizes of the best origin, turn and stretch: few counts, but the right ones."""
         return self._volume.directed(distance) | largest_stretches(self._edges, distance)
 
     # --- time ---------------------------------------------------------------------------------
 
     def _timing(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
-        """Origins whose profile over time would fit if it came sooner or later."""
+        """Find origins whose profile over time would fit if it came sooner or later."""
         z, difference = distance.z["time"], distance.difference["time"]
         block = reference.blocks["time"]
         found: list[tuple[float, str, float]] = []
@@ -120,7 +120,7 @@ class Proposer:
     def _windows(
         self, reference: Reference, distance: Distance, periods: Sequence[Period]
     ) -> list[Hypothesis]:
-        """Surges and closures in the stretches that depart most."""
+        """Propose surges and closures in the stretches that depart most."""
         if len({(p.begin_s, p.end_s) for p in periods}) > 1:
             return []
         found: list[tuple[float, Hypothesis]] = []
@@ -191,7 +191,7 @@ class Proposer:
     def _minutes(
         self, periods: Sequence[Period], members: Sequence[int], kind: str, other: str, minutes: int
     ) -> Array:
-        """Counts, or occupied seconds, per minute: the mean over the periods."""
+        """Return counts, or occupied seconds, per minute: the mean over the periods."""
         total = np.zeros(minutes)
         for period in periods:
             edges = np.linspace(period.begin_s, period.end_s, minutes + 1)
@@ -265,7 +265,7 @@ class Proposer:
         return found
 
     def _speed_ratio(self, reference: Reference, distance: Distance, edge: str) -> float:
-        """Free speed on an edge, as a multiple of the simulated one."""
+        """Return the free speed on an edge, as a multiple of the simulated one."""
         rows = [index for index, name in enumerate(self._edges) if name == edge]
         mean = reference.blocks["lane"].mean[rows, INDEX["free_speed"]]
         difference = distance.difference["lane"][rows, INDEX["free_speed"]]
@@ -276,7 +276,7 @@ class Proposer:
         return float(np.clip(ratio, 0.2, 2.0)) if abs(ratio - 1.0) > 0.03 else 0.8
 
     def _traffic_lights(self, distance: Distance) -> list[Hypothesis]:
-        """The two traffic lights whose starts of green differ most from the others'."""
+        """Find the two traffic lights whose starts of green differ most from the others'."""
         lost = distance.z["intersection"][:, INDEX["lost"]]
         lost = lost - np.median(lost)
         drift = distance.z["intersection"][:, INDEX["lost_trend"]]
@@ -308,7 +308,7 @@ def _parking(lane: str) -> Hypothesis:
 
 
 def _later(counts: Array, bins: float) -> Array:
-    """Counts ``(rows, bins)`` so many bins later; nobody comes from before the first bin."""
+    """Return counts ``(rows, bins)`` so many bins later; nobody comes from before the first bin."""
     moved = np.zeros_like(counts)
     whole = int(np.floor(bins))
     for part, step in ((1.0 - (bins - whole), whole), (bins - whole, whole + 1)):
@@ -324,7 +324,7 @@ def _later(counts: Array, bins: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Routes:
-    """Which edges vehicles use: per pair of edges, vehicles per hour of the scenario.
+    """Edges that vehicles use: per pair of edges, vehicles per hour of the scenario.
 
     Attributes:
         origins: Vehicles per hour by first edge.
@@ -339,13 +339,13 @@ class Routes:
     joint: dict[str, dict[str, float]]
 
     def share(self, origin: str, edge: str) -> float:
-        """Share of the vehicles that pass an edge which start at an origin."""
+        """Return the share of the vehicles that pass an edge which start at an origin."""
         own = self.passing[origin].get(edge, 0.0)
         return own / self.joint[edge][edge] if own else 0.0
 
     @classmethod
     def of(cls, scenario: Scenario) -> Routes:
-        """Counts the routes of all vehicles."""
+        """Count the routes of all vehicles."""
         origins: dict[str, float] = defaultdict(float)
         passing: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         turns: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
@@ -383,7 +383,7 @@ class _Counts:
     measured: Array
 
     def weighed(self, change: dict[str, float]) -> tuple[float, float, float]:
-        """A change of vehicles per hour, by edge: strength, squared z, and z of strength 1."""
+        """Return strength, squared z, and squared z of strength 1 of a change of flows by edge."""
         ray = np.zeros(len(self.place))
         for edge, value in change.items():
             if edge in self.place:
@@ -395,7 +395,7 @@ class _Counts:
 
 
 class Volume:
-    """Finds origins and turns.
+    """Finder of origins and turns, from counts alone.
 
     Args:
         site: Lanes and detectors.
@@ -408,7 +408,7 @@ class Volume:
         self._edges = [edge for _, edge, _ in site.places]
 
     def directed(self, distance: Distance) -> dict[str, float]:
-        """Squared standardised size of the best origin and of the best turn."""
+        """Return the squared standardised sizes of the best origin and of the best turn."""
         counts = self._counts(distance)
         return {
             "demand": max((item[0] for item in self._origins(counts)), default=0.0),
@@ -416,7 +416,7 @@ class Volume:
         }
 
     def hypotheses(self, distance: Distance) -> list[Hypothesis]:
-        """The most suspicious origins and turns, with the strength the counts suggest."""
+        """Propose the most suspicious origins and turns, with the strength the counts suggest."""
         counts = self._counts(distance)
         found: list[Hypothesis] = []
         if len(self._routes.passing) > 1:
@@ -464,7 +464,7 @@ class Volume:
         return _Counts(place, whiten, whiten @ np.array(differences))
 
     def _correlation(self, edges: tuple[str, ...]) -> Array:
-        """Of the counts of edges if vehicles come by chance: what they share."""
+        """Return the correlation of the counts of edges if vehicles come by chance."""
         joint = self._routes.joint
         shared = np.array([[joint.get(a, {}).get(b, 0.0) for b in edges] for a in edges])
         shared = shared.reshape(len(edges), len(edges))
@@ -473,7 +473,7 @@ class Volume:
         return (1 - THRESHOLDS.alone) * shared / np.outer(size, size) + np.diag(alone)
 
     def _origins(self, counts: _Counts) -> list[tuple[float, str, float]]:
-        """Squared z, origin and factor of every origin that can be told."""
+        """Return squared z, origin and factor of every origin that can be told."""
         found: list[tuple[float, str, float]] = []
         for origin, reached in self._routes.passing.items():
             strength, gain, size = counts.weighed(reached)
@@ -482,7 +482,7 @@ class Volume:
         return found
 
     def _turns(self, counts: _Counts, distance: Distance) -> list[tuple[float, str, str, float]]:
-        """Squared z, edges and share of every pair of edges between which vehicles may move.
+        """Return squared z, edges and share of every pair of edges between which vehicles may move.
 
         What arrives says where to, and hardly where from; that is told by the lanes vehicles left.
         """
@@ -536,7 +536,7 @@ _COUNTS = 3
 
 
 def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, float]:
-    """The largest squared departure over any stretch of bins: of an edge's counts, of a lane's.
+    """Return the largest squared departure over any stretch of bins: of an edge, of a lane.
 
     Args:
         edges: Edge of every place.
@@ -556,7 +556,7 @@ def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, flo
 
 
 def _largest(difference: Array, variance: Array) -> float:
-    """Over all rows and all stretches of bins; both ``(rows, bins)``."""
+    """Return the largest over all rows and all stretches of bins; both ``(rows, bins)``."""
     sums, noise = (
         np.concatenate((np.zeros((len(item), 1)), np.cumsum(item, axis=1)), axis=1)
         for item in (difference, variance)
@@ -572,7 +572,7 @@ def _largest(difference: Array, variance: Array) -> float:
 def most_unusual(
     measured: Array, expected: Array, variance: Array, begin_s: float, side: int = 0
 ) -> tuple[float, float, float, float] | None:
-    """Scans all stretches for the largest standardised departure from a constant ratio.
+    """Scan all stretches for the largest standardised departure from a constant ratio.
 
     Args:
         measured: Per minute.
@@ -606,7 +606,7 @@ def most_unusual(
 
 
 def occupied_between(on: Array, off: Array, edges: Array) -> Array:
-    """Occupied seconds between edges of time."""
+    """Return occupied seconds between edges of time."""
     filled = np.zeros(len(edges))
     for index, edge in enumerate(edges):
         filled[index] = np.clip(np.minimum(off, edge) - on, 0.0, None).sum()
@@ -619,7 +619,7 @@ def occupied_between(on: Array, off: Array, edges: Array) -> Array:
 def fault_hypotheses(
     site: Site, reference: Reference, distance: Distance, periods: Sequence[Period]
 ) -> list[Hypothesis]:
-    """Detectors that count too few, stick, fall silent, or have each other's place."""
+    """Propose detectors that count too few, stick, fall silent, or have each other's place."""
     found: list[Hypothesis] = []
     places = {name: (place, INDEX[kind]) for name, (kind, place) in site.counted.items()}
     z = {name: float(distance.z["lane"][row]) for name, row in places.items()}
@@ -641,7 +641,7 @@ def fault_hypotheses(
 
 
 def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:
-    """Detectors that were on for minutes at the same time of every period."""
+    """Find detectors that were on for minutes at the same time of every period."""
     found: list[Hypothesis] = []
     for name in sorted(set.intersection(*(set(p.passages) for p in periods))):
         windows: list[tuple[float, float]] = []
@@ -666,7 +666,7 @@ def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:
 
 
 def _silent(periods: Sequence[Period], rate: Mapping[str, float]) -> list[Hypothesis]:
-    """Detectors that saw nothing at the same time of every period, though vehicles came."""
+    """Find detectors that saw nothing at the same time of every period, though vehicles came."""
     found: list[tuple[float, Hypothesis]] = []
     for name, expected in rate.items():
         begin, end = -np.inf, np.inf
@@ -691,7 +691,7 @@ def _swapped(
     difference: Mapping[str, float],
     z: Mapping[str, float],
 ) -> list[Hypothesis]:
-    """Pairs of detectors of one kind whose counts fit once they are exchanged."""
+    """Find pairs of detectors of one kind whose counts fit once they are exchanged."""
     found: list[tuple[float, Hypothesis]] = []
     suspects = [name for name in mean if abs(z[name]) > 4.0]
     for first in suspects:
@@ -709,7 +709,7 @@ def _swapped(
 
 
 def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None:
-    """Two detectors of one stream that are both said to miss vehicles, in its direction.
+    """Find two detectors of one stream that are both said to miss vehicles, in its direction.
 
     One detector of a stream that counts too few stands against the others. Where those behind it
     count too few as well, the vehicles may have left the road.

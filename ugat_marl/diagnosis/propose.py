@@ -1,4 +1,4 @@
-"""Proposes models: which effects, at which strengths, would make the measured difference.
+"""Sets of effects, with their strengths, that would make the measured difference.
 
 Every hypothesis is simulated at a few strengths; each is a ray in the space of statistics. Subsets
 of up to three rays are fitted to the measured difference by least squares, all of them, which costs
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Ray:
-    """What a hypothesis does at one strength.
+    """Change of the statistics under a hypothesis at one strength.
 
     Attributes:
         hypothesis: Which.
@@ -42,7 +42,7 @@ class Ray:
     origin: tuple[float, ...] | None
 
     def at(self, strength: float) -> tuple[float, ...]:
-        """Values of the free fields at a multiple of the simulated strength."""
+        """Return the values of the free fields at a multiple of the simulated strength."""
         if self.origin is None:
             return self.level
         values = [n + strength * (x - n) for n, x in zip(self.origin, self.level, strict=True)]
@@ -50,7 +50,7 @@ class Ray:
 
 
 def between(rays: Sequence[Ray]) -> list[Ray]:
-    """The rays, and further ones half-way between strengths of the same hypothesis.
+    """Return the rays, and further ones half-way between strengths of the same hypothesis.
 
     What an effect does is not in proportion to its strength; between two strengths that were
     simulated it nearly is.
@@ -84,7 +84,7 @@ def _side(ray: Ray) -> bool:
 def propose(
     rays: Sequence[Ray], whitener: Whitener, price: float, largest: int = 3
 ) -> list[Proposed]:
-    """Sets of effects in order of what they would leave.
+    """Find sets of effects, in order of what they would leave.
 
     Args:
         rays: What hypotheses do.
@@ -130,14 +130,14 @@ def propose(
 
 
 def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
-    """Whether the values differ from nominal once they are on the hypothesis's grid."""
+    """Return True if the values differ from nominal once they are on the hypothesis's grid."""
     return hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
 
 
 def _least_squares(
     gram: Array, match: Array, chosen: tuple[int, ...], both: tuple[bool, ...]
 ) -> Array | None:
-    """Strengths along the rays, within reach; None if one of them does not help."""
+    """Return strengths along the rays, within reach; None if one of them does not help."""
     part = gram[np.ix_(chosen, chosen)]
     try:
         found = np.linalg.solve(
@@ -152,7 +152,7 @@ def _least_squares(
 
 
 def _useful(best: dict[tuple[object, ...], Proposed], rays: Sequence[Ray], count: int) -> list[int]:
-    """Rays of the hypotheses in the best sets so far."""
+    """Return the rays of the hypotheses in the best sets so far."""
     keys: list[str] = []
     for item in sorted(best.values(), key=lambda item: item.expected):
         keys += [str(hypothesis.key) for hypothesis, _ in item.members]
@@ -166,7 +166,7 @@ def _useful(best: dict[tuple[object, ...], Proposed], rays: Sequence[Ray], count
 
 
 def promising(proposals: Sequence[Proposed]) -> list[Proposed]:
-    """The best sets of each size, if a larger one promises more than a smaller one."""
+    """Choose the best sets of each size, if a larger one promises more than a smaller one."""
     if not proposals:
         return []
     chosen = [item for item in proposals if len(item.members) == 1][:1]
@@ -181,7 +181,7 @@ def promising(proposals: Sequence[Proposed]) -> list[Proposed]:
 
 
 def squared_gap(distance: Distance, base: Reference, periods: int) -> float:
-    """Squared differences in units of the noise of the scenario as it is, whatever the model's is.
+    """Return squared differences in units of the noise of the scenario as it is.
 
     Args:
         distance: Of a data set from a model.

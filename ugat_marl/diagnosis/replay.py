@@ -85,7 +85,7 @@ class Day:
 
 
 class Replay:
-    """Simulates a scenario with effects under measured signals.
+    """Simulator of a scenario with effects under measured signals.
 
     Args:
         scenario: The scenario as it is, with the effects of its own file.
@@ -118,11 +118,11 @@ class Replay:
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[functools.partial[Replay], tuple[Any, ...]]:
-        """For executors elsewhere: the days it remembers stay here."""
+        """Send it to other processes without the days it remembers."""
         return functools.partial(Replay, answering=self.answering), self._given
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
-        """Simulates one day.
+        """Simulate one day.
 
         Args:
             effects: Applied to the day one after the other; those of detectors to what they see.
@@ -148,13 +148,13 @@ class Replay:
         return Day(_logged(seen), done.travel_time_s, due)
 
     def observed(self, effects: Sequence[Effect], period: Period) -> Period:
-        """A simulated period as other detectors would have seen it; costs no simulation."""
+        """Return a simulated period as other detectors would have seen it; costs no simulation."""
         for effect in effects:
             period = effect.observe(period, self._detectors, self._owner)
         return _logged(period)
 
     def asked(self, effects: Sequence[Effect], period: Period, seed: int) -> Mapping[str, Array]:
-        """What a day of a model asks for, see `Due`; costs no simulation.
+        """Return what a day of a model asks for, see `Due`; this costs no simulation.
 
         Raises:
             ValueError: The signals answered nobody.
@@ -206,7 +206,7 @@ def _with(scenario: Scenario, effects: Sequence[Effect]) -> Scenario:
 
 
 def _logged(period: Period) -> Period:
-    """What the electronics of a street would have kept of it."""
+    """Return what the electronics of a street would have kept of a period."""
     passages = {
         name: as_logged(item, period.begin_s, period.end_s)
         for name, item in period.passages.items()
@@ -215,7 +215,7 @@ def _logged(period: Period) -> Period:
 
 
 def replay_document(scenario: Scenario, period: Period, begin_s: float) -> Document:
-    """A programme for every measured traffic light that shows what was measured.
+    """Write a programme for every measured traffic light that shows what was measured.
 
     Before the period the light shows the beginning of its own log once more. A lost time of the
     scenario's settings is put behind every start of green.
@@ -243,7 +243,7 @@ def replay_document(scenario: Scenario, period: Period, begin_s: float) -> Docum
 
 
 def _from(log: SignalLog, period: Period, begin_s: float) -> SignalLog:
-    """The log from `begin_s` on, with its own beginning repeated before the period."""
+    """Return the log from `begin_s` on, with its own beginning repeated before the period."""
     early = period.begin_s - begin_s
     if early <= 0:
         return log
@@ -254,7 +254,7 @@ def _from(log: SignalLog, period: Period, begin_s: float) -> SignalLog:
 def _durations(
     log: SignalLog, end_s: float, begin_s: float, step_s: float
 ) -> list[tuple[float, str]]:
-    """Phases in whole steps, at least to the end; times are rounded, not durations."""
+    """Return phases in whole steps, at least to the end; times are rounded, not durations."""
     shown: list[tuple[int, str]] = []
     for time, state in log:
         tick = max(round((time - begin_s) / step_s), 0)
@@ -301,7 +301,7 @@ class Due:
 
 
 class Arrivals:
-    """Reads when vehicles came, and makes a simulated day's vehicles come then.
+    """Times at which vehicles came, for the vehicles of a simulated day.
 
     Args:
         site: Lanes and detectors.
@@ -316,7 +316,7 @@ class Arrivals:
         self._counted = frozenset(edge for _, edge, _ in site.places)
 
     def given(self, asked: Scenario, drivers: Scenario, period: Period) -> tuple[Scenario, Due]:
-        """The day with the measured arrivals.
+        """Give a day the measured arrivals.
 
         Args:
             asked: The day as the model has it, with all its effects.
@@ -356,7 +356,7 @@ class Arrivals:
         return self._by_edge(day.routes[0].parse(), period)
 
     def _coming(self, item: ET.Element, period: Period) -> _Coming | None:
-        """Where a vehicle is seen first, and when; None if it has to be left alone."""
+        """Place and time at which a vehicle is first seen; None if it has to be left alone."""
         way = self._way(_route(item))
         if way.approach is None or item.find("stop") is not None:
             return None
@@ -367,7 +367,7 @@ class Arrivals:
         return _Coming(way.approach, time, way_s, way.following, item)
 
     def _way(self, route: str) -> _Way:
-        """A route at the speed limit; remembered, since thousands drive the same few."""
+        """Return a route at the speed limit; remembered, since thousands drive the same few."""
         found = self._ways.get(route)
         if found is not None:
             return found
@@ -387,7 +387,7 @@ class Arrivals:
         return found
 
     def _came(self, edge: str, period: Period) -> list[tuple[float, frozenset[str]]]:
-        """When vehicles would have come by an approach's advance detectors, and where they went."""
+        """Times at which vehicles came by an approach's advance detectors, and their next edges."""
         lanes = self._approaches[edge]
         seen = [period.passages.get(lane.advance, Passages.none()) for lane in lanes]
         times = [
@@ -414,7 +414,7 @@ class Arrivals:
         return sorted(found, key=lambda row: row[0])
 
     def _by_edge(self, vehicles: Iterable[ET.Element], period: Period) -> dict[str, Array]:
-        """Vehicles that would come by the end of each counted edge, by bin of time."""
+        """Count vehicles that would come by the end of each counted edge, by bin of time."""
         bins = bins_of(period)
         times: dict[str, list[float]] = {edge: [] for edge in self._counted}
         for item in vehicles:
@@ -463,7 +463,7 @@ def _filled(
     earliest_s: float,
     period: Period,
 ) -> list[ET.Element]:
-    """Vehicles of the pool at the times of those that came; again from the first if too few.
+    """Return vehicles of the pool at the times of those that came; again from the first if too few.
 
     In their own order, each where it can go on as it means to.
     """
@@ -497,7 +497,7 @@ def _filled(
 
 
 def corrected(counted: Tally, site: Site, due: Due) -> Tally:
-    """The tally with the counts the demand asks for, in the place of those that were given.
+    """Return the tally with the counts the demand asks for, in the place of those that were given.
 
     Args:
         counted: Of a day with measured arrivals.
@@ -524,7 +524,7 @@ def corrected(counted: Tally, site: Site, due: Due) -> Tally:
 
 
 def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
-    """Edges all of whose lanes in front of the traffic light have an advance detector."""
+    """Find edges all of whose lanes in front of the traffic light have an advance detector."""
     zones = {item.id: item for item in site.detectors}
     lanes: dict[str, list[_Lane] | None] = {}
     for lane in site.lanes:
@@ -562,7 +562,7 @@ def _factor(item: ET.Element) -> float:
 
 
 def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float = 0.0) -> Array:
-    """When vehicles would have come if nobody had stood in their way, s.
+    """Return times at which vehicles would have come if nobody had stood in their way, s.
 
     Vehicles that came through a queue arrived at its end before; when, nobody saw. They are spread
     evenly between the last that came freely and the next, but none comes later than it did.
@@ -596,7 +596,7 @@ def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float =
 def by_lane_left(
     came: Sequence[Array], crossed: Sequence[Array], travel_s: Sequence[float]
 ) -> list[Array]:
-    """When the vehicles came that left an approach by each of its lanes.
+    """Return arrival times of the vehicles that left an approach by each of its lanes.
 
     Between the detectors some change lanes. Every vehicle at a stop detector is taken for the first
     that came on its lane and has not left yet; if there is none, for the first on any other lane.
@@ -623,7 +623,7 @@ def by_lane_left(
 
 
 def missed(times: Array, crossed: Array, period: Period) -> Array:
-    """Vehicles advance detectors missed if the stop detectors saw many more, by window."""
+    """Vehicles that advance detectors missed if the stop detectors saw many more, by window."""
     if len(crossed) - len(times) <= THRESHOLDS.missing + THRESHOLDS.missing_share * len(times):
         return np.empty(0)
     count = max(1, round((period.end_s - period.begin_s) / THRESHOLDS.missed_window_s))
@@ -657,7 +657,7 @@ class Unmeasured:
 
     @classmethod
     def of(cls, periods: Sequence[Period]) -> Unmeasured:
-        """What no measured period tells."""
+        """Find what no measured period tells."""
         seen: set[str] = set()
         speeds: set[str] = set()
         lengths: set[str] = set()
@@ -675,7 +675,7 @@ class Unmeasured:
         return bool(self.speeds or self.lengths)
 
     def kept_from(self, period: Period) -> Period:
-        """A simulated period as the detectors of the street would have told it."""
+        """Return a simulated period as the detectors of the street would have told it."""
         if not self:
             return period
         passages = {

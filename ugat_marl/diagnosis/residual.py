@@ -1,4 +1,4 @@
-"""Is what a model leaves no more than chance? The distribution of chance is simulated.
+"""Test of what a model leaves against chance, whose distribution is simulated.
 
 The days of the model are cut in halves: one gives the statistics and their noise, sets of days from
 the other are treated as data. Nothing is looked up in a table, since the parts of the distance
@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.fit import WIDE
@@ -85,7 +86,7 @@ class Null:
         data: Sequence[Tally],
         extra: Mapping[str, Array] | None = None,
     ) -> Residual:
-        """Tests a data set.
+        """Test a data set.
 
         A network may lock up on one day in a hundred. So a difference must not hang on one day: if
         it is nothing unusual once some period is left out, that is the chance reported.
@@ -107,22 +108,31 @@ class Null:
         smallest = min(chances.values())
         return Residual(
             found.total,
-            self.quantile(0.99),
+            self.floor,
             self.expected,
             min(1.0, smallest * len(chances)),
             chances,
         )
 
-    def quantile(self, share: float) -> float:
-        """What this share of data sets of the model stay below, in total."""
+    @property
+    def floor(self) -> float:
+        """Total distance that 99 of 100 data sets of the model stay below."""
         mean, deviation = self._moments["total"]
-        normal = {0.95: 1.645, 0.99: 2.326}[share]
-        return math.exp(mean + normal * deviation)
+        return math.exp(mean + THRESHOLDS.floor_deviations * deviation)
 
     def _chance(self, name: str, value: float) -> float:
-        """Upper tail of a log-normal distribution, heavier than that of a chi-square."""
-        mean, deviation = self._moments[name]
-        return 0.5 * math.erfc((math.log(max(value, 1e-9)) - mean) / (deviation * math.sqrt(2)))
+        return log_normal_tail(value, *self._moments[name])
+
+
+def log_normal_tail(value: float, mean: float, deviation: float) -> float:
+    """Return the upper tail of a log-normal distribution, heavier than that of a chi-square.
+
+    Args:
+        value: The value.
+        mean: Mean of the logarithms.
+        deviation: Their standard deviation.
+    """
+    return float(special.ndtr((mean - math.log(max(value, 1e-9))) / deviation))
 
 
 def _statistics(found: Distance, directed: Directed | None) -> dict[str, float]:
@@ -144,7 +154,7 @@ def _log_moments(values: Sequence[float]) -> tuple[float, float]:
 
 
 class Matched:
-    """Asks of each known direction whether a difference points there: a matched filter.
+    """Matched filters: one for each known direction in which a difference may point.
 
     What an effect does is spread over many statistics, each of them within its noise. Along its own
     direction it is one number of unit noise, and so it shows when the sum over everything does not.
@@ -195,7 +205,7 @@ class Matched:
         self._units = found[seen] / left[seen, None]
 
     def __call__(self, distance: Distance) -> float:
-        """The largest squared component along any of the directions."""
+        """Return the largest squared component along any of the directions."""
         counted = {name: softened(name, distance.z[name]) for name, _ in self._parts}
         components = self._units @ self._whitened(counted)
         return float((components**2).max(initial=0.0))
@@ -205,14 +215,14 @@ class Matched:
 
 
 def _spanned(rows: Array) -> Array:
-    """Orthonormal columns that span the rows; rows of 0, or the same twice, add nothing."""
+    """Return orthonormal columns that span the rows; rows of 0, or the same twice, add nothing."""
     _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
     return directions[sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)].T
 
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Where single effects would show in what a model leaves.
+    """Directions in which single effects would show in what a model leaves.
 
     Attributes:
         rays: What effects do, simulated upon the scenario as it is.

@@ -1,4 +1,4 @@
-"""Selects the effects: propose, simulate, fit, and stop when what is left is chance."""
+"""Selection of the effects: propose, simulate, fit, and stop when what is left is chance."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MOVES_OF_A_VALUE = 8
 
 
 class Selector:
-    """Searches for the effects that make the difference.
+    """Search for the effects that make the difference.
 
     Args:
         fitter: Simulates and fits.
@@ -115,7 +115,7 @@ class Selector:
         return Selected(best, rivals, complete, located.examined | self.examined)
 
     def test(self, model: Fitted) -> Tested:
-        """Simulates more days of a model and tests what it leaves."""
+        """Simulate more days of a model and tests what it leaves."""
         fitter = self._fitter
         moves = len(model.values) * MOVES_OF_A_VALUE * fitter.days
         days = THRESHOLDS.settling_days + self._effort.test + moves
@@ -143,11 +143,11 @@ class Selector:
         return [item.tally for item in found.values()]
 
     def _untested(self, model: Fitted, base: Tested) -> Tested:
-        """A model for whose test there was no time: its errors are unknown."""
+        """Return a model without a test of its own, for which there was no time."""
         return Tested(model, base.residual, 0.0 * model.values, {})
 
     def _round(self, start: Tested, number: int) -> Tested | None:
-        """Adds, changes or removes effects; None if nothing is worth it."""
+        """Add, change or remove effects; None if nothing is worth it."""
         rays = between(self._library_rays(start.model, number))
         whitener = self._whitener(start.model, WIDE)
         gap = float(whitener.measured @ whitener.measured)
@@ -184,7 +184,7 @@ class Selector:
         return None
 
     def _nearest(self) -> list[Members]:
-        """The single strengths of the library that come nearest, simulated, not along rays.
+        """Return the single strengths of the library that come nearest, simulated, not along rays.
 
         What effects do may come in steps, as whole vehicles cross the start of green or a detector.
         """
@@ -200,7 +200,7 @@ class Selector:
         return [strengths[place] for _, place in sorted(found)[: THRESHOLDS.nearest]]
 
     def _elsewhere(self, model: Fitted, rays: Sequence[Ray], number: int) -> list[Members]:
-        """Proposals with effects at places and in windows, judged by lanes and minutes too."""
+        """Propose effects at places and in windows, judged by lanes and minutes too."""
         present = {item.key for item in self._library}
         found = self._proposer.hypotheses(model.reference, model.distance, self._periods)
         local = [item for item in found if item.key not in present]
@@ -227,7 +227,7 @@ class Selector:
         return Whitener(model.reference, data, THRESHOLDS.foresight, base, blocks)
 
     def _library_rays(self, model: Fitted, number: int) -> tuple[Ray, ...]:
-        """The whole library on top of a model; upon the scenario as it is it is worked out once."""
+        """Return rays of the library on top of a model; those of the scenario as it is are kept."""
         if number:
             return tuple(self._bank(model, self._library, number))
         self._rays = self._rays or tuple(self._bank(model, self._library, 0))
@@ -236,7 +236,7 @@ class Selector:
     def _bank(
         self, model: Fitted, hypotheses: Sequence[Hypothesis], number: int, what: str = "library"
     ) -> list[Ray]:
-        """Simulates hypotheses on top of a model."""
+        """Simulate hypotheses on top of a model."""
         present = {hypothesis.key: values for hypothesis, values in model.members}
         jobs: list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...] | None]] = []
         for hypothesis in dict.fromkeys(hypotheses):
@@ -266,7 +266,7 @@ class Selector:
         return rays
 
     def _tried(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
-        """Simulates sets of effects on top of a model."""
+        """Simulate sets of effects on top of a model."""
         found: list[Fitted] = []
         with self._reporter.task(title, len(chosen)) as advance:
             for new in chosen:
@@ -294,7 +294,7 @@ class Selector:
         return best
 
     def _kept(self, model: Fitted) -> Fitted:
-        """Remembers the best of every set of effects."""
+        """Remember the best of every set of effects."""
         key = str(sorted(str(hypothesis.key) for hypothesis, _ in model.members))
         if key not in self._seen or model.cost < self._seen[key].cost:
             self._seen[key] = model
@@ -313,7 +313,7 @@ def pruned(
     alpha: float,
     reporter: Reporter | None = None,
 ) -> Tested:
-    """Drops effects that do not matter, or that the others can do without.
+    """Drop effects that do not matter, or that the others can do without.
 
     Of two sets that leave no more than chance, the smaller one is the explanation. Costs are
     compared over the same days, and enough of them: with more the same model costs less, and what

@@ -17,7 +17,7 @@ _AMBER = frozenset("yY")
 
 
 def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> tuple[Effect, ...]:
-    """Yellow and all-red times of the log, where they are not those of the scenario's control.
+    """Read yellow and all-red times off the log, where the scenario's control has others.
 
     A log of the network's own programme is compared with that programme instead.
     """
@@ -42,12 +42,12 @@ def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> 
 
 
 def _own(log: SignalLog, programme: tuple[tuple[float, str], ...]) -> bool:
-    """Whether a log shows only states of the network's own programme."""
+    """Return True if a log shows only states of the network's own programme."""
     return {state for _, state in log} <= {state for _, state in programme}
 
 
 def _clearances(log: SignalLog) -> list[tuple[str, float]]:
-    """Durations of yellow, and of the time from its end to the next start of a green.
+    """Return durations of yellow, and of the time from its end to the next start of a green.
 
     Other links may be green all the while; red-yellow is not yellow.
     """

@@ -86,7 +86,7 @@ class Site:
 
     @classmethod
     def of(cls, network: Network, detectors: Sequence[Detector]) -> Site:
-        """Finds the traffic light and the lane of every detector.
+        """Find the traffic light and the lane of every detector.
 
         Raises:
             MeasuredDataError: No detector is at an intersection with signals.
@@ -146,7 +146,7 @@ class Site:
         return rows
 
     def greens(self, period: Period) -> tuple[Greens, ...]:
-        """The greens of every lane; only whole ones."""
+        """Return the greens of every lane; only whole ones."""
         found: list[Greens] = []
         for lane in self.lanes:
             log = period.signals.get(self.intersections[lane.intersection], ())
@@ -163,7 +163,7 @@ def _following(item: Intersection, lane: str) -> frozenset[str]:
 
 
 def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
-    """Merges what the links of a lane show into its greens."""
+    """Merge what the links of a lane show into its greens."""
     seen: dict[str, str] = {}
     changes: list[tuple[float, str]] = []
     for time, state in log:

@@ -37,7 +37,7 @@ lanes and minutes have heavy tails."""
 
 @dataclass(frozen=True)
 class Pools:
-    """How places pool.
+    """Pools of places: the network, intersections, lanes.
 
     Attributes:
         blocks: Block name to a matrix ``(members, places)`` of zeros and ones.
@@ -49,7 +49,7 @@ class Pools:
 
     @classmethod
     def of(cls, site: Site, together: int = 1) -> Pools:
-        """The network, every intersection if there are several, every lane."""
+        """Pool the network, every intersection if there are several, every lane."""
         places = len(site.places)
         owners = [owner for owner, _, _ in site.places]
         blocks = {"network": np.ones((1, places))}
@@ -64,7 +64,7 @@ class Pools:
         return cls(blocks, together)
 
     def pool(self, item: Tally) -> dict[str, Array]:
-        """Sums and weights ``(members, features, 2)`` of every block.
+        """Return sums and weights ``(members, features, 2)`` of every block.
 
         The block "time" has a member for every kind of count at every place, and bins of time for
         features.
@@ -81,7 +81,7 @@ class Pools:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """What one block looks like under a model; all arrays ``(members, features)``.
+    """One block of statistics under a model; all arrays ``(members, features)``.
 
     Attributes:
         mean: Expected statistics.
@@ -102,7 +102,7 @@ class Block:
     doubt: Array | float = 0.0
 
     def noise(self, weight: Array, periods: int) -> Array:
-        """Variance of measured minus expected; fewer observations than usual say less.
+        """Return the variance of measured minus expected; fewer observations than usual say less.
 
         Args:
             weight: Observations per measured period.
@@ -114,7 +114,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """How far data are from a model.
+    """Distance of data from a model.
 
     Attributes:
         total: Sum over the blocks.
@@ -169,7 +169,7 @@ class Reference:
             self.blocks[name] = replace(block, doubt=doubt[name] if doubt else known)
 
     def _block(self, sums: Array, prior: Block | None, partner: Array | None, name: str) -> Block:
-        """From sums ``(days, members, features, 2)``."""
+        """Make a block from sums ``(days, members, features, 2)``."""
         timed = name == "time"
         mean, variance, weight, residual = _moments(sums)
         if timed:
@@ -206,7 +206,7 @@ class Reference:
         relative_to: Reference | None = None,
         extra: Mapping[str, Array] | None = None,
     ) -> Distance:
-        """The distance of a data set.
+        """Measure the distance of a data set.
 
         Args:
             data: Its periods.
@@ -247,13 +247,13 @@ def softened(block: str, z: Array) -> Array:
 
 
 def _stack(pools: Pools, tallies: Sequence[Tally]) -> dict[str, Array]:
-    """Pooled sums of several days, ``(days, members, features, 2)``."""
+    """Return pooled sums of several days, ``(days, members, features, 2)``."""
     pooled = [pools.pool(item) for item in tallies]
     return {name: np.stack([item[name] for item in pooled]) for name in pooled[0]}
 
 
 def added(tallies: Sequence[Tally]) -> Tally:
-    """The tally of several periods together."""
+    """Return the tally of several periods together."""
     total = tallies[0]
     for item in tallies[1:]:
         total = total + item
@@ -261,7 +261,7 @@ def added(tallies: Sequence[Tally]) -> Tally:
 
 
 def _smoothed(mean: Array, variance: Array) -> Array:
-    """Variances of counts in short bins: half their own, half in proportion to the mean."""
+    """Return variances of counts in short bins: half their own, half in proportion to the mean."""
     scale = variance.sum(axis=1, keepdims=True) / np.maximum(mean.sum(axis=1, keepdims=True), 1e-9)
     return np.maximum(0.5 * variance + 0.5 * scale * mean, 0.05)
 
@@ -279,7 +279,7 @@ def _moments(sums: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _moved(mean: Array, residual: Array, partner: Array) -> NDArray[np.bool_]:
-    """Which statistics differ from those of the same days under the prior model beyond chance."""
+    """Statistics that differ from those of the same days under the prior model beyond chance."""
     before, _, _, other = _moments(partner)
     days = len(partner)
     noise = ((residual - other) ** 2).sum(axis=0) / max(days - 1, 1) / days
@@ -303,7 +303,7 @@ def _controlled(
 
 @functools.cache
 def _grain(width: int) -> Array:
-    """The smallest sum that is known to be one, for every feature, or bin of time."""
+    """Return the precision of a mean of one observation, for every feature or bin of time."""
     if width != len(FEATURES):
         return np.full(width, THRESHOLDS.grain)
     return np.array(
@@ -316,12 +316,12 @@ def _grain(width: int) -> Array:
 
 @functools.cache
 def _constant(speeds: bool) -> NDArray[np.bool_]:
-    """Features that are never used."""
+    """Mark features that are never used."""
     return np.array([not speeds and name in SPEED_FEATURES for name, _, _ in FEATURES])
 
 
 def _correlation(residual: Array) -> Array:
-    """Shrunk correlation of ``(days, members, features)``, all members of the block together."""
+    """Return the shrunk correlation of ``(days, members, features)``, all members together."""
     rows = residual.reshape(-1, residual.shape[-1])
     spread = np.sqrt((rows**2).mean(axis=0))
     rows = rows / np.where(spread > 0, spread, 1.0)
@@ -336,7 +336,7 @@ def _correlation(residual: Array) -> Array:
 
 
 def _mahalanobis(z: Array, used: NDArray[np.bool_], correlation: Array) -> float:
-    """Sum over the members of ``z' C^-1 z``, each with the features it uses."""
+    """Return the sum over the members of ``z' C^-1 z``, each with the features it uses."""
     total = 0.0
     patterns, kind = np.unique(used, axis=0, return_inverse=True)
     for index, pattern in enumerate(patterns):
@@ -350,7 +350,7 @@ def _mahalanobis(z: Array, used: NDArray[np.bool_], correlation: Array) -> float
 def shift(
     pools: Pools, after: Sequence[Tally], before: Sequence[Tally]
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """What a change of the model does to the statistics, from the same days before and after.
+    """Return the change of the statistics under a change of the model, from the same days.
 
     Returns:
         The differences, and the variances of these differences.
@@ -369,7 +369,7 @@ def shift(
 
 
 def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> dict[str, Array]:
-    """Differences drawn towards 0 by what may be chance in them.
+    """Return differences drawn towards 0 by what may be chance in them.
 
     A derivative that holds chance points everywhere a little, which makes a fit timid and its
     errors too small.
@@ -384,7 +384,7 @@ def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> di
 def without_noise(
     difference: Mapping[str, Array], variance: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Differences with those of single lanes and minutes set to 0 that may be chance."""
+    """Return differences with those of single lanes and minutes set to 0 that may be chance."""
     found: dict[str, Array] = {}
     for name, values in difference.items():
         certain = values**2 > THRESHOLDS.certain * variance[name]
@@ -399,7 +399,7 @@ Group = tuple[NDArray[np.int64], NDArray[np.bool_], Array]
 
 
 class Whitener:
-    """Turns differences of statistics into independent numbers of unit noise, in one vector.
+    """Map from differences of statistics to independent numbers of unit noise, in one vector.
 
     Args:
         reference: Whose noise.
@@ -435,7 +435,7 @@ class Whitener:
         self.measured = self(found.difference)
 
     def __call__(self, differences: Mapping[str, Array]) -> Array:
-        """Whitened differences, one after the other."""
+        """Return whitened differences, one after the other."""
         rows: list[Array] = []
         for name, scale, groups in self._parts:
             rows.append(independent(differences[name] / scale, groups))
@@ -443,7 +443,7 @@ class Whitener:
 
 
 def groups_of(used: NDArray[np.bool_], correlation: Array) -> list[Group]:
-    """Members that use the same features, with what makes those independent."""
+    """Group members that use the same features, with what makes these independent."""
     patterns, kind = np.unique(used, axis=0, return_inverse=True)
     groups: list[Group] = []
     for index, pattern in enumerate(patterns):
@@ -455,7 +455,7 @@ def groups_of(used: NDArray[np.bool_], correlation: Array) -> list[Group]:
 
 
 def independent(z: Array, groups: Sequence[Group]) -> Array:
-    """Standardised differences as independent numbers, one after the other."""
+    """Return standardised differences as independent numbers, one after the other."""
     z = np.nan_to_num(z)
     rows = [(z[members][:, used] @ inverse.T).ravel() for members, used, inverse in groups]
     return np.concatenate(rows) if rows else np.empty(0)

@@ -32,7 +32,7 @@ from ugat_marl.scenarios import Detector, Network, Period, Scenario, driven_rout
 
 @dataclass(frozen=True)
 class DiagnosisConfig:
-    """How a diagnosis is made.
+    """Options of a diagnosis.
 
     Attributes:
         budget_s: Wall time after which no further simulation is begun, s.
@@ -64,7 +64,7 @@ class DiagnosisConfig:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """What all steps share.
+    """State that all stages share.
 
     Attributes:
         scenario: The scenario as it is.
@@ -107,7 +107,7 @@ class Study:
 
     @classmethod
     def of(cls, scenario: Scenario, measured: Measured, config: DiagnosisConfig) -> Study:
-        """Prepares a diagnosis; nothing is simulated yet.
+        """Prepare a diagnosis; nothing is simulated yet.
 
         Raises:
             MeasuredDataError: The data hold nothing to compare, or nothing that vehicles of the
@@ -160,11 +160,11 @@ class Study:
 
     @property
     def speeds(self) -> bool:
-        """Whether speeds were measured."""
+        """True if speeds were measured."""
         return self.measured.has_speeds
 
     def base(self, reporter: Reporter) -> Tested:
-        """The scenario as it is, and whether the data could be its own.
+        """Simulate the scenario as it is, and test if the data could be its own.
 
         Raises:
             OutOfTime: The budget does not suffice even for this.
@@ -198,7 +198,7 @@ class Study:
         directions: Directions | None = None,
         effects: tuple[Effect, ...] = (),
     ) -> Null:
-        """What chance makes of a model's own days, seen as far as the data see.
+        """Make the distribution of chance from a model's own days, seen as far as the data see.
 
         Args:
             tallies: The model's days.
@@ -264,11 +264,11 @@ class Study:
 
     @functools.cached_property
     def proposer(self) -> Proposer:
-        """Finds places and windows."""
+        """Finder of places and windows."""
         return Proposer(self.site, Routes.of(self.scenario), self.allowed)
 
     def fitter(self, base: Tested) -> Fitter:
-        """Simulates and fits single models; `selector` tries the whole library."""
+        """Make the fitter of single models; `selector` tries the whole library."""
         return Fitter(
             self.engine,
             self.pools,
@@ -281,7 +281,7 @@ class Study:
         )
 
     def selector(self, base: Tested, reporter: Reporter) -> Selector:
-        """Searches for effects."""
+        """Make the search for effects."""
         return Selector(
             self.fitter(base),
             self.proposer,
@@ -295,12 +295,12 @@ class Study:
 
 
 def effort_for(intersections: int) -> Effort:
-    """Numbers of days that suit the size of a network."""
+    """Return the numbers of days that suit the size of a network."""
     return next((effort for most, effort in EFFORTS if intersections <= most), LEAST_EFFORT)
 
 
 def heard(measured: Measured) -> tuple[Detector, ...]:
-    """The detectors to compare: if half of them never saw anything, only the others.
+    """Return the detectors to compare: if half of them never saw anything, only the others.
 
     So many are missing from the recording, and silence is no count of zero.
     """
@@ -328,7 +328,7 @@ _NAMED = 6
 def unreached(
     scenario: Scenario, measured: Measured, detectors: Sequence[Detector]
 ) -> tuple[Finding, ...]:
-    """A finding on edges where detectors counted vehicles, and which no route leads over.
+    """Return a finding on edges where detectors counted vehicles, and which no route leads over.
 
     Args:
         scenario: The scenario as it is.

@@ -237,6 +237,9 @@ class Thresholds:
     null_draws: int = 40
     """Data sets drawn from each half of a model's days. By hand. Halved: the distribution of chance
     is known 1.4 times less well."""
+    floor_deviations: float = 2.326
+    """Deviations of the logarithm to the noise floor: the normal quantile of 0.99, to three digits.
+    Halved: 12 of 100 data sets of the model itself lie above the floor."""
     one_day: float = 0.25
     """Chance above which data without some day are nothing unusual. By hand: a difference must not
     hang on one day. Halved: single odd days excuse more models."""

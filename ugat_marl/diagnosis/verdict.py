@@ -1,4 +1,4 @@
-"""What can be said: one of five verdicts, in a sentence, with what would decide between rivals."""
+"""Verdict: one of five, in a sentence, with what would decide between rivals."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection, Sequence
 
 import numpy as np
+from scipy import stats
 
 from ugat_marl.diagnosis.features import FEATURES
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members
@@ -114,7 +115,7 @@ def unverified(located: Located, selected: Selected) -> tuple[Verified, Conclusi
 
 
 def _sufficient(selection: Selected, selector: Selector, alpha: float, site: Site) -> Conclusion:
-    """The conclusion where a set of effects leaves no more than chance."""
+    """Conclude where a set of effects leaves no more than chance."""
     best = selection.best
     names = describe_members(best.model.members)
     if ends := _at_an_end(best.model.members):
@@ -143,7 +144,7 @@ def _sufficient(selection: Selected, selector: Selector, alpha: float, site: Sit
 
 
 def _unexplained(selection: Selected) -> str:
-    """That nothing was found, which only a search that came to its end says of the library."""
+    """Say that nothing was found; only a search that came to its end says it of the library."""
     if selection.complete:
         return "Simulation and measurement disagree, and no effect of the library explains it"
     return (
@@ -153,13 +154,13 @@ def _unexplained(selection: Selected) -> str:
 
 
 def combined(one: float, other: float) -> float:
-    """Chance of two independent tests as a whole (Fisher 1932)."""
+    """Return the chance of two independent tests as a whole (Fisher 1932)."""
     product = max(one * other, 1e-300)
-    return product * (1.0 - math.log(product))
+    return float(stats.chi2.sf(-2.0 * math.log(product), df=4))
 
 
 def _rivals(selection: Selected, selector: Selector, alpha: float) -> tuple[Fitted, ...]:
-    """Other sets of effects that leave no more than chance and are hardly farther away."""
+    """Find other sets of effects that leave no more than chance and are hardly farther away."""
     best = selection.best.model
     names = _kinds(best.members)
     found: list[Fitted] = []
@@ -204,7 +205,7 @@ def _look_at(selection: Selected) -> str | None:
 
 
 def _separating(best: Fitted, rival: Fitted) -> str:
-    """The statistic in which two models differ most, and how many periods would decide."""
+    """Name the statistic in which two models differ most, and the periods that would decide."""
     block, other = best.reference.blocks["network"], rival.reference.blocks["network"]
     difference = (block.mean - other.mean)[0]
     deviation = np.sqrt(block.variance[0])
@@ -217,12 +218,12 @@ def _separating(best: Fitted, rival: Fitted) -> str:
 
 
 def describe_members(members: Members) -> str:
-    """Effects in words: name, place, window, values."""
+    """Describe effects: name, place, window, values."""
     return listed([describe_effect(hypothesis, values) for hypothesis, values in members])
 
 
 def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
-    """One effect in words."""
+    """Describe one effect."""
     place, window = place_and_window(hypothesis)
     ranges = known_effects()[hypothesis.name].ranges
     text = NOUNS.get(hypothesis.name, hypothesis.name.replace("_", " "))
@@ -324,20 +325,20 @@ STATISTICS = {
 
 
 def statistic(name: str) -> str:
-    """A statistic in words; its own name where none are known."""
+    """Return a statistic in words; its own name where none are known."""
     base = name.removesuffix(" in time")
     return STATISTICS.get(base, base) + (" in some stretch of time" if base != name else "")
 
 
 def clock(seconds: float) -> str:
-    """A time of the scenario's clock as h:mm:ss."""
+    """Return a time of the scenario's clock as h:mm:ss."""
     whole = round(seconds)
     sign, whole = ("-" if whole < 0 else ""), abs(whole)
     return f"{sign}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
 def amount(field: str, value: float, unit: str) -> str:
-    """A number of an effect as it follows the effect's name: `` of 1.4 s``, `` × 0.8``."""
+    """Return a number of an effect as it follows the effect's name: `` of 1.4 s``, `` × 0.8``."""
     if field == "factor":
         return f" × {value:.3g}"
     if field == "share":
@@ -346,5 +347,5 @@ def amount(field: str, value: float, unit: str) -> str:
 
 
 def listed(items: Sequence[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
+    """Join texts: ``a``, ``a and b``, ``a, b and c``."""
     return " and ".join(filter(None, (", ".join(items[:-1]), *items[-1:])))
