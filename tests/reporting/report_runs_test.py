@@ -26,13 +26,13 @@ from ugat_marl.cli.train import Train
 from ugat_marl.data import Metrics, Scores, write_settings
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import Evaluation, Interval, TransferConfig, transfer
+from ugat_marl.experiments import Evaluation, Interval, TransferConfig, binned, joined, transfer
 from ugat_marl.experiments.paper.settings import TABLES, settings_of
 from ugat_marl.experiments.scores import Result
 from ugat_marl.grounding import FitConfig, UgatConfig
 from ugat_marl.reporting import RunRecord, read_records, runs_page, style, write_pictures
 from ugat_marl.reporting import formats as words
-from ugat_marl.reporting.charts import binned, joined, radar_picture
+from ugat_marl.reporting.charts import radar_picture
 from ugat_marl.reporting.figures import Picture
 from ugat_marl.reporting.job_names import job_name
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
@@ -250,9 +250,7 @@ def test_what_is_broken_is_named(run: Path, name: str, how: str) -> None:
         broken = {"empty": b"", "half": content[: len(content) // 2], "other": b"[1, 2]"}
         path.write_bytes(broken[how])
     made, page = page_of(run)
-    if how == "gone" and name == "settings.json":  # as runs were before it was kept
-        assert "are not on record" in page.text and "Missing here" not in page.text
-    elif how == "gone" and name == "run.json":
+    if how == "gone" and name == "run.json":
         assert "Missing here" not in page.text  # its settings are known all the same
     elif name != "run.json":
         assert "Missing here" in page.text and name in page.text
@@ -365,9 +363,10 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
     pl.DataFrame(names, schema=queues().schema, orient="row").write_parquet(run / "queues.parquet")
     numbers = Metrics([(s, n, f"{k}{NASTY}\x07", v) for s, n, k, v in metrics().rows])
     Metrics([*metrics().rows, *numbers.rows]).write(run / "metrics.parquet")
-    (run / "settings.json").unlink()
-    identity = json.loads((run / "run.json").read_text())
-    (run / "run.json").write_text(json.dumps({**identity, NASTY: "\ud800\x00", "real": NASTY}))
+    kept = json.loads((run / "settings.json").read_text())
+    kept["settings"] |= {NASTY: "\ud800\x00", "real": NASTY}
+    kept["versions"] |= {NASTY: NASTY}
+    (run / "settings.json").write_text(json.dumps(kept))
     made, page = page_of(run)
     assert NASTY in " ".join(page.texts)
     _, plain = page_of(harmless)

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.data import SETTINGS
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig
 from ugat_marl.files import require_writable, write_whole
@@ -99,18 +98,9 @@ def again(record: RunRecord | TableRecord) -> list[str]:
 
 
 def _train(record: RunRecord, folder: str) -> list[str]:
-    settings = dict(record.settings)
-    lines: list[str] = []
-    if not (record.directory / SETTINGS).is_file():  # a run from before it was kept
-        lines.append("# options that only add policies, such as --oracle, are not on record")
-        if settings.get("real_log"):
-            settings["real_log"] = "REAL_LOG"
-        if record.evaluation is not None:
-            seeds = {result.seed for result in record.evaluation.results}
-            settings["evaluation_seeds"] = len(seeds)
-    options = train_options(settings)
+    options = train_options(record.settings)
     place = ["--out", f"{folder}-again"] if record.finished else ["--out", folder, "--resume"]
-    return [*lines, shlex.join(["ugat-marl", "train", record.scenario, *options, *place])]
+    return [shlex.join(["ugat-marl", "train", record.scenario, *options, *place])]
 
 
 def train_options(settings: Mapping[str, Any]) -> list[str]:

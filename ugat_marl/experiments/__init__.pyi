@@ -40,6 +40,8 @@ from .scores import Estimate as Estimate
 from .scores import Evaluation as Evaluation
 from .scores import Tuned as Tuned
 from .scores import result_of as result_of
+from .series import binned as binned
+from .series import joined as joined
 from .statistics import Floats as Floats
 from .statistics import Interval as Interval
 from .statistics import PairedTest as PairedTest

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Metrics
-from ugat_marl.experiments import Comparison, Evaluation, Interval
+from ugat_marl.experiments import Comparison, Evaluation, Interval, binned, joined
 from ugat_marl.reporting.figures import (
     TOP,
     WIDTH,
@@ -38,12 +38,7 @@ MEASURES: dict[str, tuple[str, str]] = {
     "delay": ("delay, 1 − v/vmax", ""),
 }
 """The paper's five measures on a radar, with their units."""
-_BINS = 20
-_LEAST = 4
 _ROW = 30.0
-
-Row = tuple[float, float, float, float]
-"""x, mean, low, high."""
 
 Estimated = tuple[float, float, float]
 """Mean, low, high."""
@@ -89,7 +84,7 @@ def learning_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
 @styled()
 def travel_time_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
     """Draw ATT after each iteration by domain; with several seeds, 95 % intervals over them."""
-    domains: dict[str, list[Row]] = {}
+    domains: dict[str, list[tuple[float, float, float, float]]] = {}
     for domain in _domains(records):
         series = [record.series("iteration", f"att_s/{domain}") for record in records]
         if rows := joined([one for one in series if one]):
@@ -129,42 +124,6 @@ def gate_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
     return picture
 
 
-def binned(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
-    """Return stretches of episodes: middle, mean, and Student's 95 % interval.
-
-    The interval is over the episodes of a stretch for one series, over the series for several.
-    """
-    if not series:
-        return []
-    last = max(one[-1][0] for one in series) + 1
-    size = max(_LEAST, math.ceil(last / _BINS))
-    rows: list[Row] = []
-    for start in range(0, last, size):
-        parts = [[v for x, v in one if start <= x < start + size] for one in series]
-        parts = [part for part in parts if part]
-        values = parts[0] if len(series) == 1 and parts else [float(np.mean(p)) for p in parts]
-        if values and (len(values) > 1 or len(series) > 1 or last < 2 * size):
-            rows.append((start + min(size, last - start) / 2, *_interval(values)))
-    return rows
-
-
-def joined(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
-    """Return mean and Student's 95 % interval over the series at each step (nan for one)."""
-    steps: dict[int, list[float]] = {}
-    for one in series:
-        for step, value in one:
-            steps.setdefault(step, []).append(value)
-    return [(step, *_interval(values)) for step, values in sorted(steps.items())]
-
-
-def _interval(values: Sequence[float]) -> Estimated:
-    finite = np.array([value for value in values if math.isfinite(value)])
-    if not finite.size or finite.size < len(values):
-        return math.nan, math.nan, math.nan
-    interval = Interval.of(finite)
-    return interval.mean, interval.low, interval.high
-
-
 def _plot(
     name: str, title: str, x_label: str, y_label: str, legend: Sequence[str] = ()
 ) -> tuple[Picture, Any]:
@@ -196,7 +155,12 @@ def _points_wide(axes: Any) -> float:
 
 
 def _draw_curve(
-    picture: Picture, axes: Any, number: int, rows: Sequence[Row], *, markers: bool = True
+    picture: Picture,
+    axes: Any,
+    number: int,
+    rows: Sequence[tuple[float, float, float, float]],
+    *,
+    markers: bool = True,
 ) -> None:
     """Draw a curve with its interval; it is interrupted where there is no value."""
     x, mean, low, high = np.array(rows, dtype=float).reshape(-1, 4).T

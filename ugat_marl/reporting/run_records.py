@@ -229,7 +229,7 @@ def _object(path: Path) -> dict[str, Any]:
 def _run(directory: Path, name: str) -> RunRecord:
     reader = _Reader(directory)
     job = (directory / JOB).is_file()
-    kept = _kept(reader, job)
+    kept = reader.read(JOB if job else SETTINGS, _object, "its settings are unknown") or {}
     settings = kept.get("settings", kept)
     settings = settings if isinstance(settings, dict) else {}
     if job:
@@ -259,21 +259,6 @@ def _run(directory: Path, name: str) -> RunRecord:
         missing=tuple(reader.missing),
         written=_written(directory),
     )
-
-
-def _kept(reader: _Reader, job: bool) -> dict[str, Any]:
-    """Options and versions; of runs from before `SETTINGS` what their identity holds."""
-    if job:
-        return reader.read(JOB, _object, "its settings are unknown") or {}
-    if (reader.directory / SETTINGS).is_file():
-        return reader.read(SETTINGS, _object, "some of its options are unknown") or _identity(
-            reader
-        )
-    return _identity(reader)
-
-
-def _identity(reader: _Reader) -> dict[str, Any]:
-    return reader.read(RUN, _object, "its settings are unknown") or {}
 
 
 def _hashes(directory: Path, kept: Mapping[str, Any]) -> Any:

@@ -1,0 +1,54 @@
+"""Means with intervals of what trainings log by episode or by iteration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ugat_marl.experiments.statistics import Interval
+
+Row = tuple[float, float, float, float]
+"""Episode or iteration, mean, low, high."""
+
+_STRETCHES = 20
+"""Stretches that a training is cut into, at most."""
+_LEAST = 4
+"""Episodes of a stretch, at least."""
+
+
+def binned(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
+    """Return stretches of episodes: middle, mean, and Student's 95 % interval.
+
+    The interval is over the episodes of a stretch for one series, over the series for several.
+    """
+    if not series:
+        return []
+    last = max(one[-1][0] for one in series) + 1
+    size = max(_LEAST, math.ceil(last / _STRETCHES))
+    rows: list[Row] = []
+    for start in range(0, last, size):
+        parts = [[v for x, v in one if start <= x < start + size] for one in series]
+        parts = [part for part in parts if part]
+        values = parts[0] if len(series) == 1 and parts else [float(np.mean(p)) for p in parts]
+        if values and (len(values) > 1 or len(series) > 1 or last < 2 * size):
+            rows.append((start + min(size, last - start) / 2, *_interval(values)))
+    return rows
+
+
+def joined(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
+    """Return mean and Student's 95 % interval over the series at each step (nan for one)."""
+    steps: dict[int, list[float]] = {}
+    for one in series:
+        for step, value in one:
+            steps.setdefault(step, []).append(value)
+    return [(step, *_interval(values)) for step, values in sorted(steps.items())]
+
+
+def _interval(values: Sequence[float]) -> tuple[float, float, float]:
+    finite = np.array([value for value in values if math.isfinite(value)])
+    if not finite.size or finite.size < len(values):
+        return math.nan, math.nan, math.nan
+    interval = Interval.of(finite)
+    return interval.mean, interval.low, interval.high
