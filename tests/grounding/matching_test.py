@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from sklearn.isotonic import IsotonicRegression
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionRecorder
 from ugat_marl.envs import parallel_env
@@ -48,6 +49,12 @@ def test_no_other_falling_curve_is_closer(values: list[int], data: st.DataObject
     other = np.array(sorted(drawn, reverse=True), dtype=np.float64)
     assert (np.diff(found) <= 1e-9).all() and found.sum() == pytest.approx(own.sum())
     assert ((found - own) ** 2).sum() <= ((other - own) ** 2).sum() + 1e-9
+
+
+@given(st.lists(st.floats(-50, 0), min_size=1, max_size=8))
+def test_the_falling_curve_is_that_of_scikit_learn(values: list[float]) -> None:
+    theirs = IsotonicRegression(increasing=False).fit_transform(np.arange(len(values)), values)
+    assert falling(np.array(values)) == pytest.approx(theirs, abs=1e-9)
 
 
 def test_delays_lie_where_the_rewards_are_the_same() -> None:

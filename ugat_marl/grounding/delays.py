@@ -27,7 +27,7 @@ import numpy as np
 import polars as pl
 import torch
 from numpy.typing import NDArray
-from scipy import special
+from scipy import optimize, special
 from torch import Tensor
 
 from ugat_marl.data import TransitionLog
@@ -284,13 +284,7 @@ def matching_delays(street: Floats, simulated: Floats) -> Floats:
 
 def falling(values: Floats) -> Floats:
     """Return the sequence that never rises and is closest to `values` (least squares), ``(n,)``."""
-    blocks: list[tuple[float, int]] = []
-    for value in values.tolist():
-        blocks.append((value, 1))
-        while len(blocks) > 1 and blocks[-2][0] < blocks[-1][0]:
-            (late, n), (early, m) = blocks.pop(), blocks.pop()
-            blocks.append(((early * m + late * n) / (m + n), m + n))
-    return np.repeat([mean for mean, _ in blocks], [count for _, count in blocks])
+    return optimize.isotonic_regression(values, increasing=False).x
 
 
 def _matching(paid: float, curve: Floats) -> float:
