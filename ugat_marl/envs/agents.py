@@ -73,9 +73,9 @@ class AgentSet:
         for row, (name, size) in enumerate(zip(self.names, self.observation_sizes, strict=True)):
             vector = observations.get(name)
             if vector is None or vector.shape != (size,):
-                found = "is missing" if vector is None else f"has shape {vector.shape}"
+                problem = "is missing" if vector is None else f"has shape {vector.shape}"
                 raise OptionError(
-                    f"the observation of agent {name!r} {found}, expected ({size},); use the "
+                    f"the observation of agent {name!r} {problem}, expected ({size},); use the "
                     "scenario and the observation this policy was trained with"
                 )
             stacked[row, :size] = vector

@@ -188,7 +188,7 @@ class _Pad(Wrapper):
         self._most = max(int(space.n) for space in self._own.values())
         padded = {own: PaddedDiscrete(self._most, own) for own in map(_size, self._own.values())}
         self.action_spaces = {agent: padded[_size(own)] for agent, own in self._own.items()}
-        common = _common_box(list(self.observation_spaces.values()))
+        common = common_box(list(self.observation_spaces.values()))
         self._width = common.shape[0]
         self.observation_spaces = dict.fromkeys(self.observation_spaces, common)
 
@@ -368,7 +368,7 @@ def _each(boxes: Mapping[str, spaces.Box], change: Any) -> dict[str, spaces.Box]
     return {agent: changed[id(box)] for agent, box in boxes.items()}
 
 
-def _common_box(boxes: list[spaces.Box]) -> spaces.Box:
+def common_box(boxes: list[spaces.Box]) -> spaces.Box:
     """Return a box for all, of the longest length, that holds zeros behind shorter vectors."""
     width = max(box.shape[0] for box in boxes)
     low, high = (

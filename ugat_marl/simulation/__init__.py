@@ -2,6 +2,11 @@
 
 The only room that imports libsumo. A simulator advances by some seconds with one signal state per
 second and returns a `Snapshot`; at the end of an episode it returns `Trips`.
+
+`simulator` runs SUMO in this process, with `mesoscopic` for SUMO's queue model; `process` runs it
+in another one. `host` starts and ends processes for `process` and for vectors of environments,
+`worker` is what runs in them, `channel` the line between the two. `snapshots`, `trips` and
+`detectors` hold what is measured.
 """
 
 import lazy_loader

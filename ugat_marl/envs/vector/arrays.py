@@ -59,18 +59,18 @@ class Arrays:
     def over(cls, descriptor: int, shape: Shape) -> Arrays:
         """The arrays in an open file that `shared_memory` made; it may be closed afterwards."""
         memory = mmap.mmap(descriptor, _size(shape))
-        found: dict[str, NDArray[Any]] = {}
+        arrays: dict[str, NDArray[Any]] = {}
         offset = 0
-        for name, (kind, sizes) in _layout(shape).items():
+        for name, (dtype, sizes) in _layout(shape).items():
             count = int(np.prod(sizes))
-            flat = np.frombuffer(memory, dtype=kind, count=count, offset=offset)
-            found[name] = flat.reshape(sizes)
-            offset += _room(kind, sizes)
-        return cls(**found)
+            flat = np.frombuffer(memory, dtype=dtype, count=count, offset=offset)
+            arrays[name] = flat.reshape(sizes)
+            offset += _room(dtype, sizes)
+        return cls(**arrays)
 
     def part(self, where: slice | int) -> Arrays:
         """Some of the environments, or one without the first axis, in the same memory."""
-        return Arrays(*(getattr(self, item.name)[where] for item in fields(self)))
+        return Arrays(*(getattr(self, field.name)[where] for field in fields(self)))
 
 
 def shared_memory(shape: Shape) -> int:
@@ -95,11 +95,11 @@ def _layout(shape: Shape) -> dict[str, tuple[type[np.generic], tuple[int, ...]]]
     }
 
 
-def _room(kind: type[np.generic], sizes: tuple[int, ...]) -> int:
+def _room(dtype: type[np.generic], sizes: tuple[int, ...]) -> int:
     """Bytes up to the next array."""
-    size = np.dtype(kind).itemsize * int(np.prod(sizes))
+    size = np.dtype(dtype).itemsize * int(np.prod(sizes))
     return -(-size // _ALIGNED) * _ALIGNED
 
 
 def _size(shape: Shape) -> int:
-    return sum(_room(kind, sizes) for kind, sizes in _layout(shape).values())
+    return sum(_room(dtype, sizes) for dtype, sizes in _layout(shape).values())

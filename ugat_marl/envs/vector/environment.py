@@ -198,8 +198,8 @@ class VectorEnv:
 
     def step_async(self, actions: ArrayLike) -> None:
         """Begin a step, which `step_wait` ends; the caller may do other work in between."""
-        asked = self._checked(actions)
-        idle = [env.over and not env.asked for env in self._environments]
+        requested = self._checked(actions)
+        idle = [env.over and not env.pending for env in self._environments]
         anew = self.autoreset == "next-step" and self._environments[0].episode is not None
         for env, over in zip(self._environments, idle, strict=True):
             if not (anew and over):
@@ -207,7 +207,7 @@ class VectorEnv:
         self._begun = [index for index, over in enumerate(idle) if over]
         self._stepped = [index for index, over in enumerate(idle) if not over]
         for index in self._stepped:
-            self._environments[index].act(asked[index].copy())
+            self._environments[index].act(requested[index].copy())
         for index in self._begun:
             self._environments[index].begin(None, self._domains)
 
@@ -284,7 +284,7 @@ class VectorEnv:
             if isinstance(seed, int | np.integer):
                 listed = [int(seed) + i for i in range(self.n)]
             else:
-                listed = [operator.index(one) for one in seed]
+                listed = [operator.index(number) for number in seed]
         except TypeError:  # no sequence, or not of whole numbers
             listed = []
         if len(listed) != self.n or min(listed) < 0:
@@ -295,22 +295,22 @@ class VectorEnv:
         return {index: listed[index] for index in chosen}
 
     def _checked(self, actions: ArrayLike) -> NDArray[np.int64]:
-        asked = np.asarray(actions)
+        phases = np.asarray(actions)
         wanted = (self.n, len(self.agents))
-        if asked.shape != wanted or not np.issubdtype(asked.dtype, np.integer):
+        if phases.shape != wanted or not np.issubdtype(phases.dtype, np.integer):
             raise ActionError(
-                f"actions are {asked.dtype} of shape {asked.shape}; allowed: integers of shape "
+                f"actions are {phases.dtype} of shape {phases.shape}; allowed: integers of shape "
                 f"{wanted}, one for each environment and agent"
             )
-        wrong = (asked < 0) | (asked >= self._counts)
+        wrong = (phases < 0) | (phases >= self._counts)
         if wrong.any():
             row, column = (int(places[0]) for places in np.nonzero(wrong))
             raise ActionError(
                 f"action of agent {self.agents[column]!r} in environment {row} is "
-                f"{asked[row, column]}; allowed: the integers 0 to {self._counts[column] - 1}, its "
-                "green phases; the others are padding, and 0 in the mask"
+                f"{phases[row, column]}; allowed: the integers 0 to {self._counts[column] - 1}, "
+                "its green phases; the others are padding, and 0 in the mask"
             )
-        return asked.astype(np.int64)
+        return phases.astype(np.int64)
 
     def _begin(self, chosen: list[int], seeds: dict[int, int | None]) -> None:
         for index in chosen:

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ugat_marl.envs.vector.environment import Batch, VectorEnv
-from ugat_marl.envs.wrappers import _common_box
+from ugat_marl.envs.wrappers import common_box
 from ugat_marl.errors import ActionError, OptionError
 
 _MODES = {"same-step": "SAME_STEP", "next-step": "NEXT_STEP", "disabled": "DISABLED"}
@@ -34,7 +34,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         self.env = env
         self.num_envs = env.n * len(env.agents)
         boxes: list[Any] = [env.observation_spaces[agent] for agent in env.agents]
-        self.single_observation_space: Box = _common_box(boxes)
+        self.single_observation_space: Box = common_box(boxes)
         self.single_action_space = Discrete(env.agent_set.most_actions)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -73,10 +73,10 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
 
     def step_async(self, actions: Any) -> None:
         """Begin a step; `step_wait` ends it, and learning may go on meanwhile."""
-        asked = np.asarray(actions)
-        if asked.shape != (self.num_envs,):
-            raise ActionError(f"actions have shape {asked.shape}; allowed: ({self.num_envs},)")
-        self.env.step_async(asked.reshape(self.env.n, -1))
+        requested = np.asarray(actions)
+        if requested.shape != (self.num_envs,):
+            raise ActionError(f"actions have shape {requested.shape}; allowed: ({self.num_envs},)")
+        self.env.step_async(requested.reshape(self.env.n, -1))
 
     def step_wait(
         self,

@@ -152,7 +152,7 @@ class RemoteEnv:
     Attributes:
         episode: The episode it is in, or was in; None before the first.
         over: True if there is none under way.
-        asked: True if an answer is awaited.
+        pending: True if an answer is awaited.
     """
 
     def __init__(self, shared: Shared, index: int, arrays: Arrays) -> None:
@@ -160,7 +160,7 @@ class RemoteEnv:
         self.arrays = arrays
         self.episode: Episode | None = None
         self.over = True
-        self.asked = False
+        self.pending = False
         self._shared = shared
         self._root: int | None = None
         self._domain: Domain = "sim"
@@ -186,7 +186,7 @@ class RemoteEnv:
         assert self._worker is not None
         self._history.append(actions)
         self.arrays.actions[:] = actions
-        self.asked = True
+        self.pending = True
         with contextlib.suppress(ChannelClosed):  # it is dead; `answer` will notice
             self._worker.ask("step")
 
@@ -209,7 +209,7 @@ class RemoteEnv:
                 self.close()
                 raise
         self._deaths = 0
-        self.asked = False
+        self.pending = False
         self.over = reply["over"]
         scores = Scores(**reply["scores"]) if reply["scores"] is not None else None
         if self.over:
@@ -218,7 +218,7 @@ class RemoteEnv:
 
     def close(self) -> None:
         """End the episode and its process; may be called again."""
-        self.over, self.asked = True, False
+        self.over, self.pending = True, False
         self._history = []
         self._end()
 
@@ -228,7 +228,7 @@ class RemoteEnv:
         Raises:
             EpisodeError: It is so.
         """
-        if self.asked:
+        if self.pending:
             raise EpisodeError(
                 f"environment {self.index} is in the middle of a step; call step_wait() first"
             )
@@ -244,7 +244,7 @@ class RemoteEnv:
         self._end()
         shared = self._shared
         self._worker = shared.start(self._domain, self.index)
-        self.over, self.asked = False, True
+        self.over, self.pending = False, True
         size = len(self._history), len(shared.agents)
         history = np.array(self._history, dtype=np.float64).reshape(size)
         with contextlib.suppress(ChannelClosed):

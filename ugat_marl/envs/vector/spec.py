@@ -103,7 +103,7 @@ def listed(wraps: Wraps) -> list[Wrap]:
     return [wraps] if isinstance(wraps, str) or callable(wraps) else list(wraps)
 
 
-def spelling(what: str, function: Callable[..., Any] | str) -> str:
+def spelling(option: str, function: Callable[..., Any] | str) -> str:
     """The ``"module:name"`` by which a worker imports a function.
 
     Raises:
@@ -115,7 +115,7 @@ def spelling(what: str, function: Callable[..., Any] | str) -> str:
     module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", "<")
     if module in (None, "__main__") or "<" in name:
         raise OptionError(
-            f"{what} = {function!r}: the workers of a vector_env import it by its name, which a "
+            f"{option} = {function!r}: the workers of a vector_env import it by its name, which a "
             "lambda, an inner function and one of the program itself do not have; move it to a "
             "module, at its top level"
         )
