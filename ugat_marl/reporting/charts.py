@@ -212,7 +212,8 @@ def scores_picture(
     if not any(math.isfinite(v) for rows in series.values() for row in rows for v in row):
         return None
     below = legend_height(list(series))
-    picture = new_picture(name, title, TOP + _ROW * len(labels) + 48 + below)
+    row = max(_ROW, 10.0 * len(series) + 6)
+    picture = new_picture(name, title, TOP + row * len(labels) + 48 + below)
     axes = add_axes(picture, 186, TOP, 16, 48 + below)
     _draw_estimates(axes, labels, series, "s")
     axes.set_xlabel("travel time, s", loc="right")
