@@ -89,9 +89,9 @@ def test_what_the_log_tells_can_be_left_out(
     measured = Measured(standard_detectors(network), (period,))
     # Nothing is simulated within such a budget; the log is read all the same.
     config = DiagnosisConfig(budget_s=1e-9, leave_out=left_out, cache=tmp_path / "cache")
-    record = diagnose(scenario, measured, tmp_path / "found", config)
-    assert [item["name"] for item in record["effects"]] == named
-    assert (record["corrected"] is not None) == bool(named)
+    diagnosis = diagnose(scenario, measured, tmp_path / "found", config)
+    assert [effect.name for effect in diagnosis.effects] == named
+    assert (diagnosis.corrected is not None) == bool(named)
 
 
 def test_green_right_behind_yellow_is_no_all_red(scenario: Scenario, network: Network) -> None:
