@@ -48,9 +48,9 @@ def as_vehicles(scenario: Scenario) -> Scenario:
     Raises:
         ScenarioError: duarouter refuses; its own words are in the message.
     """
-    if all(map(_is_explicit, scenario.routes)):
+    if all(map(_holds_single_vehicles, scenario.routes)):
         return scenario
-    return replace(scenario, routes=(_routed(scenario),))
+    return replace(scenario, routes=(_routed_by_duarouter(scenario),))
 
 
 def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
@@ -93,16 +93,18 @@ def departures(
                 yield name, depart, tag.attributes.get("edges", "").split()
 
 
-def _is_explicit(document: Document) -> bool:
+def _holds_single_vehicles(document: Document) -> bool:
     """Return True if the file holds nothing but single vehicles with their own edges."""
     if document.path is None or document.content is not None:
-        return _explicit_content(document, 0, 0)
+        return _content_holds_single_vehicles(document, 0, 0)
     state = document.path.stat()
-    return _explicit_content(replace(document, home=None), state.st_size, state.st_mtime_ns)
+    return _content_holds_single_vehicles(
+        replace(document, home=None), state.st_size, state.st_mtime_ns
+    )
 
 
 @functools.lru_cache(maxsize=8)
-def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
+def _content_holds_single_vehicles(document: Document, size: int, changed_ns: int) -> bool:
     """Do the same, cached for a file as long as it does not change."""
     del size, changed_ns
     singles = OwnEdges()
@@ -113,7 +115,7 @@ def _explicit_content(document: Document, size: int, changed_ns: int) -> bool:
     return singles.ended()
 
 
-def _routed(scenario: Scenario) -> Document:
+def _routed_by_duarouter(scenario: Scenario) -> Document:
     """Route all demand of the scenario with duarouter."""
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
