@@ -106,7 +106,7 @@ def together(
                 turn = (turn + 1) % len(in_turn)
             movers = in_turn[turn] & changes
             turn = (turn + 1) % len(in_turn)
-            if count == PASSES:  # whoever gives up never moves again, so that these are new ones
+            if count == PASSES:  # an agent that gave up never moves again: these are new ones
                 given_up = given_up | movers
                 will_run = own
             told = np.where(movers, will_run, told)
