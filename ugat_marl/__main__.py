@@ -8,61 +8,64 @@ from collections.abc import Sequence
 from ugat_marl.cli import CommandLine, run
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "train": ("ugat_marl.cli.train:Train", "train by UGAT across the gap, print what was won"),
-    "report": ("ugat_marl.cli.report:Report", "trainings as one page: tables, curves, maps"),
+    "train": ("ugat_marl.cli.train:Train", "train by UGAT across the gap and compare"),
+    "report": ("ugat_marl.cli.report:Report", "show trainings on one page: tables, curves, maps"),
     "evaluate": (
         "ugat_marl.cli.evaluate:Evaluate",
-        "policies and rules in any domains: measures, gaps",
+        "measure policies and rules in any domains",
     ),
-    "tune": ("ugat_marl.cli.tune:Tune", "the settings with which each rule does best in a domain"),
-    "rollout": ("ugat_marl.cli.rollout:Rollout", "record transitions as a Parquet log"),
+    "tune": ("ugat_marl.cli.tune:Tune", "find the best settings of each rule in a domain"),
+    "rollout": ("ugat_marl.cli.rollout:Rollout", "record transitions as a Parquet log, or film"),
     "field": (
         "ugat_marl.cli.field:Field",
-        "drive the lights of a running SUMO as if it were the street",
+        "drive the lights of a running SUMO, as on a street",
     ),
     "record": ("ugat_marl.cli.record:Record", "measure a domain as a street is measured"),
     "import-atspm": (
         "ugat_marl.cli.import_atspm:ImportAtspm",
-        "measured data from a signal controllers' log",
+        "convert a log of signal controllers to measured data",
     ),
     "policy-gap": (
         "ugat_marl.cli.policy_gap:PolicyGap",
-        "what a diagnosis is worth: policies before, after",
+        "compare policies before and after a diagnosis",
     ),
     "diagnose": (
         "ugat_marl.cli.diagnose:Diagnose",
-        "where a simulation and measured data disagree, and why",
+        "find why a simulation and measured data disagree",
     ),
-    "export": ("ugat_marl.cli.export:Export", "a trained policy as TorchScript, ONNX or matrices"),
+    "export": ("ugat_marl.cli.export:Export", "write a policy as TorchScript, ONNX or matrices"),
     "scenario list": (
         "ugat_marl.cli.scenario_list:ScenarioList",
-        "the networks and domains that can be named",
+        "list the networks and domains that have a name",
     ),
     "scenario new": (
         "ugat_marl.cli.scenario_new:ScenarioNew",
-        "a scenario from any road network and demand",
+        "make a scenario from a road network and demand",
     ),
     "scenario check": (
         "ugat_marl.cli.scenario_check:ScenarioCheck",
-        "what a controller will face; is it sound?",
+        "check that a scenario is sound",
     ),
     "scenario draw": (
         "ugat_marl.cli.scenario_draw:ScenarioDraw",
-        "every intersection with its phases, as pictures",
+        "draw every intersection with its phases",
     ),
-    "domains": ("ugat_marl.cli.domains:Domains", "the named domains: gap, effects, counterpart"),
-    "paper main": ("ugat_marl.cli.paper:Main", "UGAT and every control, with intervals over seeds"),
-    "paper ablation": ("ugat_marl.cli.paper:Ablation", "UGAT without its parts"),
-    "paper alpha": ("ugat_marl.cli.paper:Alpha", "static thresholds against the dynamic one"),
-    "paper uncertainty": ("ugat_marl.cli.paper:Uncertainty", "the methods of uncertainty compared"),
-    "paper gap": ("ugat_marl.cli.paper:Gap", "what direct transfer loses, as radar charts"),
+    "domains": (
+        "ugat_marl.cli.domains:Domains",
+        "list the named domains: gap, effects, counterpart",
+    ),
+    "paper main": ("ugat_marl.cli.paper:Main", "compare UGAT with every control over seeds"),
+    "paper ablation": ("ugat_marl.cli.paper:Ablation", "compare UGAT with and without its parts"),
+    "paper alpha": ("ugat_marl.cli.paper:Alpha", "compare static thresholds with the dynamic one"),
+    "paper uncertainty": ("ugat_marl.cli.paper:Uncertainty", "compare the methods of uncertainty"),
+    "paper gap": ("ugat_marl.cli.paper:Gap", "draw the losses of direct transfer as radar charts"),
 }
 
 SHORT: dict[str, tuple[str, ...]] = {
     "scenarios": ("scenario", "list"),
     "check": ("scenario", "check", "--conformance"),
 }
-"""Short names of commands, and what they stand for."""
+"""Short names of commands, and the words they stand for."""
 
 
 LINE = CommandLine(

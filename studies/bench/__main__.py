@@ -11,26 +11,29 @@ from ugat_marl.cli import CommandLine, run
 from ugat_marl.progress import Bars
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "env": ("studies.bench.env:EnvBench", "speed against SUMO alone and sumo-rl"),
-    "learning": ("studies.bench.learning:LearningBench", "what learning adds to an episode"),
+    "env": ("studies.bench.env:EnvBench", "measure speed against SUMO alone and sumo-rl"),
+    "learning": (
+        "studies.bench.learning:LearningBench",
+        "measure what learning adds to an episode",
+    ),
     "fitting": (
         "studies.bench.fitting:FittingBench",
-        "what each uncertainty costs and is worth",
+        "measure cost and calibration of each uncertainty",
     ),
     "strength": (
         "studies.bench.strength:StrengthBench",
         "is the learner as good as the best rule where it was trained?",
     ),
-    "memory": ("studies.bench.memory:MemoryBench", "memory over many resets"),
+    "memory": ("studies.bench.memory:MemoryBench", "measure memory over many resets"),
     "scale": (
         "studies.bench.scale:ScaleBench",
-        "many simulations, large networks, processes that die",
+        "measure many simulations, large networks, deaths",
     ),
     "device": (
         "studies.bench.device:DeviceBench",
-        "from how many intersections on a GPU pays for learning",
+        "find the size from which on a GPU learns faster",
     ),
-    "all": ("studies.bench.everything:AllBench", "all but strength, scale and device"),
+    "all": ("studies.bench.everything:AllBench", "measure all but strength, scale and device"),
 }
 
 

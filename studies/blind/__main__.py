@@ -9,7 +9,10 @@ from ugat_marl.cli import CommandLine, run
 COMMANDS: dict[str, tuple[str, str]] = {
     "generate": ("studies.blind.commands:BlindGenerate", "hide effects, measure, seal the labels"),
     "run": ("studies.blind.commands:BlindRun", "diagnose the cases of a blind test"),
-    "visible": ("studies.blind.commands:BlindVisible", "could the hidden effects be seen at all"),
+    "visible": (
+        "studies.blind.commands:BlindVisible",
+        "test if the hidden effects can be seen at all",
+    ),
     "grade": ("studies.blind.commands:BlindGrade", "open the labels of diagnosed cases"),
     "table": ("studies.blind.commands:BlindTable", "sum up graded blind tests"),
 }

@@ -14,8 +14,10 @@ from ugat_marl.errors import OptionError
 Workers = Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: one per core)")]
 """Simulations at a time."""
 
-Ray = Annotated[str | None, arg(metavar="[ADDRESS]", help_behavior_hint="(default: not used)")]
-"""Where Ray is: local (meant by a bare --ray), auto, host:port, ray://host:port."""
+RayAddress = Annotated[
+    str | None, arg(metavar="[ADDRESS]", help_behavior_hint="(default: not used)")
+]
+"""Address of Ray: local (meant by a bare --ray), auto, host:port, ray://host:port."""
 
 LengthS = Annotated[
     float | None, arg(metavar="FLOAT", help_behavior_hint="(default: the scenario's own)")

@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import Ray, Workers, workers_of
+from ugat_marl.cli.arguments import RayAddress, Workers, workers_of
 from ugat_marl.data import Measured, read_measured
 from ugat_marl.diagnosis import (
     CORRECTED,
@@ -45,8 +45,8 @@ class Diagnose:
             (docs/reference/measured-data.md); it is never written to.
         out: Directory for diagnosis.json, report.html and the corrected scenario; an earlier
             diagnosis in it is replaced.
-        budget_s: Time in s after which no further simulation is begun. The result is marked as
-            partial then; the same command goes on from there.
+        budget_s: Time in s after which no further simulation begins. The result is then marked as
+            partial; the same command continues from there.
         alpha: Chance of naming an effect where there is none.
         seed: Root of the simulated days; the same data and seed give the same diagnosis.
         leave_out: Names of effects (docs/reference/effects.md) that are not examined.
@@ -69,7 +69,7 @@ class Diagnose:
         Path | None, arg(metavar="PATH", help_behavior_hint="(default: the user's cache folder)")
     ] = None
     workers: Workers = None
-    ray: Ray = None
+    ray: RayAddress = None
     report: bool = True
 
     def run(self, console: Console) -> int:

@@ -17,9 +17,9 @@ from ugat_marl.errors import UnknownNameError
 
 _TITLES = {
     "observation": "observation gap: controllers see something else",
-    "action": "action gap: something else becomes of commands",
-    "transition": "transition gap: traffic does something else",
-    "reward": "reward gap: something else is wanted",
+    "action": "action gap: commands are executed otherwise",
+    "transition": "transition gap: traffic behaves otherwise",
+    "reward": "reward gap: the objective is another one",
 }
 
 
@@ -27,7 +27,7 @@ _TITLES = {
 class Domains:
     """List the domains that have a name: their gap, effects, and counterpart in Sim2Signal.
 
-    Any of them, and any effect, goes together with others: V4+zone-50+counting_noise=0.1.
+    Domains and effects can be combined: V4+zone-50+counting_noise=0.1.
 
     Examples:
         ugat-marl domains
@@ -35,8 +35,8 @@ class Domains:
         ugat-marl evaluate single-v1 --domains sim action --seeds 2
 
     Attributes:
-        gap: observation, action, transition or reward.
-        json: Prints JSON instead of tables.
+        gap: Gap to list: observation, action, transition or reward.
+        json: Print JSON instead of tables.
     """
 
     gap: Annotated[

@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import Ray, workers_of
+from ugat_marl.cli.arguments import RayAddress, workers_of
 from ugat_marl.effects import NAMED, load_scenario, spelled_out
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError
@@ -54,7 +54,7 @@ class Evaluate:
     first_seed: int = 1000
     duration_s: float | None = None
     workers: int | None = None
-    ray: Ray = None
+    ray: RayAddress = None
     out: Path | None = None
 
     def run(self, console: Console) -> int:

@@ -18,6 +18,10 @@ from rich.console import Console
 from ugat_marl.errors import UgatMarlError, UnknownNameError, nearest
 from ugat_marl.progress import Bars, showing
 
+USAGE_ERROR = 2
+INTERRUPTED = 130
+HELP = ("-h", "--help")
+
 
 def run_command(command: Any, console: Console) -> int:
     """Run a command's dataclass and return its exit code."""
@@ -45,10 +49,6 @@ class CommandLine:
     perform: Callable[[Any, Console], int] = run_command
 
 
-USAGE_ERROR = 2
-INTERRUPTED = 130
-
-
 def run(line: CommandLine, arguments: Sequence[str]) -> int:
     """Run the command that the arguments name.
 
@@ -61,38 +61,40 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         which), 130 (interrupted).
     """
     console = Console(highlight=False)
-    shown = console if console.is_terminal else Console(stderr=True, highlight=False)
+    progress = console if console.is_terminal else Console(stderr=True, highlight=False)
     try:
-        with showing(Bars(shown)):
-            return _run(line, list(arguments), console)
+        with showing(Bars(progress)):
+            return _dispatch(line, list(arguments), console)
     except UgatMarlError as error:
         print(f"{line.program}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR
-    except KeyboardInterrupt as stop:
-        print("; ".join([f"{line.program}: interrupted", *map(str, stop.args)]), file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        parts = [f"{line.program}: interrupted", *map(str, interrupt.args)]
+        print("; ".join(parts), file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:
+    except BrokenPipeError:  # the reader has gone; the interpreter must not write to it at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return USAGE_ERROR
 
 
-def _run(line: CommandLine, given: list[str], console: Console) -> int:
-    if not given or given[0] in ("-h", "--help", "help"):
+def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
+    """Print help or the version, or run the command that the words name."""
+    if not words or words[0] in (*HELP, "help"):
         _print_help(line, console)
-        return 0 if given else USAGE_ERROR
-    if given[0] == "--version":
+        return 0 if words else USAGE_ERROR
+    if words[0] == "--version":
         from ugat_marl import __version__
 
         console.print(f"ugat-marl {__version__}")
         return 0
-    given = [*line.short.get(given[0], (given[0],)), *given[1:]]
-    name, rest = given[0], given[1:]
-    if parts := {key.split()[1] for key in line.commands if key.startswith(f"{name} ")}:
-        if not rest or rest[0] in ("-h", "--help"):
+    words = [*line.short.get(words[0], (words[0],)), *words[1:]]
+    name, rest = words[0], words[1:]
+    if members := {key.split()[1] for key in line.commands if key.startswith(f"{name} ")}:
+        if not rest or rest[0] in HELP:
             _print_help(line, console, f"{name} ")
             return 0 if rest else USAGE_ERROR
-        if rest[0] not in parts:
-            raise UnknownNameError(name, rest[0], parts)
+        if rest[0] not in members:
+            raise UnknownNameError(name, rest[0], members)
         name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in line.commands:
         names = {*(key.split()[0] for key in line.commands), *line.short}
@@ -100,33 +102,31 @@ def _run(line: CommandLine, given: list[str], console: Console) -> int:
     return line.perform(_parse(line, name, rest), console)
 
 
-def _parse(line: CommandLine, name: str, rest: list[str]) -> Any:
-    """Parse the command's dataclass; turn a message of tyro into one line."""
+def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
+    """Parse the options of a command into its dataclass; turn a message of tyro into one line."""
     import tyro
 
     module, _, attribute = line.commands[name][0].partition(":")
-    kind = getattr(importlib.import_module(module), attribute)
-    said = io.StringIO()
+    command_type = getattr(importlib.import_module(module), attribute)
+    messages = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(messages):
             command, unknown = tyro.cli(
-                kind,
-                args=_with_address(rest),
+                command_type,
+                args=_with_address(words),
                 prog=f"{line.program} {name}",
-                description=_description(kind),
+                description=_description(command_type),
                 return_unknown_args=True,
             )
     except SystemExit as end:
         if not end.code:
             raise
-        raise UgatMarlError(
-            f"{_one_line(said.getvalue())}; see {line.program} {name} --help"
-        ) from None
+        message = _one_line(messages.getvalue())
+        raise UgatMarlError(f"{message}; see {line.program} {name} --help") from None
     if unknown:
         first = unknown[0].partition("=")[0]
         if first.startswith("-"):
-            options = sorted(_options(kind))
-            guess = nearest(first, options)
+            guess = nearest(first, sorted(_options(command_type)))
             hint = f"Did you mean {guess!r}?" if guess else ""
             raise UgatMarlError(
                 f"unknown option {first!r} of {name}. {hint} See {line.program} {name} --help"
@@ -135,37 +135,36 @@ def _parse(line: CommandLine, name: str, rest: list[str]) -> Any:
     return command
 
 
-def _with_address(rest: list[str]) -> list[str]:
+def _with_address(words: list[str]) -> list[str]:
     """Complete a bare ``--ray``, which means the Ray of this machine."""
-    followed = zip(rest, [*rest[1:], "--"], strict=False)
-    bare = [word == "--ray" and after.startswith("-") for word, after in followed]
-    return [
-        part
-        for word, b in zip(rest, bare, strict=True)
-        for part in ((word, "local") if b else (word,))
-    ]
+    complete: list[str] = []
+    for word, following in zip(words, [*words[1:], "--"], strict=False):
+        complete.append(word)
+        if word == "--ray" and following.startswith("-"):
+            complete.append("local")
+    return complete
 
 
-def _description(kind: Any) -> str:
+def _description(command_type: Any) -> str:
     """Return the docstring up to its list of attributes, examples included."""
-    return (inspect.getdoc(kind) or "").partition("\nAttributes:")[0].strip()
+    return (inspect.getdoc(command_type) or "").partition("\nAttributes:")[0].strip()
 
 
-def _options(kind: Any, prefix: str = "") -> set[str]:
+def _options(command_type: Any, prefix: str = "") -> set[str]:
     """Return the long options of a command, nested settings included."""
-    found: set[str] = set()
-    hints = get_type_hints(kind, include_extras=True)
-    for item in fields(kind):
-        hint = hints[item.name]
+    options: set[str] = set()
+    hints = get_type_hints(command_type, include_extras=True)
+    for option in fields(command_type):
+        hint = hints[option.name]
         inner = getattr(hint, "__origin__", hint)
         if isinstance(inner, type) and is_dataclass(inner):
             flat = any(
                 getattr(extra, "name", None) == "" for extra in getattr(hint, "__metadata__", ())
             )
-            found |= _options(inner, prefix if flat else f"{prefix}{item.name}.")
+            options |= _options(inner, prefix if flat else f"{prefix}{option.name}.")
         else:
-            found.add(f"--{prefix}{item.name}".replace("_", "-"))
-    return found
+            options.add(f"--{prefix}{option.name}".replace("_", "-"))
+    return options
 
 
 def _one_line(box: str) -> str:
@@ -181,9 +180,14 @@ def _one_line(box: str) -> str:
 def _print_help(line: CommandLine, console: Console, prefix: str = "") -> None:
     console.print(f"{line.purpose}\n")
     console.print(f"usage: {line.program} {prefix}COMMAND [options]\n", markup=False)
-    for name, (_, text) in line.commands.items():
-        if name.startswith(prefix):
-            console.print(f"  {name.removeprefix(prefix):<15} {text}")
+    listed = {
+        name.removeprefix(prefix): text
+        for name, (_, text) in line.commands.items()
+        if name.startswith(prefix)
+    }
+    width = max(map(len, listed))
+    for name, text in listed.items():
+        console.print(f"  {name:<{width}}  {text}")
     console.print(
         f"\n{line.program} {prefix}COMMAND --help shows options and examples of a command."
     )

@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 from rich.console import Console
 from tyro.conf import arg
 
-from ugat_marl.cli.arguments import Ray, workers_of
+from ugat_marl.cli.arguments import RayAddress, workers_of
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import (
     DIRECT,
@@ -50,7 +50,7 @@ class _Paper:
     out: Path = Path("results")
     runs: Path = Path("runs/paper")
     jobs: int | None = None
-    ray: Ray = None
+    ray: RayAddress = None
 
     table: ClassVar[str]
 

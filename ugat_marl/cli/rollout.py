@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import Ray, Workers, workers_of
+from ugat_marl.cli.arguments import RayAddress, Workers, workers_of
 from ugat_marl.cli.evaluate import names_of
 from ugat_marl.effects import describe, load_scenario
 from ugat_marl.envs import parallel_env
@@ -29,8 +29,8 @@ class VideoConfig:
     """Part of an episode to film, and the form of the video.
 
     Attributes:
-        from_s: Where it begins, in s from the beginning of the episode.
-        length_s: How long it is, in s of traffic.
+        from_s: Begin of the film, in s from the begin of the episode.
+        length_s: Length of the film, in s of traffic.
         speed: Seconds of traffic per second of video; one frame is one second of traffic.
         size: Longer side of the picture of a network, in pixels.
     """
@@ -65,8 +65,8 @@ class Rollout:
         episodes: Number of episodes.
         seed: Root of the episodes' seeds.
         epsilon: Chance of a random phase, so that the log holds actions the policy does not take.
-        observation: What to record: count, queue, pressure, waiting, density, movements.
-        neighbours: How many roads away intersections are recorded too.
+        observation: Observation to record: count, queue, pressure, waiting, density, movements.
+        neighbours: Distance, in roads, up to which other intersections are recorded too.
         duration_s: Length of an episode in s; default: the scenario's own.
         crossings: Also record when vehicles cross the stop lines: timed grounding reads it.
         workers: Simulations at a time.
@@ -74,7 +74,7 @@ class Rollout:
         video: Video to write: .mp4 (needs ffmpeg: pip install 'ugat-marl[video]'), .webp or .gif
             (need nothing). It is of an episode of its own, without random phases.
         beside: A second policy, filmed beside the first in the same episode.
-        film: What of the episode is filmed.
+        film: Part of the episode to film.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -91,7 +91,7 @@ class Rollout:
     duration_s: float | None = None
     crossings: bool = False
     workers: Workers = None
-    ray: Ray = None
+    ray: RayAddress = None
     video: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: nothing is filmed)")
     ] = None

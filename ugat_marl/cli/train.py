@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import arg
 
-from ugat_marl.cli.arguments import Ray, workers_of
+from ugat_marl.cli.arguments import RayAddress, workers_of
 from ugat_marl.data import METRICS, Metrics
 from ugat_marl.effects import describe
 from ugat_marl.errors import OptionError
@@ -40,7 +40,7 @@ class Train:
     config: Annotated[TransferConfig, arg(name="")]
     out: Path | None = None
     resume: bool = False
-    ray: Ray = None
+    ray: RayAddress = None
 
     def run(self, console: Console) -> int:
         """Trains, evaluates, prints the table, draws it."""

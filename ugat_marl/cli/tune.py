@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, Ray, Workers, workers_of
+from ugat_marl.cli.arguments import LengthS, RayAddress, Workers, workers_of
 from ugat_marl.effects import describe, load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import BUDGET, LEAST_BUDGET, TUNED_RULES, tune
@@ -46,7 +46,7 @@ class Tune:
     budget: int = BUDGET
     duration_s: LengthS = None
     workers: Workers = None
-    ray: Ray = None
+    ray: RayAddress = None
     fresh: bool = False
     out: Path | None = None
 

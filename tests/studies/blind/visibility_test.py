@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from studies.blind import visible
+from studies.blind import visibility
 from studies.blind.cases import DIAGNOSIS, Case, Hidden, Label, write_label, write_plan
 from studies.blind.grade import SEEN, grade_cases
 from studies.blind.table import rows_of
@@ -111,7 +111,7 @@ def test_what_the_log_shows_is_visible_and_the_table_says_so(tmp_path: Path) -> 
     hide(tmp_path, case001="yellow_time", case002="headway", case003="headway")
     assert judge_visibility(tmp_path, only=["case001"]) == {"case001": None}
     known = {"case001": None, "case002": SEEN - 0.1}
-    (tmp_path / visible.VISIBLE).write_text(json.dumps(known))
+    (tmp_path / visibility.VISIBLE).write_text(json.dumps(known))
     grades = grade_cases(tmp_path)
     assert [item.visible for item in grades] == [True, False, None]
     row = next(x for x in rows_of(grades) if "knows the effect" in x.measure)
