@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from ugat_marl.experiments import Interval, PairedTest, student_p
-from ugat_marl.experiments.statistics import student_quantile
 
 
 @pytest.mark.parametrize(
@@ -16,7 +15,9 @@ from ugat_marl.experiments.statistics import student_quantile
     [(1, 12.706), (2, 4.303), (3, 3.182), (4, 2.776), (5, 2.571), (9, 2.262), (30, 2.042)],
 )
 def test_quantiles_are_those_of_the_printed_tables(degrees: int, quantile: float) -> None:
-    assert student_quantile(0.975, degrees) == pytest.approx(quantile, abs=5e-4)
+    values = np.arange(degrees + 1.0)
+    half = quantile * values.std(ddof=1) / math.sqrt(degrees + 1)
+    assert Interval.of(values).high - values.mean() == pytest.approx(half, rel=5e-4)
     assert student_p(quantile, degrees) == pytest.approx(0.05, abs=1e-4)
 
 

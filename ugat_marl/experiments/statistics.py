@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtr, stdtrit
 
 Floats = NDArray[np.float64]
 
@@ -21,13 +22,13 @@ class Interval:
 
     @classmethod
     def of(cls, values: Floats) -> Interval:
-        """Student's interval of the mean of ``(n,)`` values."""
+        """Return Student's interval of the mean of ``(n,)`` values."""
         mean, count = float(values.mean()), values.size
         if count < 2:
             return cls(mean, math.nan, math.nan)
         # Equal values have a mean beside them by rounding, and a spread of nearly 0.
         spread = float(values.std(ddof=1)) if values.min() < values.max() else 0.0
-        half = student_quantile(0.975, count - 1) * spread / math.sqrt(count)
+        half = float(stdtrit(count - 1, 0.975)) * spread / math.sqrt(count)
         return cls(mean, mean - half, mean + half)
 
 
@@ -49,7 +50,7 @@ class PairedTest:
 
     @classmethod
     def of(cls, one: Floats, other: Floats) -> PairedTest:
-        """Of two settings, ``(n,)`` each, in the same order of seeds."""
+        """Compare two settings, ``(n,)`` each, in the same order of seeds."""
         differences = one - other
         count, better = differences.size, int((differences < 0).sum())
         p = math.nan
@@ -62,33 +63,10 @@ class PairedTest:
 
 
 def student_p(t: float, degrees: int) -> float:
-    """Two-sided p-value of Student's t (Abramowitz and Stegun 26.7.3, 26.7.4).
+    """Return the two-sided p-value of Student's t.
 
     Args:
         t: The statistic.
         degrees: Degrees of freedom, at least 1.
     """
-    angle = math.atan(abs(t) / math.sqrt(degrees))
-    cosine, sine = math.cos(angle), math.sin(angle)
-    odd = degrees % 2 == 1
-    term = cosine if odd else 1.0
-    total = term if degrees > 1 else 0.0
-    for k in range(3 if odd else 2, degrees - 1, 2):
-        term *= cosine**2 * (k - 1) / k
-        total += term
-    inside = 2.0 / math.pi * (angle + sine * total) if odd else sine * total
-    return min(max(1.0 - inside, 0.0), 1.0)
-
-
-def student_quantile(level: float, degrees: int) -> float:
-    """The t below which Student's distribution has `level`, for 0.5 < level < 1."""
-    low, high = 0.0, 1.0
-    while student_p(high, degrees) > 2.0 * (1.0 - level):
-        high *= 2.0
-    for _ in range(80):
-        middle = (low + high) / 2.0
-        if student_p(middle, degrees) > 2.0 * (1.0 - level):
-            low = middle
-        else:
-            high = middle
-    return high
+    return float(2.0 * stdtr(degrees, -abs(t)))
