@@ -1,4 +1,4 @@
-"""``bench strength``: is a policy as good as the best rule where it was trained, and does it stay.
+"""``bench strength``: a policy beside the best rule, in the very domain it was trained in.
 
 A table across a gap measures transfer only if its learner is not under-trained. So the learner is
 trained and judged in one and the same domain, beside the rule that is best there.
@@ -6,7 +6,8 @@ trained and judged in one and the same domain, beside the rule that is best ther
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean
@@ -14,56 +15,28 @@ from typing import Any
 
 from studies.bench.report import Report, Target, require_positive
 from ugat_marl.effects import describe, load_scenario
-from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import TUNING_SEED, best_rules, evaluate, rule_factory
-from ugat_marl.policies import DQN, DQNConfig, Policy, device_of, require_device_name, roll_out
+from ugat_marl.experiments import (
+    DIRECT,
+    RULE,
+    RULE_FILE,
+    Curve,
+    Job,
+    LearnerSpec,
+    Setting,
+    evaluation_seeds,
+    perform_here,
+)
+from ugat_marl.policies import DQN_NAME, DQNConfig, require_device_name
 from ugat_marl.progress import Reporter, Silent
-from ugat_marl.scenarios import Scenario
-
-FIRST_SEED = 1000
-"""First seed of the evaluations; apart from those of training and of the search for rules."""
 
 STEADY = 1.05
 """The mean of the last evaluations may be so much above the best one."""
 
 
 @dataclass(frozen=True)
-class Curve:
-    """Greedy evaluations in the course of one training.
-
-    Attributes:
-        att_s: Episodes trained to mean travel time over the evaluation seeds, in s.
-        last: How many evaluations at the end count as the last ones.
-    """
-
-    att_s: Mapping[int, float]
-    last: int
-
-    @property
-    def final_s(self) -> float:
-        """Travel time of the policy at the end."""
-        return list(self.att_s.values())[-1]
-
-    @property
-    def best_s(self) -> float:
-        """The smallest of all evaluations."""
-        return min(self.att_s.values())
-
-    @property
-    def mean_of_last_s(self) -> float:
-        """Mean of the last evaluations."""
-        return fmean(list(self.att_s.values())[-self.last :])
-
-    @property
-    def unsteadiness(self) -> float:
-        """Mean of the last evaluations over the best one, at least 1."""
-        return self.mean_of_last_s / self.best_s
-
-
-@dataclass(frozen=True)
 class StrengthBench:
-    """What DQN reaches in the domain it is trained in, beside the best rule there.
+    """Compares a learner with the best rule in the domain it is trained in.
 
     Every greedy policy is evaluated on the same seeds, and so is the rule, which is chosen on
     others unless it is named. Evaluated are the policies after every `every` episodes and after
@@ -86,8 +59,10 @@ class StrengthBench:
         observation: What agents see.
         reward: What agents want; they are judged by travel time.
         neighbours: How many roads away intersections are seen too.
-        device: Where updates are computed: cpu, cuda, or cuda:N.
-        dqn: Settings of the learner.
+        learner: The algorithm: dqn, the suite's own, or a baseline.
+        learner_settings: Settings of a baseline as NAME=VALUE.
+        device: Where dqn's updates are computed: cpu, cuda, or cuda:N.
+        dqn: Settings of dqn.
         out: JSON file to write.
     """
 
@@ -104,6 +79,8 @@ class StrengthBench:
     observation: str = "count"
     reward: str = "queue"
     neighbours: int = 0
+    learner: str = DQN_NAME
+    learner_settings: tuple[str, ...] = ()
     device: str = "cpu"
     dqn: DQNConfig = field(default_factory=DQNConfig)
     out: Path | None = None
@@ -122,105 +99,88 @@ class StrengthBench:
             raise OptionError("bench strength: seeds is empty; give one seed of training or more")
 
     @property
-    def judged(self) -> list[int]:
-        """Numbers of episodes after which the policy is evaluated."""
-        late = range(max(1, self.episodes - self.last + 1), self.episodes + 1)
-        return sorted({*range(self.every, self.episodes + 1, self.every), *late})
+    def spec(self) -> LearnerSpec:
+        """The learner."""
+        return LearnerSpec(self.learner, self.learner_settings, self.dqn)
+
+    @property
+    def plan(self) -> list[Job]:
+        """The job of the rule, then a training for each seed."""
+        rules = () if self.rule is None else (self.rule,)
+        return [
+            self._job(Setting(RULE, "rule", rules=rules), None),
+            *(self._job(Setting(DIRECT, "direct", learner=self.spec), s) for s in self.seeds),
+        ]
 
     def run(self, reporter: Reporter | None = None) -> Report:
-        """Trains and measures, and writes `out` if it is given.
+        """Train and measure, and write `out` if it is given.
 
         Args:
             reporter: Is told how far it has come.
         """
-        reporter = reporter or Silent()
-        device_of(self.device)  # what is not there is said now, not after the search for the rule
-        scenario = load_scenario(self.scenario)
-        rule, rule_s = self._best_rule(scenario, reporter)
-        curves = {seed: self._curve(scenario, seed, reporter) for seed in self.seeds}
-        rows = [_row(seed, curve, rule_s) for seed, curve in curves.items()]
-        final_s = fmean(curve.final_s for curve in curves.values())
-        worst = max(curve.unsteadiness for curve in curves.values())
+        self.spec.factory(self.device)  # what is not there is said now, not after the search
+        scenario, plan = load_scenario(self.scenario), self.plan
+        with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+            folder = Path(name)
+            by_rule, *records = perform_here(plan, folder, reporter or Silent())
+            rule = (folder / plan[0].name / RULE_FILE).read_text()
+        rule_s = fmean(s.att_s for s in by_rule.played(plan[0], 0, self.domain))
+        trained = zip(plan[1:], records, strict=True)
+        curves = [Curve.of(job, record, scenario) for job, record in trained]
+        return self._report(rule, rule_s, curves)
+
+    def _report(self, rule: str, rule_s: float, curves: Sequence[Curve]) -> Report:
+        final_s = fmean(curve.final_s for curve in curves)
+        worst = max(curve.unsteadiness(self.last) for curve in curves)
         targets = [
             Target("ATT, mean over trainings / rule", final_s / rule_s, 1.0, at_least=False),
             Target("mean of last / best evaluation, worst", worst, STEADY, at_least=False),
         ]
         named = "best rule" if self.rule is None else "rule"
+        learner = "DQN" if self.learner == DQN_NAME else self.learner
+        seeds = evaluation_seeds(self.evaluation_seeds)
         notes = [
             f"{self.scenario} in {describe(self.domain)}: {named} {rule}, {rule_s:.1f} s; "
-            f"DQN after {self.episodes} episodes {final_s:.1f} s. ATT over all vehicles due, on "
-            f"seeds {FIRST_SEED} to {FIRST_SEED + self.evaluation_seeds - 1}."
+            f"{learner} after {self.episodes} episodes {final_s:.1f} s. ATT over all vehicles due, "
+            f"on seeds {seeds[0]} to {seeds[-1]}."
         ]
+        rows = [_row(curve, self.last, rule_s) for curve in curves]
         settings = {**asdict(self), "rule": rule}
         report = Report("strength", settings, rows, targets, notes, aside=("curve",))
         if self.out is not None:
             report.write(self.out)
         return report
 
-    def _best_rule(self, scenario: Scenario, reporter: Reporter) -> tuple[str, float]:
-        """The rule, searched on seeds of its own if none is named, and its travel time."""
-        rule = self.rule
-        if rule is None:
-            tuned = best_rules(
-                scenario,
-                [self.domain],
-                seeds=[TUNING_SEED + k for k in range(self.tuning_seeds)],
-                duration_s=self.duration_s,
-                reporter=reporter,
-            )
-            (rule,) = tuned.values()
-        found = evaluate(
-            scenario,
-            {rule: rule_factory(rule)},
-            [self.domain],
-            self._seeds_of_evaluations(),
-            duration_s=self.duration_s,
-        )
-        return rule, found.estimate(rule, found.domains[0], "att_s").mean
-
-    def _curve(self, scenario: Scenario, seed: int, reporter: Reporter) -> Curve:
-        training, judging = self._env(scenario), self._env(scenario)
-        learner = DQN.of(training, self.dqn, seed, device=device_of(self.device))
-        att_s: dict[int, float] = {}
-        try:
-            with reporter.task(f"training, seed {seed}", self.episodes) as advance:
-                for number in self.judged:
-                    left = number - learner.episodes
-                    policy = learner.learn(training, left, seed, lambda _number, _: advance())
-                    att_s[number] = self._att_s(judging, policy)
-        finally:
-            training.close()
-            judging.close()
-        return Curve(att_s, self.last)
-
-    def _env(self, scenario: Scenario) -> TrafficEnv:
-        return parallel_env(
-            scenario,
-            self.domain,
-            observation=self.observation,
-            reward=self.reward,
-            neighbours=self.neighbours,
-            duration_s=self.duration_s,
+    def _job(self, setting: Setting, seed: int | None) -> Job:
+        is_rule = setting.recipe == "rule"
+        return Job(
+            setting,
+            self.scenario,
+            sim=self.domain,
+            seed=seed,
+            episodes=0 if is_rule else self.episodes,
+            every=0 if is_rule else self.every,
+            last=1 if is_rule else self.last,
+            options={
+                "observation": self.observation,
+                "reward": self.reward,
+                "neighbours": self.neighbours,
+                "duration_s": self.duration_s,
+            },
+            tuning_seeds=self.tuning_seeds,
+            domains=(self.domain,),
+            evaluation_seeds=evaluation_seeds(self.evaluation_seeds),
+            device=self.device,
         )
 
-    def _att_s(self, env: TrafficEnv, policy: Policy) -> float:
-        times: list[float] = []
-        for seed in self._seeds_of_evaluations():
-            roll_out(env, policy, seed)
-            times.append(env.scores().att_s)
-        return fmean(times)
 
-    def _seeds_of_evaluations(self) -> list[int]:
-        return [FIRST_SEED + k for k in range(self.evaluation_seeds)]
-
-
-def _row(seed: int, curve: Curve, rule_s: float) -> dict[str, Any]:
+def _row(curve: Curve, last: int, rule_s: float) -> dict[str, Any]:
     return {
-        "training seed": str(seed),
+        "training seed": str(curve.seed),
         "ATT [s]": curve.final_s,
         "/ rule": curve.final_s / rule_s,
         "best [s]": curve.best_s,
-        f"mean of last {curve.last} [s]": curve.mean_of_last_s,
-        "/ best": curve.unsteadiness,
+        f"mean of last {last} [s]": curve.mean_of_last_s(last),
+        "/ best": curve.unsteadiness(last),
         "curve": {str(number): att_s for number, att_s in curve.att_s.items()},
     }

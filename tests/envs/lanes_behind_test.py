@@ -14,7 +14,7 @@ import ugat_marl
 from ugat_marl.__main__ import main
 from ugat_marl.effects import in_domain, load_scenario
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.experiments.recipes import simulated_worlds
+from ugat_marl.experiments.training import simulated_worlds
 from ugat_marl.field import Site
 from ugat_marl.files import Document
 from ugat_marl.grounding import UgatConfig

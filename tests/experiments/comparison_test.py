@@ -39,7 +39,8 @@ def found() -> Comparison:
         *trials("constant delay 2 s", {0: (70.0, 120.0), 1: (70.0, 160.0)}),
         *trials("best rule, tuned there", {None: (80.0, 120.0)}),
     ]
-    return Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
+    kinds = {"constants": ("constant delay 2 s",), "grounded": ("UGAT",)}
+    return Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"}, **kinds)
 
 
 def test_values_are_in_the_order_of_the_training_seeds(found: Comparison) -> None:
@@ -113,7 +114,7 @@ def test_pages_hold_the_numbers(found: Comparison) -> None:
     assert "| UGAT | −54 % |" in page
     assert "| UGAT | 0.80 |" in page
     assert "| direct transfer | 100 (-154 to 354) |" in page  # t = 12.71, 20 s apart from the mean
-    assert "| best constant | 2 s |" in page
+    assert "| best constant | constant delay 2 s |" in page
     assert "| UGAT | -80.0 (" in page
     table = as_csv(found).splitlines()
     assert len(table) == 5

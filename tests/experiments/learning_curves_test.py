@@ -1,22 +1,32 @@
-"""Trainings that are judged as they go: taken up again, refused, and told of on a page."""
+"""Learning curves: what is trained, in what order, and the page that tells of it."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.experiments import Curve, Training, found, perform, word
-from ugat_marl.experiments import learning_curves as module
-from ugat_marl.reporting.learning_curves import curves_as_csv, curves_page
+import ugat_marl.experiments.learning_curves as module
+from ugat_marl.data import Scores
+from ugat_marl.effects import load_scenario
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.experiments import (
+    RULE,
+    Curve,
+    Curves,
+    CurvesConfig,
+    Record,
+    learn_curves,
+    record_of,
+    word,
+)
+from ugat_marl.policies import BASELINES
+from ugat_marl.progress import Silent
+from ugat_marl.reporting import curves_as_csv, curves_page
 
-PLAN = Training("single-v1", "ippo", 3, 4, 2, 2)
-MADE = {"library": "wonder 1.0"}
+CONFIG = CurvesConfig(learners=("ippo", "dqn"), seeds=2, episodes=4, evaluate_every=2)
 FACTS = {
     "command": "results.py --seeds 2",
     "cpu": "abacus",
@@ -26,52 +36,61 @@ FACTS = {
 }
 
 
-def curve(*att_s: list[float], speed: float = 10.0) -> Curve:
-    marks = dict(zip(PLAN.marks, att_s, strict=True))
-    return Curve(MADE, marks, decisions=100, seconds=100 / speed, own_seconds=0.5)
+def curve(learner: str, seed: int, *att_s: float, speed: float = 10.0) -> Curve:
+    library = "wonder 1.0" if learner == "ippo" else ""
+    return Curve(learner, library, seed, dict(zip((2, 4), att_s, strict=True)), speed, 5.0)
 
 
-def test_it_is_judged_every_few_episodes_and_at_the_end() -> None:
-    assert PLAN.marks == (2, 4)
-    assert replace(PLAN, episodes=5).marks == (2, 4, 5)
-    assert replace(PLAN, evaluate_every=9).marks == (4,)
-    assert PLAN.name == "single-v1-ippo-s3"
+def test_a_curve_by_hand() -> None:
+    one = Curve("dqn", "", 0, {5: 200.0, 6: 100.0, 8: 104.0, 9: 112.0})
+    assert (one.final_s, one.best_s) == (112.0, 100.0)
+    assert one.mean_of_last_s(3) == pytest.approx((100 + 104 + 112) / 3)
+    assert one.unsteadiness(3) == pytest.approx(1.0533, abs=1e-4)
+    assert Curve("dqn", "", 0, {1: 50.0, 2: 100.0}).unsteadiness(1) == 2.0
+
+
+def test_a_curve_is_the_means_of_a_record() -> None:
+    scenario = load_scenario("single-v1").with_duration(100)
+    job = CONFIG.trainings("single-v1")[0]
+    scores = Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1)
+    played = {
+        (mark, "sim", seed): replace(scores, att_s=float(mark + seed))
+        for mark in job.marks
+        for seed in job.evaluation_seeds
+    }
+    found = Curve.of(job, Record(played, episodes=4, seconds=2.0, own_seconds=1.0), scenario)
+    assert found.att_s == {2: 1004.0, 4: 1006.0}  # seeds 1000 to 1004
+    assert found.speed == 4 * scenario.decisions / 2
+    assert found.own_ms == 1000 / (4 * scenario.decisions)
+
+
+def test_all_learners_have_a_seed_before_one_has_two() -> None:
+    plan = CurvesConfig(seeds=2).trainings("single-v1")
+    names = ["dqn", *BASELINES]
+    assert [job.setting.name for job in plan] == names * 2
+    assert [job.seed for job in plan] == [0] * len(names) + [1] * len(names)
+    with pytest.raises(OptionError, match="seeds = 0"):
+        CurvesConfig(seeds=0)
+    with pytest.raises(UnknownNameError, match="sb3-pp"):
+        CurvesConfig(learners=("sb3-pp",))
+
+
+def test_names_of_scenarios_are_parts_of_names_of_files() -> None:
     assert word("resco:cologne3") == "resco-cologne3"
     assert word("/there/mine.sumocfg") == "mine"
 
 
-def test_a_training_is_whole_when_it_has_all_its_evaluations(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "made_now", lambda scenario, learner: MADE)
-    folder = tmp_path / PLAN.name
-    assert found(PLAN, tmp_path) is None
-    curve([1.0, 2.0], [3.0, 4.0]).write(folder)
-    assert found(PLAN, tmp_path) == curve([1.0, 2.0], [3.0, 4.0])
-    assert found(replace(PLAN, evaluation_seeds=3), tmp_path) is None
-    assert found(replace(PLAN, episodes=6), tmp_path) is None
-    own = found(replace(PLAN, evaluation_seeds=1, episodes=2), tmp_path)
-    assert own is not None and own.means(replace(PLAN, evaluation_seeds=1)) == [1.0, 3.0]
-    monkeypatch.setattr(module, "made_now", lambda scenario, learner: {"library": "wonder 2.0"})
-    with pytest.raises(OptionError, match=r"was made with library wonder 1\.0 \(now wonder 2\.0\)"):
-        found(PLAN, tmp_path)
-    monkeypatch.setattr(module, "is_installed", lambda name: False)
-    assert found(PLAN, tmp_path) is not None
-    (folder / "curve.json").write_text("{")
-    with pytest.raises(CheckpointError, match=r"curve\.json: broken"):
-        found(PLAN, tmp_path)
-
-
 def test_the_page_by_hand() -> None:
-    curves = {
-        PLAN: curve([300.0, 300.0], [110.0, 130.0], speed=10),
-        replace(PLAN, seed=4): curve([90.0, 90.0], [140.0, 140.0], speed=30),
-        replace(PLAN, learner="dqn"): curve([500.0, 500.0], [400.0, 400.0]),
-    }
-    rules = {"programme": [210.0, 190.0], "fixed-time:30": [150.0, 150.0], "sotl": [125.0, 125.0]}
-    lines = curves_page("single-v1", curves, rules, "sotl", FACTS).splitlines()
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if "| " in line]
     # seeds 3 and 4 end with 120 and 140, 150 is fixed time; their best are 120 and 90
+    curves = (
+        curve("ippo", 3, 300.0, 120.0, speed=10.0),
+        curve("ippo", 4, 90.0, 140.0, speed=30.0),
+        curve("dqn", 3, 500.0, 400.0),
+    )
+    rules = {"programme": 200.0, "fixed-time:30": 150.0, "sotl": 125.0}
+    found = Curves("single-v1", "sim", curves, rules, "sotl", {})
+    lines = curves_page(found, CONFIG, FACTS).splitlines()
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if "| " in line]
     half = 12.706 * np.std([120, 140], ddof=1) / np.sqrt(2)
     assert cells[1][:5] == ["ippo", "wonder 1.0", "2", "20", "5.0"]
     assert (
@@ -91,38 +110,29 @@ def test_the_page_by_hand() -> None:
     assert len(rows) == 1 + 3 * 2 and rows[2] == "ippo,wonder 1.0,3,4,120.0,10.0,5.0"
 
 
-@pytest.fixture
-def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Episodes of two minutes."""
-    load = module.load
-    monkeypatch.setattr(module, "load", lambda name: load(name).with_duration(120))
-
-
-def att_of(folder: Path) -> Any:
-    return json.loads((folder / "curve.json").read_text())["att_s"]
-
-
-@pytest.mark.usefixtures("short")
-def test_a_training_that_was_interrupted_goes_on(
+def test_what_is_there_is_not_trained_again_and_failures_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    perform(PLAN, whole)
-    assert list(att_of(whole)) == ["2", "4"] and len(att_of(whole)["4"]) == 2
-    perform(replace(PLAN, episodes=2), parts)
-    assert sorted(path.name for path in parts.glob("learner*")) == ["learner-2.pt"]
-    perform(PLAN, parts)
-    assert att_of(parts) == att_of(whole)
-    assert sorted(path.name for path in parts.glob("learner*")) == ["learner-4.pt"]
-    curve = Curve.read(whole)
-    assert (
-        curve is not None
-        and curve.decisions == 4 * 12
-        and curve.seconds > 0
-        and curve.own_seconds > 0
-    )
-    with pytest.raises(OptionError, match="is beyond it"):
-        perform(replace(PLAN, episodes=3), parts)
-    monkeypatch.setattr(module, "versions_of", lambda *names: {})
-    with pytest.raises(OptionError, match=r"was made with versions .*; remove it"):
-        perform(replace(PLAN, episodes=6), parts)
+    short = replace(CONFIG, seeds=1, episodes=1, evaluation_seeds=1, rule_budget=2, duration_s=60.0)
+    scenario = load_scenario("single-v1").with_duration(60)
+    found = learn_curves(scenario, "single-v1", short, tmp_path, 2, Silent())
+    assert not found.failures and [own.learner for own in found.curves] == ["ippo", "dqn"]
+    programme, fixed, *_ = found.rules
+    assert programme == "programme" and fixed.startswith("fixed-time:")
+    assert found.best in found.rules and all(0 < att_s < 60 for att_s in found.rules.values())
+    best = next(job for job in short.rules("single-v1") if job.setting.name == RULE)
+    record = record_of(best, tmp_path)
+    assert record is not None
+    assert found.rules[found.best] == record.scores[0, "sim", 1000].att_s
+    files = list(tmp_path.glob("*/scores.json"))
+    times = [path.stat().st_mtime_ns for path in files]
+    assert len(files) == 5
+
+    def refused(job: object, failures: dict[str, str]) -> bool:
+        failures["ippo"] = "is not installed"
+        return job is not short.trainings("single-v1")[0]
+
+    monkeypatch.setattr(module, "_can_be_made", refused)
+    again = learn_curves(scenario, "single-v1", short, tmp_path, 2, Silent())
+    assert again.rules == found.rules and again.failures == {"ippo": "is not installed"}
+    assert [path.stat().st_mtime_ns for path in files] == times

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from ugat_marl.__main__ import main
-from ugat_marl.data import Scores, locked
-from ugat_marl.errors import MeasurementError, OptionError, UnknownNameError
+from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import DIRECT, QUEUES, TIMED, PaperConfig, read_queues
-from ugat_marl.experiments.paper.job import JOB, SCORES, read_scores
-from ugat_marl.experiments.paper.runner import LOG, Planned, done, perform_all
-from ugat_marl.experiments.paper.settings import TABLES, Setting, settings_of
-from ugat_marl.experiments.paper.tables import Planner
+from ugat_marl.experiments.jobs import SCORES
+from ugat_marl.experiments.paper import TABLES, Planner, settings_of
+from ugat_marl.experiments.settings import LearnerSpec, Setting
 from ugat_marl.grounding import FitConfig, GateConfig, InputsConfig, TimedConfig, UgatConfig
-from ugat_marl.progress import Silent
 
 SHORT = PaperConfig(episodes=10, iterations=2, grounded_episodes=5, real_rollouts=3, seeds=2)
 
@@ -45,10 +39,7 @@ def test_main_has_the_controls_an_honest_table_needs() -> None:
 
 def test_rewards_are_matched_in_the_row_that_says_so_alone() -> None:
     matching = {
-        setting.name
-        for table in TABLES
-        for setting in SHORT.settings(table)
-        if setting.kind == "grounded" and setting.ugat.matches
+        setting.name for table in TABLES for setting in SHORT.settings(table) if setting.matches
     }
     assert matching == {"UGAT, timed: rewards matched"}
 
@@ -58,8 +49,8 @@ def test_rows_share_what_is_given_and_keep_what_they_are_named_for() -> None:
         SHORT, inputs=InputsConfig(hops=1), gate=GateConfig(window_epochs=3),
         fit=FitConfig(uncertainty="dropout"),
     )  # fmt: skip
-    rows = {setting.name: setting.ugat for setting in config.settings("ablation")}
-    grounded = {name: own for name, own in rows.items() if name.startswith("UGAT")}
+    rows = config.settings("ablation")
+    grounded = {row.name: row.ugat for row in rows if row.ugat is not None}
     assert all(own.inputs.hops == 1 for own in grounded.values())
     assert all(own.gate.window_epochs == 3 for own in grounded.values())
     named = {name: own.fit.uncertainty for name, own in grounded.items()}
@@ -92,7 +83,7 @@ def test_rows_can_be_picked_and_keep_their_order() -> None:
 
 def test_what_does_not_know_the_domain_is_trained_once_for_all_of_them() -> None:
     def trained(name: str) -> int:
-        return len({planned.name for planned in planner().jobs(row(name))})
+        return len({job.name for job in planner().jobs(row(name))})
 
     assert trained(DIRECT) == 2  # seeds
     assert trained("constant delay 3 s") == 2
@@ -102,7 +93,7 @@ def test_what_does_not_know_the_domain_is_trained_once_for_all_of_them() -> None
 
 def test_every_policy_has_as_many_episodes() -> None:
     def episodes(name: str) -> int:
-        return planner().jobs(row(name))[0].job.episodes
+        return planner().jobs(row(name))[0].episodes
 
     assert episodes(DIRECT) == 10
     assert episodes("more plain sim") == episodes("trained in real") == 20
@@ -110,7 +101,7 @@ def test_every_policy_has_as_many_episodes() -> None:
 
 
 def test_tables_share_trainings() -> None:
-    main_names = {planned.name for planned in planner().jobs(row("UGAT"))}
+    main_names = {job.name for job in planner().jobs(row("UGAT"))}
     for table, name in (
         ("ablation", "UGAT"),
         ("alpha", "UGAT"),
@@ -118,20 +109,32 @@ def test_tables_share_trainings() -> None:
     ):
         one_domain = replace(SHORT, domains=("V1",))
         own = planner(one_domain, table).jobs(row(name, one_domain, table))
-        assert {planned.name for planned in own} <= main_names
+        assert {job.name for job in own} <= main_names
 
 
 def test_what_decides_a_policy_decides_its_folder() -> None:
     (first, *_) = planner().jobs(row("UGAT"))
+    other = UgatConfig(grounded_episodes=6)
     for change in (
         {"seed": 7},
         {"target": "V2"},
-        {"options": {**first.job.options, "duration_s": 600.0}},
-        {"ugat": UgatConfig(grounded_episodes=6)},
+        {"options": {**first.options, "duration_s": 600.0}},
+        {"setting": replace(first.setting, ugat=other)},
+        {"setting": replace(first.setting, learner=LearnerSpec("ippo"))},
     ):
-        assert Planned.of(replace(first.job, **change)).name != first.name
-    for judging in ({"evaluation_seeds": (1,)}, {"domains": ("V1",)}):
-        assert Planned.of(replace(first.job, **judging)).name == first.name
+        assert replace(first, **change).name != first.name
+    renamed = replace(first.setting, name="another name")
+    for same in ({"evaluation_seeds": (1,)}, {"domains": ("V1",)}, {"setting": renamed}):
+        assert replace(first, **same).name == first.name
+
+
+def test_every_row_of_a_table_has_the_learner_that_is_asked_for() -> None:
+    config = replace(SHORT, learner="ippo", learner_settings=("hidden=8",))
+    for table in TABLES:
+        for setting in config.settings(table):
+            assert setting.learner == LearnerSpec("ippo", ("hidden=8",))
+    with pytest.raises(UnknownNameError, match="sb3-pp"):
+        replace(SHORT, learner="sb3-pp")
 
 
 @pytest.mark.parametrize(
@@ -176,70 +179,13 @@ def test_the_simulation_is_no_real_domain_of_its_own_table() -> None:
         PaperConfig(sim="light-loads").targets("alpha")
 
 
-def test_a_failed_job_says_why_and_the_next_call_starts_it_again(tmp_path: Path) -> None:
-    broken = replace(planner().bases[0].job, options={"observation": "conut"})
-    planned = Planned(broken, "broken")
-    with pytest.raises(MeasurementError, match="conut"):
-        perform_all([planned], tmp_path, 1, Silent(), "test")
-    assert "conut" in (tmp_path / "broken" / LOG).read_text()
-    assert json.loads((tmp_path / "broken" / JOB).read_text())["kind"] == "direct"
-
-
-def test_two_tables_do_not_train_in_one_folder(tmp_path: Path) -> None:
-    lock = locked(tmp_path)
-    with pytest.raises(OptionError, match="another process"):
-        perform_all([], tmp_path, 1, Silent(), "test")
-    lock.close()
-    perform_all([], tmp_path, 1, Silent(), "test")
-
-
-def test_a_job_ends_with_whoever_started_it(tmp_path: Path) -> None:
-    endless = replace(planner().bases[0].job, episodes=10**6)
-    (tmp_path / JOB).write_text(json.dumps(asdict(endless)))
-    process = subprocess.Popen(
-        [sys.executable, "-m", "ugat_marl.experiments.paper.job", str(tmp_path)],
-        stdin=subprocess.PIPE,
-    )
-    assert process.stdin is not None
-    process.stdin.close()
-    assert process.wait(60) == 1
-
-
-def test_what_a_killed_job_was_writing_is_cleared(tmp_path: Path) -> None:
-    planned = planner(replace(SHORT, evaluation_seeds=1)).bases[0]
-    scores = asdict(Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1))
-    rows = [{"domain": domain, "seed": 1000, **scores} for domain in planned.job.domains]
-    (tmp_path / SCORES).write_text(json.dumps(rows))  # nothing is left to do
-    (tmp_path / JOB).write_text(json.dumps(asdict(planned.job)))
-    (tmp_path / ".learner.pt.x1y2z3.tmp").write_bytes(b"half")
-    command = [sys.executable, "-m", "ugat_marl.experiments.paper.job", str(tmp_path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
-        assert process.wait(60) == 0  # its input stays open: it would end with whoever started it
-    assert {path.name for path in tmp_path.iterdir()} == {SCORES, JOB}
-
-
-@pytest.mark.parametrize("content", ["", "[{}]", '[{"domain": "sim"}]', '{"a": 1}', "[1]"])
-def test_broken_scores_are_no_scores(tmp_path: Path, content: str) -> None:
-    (tmp_path / SCORES).write_text(content)
-    assert read_scores(tmp_path) == {}
-
-
-def test_a_job_is_done_when_everything_was_played(tmp_path: Path) -> None:
-    planned = planner(replace(SHORT, evaluation_seeds=1)).bases[0]
-    scores = asdict(Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1))
-    rows = [{"domain": domain, "seed": 1000, **scores} for domain in planned.job.domains]
-    folder = tmp_path / planned.name
-    folder.mkdir()
-    (folder / SCORES).write_text(json.dumps(rows[:-1]))
-    assert done(planned, tmp_path) is None
-    (folder / SCORES).write_text(json.dumps(rows))
-    assert done(planned, tmp_path) is not None
-
-
-def test_a_table_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("learner", [(), ("--learner", "ippo")])
+def test_a_table_from_the_command_line(
+    learner: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     call = [
         "paper", "gap", "--domains", "V4", "--episodes", "1", "--seeds", "1", "--duration-s", "120",
-        "--evaluation-seeds", "2", "--rule-budget", "2",
+        "--evaluation-seeds", "2", "--rule-budget", "2", *learner,
         "--out", str(tmp_path / "results"), "--runs", str(tmp_path / "runs"),
     ]  # fmt: skip
     assert main(call) == 0

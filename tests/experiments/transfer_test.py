@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ from ugat_marl.__main__ import main
 from ugat_marl.data import Metrics, TransitionLog
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import TransferConfig, transfer
+from ugat_marl.experiments.jobs import file_names
 from ugat_marl.experiments.randomised import RandomisedEnv
-from ugat_marl.experiments.recipes import file_names
 from ugat_marl.grounding import FitConfig, RandomDelays, TimedConfig, UgatConfig
 from ugat_marl.policies import DQNConfig, NetworkPolicy
 from ugat_marl.progress import Silent
@@ -68,8 +69,14 @@ def weights(folder: Path, name: str) -> np.ndarray[Any, Any]:
 
 
 def episodes(folder: Path, name: str) -> int:
-    saved = torch.load(folder / f"{name}-learner.pt", weights_only=True)
+    """Episodes that the learner of a setting has had, found by the name it carries."""
+    jobs = {json.loads(path.read_text())["setting"]["name"]: path for path in jobs_of(folder)}
+    saved = torch.load(jobs[name].parent / "learner.pt", weights_only=True)
     return int(saved["counters"]["episodes"])
+
+
+def jobs_of(folder: Path) -> list[Path]:
+    return list((folder / "trainings").glob("*/job.json"))
 
 
 class KillIn(Silent):
@@ -132,10 +139,10 @@ def test_every_control_is_trained_as_long_as_it_says_where_it_says(
     ]  # fmt: skip
     assert found.policies == names
     assert config.episodes == 8
-    for name in ("control", "random-delay-0-5-s", "domain-randomisation", "oracle"):
+    for name in ("more plain sim", "random delay 0-5 s", "domain randomisation", "trained in real"):
         assert episodes(tmp_path, name) == 8
     # UGAT saw two roll-outs of the real domain in each of two iterations.
-    assert episodes(tmp_path, "fine-tuned-on-the-same-data") == 2 + 4
+    assert episodes(tmp_path, "fine-tuned on the same data") == 2 + 4
     assert len(worlds) == len(set(worlds)) == 8
     for world in worlds:
         parts = {part.partition("=")[0] for part in world.split("+")}
@@ -165,7 +172,7 @@ def test_controls_are_the_trainings_that_go_by_other_names(tmp_path: Path) -> No
 def test_domains_whose_names_differ_by_a_sign_are_trained_in_one_by_one(tmp_path: Path) -> None:
     domains = ("acceleration=0.5+demand_timing=*,-60", "acceleration=0.5+demand_timing=*,60")
     transfer(replace(SMALL, further=domains), tmp_path)
-    assert len(list(tmp_path.glob("further-in-*-learner.pt"))) == 2
+    assert len(jobs_of(tmp_path)) == 2
     first = "further-in-acceleration-0.5-demand-timing-60"
     one, two = (weights(tmp_path, name) for name in (first, f"{first}-2"))
     assert not np.array_equal(one, two)
@@ -189,8 +196,8 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
     config = replace(SMALL, ugat=ugat, randomised=True)
     transfer(config, tmp_path / "unbroken")
     with pytest.raises(KeyboardInterrupt):
-        transfer(config, tmp_path / "run", reporter=KillIn("domain randomisation", 11))
-    assert episodes(tmp_path / "run", "domain-randomisation") == 10
+        transfer(config, tmp_path / "run", reporter=KillIn("training: domain randomisation", 11))
+    assert episodes(tmp_path / "run", "domain randomisation") == 10
     transfer(config, tmp_path / "run", resume=True)
     name = "domain-randomisation"
     assert np.array_equal(weights(tmp_path / "run", name), weights(tmp_path / "unbroken", name))

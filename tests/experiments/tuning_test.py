@@ -29,8 +29,8 @@ from ugat_marl.experiments import (
 )
 from ugat_marl.experiments import transfers as transfer
 from ugat_marl.experiments.evaluation import race
+from ugat_marl.experiments.jobs import EVALUATION_SEED
 from ugat_marl.experiments.scores import Result, Trial
-from ugat_marl.experiments.transfers import EVALUATION_SEED
 from ugat_marl.experiments.tuning import rungs, settings_of
 from ugat_marl.policies import RULES, STANDARD_RULES, format_spec, parse_spec
 from ugat_marl.progress import Silent

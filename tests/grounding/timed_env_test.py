@@ -18,7 +18,7 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import TransferConfig, transfer
-from ugat_marl.experiments.recipes import simulated_worlds
+from ugat_marl.experiments.training import simulated_worlds
 from ugat_marl.grounding import (
     FitConfig,
     GateConfig,

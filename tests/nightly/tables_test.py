@@ -18,13 +18,12 @@ from ugat_marl.experiments import (
     ORACLE,
     RULE,
     TIMED,
+    UGAT,
     Comparison,
     PaperConfig,
     compare,
 )
-from ugat_marl.experiments.paper.settings import constant_name
-from ugat_marl.experiments.paper.tables import Planner
-from ugat_marl.experiments.transfers import UGAT
+from ugat_marl.experiments.paper import Planner, constant_name
 from ugat_marl.progress import Silent
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
@@ -54,8 +53,8 @@ def accepted(table_name: str, setting: str, runs: Path) -> float:
     (row,) = [own for own in CONFIG.settings(table_name) if own.name == setting]
     values = [
         value
-        for planned in Planner(table_name, "single-v1", CONFIG).jobs(row)
-        for _, _, name, value in Metrics.read(runs / planned.name / METRICS).rows
+        for job in Planner(table_name, "single-v1", CONFIG).jobs(row)
+        for _, _, name, value in Metrics.read(runs / job.name / METRICS).rows
         if name == "gate/acceptance"
     ]
     assert len(values) == CONFIG.seeds * CONFIG.iterations

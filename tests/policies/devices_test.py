@@ -29,7 +29,7 @@ from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRec
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import PaperConfig, TransferConfig, transfer
-from ugat_marl.experiments.paper.tables import Planner
+from ugat_marl.experiments.paper import Planner
 from ugat_marl.grounding import (
     METHODS,
     FitConfig,
@@ -543,7 +543,7 @@ def test_trainings_of_a_table_are_the_same_jobs_on_any_device(
         for name in ("cpu", "cuda")
     )
     assert own.name == there.name
-    assert (own.job.device, there.job.device) == ("cpu", "cuda")
+    assert (own.device, there.device) == ("cpu", "cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert main(["paper", "gap", "--device", "cuda", "--ray", "local"]) == 2
     assert "leave --ray or --device out" in capsys.readouterr().err

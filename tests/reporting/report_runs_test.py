@@ -26,15 +26,23 @@ from ugat_marl.cli.train import Train
 from ugat_marl.data import Metrics, Scores, write_settings
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import Evaluation, Interval, TransferConfig, binned, joined, transfer
-from ugat_marl.experiments.paper.settings import TABLES, settings_of
+from ugat_marl.experiments import (
+    Evaluation,
+    Interval,
+    Job,
+    Record,
+    Setting,
+    TransferConfig,
+    binned,
+    joined,
+    transfer,
+)
 from ugat_marl.experiments.scores import Result
-from ugat_marl.grounding import FitConfig, UgatConfig
+from ugat_marl.grounding import FitConfig, GateConfig, UgatConfig
 from ugat_marl.reporting import RunRecord, read_records, runs_page, style, write_pictures
 from ugat_marl.reporting import formats as words
 from ugat_marl.reporting.charts import radar_picture
 from ugat_marl.reporting.figures import Picture
-from ugat_marl.reporting.job_names import job_name
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Page as MadePage
 from ugat_marl.scenarios import Network
@@ -406,35 +414,29 @@ def test_domains_stand_in_columns_and_what_differs_stays_apart(tmp_path: Path) -
     assert "1 training seed; no intervals" in page.text
 
 
-def make_job(folder: Path, name: str, played: Sequence[str], **job: Any) -> None:
+def make_job(folder: Path, name: str, played: Sequence[str], setting: Setting, **more: Any) -> None:
     options = {"observation": "count", "neighbours": 0}
-    options = {"observation": "count", "neighbours": 0}
-    usual = {
-        "kind": "direct", "scenario": "single-v1", "sim": "sim", "target": None, "world": None,
-        "seed": 0, "options": options, "ugat": None,
-    }  # fmt: skip
-    (folder / name).mkdir(parents=True)
-    (folder / name / "job.json").write_text(json.dumps({**usual, **job}))
-    base = 100.0 + 10 * (job.get("seed") or 0)
-    rows = [
-        {"domain": d, "seed": s, **asdict(scores(base + 50 * (d != "sim") + s))}
-        for d in played
-        for s in (0, 1)
-    ]
-    if rows:
-        (folder / name / "scores.json").write_text(json.dumps(rows))
+    job = Job(setting, "single-v1", **{"seed": 0, "options": options, **more})
+    job.write(folder / name)
+    base = 100.0 + 10 * (job.seed or 0)
+    played_scores = {
+        (0, d, s): scores(base + 50 * (d != "sim") + s) for d in played for s in (0, 1)
+    }
+    if played_scores:
+        Record(played_scores).write(folder / name)
 
 
 def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
+    direct, oracle = Setting("direct transfer", "direct"), Setting("trained in real", "scratch")
+    ugat = UgatConfig(grounding="timed")
+    timed = Setting("UGAT, timed", "grounded", ugat=ugat)
+    fixed = replace(timed, ugat=replace(ugat, gate=GateConfig(mode="static", static_alpha=0.5)))
     for seed in (0, 1):
-        make_job(tmp_path, f"direct-{seed}", ("sim", "V1", "V4"), seed=seed)
-        ugat = {"grounding": "timed", "gate": {"mode": "dynamic"}}
-        make_job(tmp_path, f"timed-{seed}", ("sim", "V4"), kind="grounded", target="V4", seed=seed,
-                 ugat=ugat)  # fmt: skip
-    static = {"grounding": "timed", "gate": {"mode": "static"}}
-    make_job(tmp_path, "static", ("sim", "V4"), kind="grounded", target="V4", ugat=static)
-    make_job(tmp_path, "waiting", (), kind="scratch", target="V1")
-    make_job(tmp_path, "half", ("sim",), kind="scratch", target="V4")
+        make_job(tmp_path, f"direct-{seed}", ("sim", "V1", "V4"), direct, seed=seed)
+        make_job(tmp_path, f"timed-{seed}", ("sim", "V4"), timed, target="V4", seed=seed)
+    make_job(tmp_path, "static", ("sim", "V4"), fixed, target="V4")
+    make_job(tmp_path, "waiting", (), oracle, target="V1")
+    make_job(tmp_path, "half", ("sim",), oracle, target="V4")
     _, page = page_of(tmp_path)
     row = next(row for row in page.cells if row[:1] == ["direct transfer"] and len(row) == 3)
     interval = Interval.of(np.array([150.5, 160.5]))
@@ -445,7 +447,7 @@ def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
 
 
 def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
-    make_job(tmp_path, "direct-0", ("sim", "V4"), seed=0)
+    make_job(tmp_path, "direct-0", ("sim", "V4"), Setting("direct transfer", "direct"))
     rows = [("policy", d, m, "A1", 3.0 + m, 6) for d in ("sim", "V4") for m in range(5)]
     schema = ["policy", "domain", "minute", "intersection", "queue", "looks"]
     pl.DataFrame(rows, schema=schema, orient="row").write_parquet(
@@ -454,15 +456,6 @@ def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
     _, page = page_of(tmp_path / "direct-0")
     assert "The worst intersections and minutes" in page.text
     assert "direct transfer in V4" in page.text
-
-
-@pytest.mark.parametrize("sim", ["sim", "meso"])
-@pytest.mark.parametrize("table", TABLES)
-def test_jobs_are_called_as_in_the_tables_of_the_paper(table: str, sim: str) -> None:
-    for row in settings_of(table, UgatConfig(), sim):
-        job = {"kind": row.kind, "world": row.world, "sim": sim,
-               "ugat": asdict(row.ugat) if row.kind == "grounded" else None}  # fmt: skip
-        assert row.name.split(":")[0] == job_name(job)
 
 
 def test_a_finished_table_is_shown_with_its_command() -> None:

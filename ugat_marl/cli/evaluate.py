@@ -58,7 +58,7 @@ class Evaluate:
     out: Path | None = None
 
     def run(self, console: Console) -> int:
-        """Evaluates and prints."""
+        """Evaluate and print."""
         for name in ("policies", "domains"):
             if not getattr(self, name):
                 raise OptionError(f"--{name} needs at least one value")
@@ -94,7 +94,7 @@ class Evaluate:
         return 0
 
     def _domains(self, scenario: Scenario, console: Console) -> list[str]:
-        """The domains spelled out, without those of a list that the network does not allow."""
+        """Return the domains spelled out, without those that the network does not allow."""
         found: list[str] = []
         for name in spelled_out(self.domains):
             if name in NAMED and name not in self.domains and _may_not_fit(name):
@@ -108,7 +108,7 @@ class Evaluate:
 
 
 def _may_not_fit(name: str) -> bool:
-    """Whether a named domain asks for something not every network has: a barrier, a long lane.
+    """Return True if a domain asks for what not every network has: a barrier, a long lane.
 
     Or not every episode: vehicles that come later may all come too late for a short one.
     """
@@ -117,7 +117,7 @@ def _may_not_fit(name: str) -> bool:
 
 
 def names_of(policies: Sequence[str]) -> list[str]:
-    """What to call policies in the table: files by the shortest path endings that differ."""
+    """Return names of policies in the table: files by the shortest path endings that differ."""
     paths = [Path(spec.removesuffix(".pt")).parts for spec in policies]
     for length in range(1, max(map(len, paths)) + 1):
         names = ["/".join(parts[-length:]) for parts in paths]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -20,6 +19,7 @@ from ugat_marl.experiments import (
     compare,
     machine_facts,
     matched_name,
+    word,
 )
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import device_of
@@ -36,7 +36,7 @@ from ugat_marl.reporting import (
 
 @dataclass(frozen=True)
 class _Paper:
-    """What all tables have in common.
+    """Options that all tables have.
 
     Attributes:
         config: What is trained, how often, and how it is judged.
@@ -55,7 +55,7 @@ class _Paper:
     table: ClassVar[str]
 
     def run(self, console: Console) -> int:
-        """Trains, plays, prints the table, writes it as Markdown, CSV and PNG."""
+        """Train, play, print the table, write it as Markdown, CSV and PNG."""
         if self.jobs is not None and self.jobs < 1:
             raise OptionError(f"jobs = {self.jobs}: must be at least 1")
         if self.ray is not None and self.config.device != "cpu":
@@ -65,7 +65,7 @@ class _Paper:
             )
         device_of(self.config.device)  # what is not there is an error now, not in a job's log
         for scenario in self.config.scenario:
-            folder = self.out / self._folder(scenario)
+            folder = self.out / word(scenario) / self.table
             require_writable(folder / "table.md")
             with workers_of(self.jobs, self.ray, "--jobs") as workers:
                 found = compare(
@@ -75,10 +75,6 @@ class _Paper:
             console.print(terminal_tables(found, DIRECT))
             console.print(f"table and pictures: {folder}\ntrainings: {self.runs}", soft_wrap=True)
         return 0
-
-    def _folder(self, scenario: str) -> str:
-        name = Path(scenario).name.removesuffix(".sumocfg")
-        return f"{re.sub(r'[^A-Za-z0-9_.+-]+', '-', name).strip('-')}/{self.table}"
 
 
 @dataclass(frozen=True)
@@ -93,6 +89,7 @@ class Main(_Paper):
     Examples:
         ugat-marl paper main
         ugat-marl paper main --scenario grid4x4-v1 --domains V3 V4 --seeds 3 --episodes 40
+        ugat-marl paper main --learner sb3-ppo
     """
 
     table: ClassVar[str] = "main"
@@ -134,7 +131,7 @@ class Uncertainty(_Paper):
 
 @dataclass(frozen=True)
 class Gap(_Paper):
-    """What direct transfer loses in each real domain, as radar charts (paper, Fig. 3).
+    """Loss of direct transfer in each real domain, as radar charts (paper, Fig. 3).
 
     Examples:
         ugat-marl paper gap --scenario single-v1 grid2x2-v1

@@ -1,4 +1,4 @@
-"""``ugat-marl policy-gap``: what a diagnosis is worth to policies."""
+"""``ugat-marl policy-gap``: the worth of a diagnosis to policies."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ugat_marl.scenarios import Network
 
 @dataclass(frozen=True)
 class PolicyGap:
-    """How much nearer a diagnosis brings policies to what they do in the real domain.
+    """Measures how much nearer a diagnosis brings policies to what they do in the real domain.
 
     They are played in sim, in the corrected scenario and in the real domain.
 
@@ -57,7 +57,7 @@ class PolicyGap:
     workers: Workers = None
 
     def run(self, console: Console) -> int:
-        """Plays, writes and prints."""
+        """Play, write and print."""
         if not self.policies:
             raise OptionError("--policies needs at least one value")
         if len(set(self.policies)) < len(self.policies):

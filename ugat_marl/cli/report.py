@@ -83,9 +83,7 @@ def again(record: RunRecord | TableRecord) -> list[str]:
         return [record.command] if record.command else []
     folder = str(record.directory)
     if record.job:
-        return [
-            shlex.join([Path(sys.executable).name, "-m", "ugat_marl.experiments.paper.job", folder])
-        ]
+        return [shlex.join([Path(sys.executable).name, "-m", "ugat_marl.experiments.jobs", folder])]
     if not record.scenario:
         return []
     lines = _train(record, folder)

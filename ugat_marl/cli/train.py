@@ -43,7 +43,7 @@ class Train:
     ray: RayAddress = None
 
     def run(self, console: Console) -> int:
-        """Trains, evaluates, prints the table, draws it."""
+        """Train, evaluate, print the table, draw it."""
         config = self.config
         if self.out == Path():
             raise OptionError("--out is empty; give the name of a folder")
@@ -68,6 +68,6 @@ class Train:
 
 
 def _names(config: TransferConfig) -> tuple[str, str]:
-    """Scenario and real domain; of paths the last part."""
+    """Return scenario and real domain; of paths the last part."""
     scenario, real = config.scenario, describe(config.real)
     return Path(scenario).name.removesuffix(".sumocfg"), Path(real).name

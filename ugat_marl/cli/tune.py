@@ -51,7 +51,7 @@ class Tune:
     out: Path | None = None
 
     def run(self, console: Console) -> int:
-        """Tunes and prints."""
+        """Tune and print."""
         if not self.rules:
             raise OptionError("--rules needs at least one value")
         if len(set(self.rules)) < len(self.rules):

@@ -1,4 +1,4 @@
-"""The command of a baseline: train a learner on one scenario, judge it on seeds kept for that."""
+"""Command of a baseline's file: train its learner on one scenario and judge it."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AnyParallelEnv, parallel_env
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.experiments.evaluation import evaluate, fixed_policy
+from ugat_marl.experiments.jobs import evaluation_seeds
+from ugat_marl.experiments.training import train_through
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import EpisodeCallback, NetworkPolicy
-
-FIRST_SEED = 1000
-"""Of the evaluations; the same episodes as in the tables of ``ugat-marl train``."""
 
 
 @dataclass(frozen=True)
 class BaselineArgs:
-    """What every baseline is asked.
+    """Options that every baseline has.
 
     Attributes:
         scenario: Id or path of the scenario.
@@ -62,7 +61,7 @@ def train_baseline(
     make: Callable[[AnyParallelEnv], Any],
     on_episode: EpisodeCallback | None = None,
 ) -> Result:
-    """Trains and evaluates; writes the results if `args.out` is given.
+    """Train and evaluate; write the results if `args.out` is given.
 
     Args:
         args: What to do.
@@ -72,7 +71,6 @@ def train_baseline(
     scenario, length = load_scenario(args.scenario), args.duration_s
     if args.out is not None:
         require_writable(args.out / "policy.pt")
-    env = parallel_env(scenario, domain=args.domain, duration_s=length)
     returns: list[float] = []
     att_s: dict[int, list[float]] = {}
 
@@ -81,28 +79,29 @@ def train_baseline(
         if on_episode is not None:
             on_episode(episode, numbers)
 
-    seeds = range(FIRST_SEED, FIRST_SEED + args.evaluation_seeds)
+    seeds = evaluation_seeds(args.evaluation_seeds)
     every = args.evaluate_every or max(1, args.episodes)
-    with contextlib.closing(env):
+    marks = (*range(every, args.episodes, every), args.episodes)
+    with contextlib.closing(parallel_env(scenario, domain=args.domain, duration_s=length)) as env:
         learner = make(env)
-        for until in (*range(every, args.episodes, every), args.episodes):
-            policy = fixed_policy(learner.learn(env, until - learner.episodes, args.seed, note))
+        for mark, policy in train_through(learner, env, marks, args.seed, on_episode=note):
             if seeds:
-                found = evaluate(scenario, {"it": policy}, [args.domain], seeds, duration_s=length)
-                att_s[learner.episodes] = [item.scores.att_s for item in found.results]
+                played = {"it": fixed_policy(policy)}
+                found = evaluate(scenario, played, [args.domain], seeds, duration_s=length)
+                att_s[mark] = [result.scores.att_s for result in found.results]
         result = Result(learner.policy(), returns, att_s)
     if args.out is not None:
         result.policy.save(args.out / "policy.pt")
         learner.save(args.out / "learner.pt")
-        told = {"args": asdict(args), "returns": returns, "att_s": att_s}
-        write_whole(args.out / "result.json", json.dumps(told, default=str) + "\n")
+        content = {"args": asdict(args), "returns": returns, "att_s": att_s}
+        write_whole(args.out / "result.json", json.dumps(content, default=str) + "\n")
     return result
 
 
 def baseline_command(
     kind: type[BaselineArgs], train: Callable[[Any, EpisodeCallback | None], Result]
 ) -> None:
-    """Reads the command line into `kind`, trains, prints; errors are one line."""
+    """Read the command line into `kind`, train, print; errors are one line."""
     name = Path(sys.argv[0]).name
     try:
         result = train(

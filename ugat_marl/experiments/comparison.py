@@ -1,4 +1,4 @@
-"""Settings x training seeds x domains: what a method is worth, with intervals over training seeds.
+"""Settings x training seeds x domains, compared with intervals over training seeds.
 
 One training is one sample. Episodes of its evaluation are averaged first; intervals are Student's
 over training seeds, and two settings are compared seed by seed: the same seed means the same
@@ -53,7 +53,9 @@ class Comparison:
         scenario_hash: Its hash.
         sim: The simulation, as the trials spell it.
         trials: One per setting, target, domain, training seed and episode.
-        notes: What else a reader must know.
+        notes: Whatever else a reader must know.
+        constants: Settings that sweep a constant delay.
+        grounded: Settings trained by UGAT.
     """
 
     scenario: str
@@ -61,6 +63,8 @@ class Comparison:
     sim: str
     trials: tuple[Trial, ...]
     notes: Mapping[str, str]
+    constants: tuple[str, ...] = ()
+    grounded: tuple[str, ...] = ()
 
     @property
     def settings(self) -> list[str]:
@@ -78,7 +82,7 @@ class Comparison:
         return sorted({t.training_seed for t in self.trials if t.training_seed is not None})
 
     def has(self, setting: str, target: str) -> bool:
-        """Whether there are trials of the setting for that domain."""
+        """Return True if there are trials of the setting for that domain."""
         return any(played[:2] == (setting, target) for played in self._scores)
 
     @functools.cached_property
@@ -91,7 +95,7 @@ class Comparison:
         return found
 
     def values(self, setting: str, target: str, measure: str, domain: str | None = None) -> Floats:
-        """Means over the episodes, one per training seed, ``(n,)``.
+        """Return means over the episodes, one per training seed, ``(n,)``.
 
         A rule stands beside every training with the same value.
 
@@ -110,46 +114,46 @@ class Comparison:
         return np.array([means[seed] for seed in sorted(means, key=lambda s: s or 0)])
 
     def episodes(self, setting: str, target: str) -> list[Scores]:
-        """Every episode in the target, of all training seeds."""
+        """Return every episode in the target, of all training seeds."""
         wanted = setting, target, target
         return [t.scores for t in self.trials if (t.setting, t.target, t.domain) == wanted]
 
     def median_s(self, setting: str, target: str) -> float:
-        """The ATT that half of the episodes in the target stay below."""
+        """Return the ATT that half of the episodes in the target stay below, in s."""
         return float(np.median([own.att_s for own in self.episodes(setting, target)]))
 
     def unserved(self, setting: str, target: str) -> float:
-        """Share of the episodes in the target in which less than `SERVED` of those due arrived."""
+        """Return the share of episodes in the target in which less than `SERVED` arrived."""
         found = self.episodes(setting, target)
         return sum(own.throughput < SERVED * own.due for own in found) / len(found)
 
     def estimate(
         self, setting: str, target: str, measure: str, domain: str | None = None
     ) -> Interval:
-        """Mean and interval over training seeds."""
+        """Return mean and interval over training seeds."""
         return Interval.of(self.values(setting, target, measure, domain))
 
     def gaps(self, setting: str, target: str, measure: str) -> Floats:
-        """The measure in the target minus that in the simulation, one per training seed."""
+        """Return the measure in the target minus that in the simulation, one per training seed."""
         there = self.values(setting, target, measure)
         return there - self.values(setting, target, measure, self.sim)
 
     def test(self, one: str, other: str, target: str, measure: str = "att_s") -> PairedTest:
-        """Two settings in a domain, by the same training seeds."""
+        """Compare two settings in a domain, by the same training seeds."""
         return PairedTest.of(self.values(one, target, measure), self.values(other, target, measure))
 
     def best(self, target: str, among: Sequence[str] | None = None) -> str:
-        """The setting with the lowest mean ATT in a domain."""
+        """Return the setting with the lowest mean ATT in a domain."""
         names = [name for name in among or self.settings if self.has(name, target)]
         return min(names, key=lambda name: float(self.values(name, target, "att_s").mean()))
 
     def regret_s(self, setting: str, target: str) -> Floats:
-        """ATT above that of the best setting in the domain, in s, one per training seed."""
+        """Return the ATT above that of the best setting there, in s, one per training seed."""
         best = self.values(self.best(target), target, "att_s")
         return self.values(setting, target, "att_s") - best
 
     def won_back(self, setting: str, target: str, direct: str) -> float:
-        """Share of the regret of `direct` that is gone: 1 is as good as the best setting there.
+        """Return the share of the regret of `direct` that is gone: 1 is the best setting.
 
         A ratio of means over training seeds; nan where direct transfer leaves nothing to win.
         """
@@ -158,7 +162,7 @@ class Comparison:
         return 1.0 - mine / start if start > 0 else math.nan
 
     def reduction(self, setting: str, target: str, direct: str, measure: str = "att_s") -> float:
-        """By how much smaller the gap is than that of `direct`, as a share (paper, Table 2).
+        """Return the reduction of the gap against that of `direct`, as a share (paper, Table 2).
 
         nan where direct transfer loses nothing on the way: there is no gap to make smaller.
         """
@@ -168,7 +172,7 @@ class Comparison:
         return 1.0 - mine / start if start > 0 else math.nan
 
     def rows(self) -> list[dict[str, Any]]:
-        """One flat row per setting and target: means and gaps of all measures, and regret."""
+        """Return a flat row per setting and target: means and gaps of all measures, regret."""
         found: list[dict[str, Any]] = []
         for setting in self.settings:
             for target in self.targets:

@@ -65,7 +65,7 @@ def evaluate(
     notes: Mapping[str, str] | None = None,
     watch: Watch | None = None,
 ) -> Evaluation:
-    """Plays every policy in every domain with every seed, spread over the cores.
+    """Play every policy in every domain with every seed, spread over the cores.
 
     Args:
         scenario: Where.
@@ -119,7 +119,7 @@ def best_rules(
     workers: Workers = None,
     reporter: Reporter | None = None,
 ) -> dict[str, str]:
-    """For each domain the rule with the smallest mean ATT on the tuning seeds.
+    """Find the rule with the smallest mean ATT on the tuning seeds, for each domain.
 
     The rules are raced: after each seed the worse half is left behind.
 
@@ -153,7 +153,7 @@ def race(
     reporter: Reporter | None = None,
     title: str = "racing",
 ) -> tuple[Trial, ...]:
-    """Plays all rules with the first seeds, the better half with the next ones too, and so on.
+    """Play all rules with the first seeds, the better half with the next ones too, and so on.
 
     Args:
         scenario: Where.
@@ -194,29 +194,29 @@ def race(
 
 @dataclass(frozen=True)
 class RuleFactory:
-    """Makes a controller by its spelling, such as ``"largest-queue:30"``."""
+    """Maker of a controller by its spelling, such as ``"largest-queue:30"``."""
 
     spec: str
 
     def __call__(self, env: TrafficEnv) -> Policy:
-        """The controller for an environment."""
+        """Return the controller for an environment."""
         return controller_for(self.spec, env)
 
 
 @dataclass(frozen=True)
 class FixedPolicy:
-    """Always gives the same, stateless, policy."""
+    """Maker that always returns the same, stateless policy."""
 
     policy: Policy
 
     def __call__(self, env: TrafficEnv) -> Policy:
-        """The policy."""
+        """Return the policy."""
         return self.policy
 
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Gives a policy that was trained for the agents of an environment.
+    """Maker that returns a policy trained for the agents of an environment.
 
     Attributes:
         policy: It.
@@ -227,7 +227,7 @@ class TrainedPolicy:
     path: str
 
     def __call__(self, env: TrafficEnv) -> Policy:
-        """The policy, if it fits."""
+        """Return the policy, if it fits."""
         fitting = parallel_env(env.scenario, **self.policy.env_options)
         if AgentSet.of(fitting) != self.policy.agents:
             raise CheckpointError(
@@ -239,18 +239,18 @@ class TrainedPolicy:
 
 
 def rule_factory(spec: str) -> PolicyFactory:
-    """A factory for a controller such as ``"largest-queue:30"``; the spelling is checked now."""
+    """Return a factory for a controller such as ``"largest-queue:30"``; check the spelling now."""
     parse_spec(spec)
     return RuleFactory(spec)
 
 
 def fixed_policy(policy: Policy) -> PolicyFactory:
-    """A factory that always gives the same, stateless, policy."""
+    """Return a factory that always gives the same, stateless policy."""
     return FixedPolicy(policy)
 
 
 def policy_factory(spec: str) -> PolicyFactory:
-    """A factory for what a user names: a rule, or the file of a trained policy.
+    """Return a factory for a rule, or for the file of a trained policy, as a user names it.
 
     Raises:
         UnknownNameError: Neither a file nor a rule.

@@ -1,4 +1,4 @@
-"""Controllers x gaps: what each gap costs each controller, over all its domains."""
+"""Controllers x gaps: the cost of each gap to each controller, over all its domains."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ugat_marl.experiments.scores import Estimate, Evaluation
 
 @dataclass(frozen=True)
 class Cell:
-    """What a gap costs a controller.
+    """Cost of a gap to a controller.
 
     Attributes:
         cost: Mean over the gap's domains and the seeds, with an interval over seeds. For the
@@ -31,7 +31,7 @@ class Cell:
 
 
 def gaps_of(found: Evaluation) -> dict[str, list[str]]:
-    """The gaps of an evaluation with those of its domains that open them; none is left empty."""
+    """Return the gaps of an evaluation with those of its domains that open them, none empty."""
     others = found.domains[1:]
     listed = {
         gap: [name for name in others if name in NAMED and NAMED[name].gap == gap] for gap in GAPS
@@ -40,7 +40,7 @@ def gaps_of(found: Evaluation) -> dict[str, list[str]]:
 
 
 def gap_matrix(found: Evaluation) -> dict[str, Mapping[str, Cell]]:
-    """For each controller what each gap costs it."""
+    """Return the cost of each gap to each controller."""
     gaps = gaps_of(found)
     return {
         policy: {gap: _cell(found, policy, gap, names) for gap, names in gaps.items()}
@@ -63,13 +63,13 @@ def _cell(found: Evaluation, policy: str, gap: str, domains: Sequence[str]) -> C
 
 
 def _above_first(found: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
-    """Travel time above that in the first domain, seed by seed, in s."""
+    """Return the travel time above that in the first domain, seed by seed, in s."""
     first = found.values(policy, found.domains[0], "att_s")
     return found.values(policy, domain, "att_s") - first
 
 
 def _above_best(found: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
-    """Hidden cost above that of the best controller there, seed by seed, in %."""
+    """Return the hidden cost above that of the best controller there, seed by seed, in %."""
     best = min(found.policies, key=lambda name: float(found.values(name, domain, "cost").mean()))
     least = found.values(best, domain, "cost")
     return 100.0 * (found.values(policy, domain, "cost") / np.maximum(least, 1e-9) - 1.0)

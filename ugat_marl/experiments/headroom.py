@@ -1,4 +1,4 @@
-"""How much a scenario can tell controllers apart: the largest-queue rule, held long and short.
+"""Headroom of a scenario between controllers: the largest-queue rule, held long and short.
 
 Vehicles that start slowly are served better by longer greens. Where the rule that is best in
 simulation loses nothing in another domain, no transfer can win anything there.
@@ -54,7 +54,7 @@ def headroom(
     workers: Workers = None,
     reporter: Reporter | None = None,
 ) -> list[Row]:
-    """ATT of the largest-queue rule in every domain for every hold.
+    """Return the ATT of the largest-queue rule in every domain for every hold.
 
     Args:
         scenario: Where.
@@ -106,7 +106,7 @@ def headroom(
 
 
 def markdown(rows: Sequence[Row], holds_s: Sequence[int] = HOLDS_S) -> str:
-    """The rows as a table; the best hold of each domain is bold."""
+    """Return the rows as a Markdown table; the best hold of each domain is bold."""
     head = ["ATT [s]", *(f"held {hold_s} s" for hold_s in holds_s), "own programme"]
     head += [f"lost by the rule best in {rows[0].domain}", "arrived", "never got in"]
     lines = [head, ["---", *["---:"] * (len(head) - 1)]]

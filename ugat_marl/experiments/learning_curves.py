@@ -1,213 +1,229 @@
-"""One training, judged every few episodes, in a folder where it goes on if it was interrupted."""
+"""Learning curves: learners trained and judged in one domain, beside rules that are tuned there.
+
+Each learner is a setting, each of its trainings a job that is judged every few episodes. The rules
+are jobs, too.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import re
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from statistics import fmean
 
-import numpy as np
-
-from ugat_marl.data import versions_of
-from ugat_marl.effects import load_scenario
-from ugat_marl.envs import parallel_env
-from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.experiments.baseline import FIRST_SEED
-from ugat_marl.experiments.evaluation import evaluate, fixed_policy
-from ugat_marl.files import write_whole
-from ugat_marl.policies import PolicyFactory, is_installed, learner_factory, library_of, settings_of
+from ugat_marl.errors import OptionError, UgatMarlError
+from ugat_marl.experiments.driver import perform_all, record_of
+from ugat_marl.experiments.jobs import RULE_FILE, Job, Record, evaluation_seeds
+from ugat_marl.experiments.settings import RULE, LearnerSpec, Setting
+from ugat_marl.experiments.tuning import LEAST_BUDGET
+from ugat_marl.parallel import Workers
+from ugat_marl.policies import BASELINES, DQN_NAME, library_of
+from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario
 
-CURVE = "curve.json"
-DOMAIN = "sim"
-"""Where learners are trained and judged."""
+PROGRAMME, FIXED_TIME = "programme", "fixed time, tuned"
 
 
 @dataclass(frozen=True)
-class Training:
-    """One training, and when it is judged.
+class Curve:
+    """Greedy evaluations in the course of one training.
 
     Attributes:
-        scenario: As a user names it.
-        learner: Name.
-        seed: Of all that is drawn.
-        episodes: Of training.
-        evaluate_every: Episodes from one evaluation to the next; the last one ends with one too.
-        evaluation_seeds: Episodes of an evaluation, always the same.
+        learner: Name of the setting.
+        library: Library that does the learner's work, with its version; "" for none.
+        seed: Seed of the training.
+        att_s: Episodes trained to mean travel time over the evaluation seeds, in s.
+        speed: Decisions of all agents a second in training, learning included.
+        own_ms: Processor time of a decision outside the simulation, in ms.
+    """
+
+    learner: str
+    library: str
+    seed: int
+    att_s: Mapping[int, float]
+    speed: float = 0.0
+    own_ms: float = 0.0
+
+    @classmethod
+    def of(cls, job: Job, record: Record, scenario: Scenario) -> Curve:
+        """Return the curve of a finished job that is judged in a single domain.
+
+        Args:
+            job: A training.
+            record: Its record.
+            scenario: Its scenario, which says how many decisions an episode has.
+        """
+        (domain,) = job.domains
+        assert job.seed is not None
+        decisions = record.episodes * scenario.decisions
+        return cls(
+            job.setting.name,
+            library_of(job.setting.learner.name),
+            job.seed,
+            {m: fmean(s.att_s for s in record.played(job, m, domain)) for m in job.marks},
+            decisions / record.seconds if record.seconds else 0.0,
+            1000 * record.own_seconds / decisions if decisions else 0.0,
+        )
+
+    @property
+    def final_s(self) -> float:
+        """Travel time of the policy at the end, in s."""
+        return list(self.att_s.values())[-1]
+
+    @property
+    def best_s(self) -> float:
+        """The smallest of all evaluations, in s."""
+        return min(self.att_s.values())
+
+    def mean_of_last_s(self, count: int) -> float:
+        """Return the mean of so many evaluations at the end, in s."""
+        return fmean(list(self.att_s.values())[-count:])
+
+    def unsteadiness(self, count: int) -> float:
+        """Return the mean of so many evaluations at the end over the best one, at least 1."""
+        return self.mean_of_last_s(count) / self.best_s
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Everything the learners reach on a scenario.
+
+    Attributes:
+        scenario: Id of the scenario.
+        domain: Domain in which they are trained and judged.
+        curves: The trainings that have all their evaluations.
+        rules: Spelling of each rule to its mean travel time, in s; fixed time first.
+        best: The best rule, chosen on other episodes.
+        failures: Name of each job that failed, or learner that cannot be made, to its reason.
     """
 
     scenario: str
-    learner: str
-    seed: int
-    episodes: int
-    evaluate_every: int
-    evaluation_seeds: int
-
-    @property
-    def name(self) -> str:
-        """Of its folder."""
-        return f"{word(self.scenario)}-{self.learner}-s{self.seed}"
-
-    @property
-    def marks(self) -> tuple[int, ...]:
-        """After how many episodes it is judged."""
-        return (*range(self.evaluate_every, self.episodes, self.evaluate_every), self.episodes)
+    domain: str
+    curves: tuple[Curve, ...]
+    rules: Mapping[str, float]
+    best: str
+    failures: Mapping[str, str]
 
 
-@dataclass
-class Curve:
-    """What is known of a training.
+@dataclass(frozen=True)
+class CurvesConfig:
+    """Options of learning curves.
 
     Attributes:
-        made_with: Scenario, settings and versions; a training with others is another one.
-        att_s: By episodes trained the mean travel time of each evaluation seed, s.
-        decisions: Decisions of all agents together, in training.
-        seconds: Time they took, learning included, evaluations not.
-        own_seconds: Processor time of the learner's process in them; the simulation has another.
-        learner: File of the learner as it was after the last evaluation.
+        learners: Names; default: all.
+        seeds: Number of trainings of each learner, with the seeds 0, 1, ...
+        episodes: Episodes of each training.
+        evaluate_every: Episodes from one evaluation to the next.
+        evaluation_seeds: Episodes of an evaluation, always the same; rules are played for them too.
+        rule_budget: Most episodes in which each rule is tuned.
+        domain: Where learners are trained and judged.
+        duration_s: Length of an episode in s; default: the scenario's own.
     """
 
-    made_with: Mapping[str, Any]
-    att_s: dict[int, list[float]] = field(default_factory=dict)
-    decisions: int = 0
-    seconds: float = 0.0
-    own_seconds: float = 0.0
-    learner: str = ""
+    learners: tuple[str, ...] = (DQN_NAME, *BASELINES)
+    seeds: int = 3
+    episodes: int = 30
+    evaluate_every: int = 10
+    evaluation_seeds: int = 5
+    rule_budget: int = 24
+    domain: str = "sim"
+    duration_s: float | None = None
 
-    @classmethod
-    def read(cls, folder: Path) -> Curve | None:
-        """What `write` wrote; None if there is nothing.
+    def __post_init__(self) -> None:
+        for name in ("seeds", "episodes", "evaluate_every", "evaluation_seeds"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if self.rule_budget < LEAST_BUDGET:
+            raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
+        _ = self.settings  # refuses learners that do not exist
 
-        Raises:
-            CheckpointError: The file is broken.
+    @property
+    def settings(self) -> list[Setting]:
+        """One setting per learner, called as it is."""
+        return [Setting(n, "direct", learner=LearnerSpec(n)) for n in self.learners]
+
+    def job(self, scenario: str, setting: Setting, seed: int | None) -> Job:
+        """Return the job of a learner, or of a rule.
+
+        Args:
+            scenario: As a user names it.
+            setting: One of `settings`, or a rule's.
+            seed: Seed of the training; None for a rule.
         """
-        file = folder / CURVE
-        if not file.exists():
-            return None
-        try:
-            found = cls(**json.loads(file.read_text()))
-            found.att_s = {int(k): [float(x) for x in v] for k, v in found.att_s.items()}
-        except (ValueError, TypeError, AttributeError) as error:
-            raise CheckpointError(f"{file}: broken ({error!r}); remove {folder}") from None
-        return found
-
-    def write(self, folder: Path) -> None:
-        """Whole or not at all."""
-        write_whole(folder / CURVE, json.dumps(asdict(self), indent=1) + "\n")
-
-    def has(self, training: Training) -> bool:
-        """Whether every evaluation was made, with as many episodes."""
-        counts = [len(self.att_s.get(mark, ())) for mark in training.marks]
-        return min(counts) >= training.evaluation_seeds
-
-    @property
-    def speed(self) -> float:
-        """Decisions a second."""
-        return self.decisions / self.seconds
-
-    @property
-    def own_ms(self) -> float:
-        """Processor time of a decision outside the simulation, in ms."""
-        return 1000 * self.own_seconds / self.decisions
-
-    def means(self, training: Training) -> list[float]:
-        """Mean travel time of each evaluation, in their order, s."""
-        count = training.evaluation_seeds
-        return [float(np.mean(self.att_s[mark][:count])) for mark in training.marks]
-
-
-def perform(training: Training, folder: Path) -> None:
-    """Trains and judges what is missing; after each evaluation everything is saved.
-
-    Raises:
-        OptionError: What lies in the folder was made with other settings or versions.
-    """
-    scenario, name = load_scenario(training.scenario), training.learner
-    seeds = evaluation_seeds(training.evaluation_seeds)
-    with contextlib.closing(parallel_env(scenario, domain=DOMAIN)) as env:
-        learner: Any = learner_factory(name)(env, training.seed)
-        made_with = made_now(training.scenario, name)
-        curve = Curve.read(folder) or Curve(made_with)
-        _require_same(folder, curve.made_with, made_with)
-        if curve.learner:
-            learner.load(folder / curve.learner)
-        for mark in training.marks:
-            if len(curve.att_s.get(mark, ())) >= len(seeds):
-                continue
-            if mark < learner.episodes:
-                raise OptionError(
-                    f"{folder} has no evaluation of {len(seeds)} episodes after {mark} of "
-                    "training and is beyond it; remove it, or name another --runs"
-                )
-            begin, own = time.perf_counter(), time.process_time()
-            policy = learner.learn(env, mark - learner.episodes, training.seed)
-            curve.seconds += time.perf_counter() - begin
-            curve.own_seconds += time.process_time() - own
-            curve.decisions = learner.episodes * scenario.decisions
-            curve.att_s[mark] = played(scenario, fixed_policy(policy), seeds)
-            before, curve.learner = curve.learner, f"learner-{mark}.pt"
-            learner.save(folder / curve.learner)
-            policy.save(folder / "policy.pt")
-            curve.write(folder)
-            if before not in ("", curve.learner):
-                (folder / before).unlink(missing_ok=True)
-
-
-def made_now(scenario: str, learner: str) -> Mapping[str, Any]:
-    """What a training is made with today, as JSON has it; its library must be installed."""
-    made = {
-        "scenario": load_scenario(scenario).hash,
-        "library": library_of(learner),
-        "settings": settings_of(learner),
-        "versions": versions_of("eclipse-sumo", "torch"),
-    }
-    return json.loads(json.dumps(made))
-
-
-def _require_same(folder: Path, one: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    differences = ", ".join(
-        f"{key} {one.get(key)} (now {now.get(key)})"
-        for key in {**one, **now}
-        if one.get(key) != now.get(key)
-    )
-    if differences:
-        raise OptionError(
-            f"{folder} was made with {differences}; remove it, or name another --runs"
+        is_rule = setting.recipe == "rule"
+        tuned = is_rule and setting.name != PROGRAMME
+        return Job(
+            setting,
+            scenario,
+            sim=self.domain,
+            seed=seed,
+            episodes=0 if is_rule else self.episodes,
+            every=0 if is_rule else self.evaluate_every,
+            options={"duration_s": self.duration_s},
+            rule_budget=self.rule_budget if tuned else None,
+            domains=(self.domain,),
+            evaluation_seeds=evaluation_seeds(self.evaluation_seeds),
         )
 
+    def trainings(self, scenario: str) -> list[Job]:
+        """Return all trainings on a scenario, one of every learner before the next seed."""
+        pairs = [(seed, setting) for seed in range(self.seeds) for setting in self.settings]
+        return [self.job(scenario, setting, seed) for seed, setting in pairs]
 
-def evaluation_seeds(count: int) -> range:
-    """Those of every evaluation here; the first are those of a run's own table."""
-    return range(FIRST_SEED, FIRST_SEED + count)
+    def rules(self, scenario: str) -> list[Job]:
+        """Return the jobs of the network's own programme, of fixed time and of the best rule."""
+        settings = (
+            Setting(PROGRAMME, "rule", rules=("programme",)),
+            Setting(FIXED_TIME, "rule", rules=("fixed-time",)),
+            Setting(RULE, "rule"),
+        )
+        return [self.job(scenario, setting, None) for setting in settings]
 
 
-def played(scenario: Scenario, policy: PolicyFactory, seeds: Sequence[int]) -> list[float]:
-    """Mean travel time of each seed, s."""
-    found = evaluate(scenario, {"it": policy}, [DOMAIN], list(seeds), workers=1)
-    return [result.scores.att_s for result in found.results]
+def learn_curves(
+    scenario: Scenario,
+    spelling: str,
+    config: CurvesConfig,
+    folder: Path,
+    workers: Workers,
+    reporter: Reporter,
+) -> Curves:
+    """Train and judge whatever is missing, and put it together.
 
+    A learner whose library is missing and a job that fails leave the others alone.
 
-def found(training: Training, runs: Path) -> Curve | None:
-    """A training that has all its evaluations.
-
-    Raises:
-        OptionError: It was made with other settings or versions; not asked where the learner's
-            library is not installed.
+    Args:
+        scenario: The network and its traffic.
+        spelling: The scenario as a user names it.
+        config: Options.
+        folder: Folder that holds the jobs' folders; finished ones are used again.
+        workers: Jobs at a time, or an executor.
+        reporter: Shows progress.
     """
-    folder = runs / training.name
-    curve = Curve.read(folder)
-    if curve is None or not curve.has(training):
-        return None
-    if is_installed(training.learner):
-        _require_same(folder, curve.made_with, made_now(training.scenario, training.learner))
-    return curve
+    failures: dict[str, str] = {}
+    trainings = [job for job in config.trainings(spelling) if _can_be_made(job, failures)]
+    rules = config.rules(spelling)
+    plan = [*trainings, *rules]
+    failures |= perform_all(plan, folder, workers, reporter, "training", keep_going=True)
+    records = {job.name: record_of(job, folder) for job in plan}
+    curves = [
+        Curve.of(job, r, scenario) for job in trainings if (r := records[job.name]) is not None
+    ]
+    att_s: dict[str, float] = {}
+    best = ""
+    for job in rules:
+        if (record := records[job.name]) is not None:
+            rule = (folder / job.name / RULE_FILE).read_text()
+            att_s[rule] = fmean(s.att_s for s in record.played(job, 0, config.domain))
+            best = rule if job.setting.name == RULE else best
+    return Curves(scenario.id, config.domain, tuple(curves), att_s, best, failures)
 
 
-def word(text: str) -> str:
-    """A scenario as a part of a file's name."""
-    return re.sub(r"[^\w.+-]+", "-", Path(text).name.removesuffix(".sumocfg")).strip("-")
+def _can_be_made(job: Job, failures: dict[str, str]) -> bool:
+    """Return False, and keep the reason, where a learner's library is not installed."""
+    try:
+        job.setting.learner.factory()
+    except UgatMarlError as error:
+        failures[job.setting.name] = " ".join(str(error).split())
+        return False
+    return True

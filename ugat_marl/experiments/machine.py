@@ -19,7 +19,7 @@ _LIBRARIES = (
 
 
 def machine_facts() -> dict[str, Any]:
-    """CPU, cores, load, memory, system, Python, library versions, date and command line."""
+    """Return CPU, cores, load, memory, system, Python, library versions, date and command line."""
     return {
         "cpu": cpu_model(),
         "cores": usable_cores(),
@@ -34,7 +34,7 @@ def machine_facts() -> dict[str, Any]:
 
 
 def _program() -> list[str]:
-    """What to type for the running program; of an absolute path only the name."""
+    """Return the words to type for the running program; of an absolute path only the name."""
     path = Path(sys.argv[0])
     if path.name == "__main__.py":
         return ["ugat-marl"]
@@ -44,7 +44,7 @@ def _program() -> list[str]:
 
 
 def cpu_model() -> str:
-    """The processor's name, as the system calls it."""
+    """Return the processor's name, as the system calls it."""
     information = Path("/proc/cpuinfo")
     if information.exists():
         for line in information.read_text(errors="replace").splitlines():
@@ -54,7 +54,7 @@ def cpu_model() -> str:
 
 
 def memory_gib() -> float | None:
-    """Physical memory, or None where the system does not say."""
+    """Return the physical memory in GiB, or None where the system does not say."""
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
     except (AttributeError, ValueError, OSError):

@@ -1,4 +1,4 @@
-"""What a correction is worth to those who train controllers: policies before and after it.
+"""Worth of a correction to those who train controllers: policies before and after it.
 
 A policy's travel time in the simulation is a promise. The gap is how far the promise is from what
 the policy does in the real world; a corrected scenario is good if its promise is closer, for
@@ -39,7 +39,7 @@ def policy_gap(
     duration_s: float | None = None,
     workers: Workers = None,
 ) -> dict[str, dict[str, Any]]:
-    """Plays policies in the simulation, the corrected one and the real world.
+    """Play policies in the simulation, the corrected one and the real world.
 
     The demand and the seeds are the same in all three, but for what the correction changed about
     the demand. Detector faults change no traffic and have no part in this.
@@ -112,7 +112,7 @@ def _or_none(value: float) -> float | None:
 
 
 def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[dict[str, Any], Scenario]:
-    """A diagnosis and the corrected scenario beside it.
+    """Read a diagnosis and the corrected scenario beside it.
 
     Args:
         directory: What `ugat_marl.diagnosis.workflow.diagnose` wrote to.
@@ -153,7 +153,7 @@ def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[dict[str, Any],
 def write_policy_gap(
     directory: Path, record: Mapping[str, Any], gap: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Writes a diagnosis with its policy gap, whole or not at all, numbers to nine digits.
+    """Write a diagnosis with its policy gap, whole or not at all, numbers to nine digits.
 
     Returns:
         What was written.

@@ -1,4 +1,4 @@
-"""Where and when vehicles stand: halting vehicles per intersection and minute of an evaluation."""
+"""Halting vehicles per intersection and minute of an evaluation."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class _Sums:
 
 
 class QueueRecord:
-    """Adds up halting vehicles on incoming lanes, minute by minute, over all episodes it sees."""
+    """Sum of halting vehicles on incoming lanes, minute by minute, over all episodes it sees."""
 
     def __init__(self) -> None:
         self._sums: dict[tuple[str, str], _Sums] = {}
         self._lock = threading.Lock()
 
     def watch(self, policy: str, domain: str, env: AnyParallelEnv) -> StepCallback:
-        """What `evaluation.evaluate` calls for each environment.
+        """Return a callback for `evaluation.evaluate`, one per environment.
 
         Args:
             policy: Who plays in it.
@@ -80,7 +80,7 @@ class QueueRecord:
         return look
 
     def frame(self) -> pl.DataFrame:
-        """Columns policy, domain, minute (from 0), intersection, queue (mean, vehicles), looks."""
+        """Return policy, domain, minute (from 0), intersection, queue (mean, vehicles), looks."""
         rows: list[tuple[str, str, int, str, float, int]] = []
         with self._lock:
             for (policy, domain), sums in self._sums.items():
@@ -91,7 +91,7 @@ class QueueRecord:
         return pl.DataFrame(rows, schema=_SCHEMA, orient="row")
 
     def write(self, path: Path, *, keep: bool = False) -> None:
-        """Writes `frame` as Parquet, whole or not at all.
+        """Write `frame` as Parquet, whole or not at all.
 
         Args:
             path: The file.
@@ -108,7 +108,7 @@ class QueueRecord:
 
 
 def read_queues(path: Path) -> pl.DataFrame:
-    """Reads what `QueueRecord.write` wrote.
+    """Read what `QueueRecord.write` wrote.
 
     Raises:
         CheckpointError: The file is missing, cut short or of another form.

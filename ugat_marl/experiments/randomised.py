@@ -45,7 +45,7 @@ class Range:
 
 
 def effect_ranges(scenario: Scenario) -> tuple[Range, ...]:
-    """The ranges of the effects of V1 to V4 around a simulation.
+    """Return the ranges of the effects of V1 to V4 around a simulation.
 
     Each holds the simulation's own value, those of V1 to V4, and those at which the diagnosis first
     tries the effect (`discrepancy.hypotheses`).
@@ -64,7 +64,7 @@ def effect_ranges(scenario: Scenario) -> tuple[Range, ...]:
 
 
 def drawn(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
-    """The world of an episode: each value uniform in its range, independent of the others.
+    """Draw the world of an episode: each value uniform in its range, independent of the others.
 
     Args:
         ranges: What to draw.
@@ -79,7 +79,7 @@ def drawn(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
 
 
 class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
-    """An environment whose every episode is in another world; `reset(seed)` decides which.
+    """Environment with another world in every episode; `reset(seed)` decides which.
 
     The simulation of one episode is ended before that of the next begins.
 
@@ -98,7 +98,7 @@ class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
         self._generator = numpy_generator(0, "worlds")
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
-        """Starts an episode in a world of its own.
+        """Start an episode in a world of its own.
 
         Args:
             seed: Decides world and traffic; without it both follow from the seed before.
@@ -125,7 +125,7 @@ class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
 def randomised_env(
     scenario: Scenario, options: Mapping[str, Any], sim: Domain = "sim"
 ) -> RandomisedEnv:
-    """Worlds drawn around a simulation.
+    """Return an environment of worlds drawn around a simulation.
 
     Args:
         scenario: The network and its traffic.

@@ -49,7 +49,7 @@ class Estimate(Interval):
 
     @classmethod
     def of(cls, values: NDArray[np.float64]) -> Estimate:
-        """The estimate from one value per seed."""
+        """Return the estimate from one value per seed."""
         found = Interval.of(values)
         return cls(found.mean, found.low, found.high, float(np.median(values)))
 
@@ -81,33 +81,33 @@ class Evaluation:
         return list(dict.fromkeys(result.domain for result in self.results))
 
     def values(self, policy: str, domain: str, measure: str) -> NDArray[np.float64]:
-        """One value per seed, in the order of the seeds."""
+        """Return one value per seed, in the order of the seeds."""
         found = [r for r in self.results if r.policy == policy and r.domain == domain]
         found.sort(key=lambda result: result.seed)
         return np.array([_measured(result.scores, measure) for result in found])
 
     def estimate(self, policy: str, domain: str, measure: str) -> Estimate:
-        """Mean and interval of a measure."""
+        """Return mean and interval of a measure."""
         return Estimate.of(self.values(policy, domain, measure))
 
     def gap(self, policy: str, domain: str, measure: str) -> Estimate:
-        """The measure in `domain` minus that in the first domain, paired by seed."""
+        """Return the measure in `domain` minus that in the first domain, paired by seed."""
         real = self.values(policy, domain, measure)
         return Estimate.of(real - self.values(policy, self.domains[0], measure))
 
     def regret(self, policy: str, domain: str) -> Estimate:
-        """ATT above that of the best policy evaluated in the domain, in s, paired by seed."""
+        """Return the ATT above that of the best policy there, in s, paired by seed."""
         best = min(self.policies, key=lambda name: self.estimate(name, domain, "att_s").mean)
         mine = self.values(policy, domain, "att_s")
         return Estimate.of(mine - self.values(best, domain, "att_s"))
 
     def _hidden(self, domain: str) -> list[str]:
-        """What only a domain with an objective measures."""
+        """Return the measures that only a domain with an objective has."""
         played = (result.scores for result in self.results if result.domain == domain)
         return list(dict.fromkeys(name for scores in played for name in scores.hidden))
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything, for JSON: the summary and every episode."""
+        """Return everything, for JSON: the summary and every episode."""
         summary: list[dict[str, Any]] = []
         for policy in self.policies:
             for domain in self.domains:
@@ -132,20 +132,20 @@ class Evaluation:
         }
 
     def write(self, path: Path) -> None:
-        """Writes `as_dict` as JSON, whole or not at all; what has no value is null."""
+        """Write `as_dict` as JSON, whole or not at all; nan becomes null."""
         content = json.dumps(_without_nan(self.as_dict()), indent=1, allow_nan=False)
         write_whole(path, content + "\n")
 
     @classmethod
     def read(cls, path: Path) -> Evaluation:
-        """Reads what `write` wrote; what is null there, or left out, has no value (nan).
+        """Read what `write` wrote; null and missing values become nan.
 
         Raises:
             CheckpointError: The file is missing, cut short or of another form.
         """
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            results = tuple(result_of(row) for row in content["episodes"])
+            results = _whole(tuple(result_of(row) for row in content["episodes"]))
             notes = {str(key): str(text) for key, text in content["notes"].items()}
             return cls(str(content["scenario"]), str(content["scenario_hash"]), results, notes)
         except OSError as error:
@@ -201,7 +201,7 @@ class Tuned:
 
 
 def result_of(row: Mapping[str, Any]) -> Result:
-    """An episode from its row in a record; what is null or left out has no value (nan)."""
+    """Return an episode from its row in a record; null and missing values become nan."""
     numbers = {
         item.name: _number(row.get(item.name)) for item in fields(Scores) if item.name != "hidden"
     }
@@ -210,12 +210,21 @@ def result_of(row: Mapping[str, Any]) -> Result:
     return Result(str(row["policy"]), str(row["domain"]), int(row["seed"]), scores)
 
 
+def _whole(results: tuple[Result, ...]) -> tuple[Result, ...]:
+    """Refuse episodes of which some are missing: every policy plays every seed in every domain."""
+    played = {(result.policy, result.domain, result.seed) for result in results}
+    policies, domains, seeds = (len(set(part)) for part in zip(*played, strict=True))
+    if len(played) < policies * domains * seeds:
+        raise ValueError("some episodes are missing")
+    return results
+
+
 def _number(value: Any) -> float:
     return math.nan if value is None else float(value)
 
 
 def _measured(scores: Scores, measure: str) -> float:
-    """A measure, also a hidden one; nan where that was not measured."""
+    """Return a measure, also a hidden one; nan where it was not measured."""
     if hasattr(scores, measure):
         return getattr(scores, measure)
     return scores.hidden.get(measure, math.nan)

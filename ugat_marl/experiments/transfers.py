@@ -1,9 +1,10 @@
-"""One experiment: train across the gap, judge in both worlds, say what was won."""
+"""``train``: UGAT in one folder, and the settings it is compared with, judged in both worlds."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,56 +23,50 @@ from ugat_marl.experiments.evaluation import (
     fixed_policy,
     rule_factory,
 )
+from ugat_marl.experiments.jobs import Job, evaluation_seeds, file_names, train_job
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
-from ugat_marl.experiments.randomised import randomised_env
-from ugat_marl.experiments.recipes import (
-    Control,
-    file_names,
-    further,
-    simulated_worlds,
-    train_control,
-)
 from ugat_marl.experiments.scores import Evaluation
+from ugat_marl.experiments.settings import (
+    CONTROL,
+    CORRECTED,
+    DIRECT,
+    FINE_TUNED,
+    GROUNDED_NAME,
+    ORACLE,
+    RANDOM_DELAY,
+    RANDOMISED,
+    LearnerSpec,
+    Setting,
+)
+from ugat_marl.experiments.training import simulated_worlds, train_grounded
 from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES, tuned_rules
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
     PLACEBOS,
     Placebo,
-    RandomDelays,
     RecordedWorld,
-    ShuffledWorld,
+    SimulatedWorld,
     State,
-    Ugat,
     UgatConfig,
     World,
-    answer_with_noise,
-    neighbours_of,
 )
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
     DQN_NAME,
     STANDARD_RULES,
     DQNConfig,
+    LearnerFactory,
     NetworkPolicy,
     Policy,
     PolicyFactory,
-    learner_factory,
     require_device_name,
     require_known,
 )
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
-EVALUATION_SEED = 1000
-"""First seed of the reported episodes; apart from those of training and of the search for rules."""
-
-DIRECT, UGAT, TIMED = "direct transfer", "UGAT", "UGAT, timed"
-CONTROL = "more plain sim"
-CORRECTED = "corrected sim"
-RANDOMISED = "domain randomisation"
-RANDOM_DELAY = "random delay"
-FINE_TUNED = "fine-tuned on the same data"
-ORACLE = "trained in real"
+TRAININGS = "trainings"
+"""Folder, in that of the run, of the policies trained beside UGAT's: a job each."""
 
 ADDED = ("control", "further", "randomised", "random_delay_s", "fine_tuned", "oracle")
 """Options that add policies to the table and change none of the others."""
@@ -79,7 +74,7 @@ ADDED = ("control", "further", "randomised", "random_delay_s", "fine_tuned", "or
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """What to train, where, and how to judge it.
+    """Options of ``train``: what to train, where, and how to judge it.
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
@@ -185,6 +180,32 @@ class TransferConfig:
                 raise OptionError(f"{who} acts in the real domain, which a real_log does not allow")
 
     @property
+    def spec(self) -> LearnerSpec:
+        """The learner of all policies."""
+        return LearnerSpec(self.learner, self.learner_settings, self.dqn)
+
+    @property
+    def settings(self) -> list[Setting]:
+        """The settings trained beside direct transfer and UGAT."""
+        seen, spec = self.ugat.iterations * self.ugat.real_rollouts, self.spec
+        found: list[Setting] = []
+        if self.control:
+            found.append(Setting(CONTROL, "further", self.sim, spec))
+        found += [Setting(f"further in {describe(d)}", "further", d, spec) for d in self.further]
+        if (most_s := self.random_delay_s) is not None:
+            name = f"{RANDOM_DELAY} 0-{most_s} s"
+            found.append(Setting(name, "delays", self.sim, spec, most_delay_s=most_s))
+        if self.fine_tuned:
+            found.append(Setting(FINE_TUNED, "further", None, spec, episodes=seen))
+        if self.randomised:
+            found.append(Setting(RANDOMISED, "randomised", None, spec))
+        if self.corrected is not None:
+            found.append(Setting(CORRECTED, "scratch", self.corrected, spec))
+        if self.oracle:
+            found.append(Setting(ORACLE, "scratch", None, spec))
+        return found
+
+    @property
     def env_options(self) -> dict[str, Any]:
         """Options of every environment of the experiment."""
         return {
@@ -214,7 +235,7 @@ def transfer(
     reporter: Reporter | None = None,
     workers: Workers = None,
 ) -> Evaluation:
-    """Trains by UGAT, evaluates, and leaves everything in `directory`.
+    """Train by UGAT, evaluate, and leave everything in `directory`.
 
     Args:
         config: What to do.
@@ -225,37 +246,20 @@ def transfer(
         workers: An executor for roll-outs and the search for rules; the rest is played here.
     """
     reporter = reporter or Silent()
-    make = learner_factory(config.learner, config.learner_settings, config.dqn, config.device)
+    make = config.spec.factory(config.device)  # refuses what is impossible now
     scenario = load_scenario(config.scenario)
-    env = parallel_env(scenario, config.sim, **config.env_options)
-    recorded: RecordedWorld | None = None
-    if config.real_log is not None:
-        log = TransitionLog.read(config.real_log)
-        every = config.ugat.fit.held_out_every
-        recorded = RecordedWorld(log, env, every)  # refuses a misfit before anything is written
-        _say_if_from_elsewhere(log, config, reporter)
-    controls = _controls(config, scenario, env)
-    learner = make(env, config.seed)
-    transform = config.ugat.transform(env.layouts, config.seed, neighbours_of(env))
-    if config.placebo == "noise":
-        answer_with_noise(transform.forward, config.seed)
-    run = Run(directory, _identity(config, scenario, env, controls), resume, reporter)
-    write_settings(directory, asdict(config))
-    try:
-        state = State(learner, transform)
-        state.restore(run, NetworkPolicy.load)
-        policy = _train(config, scenario, env, recorded, state, run, workers)
-        assert state.direct is not None  # plain training comes first
-        policies: dict[str, Policy] = {DIRECT: state.direct}
-        if config.ugat.iterations:
-            policies[UGAT if config.ugat.grounding == "phase" else TIMED] = policy
-        direct = directory / DIRECT_LEARNER
-        for control in controls:
-            policies[control.name] = train_control(control, make, config.seed, run, direct)
-    finally:
-        for made in (env, *(control.env for control in controls)):
-            made.close()
-        run.close()
+    with contextlib.closing(parallel_env(scenario, config.sim, **config.env_options)) as env:
+        worlds = _worlds(config, scenario, env, reporter, workers)
+        jobs = _jobs(config, scenario, env)
+        run = Run(directory, _identity(config, scenario, env), resume, reporter)
+        write_settings(directory, asdict(config))
+        with contextlib.closing(run):
+            state = _train(config, make, scenario, env, worlds, run)
+            policies = _policies(config, state)
+            for job in jobs:
+                folder = directory / TRAININGS / job.name
+                job.write(folder)
+                policies[job.setting.name] = train_job(job, folder, reporter)
     for file, trained in zip(file_names(policies), policies.values(), strict=True):
         if isinstance(trained, NetworkPolicy):
             trained.save(directory / "policies" / f"{file}.pt")
@@ -264,6 +268,15 @@ def transfer(
     queues.write(directory / QUEUES)
     table.write(directory / "table.json")
     return table
+
+
+def _policies(config: TransferConfig, state: State) -> dict[str, Policy]:
+    """Return direct transfer and, if there was an iteration, the policy of UGAT."""
+    assert state.direct is not None  # plain training comes first
+    policies = {DIRECT: state.direct}
+    if config.ugat.iterations:
+        policies[GROUNDED_NAME[config.ugat.grounding]] = state.learner.policy()
+    return policies
 
 
 def _say_if_from_elsewhere(log: TransitionLog, config: TransferConfig, reporter: Reporter) -> None:
@@ -283,7 +296,7 @@ def judge(
     watch: Watch | None = None,
     workers: Workers = None,
 ) -> Evaluation:
-    """Evaluates policies beside the rules that are best in each domain, which `workers` find."""
+    """Evaluate policies beside the rules that are best in each domain, which `workers` find."""
     seeds = [TUNING_SEED + k for k in range(config.tuning_seeds)]
     options: Any = {"duration_s": config.duration_s, "reporter": reporter, "workers": workers}
     if config.rule_budget is None:
@@ -301,7 +314,7 @@ def judge(
         scenario,
         factories,
         config.domains,
-        [EVALUATION_SEED + k for k in range(config.evaluation_seeds)],
+        evaluation_seeds(config.evaluation_seeds),
         duration_s=config.duration_s,
         reporter=reporter,
         notes={
@@ -315,17 +328,36 @@ def judge(
     )
 
 
-def _train(
+def _worlds(
     config: TransferConfig,
     scenario: Scenario,
     env: TrafficEnv,
-    recorded: RecordedWorld | None,
-    state: State,
-    run: Run,
+    reporter: Reporter,
     workers: Workers,
-) -> Policy:
+) -> tuple[SimulatedWorld, World]:
+    """Return the sources of D_sim and D_real; a log that does not fit is refused here."""
+    recorded: RecordedWorld | None = None
+    if config.real_log is not None:
+        log = TransitionLog.read(config.real_log)
+        recorded = RecordedWorld(log, env, config.ugat.fit.held_out_every)
+        _say_if_from_elsewhere(log, config, reporter)
+    street = config.sim if recorded or config.placebo == "same-world" else config.real
+    sim, real = simulated_worlds(
+        scenario, config.sim, street, config.ugat, config.env_options, workers
+    )
+    return sim, recorded or real
+
+
+def _train(
+    config: TransferConfig,
+    make: LearnerFactory,
+    scenario: Scenario,
+    env: TrafficEnv,
+    worlds: tuple[SimulatedWorld, World],
+    run: Run,
+) -> State:
     def probe(policy: Policy) -> dict[str, float]:
-        """ATT after each iteration, on a seed that is not reported."""
+        """Return the ATT after an iteration, on a seed that is not reported."""
         found = evaluate(
             scenario,
             {"policy": fixed_policy(policy)},
@@ -335,83 +367,67 @@ def _train(
         )
         return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
 
-    street = config.sim if recorded or config.placebo == "same-world" else config.real
-    sim, street_world = simulated_worlds(
-        scenario, config.sim, street, config.ugat, config.env_options, workers
+    return train_grounded(
+        config.ugat,
+        make,
+        env,
+        worlds,
+        config.seed,
+        run,
+        placebo=config.placebo,
+        probe=probe,
+        device=config.device,
     )
-    real: World = recorded or street_world
-    if config.placebo == "shuffled":
-        real = ShuffledWorld(real)
-    try:
-        ugat = Ugat(env, sim, real, config.ugat, config.seed, run, probe, config.device)
-        return ugat.train(state)
-    finally:
-        sim.close()
-        real.close()
 
 
-def _controls(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> list[Control]:
-    """The policies asked for beside UGAT's; their environments are not started."""
-
-    def world(option: str, domain: str) -> TrafficEnv:
-        return _other_env(config, scenario, env, option, domain)
-
-    plain, whole = config.ugat.pretrain_episodes, config.episodes
-    found: list[Control] = []
-    if config.control:
-        title = "control: more plain sim"
-        found.append(Control(CONTROL, env, whole, file="control-learner.pt", title=title))
-    found += [further(describe(d), world("further", d), whole) for d in config.further]
-    if config.random_delay_s is not None:
-        late = RandomDelays(world("sim", config.sim), config.random_delay_s)
-        found.append(Control(f"{RANDOM_DELAY} 0-{config.random_delay_s} s", late, whole))
-    if config.fine_tuned:
-        seen = config.ugat.iterations * config.ugat.real_rollouts
-        found.append(Control(FINE_TUNED, world("real", config.real), plain + seen))
-    if config.randomised:
-        worlds = randomised_env(scenario, config.env_options, config.sim)
-        found.append(Control(RANDOMISED, worlds, whole, from_direct=False))
-    if config.corrected is not None:
-        made = world("corrected", config.corrected)
-        file = "corrected-learner.pt"
-        found.append(Control(CORRECTED, made, whole, from_direct=False, file=file))
-    if config.oracle:
-        made = world("real", config.real)
-        found.append(Control(ORACLE, made, whole, from_direct=False, file="oracle-learner.pt"))
-    return found
-
-
-def _other_env(
-    config: TransferConfig, scenario: Scenario, sim: TrafficEnv, option: str, domain: str
-) -> TrafficEnv:
-    """Another domain to train in; its policies must fit the others' worlds."""
-    env = parallel_env(scenario, domain, **config.env_options)
-    if AgentSet.of(env) != AgentSet.of(sim):
-        raise ScenarioError(
-            f"{option} = {domain!r} has other agents, observations or phases than "
-            f"scenario {scenario.id!r}: {AgentSet.of(env)}, not {AgentSet.of(sim)}; take a "
-            "corrected scenario of this one"
+def _jobs(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> list[Job]:
+    """Return the jobs of the settings beside UGAT; worlds with other agents are refused."""
+    for option in ("corrected", *(["real"] if config.fine_tuned or config.oracle else [])):
+        if (domain := getattr(config, option)) is not None:
+            _require_same_agents(config, scenario, env, option, domain)
+    for domain in config.further:
+        _require_same_agents(config, scenario, env, "further", domain)
+    return [
+        Job(
+            setting=setting,
+            scenario=config.scenario,
+            sim=config.sim,
+            target=config.real if setting.knows_target else None,
+            seed=config.seed,
+            episodes=config.episodes
+            if setting.episodes is None
+            else config.ugat.pretrain_episodes + setting.episodes,
+            start=f"../{DIRECT_LEARNER}" if setting.begins_with_direct else None,
+            options=config.env_options,
+            device=config.device,
         )
-    return env
+        for setting in config.settings
+    ]
 
 
-def _identity(
-    config: TransferConfig, scenario: Scenario, env: TrafficEnv, controls: Sequence[Control]
-) -> dict[str, Any]:
+def _require_same_agents(
+    config: TransferConfig, scenario: Scenario, sim: TrafficEnv, option: str, domain: str
+) -> None:
+    """Refuse another domain to train in whose policies would not fit the others' worlds."""
+    with contextlib.closing(parallel_env(scenario, domain, **config.env_options)) as env:
+        if AgentSet.of(env) != AgentSet.of(sim):
+            raise ScenarioError(
+                f"{option} = {domain!r} has other agents, observations or phases than "
+                f"scenario {scenario.id!r}: {AgentSet.of(env)}, not {AgentSet.of(sim)}; take a "
+                "corrected scenario of this one"
+            )
+
+
+def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> dict[str, Any]:
+    """Return everything that must be the same for a run to be taken up again."""
     settings = asdict(config)
     for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", "device", "corrected", *ADDED):
         settings.pop(other)
-    if config.placebo == "none":  # runs from before there were any can be resumed
-        settings.pop("placebo")
-    if config.learner == DQN_NAME:  # the same
-        del settings["learner"], settings["learner_settings"]
     log = config.real_log  # the same if its content is, wherever it lies
     settings["real_log"] = hashlib.sha256(log.read_bytes()).hexdigest() if log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":
         hashes["real"] = in_domain(scenario, config.real).hash
-    for control in controls:
-        if control.name == CORRECTED:
-            corrected: Any = control.env
-            hashes["corrected"] = corrected.scenario.hash  # the same, wherever it lies
+    if config.corrected is not None:  # the same, wherever it lies
+        hashes["corrected"] = in_domain(scenario, config.corrected).hash
     return {**settings, "scenario_hash": hashes, "domains": [describe(d) for d in config.domains]}

@@ -1,4 +1,4 @@
-"""A scenario tried out: does its traffic get in and through, and can controllers be told apart?"""
+"""Trial of a scenario: traffic that gets in and through, controllers that can be told apart."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MOST_BACKLOG = 0.01
 
 @dataclass(frozen=True)
 class Run:
-    """How an episode went under a rule, in sim.
+    """Result of an episode under a rule, in sim.
 
     Attributes:
         rule: The rule.
@@ -50,7 +50,7 @@ class Run:
 def try_out(
     scenario: Scenario, seed: int, workers: int | None, reporter: Reporter
 ) -> tuple[Run, ...]:
-    """One episode under each of `RULES`."""
+    """Play one episode under each of `RULES`."""
     found = evaluate(
         scenario,
         {name: rule_factory(name) for name in RULES},
@@ -74,19 +74,19 @@ def try_out(
 def measured_headroom(
     scenario: Scenario, seeds: int, workers: int | None, reporter: Reporter
 ) -> list[Row]:
-    """ATT of the largest-queue rule, held long and short, in every domain."""
+    """Return the ATT of the largest-queue rule, held long and short, in every domain."""
     return headroom(
         scenario, DOMAINS, HOLDS_S, tuple(range(seeds)), workers=workers, reporter=reporter
     )
 
 
 def is_full(runs: Sequence[Run]) -> bool:
-    """Whether too many vehicles stay outside under every rule."""
+    """Return True if too many vehicles stay outside under every rule."""
     return bool(runs) and all(run.backlog > MOST_BACKLOG * run.due for run in runs)
 
 
 def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
-    """At which roads vehicles wait at the end under the network's own programme.
+    """Count the vehicles that wait outside at the end, by road, under the network's own programme.
 
     Raises:
         ScenarioError: SUMO refused; holds its words.
@@ -109,7 +109,7 @@ def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
 def problems(
     facts: Survey, runs: Sequence[Run], outside: Mapping[str, int] | None = None
 ) -> list[str]:
-    """What has to be mended before training makes sense, each with the way out.
+    """Return the faults to mend before training makes sense, each with the way out.
 
     Args:
         facts: What was looked at.
@@ -153,7 +153,7 @@ def problems(
 
 
 def _unsuited(facts: Survey, runs: Sequence[Run]) -> str:
-    """A rule far behind the programme, where phases serve lanes in part."""
+    """Return a sentence on a rule far behind the programme, where phases serve lanes in part."""
     lanes = sum(len(item.partly_served) for item in facts.intersections)
     att_s = {run.rule: run.att_s for run in runs}
     if not lanes or any(rule not in att_s for rule in RULES):
@@ -175,7 +175,7 @@ def as_json(
     wrong: Sequence[str],
     outside: Mapping[str, int] | None = None,
 ) -> dict[str, object]:
-    """Everything as plain values."""
+    """Return everything as plain values."""
     found: dict[str, object] = asdict(facts)
     found["runs"] = [asdict(run) for run in runs]
     found["headroom"] = None if rows is None else [asdict(row) for row in rows]

@@ -55,7 +55,7 @@ def tune(
     reporter: Reporter | None = None,
     fresh: bool = False,
 ) -> Tuned:
-    """The settings of a rule with the smallest mean ATT in a domain.
+    """Find the settings of a rule with the smallest mean ATT in a domain.
 
     All combinations of the values in the rule's `RULES` entry are raced on seeds from
     `TUNING_SEED` on, which no result is reported on. If the budget does not pay for all, they are
@@ -109,7 +109,7 @@ def tuned_rules(
     workers: Workers = None,
     reporter: Reporter | None = None,
 ) -> dict[str, str]:
-    """For each domain the best rule, each rule with the settings that are best there.
+    """Find the best rule of each domain, each rule with the settings that are best there.
 
     As `ugat_marl.experiments.evaluation.best_rules`, but the rules are tuned before they are raced.
 
@@ -143,7 +143,7 @@ def tuned_rules(
 
 
 def rungs(settings: int, budget: int) -> list[list[int]]:
-    """The seeds of each rung of a race: new ones, with about the same number of episodes in each.
+    """Return the seeds of each rung: new ones, about the same number of episodes in each.
 
     Args:
         settings: How many take part.
@@ -165,7 +165,7 @@ def rungs(settings: int, budget: int) -> list[list[int]]:
 
 
 def settings_of(name: str, budget: int) -> list[str]:
-    """The spellings of a rule that a budget pays to race: the usual one, others spread evenly."""
+    """Return the spellings that a budget pays to race: the usual one, others spread evenly."""
     rule = RULES[name]
     values = itertools.product(*(parameter.choices for parameter in rule.parameters))
     specs = [format_spec(name, list(each)) for each in values]
@@ -179,7 +179,7 @@ def settings_of(name: str, budget: int) -> list[str]:
 
 
 def _fields(settings: int) -> list[int]:
-    """How many take part in each rung: half of those before, down to two."""
+    """Return the number that takes part in each rung: half of those before, down to two."""
     fields = [settings]
     while fields[-1] > 2:
         fields.append(math.ceil(fields[-1] / 2))
@@ -194,7 +194,7 @@ def _place(
     duration_s: float | None,
     specs: Sequence[str],
 ) -> Path:
-    """The file that remembers a result; whatever could change the result changes its name."""
+    """Return the file that remembers a result; whatever could change that changes its name."""
     world = in_domain(scenario, domain)
     if duration_s is not None:
         world = world.with_duration(duration_s)
@@ -204,7 +204,7 @@ def _place(
 
 
 def _recall(place: Path, specs: Sequence[str]) -> tuple[Trial, ...] | None:
-    """What was remembered; None if nothing was, or what lies there is not such a result."""
+    """Return the result in a file; None if there is none, or the file holds something else."""
     try:
         rows: Any = json.loads(place.read_text(encoding="utf-8"))
         trials = tuple(Trial(str(r["spec"]), float(r["att_s"]), int(r["episodes"])) for r in rows)

@@ -21,6 +21,7 @@ from .timed import TimedTransform as TimedTransform
 from .transform import Transform as Transform
 from .ugat import CHUNK as CHUNK
 from .ugat import DIRECT_LEARNER as DIRECT_LEARNER
+from .ugat import Probe as Probe
 from .ugat import Ugat as Ugat
 from .uncertainty import METHODS as METHODS
 from .view import InputsConfig as InputsConfig

@@ -26,7 +26,6 @@ from ugat_marl.reporting.figures import (
     tick_text,
     write_png,
 )
-from ugat_marl.reporting.job_names import grounding_of
 from ugat_marl.reporting.run_records import RunRecord
 from ugat_marl.reporting.style import LIGHT, curve_style, styled
 
@@ -180,7 +179,7 @@ def _several(records: Sequence[RunRecord]) -> str:
         return shortened(records[0].name, 34)
     first = records[0]
     name = first.scenario + (f" → {first.real}" if first.real else "")
-    kind = grounding_of(first.settings)
+    kind = first.grounding
     return f"{shortened(name, 26)}{f', {kind}' if kind else ''}, {len(records)} seeds"
 
 

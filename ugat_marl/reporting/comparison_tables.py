@@ -74,8 +74,8 @@ def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
         *_grid(found, _episodes(found)),
         "",
     ]
-    if others := constants(found):
-        lines += _against_constants(found, others)
+    if found.constants:
+        lines += _against_constants(found)
     lines += ["## The paper's measures", "", "Mean in the real domain (Δ to the simulation).", ""]
     for measure, heading in MEASURES.items():
         lines += [f"### {heading}", "", *_grid(found, _with_gap(found, measure)), ""]
@@ -110,11 +110,6 @@ def seeds_csv(found: Comparison) -> str:
                 for seed, *values in zip(seeds, *(c.tolist() for c in columns), strict=True):
                     writer.writerow([setting, target, seed, *(round(v, 3) for v in values)])
     return text.getvalue()
-
-
-def constants(found: Comparison) -> list[str]:
-    """The rows of the sweep of constant delays."""
-    return [setting for setting in found.settings if setting.startswith("constant delay")]
 
 
 def _headlines(found: Comparison, direct: str) -> list[tuple[str, Cell]]:
@@ -165,7 +160,7 @@ def _grid(found: Comparison, cell: Cell, leave_out: str = "") -> list[str]:
     return lines
 
 
-def _against_constants(found: Comparison, others: list[str]) -> list[str]:
+def _against_constants(found: Comparison) -> list[str]:
     lines = [
         "## Against the best constant delay, chosen in hindsight",
         "",
@@ -174,14 +169,11 @@ def _against_constants(found: Comparison, others: list[str]) -> list[str]:
         f"| | {' | '.join(found.targets)} |",
         f"|---|{'---:|' * len(found.targets)}",
     ]
-    best = {target: found.best(target, others) for target in found.targets}
-    lines.append(
-        f"| best constant | {' | '.join(name.split(' ', 2)[2] for name in best.values())} |"
-    )
-    for setting in found.settings:
-        if setting.startswith("UGAT"):
-            cells = (_tested(found.test(setting, best[t], t)) for t in found.targets)
-            lines.append(f"| {setting} | {' | '.join(cells)} |")
+    best = {target: found.best(target, found.constants) for target in found.targets}
+    lines.append(f"| best constant | {' | '.join(best.values())} |")
+    for setting in found.grounded:
+        cells = (_tested(found.test(setting, best[t], t)) for t in found.targets)
+        lines.append(f"| {setting} | {' | '.join(cells)} |")
     return [*lines, ""]
 
 

@@ -8,8 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ugat_marl.experiments import Comparison, Trial
-from ugat_marl.reporting.job_names import grounding_of, job_name
+from ugat_marl.experiments import DIRECT, UGAT, Comparison, Trial
 from ugat_marl.reporting.run_records import RunRecord
 
 _APART = (
@@ -52,16 +51,14 @@ def groups(records: Sequence[RunRecord]) -> list[Group]:
         note = f"{count} training seed{'s' * (count != 1)}; "
         note += "intervals: 95 %, Student's, over them." if count > 1 else "no intervals over them."
         title = f"{first.scenario}, trained in {first.sim}"
-        title += "" if first.job else f", {grounding_of(first.settings) or 'unknown'} grounding"
+        title += "" if first.job else f", {first.grounding or 'unknown'} grounding"
         found.append(Group(title, comparison.rows(), note, left_out))
     return found
 
 
 def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
     """Return trainings that differ in nothing but their seed, whose curves are drawn as one."""
-    return list(
-        _parted(records, lambda r: (*_common(r), r.real, _ugat(r), job_name(r.settings))).values()
-    )
+    return list(_parted(records, lambda r: (*_common(r), r.real, _ugat(r), r.setting)).values())
 
 
 def _common(record: RunRecord) -> tuple[Any, ...]:
@@ -127,7 +124,7 @@ def _of_job(record: RunRecord, name: str) -> Iterable[Trial]:
 
 def _rank(setting: str) -> int:
     """Direct transfer first, then UGAT, controls, and rules last; stable."""
-    order = ("direct transfer", "UGAT", "", "best rule")
+    order = (DIRECT, UGAT, "", "best rule")
     return next(n for n in (0, 1, 3, 2) if setting.startswith(order[n]))
 
 
@@ -138,7 +135,7 @@ def _seed(record: RunRecord) -> int | None:
 def job_labels(records: Sequence[RunRecord]) -> list[str]:
     """Names of jobs, with the settings of UGAT by which those of the same name differ."""
     flat = [dict(_flat(record.ugat)) for record in records]
-    names = [job_name(record.settings) for record in records]
+    names = [record.setting for record in records]
     found: list[str] = []
     for record, name, own in zip(records, names, flat, strict=True):
         others = [each for each, other in zip(flat, names, strict=True) if other == name]

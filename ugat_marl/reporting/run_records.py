@@ -22,7 +22,6 @@ import polars as pl
 from ugat_marl.data import CHECKPOINT, METRICS, SETTINGS, Metrics
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.experiments import QUEUES, Evaluation, read_queues, result_of
-from ugat_marl.reporting.job_names import job_name
 
 RUN, JOB, TABLE, SCORES = "run.json", "job.json", "table.json", "scores.json"
 TABLE_CSV, TABLE_MD = "table.csv", "table.md"
@@ -93,6 +92,16 @@ class RunRecord:
         """Settings of the algorithm."""
         found = self.settings.get("ugat")
         return found if isinstance(found, Mapping) else {}
+
+    @property
+    def setting(self) -> str:
+        """Name that the setting of a job carries; "" for none."""
+        return str(self.settings.get("name", ""))
+
+    @property
+    def grounding(self) -> str:
+        """Kind of grounding; "" for none."""
+        return str(self.ugat.get("grounding", "phase")) if self.ugat else ""
 
     @property
     def finished(self) -> bool:
@@ -232,6 +241,8 @@ def _run(directory: Path, name: str) -> RunRecord:
     kept = reader.read(JOB if job else SETTINGS, _object, "its settings are unknown") or {}
     settings = kept.get("settings", kept)
     settings = settings if isinstance(settings, dict) else {}
+    if isinstance(setting := settings.get("setting"), dict):  # of a job, with its name
+        settings = {**settings, **setting}
     if job:
         evaluation = reader.read(
             SCORES, lambda path: _scores(path, settings), "it has not been judged (yet)"
@@ -244,7 +255,7 @@ def _run(directory: Path, name: str) -> RunRecord:
     without = "nobody knows where and when vehicles stood"
     queues = reader.read(QUEUES, read_queues, without) if evaluation is not None else None
     if job and queues is not None:
-        queues = queues.with_columns(policy=pl.lit(job_name(settings)))
+        queues = queues.with_columns(policy=pl.lit(str(settings.get("name", "unknown"))))
     return RunRecord(
         name=name,
         directory=directory,
@@ -304,11 +315,14 @@ def _written(directory: Path) -> float:
 
 
 def _scores(path: Path, settings: Mapping[str, Any]) -> Evaluation:
-    rows = json.loads(path.read_text(encoding="utf-8"))
+    rows = _object(path)["episodes"]
     if not isinstance(rows, list) or not rows:
         raise ValueError("no scores in it")
-    policy = job_name(settings)
-    results = tuple(result_of({**row, "policy": policy}) for row in rows)
+    policy = str(settings.get("name", "unknown"))
+    last = max(int(row["trained"]) for row in rows)
+    results = tuple(
+        result_of({**row, "policy": policy}) for row in rows if int(row["trained"]) == last
+    )
     return Evaluation(str(settings.get("scenario", "")), "", results, {})
 
 

@@ -23,7 +23,6 @@ from ugat_marl.experiments import Estimate, Evaluation
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import Picture, printable
 from ugat_marl.reporting.formats import number, share, signed
-from ugat_marl.reporting.job_names import grounding_of, job_name
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Figure, Grid, Page, render
 from ugat_marl.reporting.run_groups import groups, seeds_of_one
@@ -158,7 +157,7 @@ def _headline(record: RunRecord) -> str:
     if evaluation is None or not evaluation.policies:
         return f"{title}, no result yet"
     if record.job:
-        return f"{title}, {job_name(record.settings)}"
+        return f"{title}, {record.setting}"
     last = evaluation.domains[-1]
     parts = [
         f"{policy} {number(evaluation.estimate(policy, last, 'att_s').mean)} s"
@@ -183,7 +182,7 @@ def _overview_row(record: RunRecord) -> list[str]:
     evaluation = record.evaluation
     accepted = record.series("iteration", "gate/acceptance")
     cells = dict.fromkeys(("sim", "direct", "real", "rule"), "–")
-    policy = job_name(record.settings) if record.job else grounding_of(record.settings)
+    policy = record.setting if record.job else record.grounding
     if evaluation is not None and evaluation.policies:
         shown = _main_policies(evaluation)
         policy = next((name for name in shown if name.startswith("UGAT")), shown[0])
@@ -281,7 +280,7 @@ def _seeds(page: Page, runs: Sequence[RunRecord]) -> list[Figure]:
     for own in seeds_of_one(runs):
         if len(own) < 2:
             continue
-        name = _file_name(own[0].scenario, own[0].real, grounding_of(own[0].settings), "seeds")
+        name = _file_name(own[0].scenario, own[0].real, own[0].grounding, "seeds")
         figures += page.figures(
             (charts.learning_picture(own, f"{name}-learning"), f"{_STRETCH}the seeds."),
             (charts.travel_time_picture(own, f"{name}-att"), over),

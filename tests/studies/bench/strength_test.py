@@ -8,25 +8,21 @@ from pathlib import Path
 
 import pytest
 
-from studies.bench.strength import FIRST_SEED, Curve, StrengthBench
+from studies.bench.strength import StrengthBench
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
+from ugat_marl.experiments import EVALUATION_SEED as FIRST_SEED
 from ugat_marl.experiments import evaluate, rule_factory
 from ugat_marl.policies import DQN, roll_out
 from ugat_marl.policies.learners.dqn import DQNConfig
 
 
-def test_a_curve_by_hand() -> None:
-    curve = Curve({5: 200.0, 6: 100.0, 8: 104.0, 9: 112.0}, last=3)
-    assert (curve.final_s, curve.best_s) == (112.0, 100.0)
-    assert curve.mean_of_last_s == pytest.approx((100 + 104 + 112) / 3)
-    assert curve.unsteadiness == pytest.approx(1.0533, abs=1e-4)
-    assert Curve({1: 50.0, 2: 100.0}, last=1).unsteadiness == 2.0
-
-
 def test_it_judges_now_and_then_and_at_the_end_after_every_episode() -> None:
-    assert StrengthBench(episodes=20, every=5, last=3).judged == [5, 10, 15, 18, 19, 20]
-    assert StrengthBench(episodes=2, every=5, last=10).judged == [1, 2]
+    marks = [
+        StrengthBench(episodes=n, every=5, last=last).plan[-1].marks
+        for n, last in ((20, 3), (2, 10))
+    ]
+    assert marks == [(5, 10, 15, 18, 19, 20), (1, 2)]
 
 
 def test_it_measures_what_training_and_evaluating_by_hand_give(tmp_path: Path) -> None:
@@ -82,3 +78,9 @@ def test_a_named_rule_is_not_searched_for() -> None:
 def test_no_seeds_are_refused() -> None:
     with pytest.raises(OptionError, match="seeds is empty"):
         StrengthBench(seeds=())
+
+
+def test_another_learner_is_measured_as_well() -> None:
+    bench = StrengthBench(episodes=1, seeds=(1,), evaluation_seeds=1, duration_s=100)
+    report = replace(bench, rule="fixed-time:40", learner="ippo").run()
+    assert "ippo after 1 episodes" in report.notes[0]

@@ -1,4 +1,4 @@
-"""What a controller commands, which is what its cabinet logs."""
+"""Commands of a controller, as its cabinet logs them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STATE = re.compile(r'<tlsState time="([\d.]+)" id="([^"]*)" [^>]*?state="([^"]*
 
 
 class _LoggingEnv(TrafficEnv):
-    """Keeps what its controller commands.
+    """Environment that keeps the commands of its controller.
 
     The plan is made by the same machine as the environment's own, and before anything on the
     street may delay a green.
@@ -52,7 +52,7 @@ class _LoggingEnv(TrafficEnv):
 def play(
     scenario: Scenario, make: PolicyFactory, seed: int, stop: threading.Event
 ) -> dict[str, SignalLog]:
-    """One episode; returns what was commanded."""
+    """Play one episode and return the commands."""
     policy = make(parallel_env(scenario))
     env = _LoggingEnv(scenario, "sim", EnvOptions.of(policy.env_options))
     env.commanded = defaultdict(list)
@@ -66,7 +66,7 @@ def play(
 def own_programmes(
     scenario: Scenario, network: Network, make: PolicyFactory
 ) -> tuple[dict[str, SignalLog], tuple[str, ...]]:
-    """What the lights nobody commands show where that is fixed, and those where it is not.
+    """Return fixed programmes of lights that nobody commands, and lights without a fixed one.
 
     SUMO itself says what a programme shows, without vehicles and without the effects of a domain.
     """
@@ -100,7 +100,7 @@ def own_programmes(
 
 
 def switch_document(lights: Sequence[str], file: Path) -> Document:
-    """An additional file by which SUMO writes every change of some traffic lights."""
+    """Return an additional file by which SUMO writes every change of some traffic lights."""
     root = ET.Element("additional")
     for tls in lights:
         options = {"type": "SaveTLSSwitchStates", "source": tls, "dest": str(file)}
@@ -109,7 +109,7 @@ def switch_document(lights: Sequence[str], file: Path) -> Document:
 
 
 def switches(file: Path, end_s: float) -> dict[str, SignalLog]:
-    """What lights showed, in SUMO's own words."""
+    """Read the states of lights from SUMO's own output."""
     try:
         text = file.read_text(encoding="utf-8")
     except OSError as error:

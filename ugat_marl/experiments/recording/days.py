@@ -1,4 +1,4 @@
-"""Plays a policy in a domain, day after day, and keeps what the detectors of a street would see.
+"""Recording of a domain, day after day, by the detectors that a street would have.
 
 Every period is another day: the vehicles are drawn again, the effects of the domain are added to
 that day, and the effects on detectors to what was seen of it. The signals that are logged are the
@@ -61,7 +61,7 @@ from ugat_marl.simulation import loops_document, read_loops, standard_detectors
 
 @dataclass(frozen=True)
 class _Street:
-    """What is the same on every day.
+    """Parts of a recording that are the same on every day.
 
     Attributes:
         base: The scenario without the effects.
@@ -109,7 +109,7 @@ def record(
     workers: int | None = None,
     reporter: Reporter | None = None,
 ) -> Measured:
-    """Measures a domain as a street is measured. The same arguments give the same data.
+    """Measure a domain as a street is measured. The same arguments give the same data.
 
     Args:
         scenario: The simulation.
@@ -172,7 +172,7 @@ def record(
 
 
 def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, ...]]:
-    """What days are drawn from, and what is added to each of them.
+    """Return the scenario that days are drawn from, and the effects added to each of them.
 
     The effects of a scenario's own file are in its documents already, but for those on detectors.
     """
@@ -183,7 +183,7 @@ def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, 
 
 
 def _zone(detector: Detector, length_m: float) -> Detector:
-    """A zone that ends where the point was, and begins on the lane."""
+    """Return a zone that ends where the point was, and begins on the lane."""
     begin = max(detector.position_m - length_m, 0.0)
     return replace(
         detector, position_m=round(begin, 2), length_m=round(detector.position_m - begin, 2)
@@ -191,7 +191,7 @@ def _zone(detector: Detector, length_m: float) -> Detector:
 
 
 def _all_days(street: _Street, periods: int, workers: int, advance: Advance) -> list[_Day]:
-    """Threads suffice: the simulations run in processes of their own."""
+    """Record all days. Threads suffice: the simulations run in processes of their own."""
     stop = threading.Event()
     pool = concurrent.futures.ThreadPoolExecutor(workers)
     splits = split_periods(periods)
@@ -212,7 +212,7 @@ def _all_days(street: _Street, periods: int, workers: int, advance: Advance) -> 
 
 
 def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _Day:
-    """One day, from its vehicles to what was seen of them."""
+    """Record one day, from its vehicles to the measured data."""
     scenario = street.base
     if not street.same_demand:
         scenario = another_day(scenario, derive_seed(street.seed, "record", index, "demand"))
@@ -252,7 +252,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
 
 
 def _renamed(scenario: Scenario, seed: int) -> Scenario:
-    """Other names for the vehicles of a day that was drawn again.
+    """Rename the vehicles of a day that was drawn again.
 
     Effects choose vehicles by their names; on a street the trucks of two days are not the same
     ones, and no model knows which they are.
@@ -269,7 +269,7 @@ def _renamed(scenario: Scenario, seed: int) -> Scenario:
 
 
 def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scenario:
-    """The scenario with detectors, and with whatever else has to be watched."""
+    """Return the scenario with detectors, and with whatever else has to be watched."""
     extra = [loops_document(street.detectors, None, directory / "loops.xml")]
     if street.watched:
         extra.append(switch_document(street.watched, directory / "signals.xml"))
@@ -285,7 +285,7 @@ def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scena
 
 
 def _logged(period: Period) -> Period:
-    """What the electronics of a street would have kept; empty detectors are left out."""
+    """Return the data that the electronics of a street would have kept, without empty detectors."""
     found = {
         name: as_logged(passages, period.begin_s, period.end_s)
         for name, passages in period.passages.items()

@@ -21,7 +21,7 @@ _ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
 
 
 def tracks(file: Path, period: str, begin_s: float, end_s: float) -> pl.DataFrame:
-    """Where every vehicle was at every whole second, junctions included."""
+    """Return the place of every vehicle at every whole second, junctions included."""
     columns: dict[str, list[Any]] = {
         name: [] for name in ("vehicle_id", "time_s", "lane_id", "position_m", "speed_mps")
     }
@@ -46,7 +46,7 @@ def tracks(file: Path, period: str, begin_s: float, end_s: float) -> pl.DataFram
 
 
 def per_lane(vehicles: pl.DataFrame, detectors: Sequence[Detector], period: Period) -> pl.DataFrame:
-    """Vehicles, halting and mean speed of every lane with a detector, empty lanes included."""
+    """Return vehicles, halting and mean speed of every lane with a detector, empty ones too."""
     names = sorted({item.lane for item in detectors})
     seconds = pl.DataFrame({"time_s": np.arange(np.ceil(period.begin_s), period.end_s)})
     grid = seconds.join(pl.DataFrame({"lane_id": names}), how="cross")

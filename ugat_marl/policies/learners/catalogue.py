@@ -126,15 +126,18 @@ def learner_factory(
     return lambda env, seed: make(env, config, seed)
 
 
-def settings_of(name: str) -> dict[str, Any]:
-    """Return the default settings of a learner.
+def settings_of(name: str, given: Sequence[str] = ()) -> dict[str, Any]:
+    """Return all settings of a baseline.
+
+    Args:
+        name: One of `BASELINES`.
+        given: Those that are not as usual, as for `learner_factory`.
 
     Raises:
-        OptionError: Its library is not installed.
+        UnknownNameError: No such setting.
+        OptionError: A value is impossible, or the library is not installed.
     """
-    if name == DQN_NAME:
-        return asdict(DQNConfig())
-    return asdict(_baseline_config(name, ()))
+    return asdict(_baseline_config(name, given))
 
 
 def _baseline_config(name: str, settings: Sequence[str]) -> Any:

@@ -1,0 +1,257 @@
+"""The driver: jobs in processes and here, taken up again, failing, ending with who started them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import TypeAdapter
+
+from ugat_marl.data import Scores, locked
+from ugat_marl.errors import MeasurementError, OptionError
+from ugat_marl.experiments import (
+    Job,
+    LearnerSpec,
+    Record,
+    Setting,
+    perform_all,
+    perform_here,
+    record_of,
+)
+from ugat_marl.experiments.driver import LOG
+from ugat_marl.experiments.jobs import JOB, LEARNER, SCORES, evaluation_seeds, perform
+from ugat_marl.experiments.paper import TABLES, settings_of
+from ugat_marl.grounding import FitConfig, UgatConfig
+from ugat_marl.policies import BASELINES, DQN_NAME, DQNConfig, is_installed
+from ugat_marl.progress import Silent
+
+QUICK = LearnerSpec(dqn=DQNConfig(warmup_decisions=5, epsilon_decay_decisions=50))
+PLAIN = Job(
+    Setting("direct transfer", "direct", learner=QUICK),
+    "single-v1",
+    seed=3,
+    episodes=4,
+    every=2,
+    options={"duration_s": 100.0},
+    domains=("sim", "V4"),
+    evaluation_seeds=evaluation_seeds(2),
+)
+UGAT = UgatConfig(
+    pretrain_episodes=4,
+    iterations=1,
+    grounded_episodes=2,
+    sim_rollouts=1,
+    real_rollouts=2,
+    least_accuracy=None,  # so little training proves nothing
+    fit=FitConfig(epochs=2),
+)
+
+
+def after(base: Job, setting: Setting, episodes: int = 6) -> Job:
+    """A job that goes on from plain training."""
+    return replace(
+        base,
+        setting=setting,
+        target="V4",
+        episodes=episodes,
+        every=0,
+        start=f"{base.name}/{LEARNER}",
+    )
+
+
+class KillAfter(Silent):
+    """Raises after some steps of one task."""
+
+    def __init__(self, name: str, steps: int) -> None:
+        self._name, self._left = name, steps
+
+    @contextlib.contextmanager
+    def task(self, name: str, total: int) -> Any:
+        with super().task(name, total) as advance:
+
+            def one(*args: Any, **note: Any) -> None:
+                advance(*args, **note)
+                self._left -= name == self._name
+                if not self._left:
+                    raise KeyboardInterrupt
+
+            yield one
+
+
+def test_it_is_judged_every_few_episodes_and_at_the_end() -> None:
+    assert PLAIN.marks == (2, 4)
+    assert replace(PLAIN, episodes=5).marks == (2, 4, 5)
+    assert replace(PLAIN, every=0).marks == (4,)
+    assert replace(PLAIN, every=3, episodes=9, last=3).marks == (3, 6, 7, 8, 9)
+    # More episodes of a training that is judged as it goes are the same training.
+    assert replace(PLAIN, episodes=6).name == PLAIN.name
+    assert replace(PLAIN, every=0, episodes=6).name != replace(PLAIN, every=0).name
+
+
+@pytest.mark.parametrize("sim", ["sim", "meso"])
+@pytest.mark.parametrize("table", TABLES)
+def test_a_job_file_carries_the_setting_with_its_name(table: str, sim: str, tmp_path: Path) -> None:
+    for row in settings_of(table, UgatConfig(), sim):
+        job = replace(PLAIN, setting=row)
+        job.write(tmp_path)
+        content = (tmp_path / JOB).read_bytes()
+        assert json.loads(content)["setting"]["name"] == row.name
+        assert TypeAdapter(Job).validate_json(content) == job
+
+
+def test_a_setting_has_settings_of_ugat_if_it_is_grounded() -> None:
+    for recipe, ugat in (("direct", UGAT), ("grounded", None)):
+        with pytest.raises(OptionError, match="give ugat with recipe"):
+            Setting("x", recipe, ugat=ugat)  # pyright: ignore[reportArgumentType]
+
+
+def test_jobs_here_and_in_processes_have_the_same_numbers(tmp_path: Path) -> None:
+    """Plain, grounded and fine-tuned; the rule of another folder has no learner."""
+    plan = [
+        PLAIN,
+        after(PLAIN, Setting("UGAT", "grounded", learner=QUICK, ugat=UGAT)),
+        after(PLAIN, Setting("fine-tuned", "further", learner=QUICK)),
+        replace(
+            PLAIN,
+            setting=Setting("rule", "rule", rules=("fixed-time:30", "largest-queue:20")),
+            seed=None,
+            target="V4",
+            episodes=0,
+            every=0,
+        ),
+    ]
+    here = perform_here(plan, tmp_path / "here", Silent())
+    assert perform_all(plan[::-1], tmp_path / "apart", 2, Silent(), "test") == {}
+    for job, record in zip(plan, here, strict=True):
+        apart = record_of(job, tmp_path / "apart")
+        assert apart is not None and record.is_whole(job)
+        assert apart.scores == record.scores and len(record.scores) == 4 * len(job.marks)
+    assert here[0].scores != here[1].scores
+    assert Record.read(tmp_path / "here" / PLAIN.name) == here[0]
+    assert here[0].episodes == 4 and here[0].seconds > 0 < here[0].own_seconds
+
+
+@pytest.mark.parametrize("grounded", [False, True])
+def test_a_killed_job_goes_on_and_ends_with_the_same_numbers(
+    grounded: bool, tmp_path: Path
+) -> None:
+    job, title = replace(PLAIN, episodes=14, every=12), "training: direct transfer"
+    if grounded:
+        ugat = replace(UGAT, iterations=2)
+        job = replace(
+            PLAIN,
+            setting=Setting("UGAT", "grounded", learner=QUICK, ugat=ugat),
+            target="V4",
+            episodes=8,
+            every=0,
+        )
+        title = "grounded, round 2"
+    whole = perform(job, tmp_path / "whole", Silent())
+    with pytest.raises(KeyboardInterrupt):
+        perform(job, tmp_path / "killed", KillAfter(title, 1 if grounded else 11))
+    assert not Record.read(tmp_path / "killed").is_whole(job)
+    again = perform(job, tmp_path / "killed", Silent())
+    assert again.scores == whole.scores
+    played = (tmp_path / "killed" / SCORES).read_bytes()
+    assert perform(job, tmp_path / "killed", Silent()).scores == whole.scores
+    assert (tmp_path / "killed" / SCORES).read_bytes() == played
+
+
+def test_more_episodes_train_only_those_and_fewer_are_refused(tmp_path: Path) -> None:
+    perform(replace(PLAIN, episodes=2), tmp_path / "parts", Silent())
+    parts = perform(PLAIN, tmp_path / "parts", Silent())
+    whole = perform(PLAIN, tmp_path / "whole", Silent())
+    assert parts.scores == whole.scores and parts.episodes == whole.episodes == 4
+    with pytest.raises(OptionError, match="is beyond it"):
+        perform(replace(PLAIN, episodes=3), tmp_path / "parts", Silent())
+    more = replace(PLAIN, episodes=4, every=0, evaluation_seeds=evaluation_seeds(3))
+    assert len(perform(more, tmp_path / "parts", Silent()).scores) == 2 * 2 * 2 + 2
+
+
+@pytest.mark.parametrize("name", [DQN_NAME, *BASELINES])
+def test_every_learner_can_have_a_job(name: str, tmp_path: Path) -> None:
+    if not is_installed(name):
+        pytest.skip(f"the library of {name} is not installed")
+    job = replace(
+        PLAIN,
+        setting=Setting(name, "direct", learner=LearnerSpec(name)),
+        episodes=1,
+        every=0,
+        domains=("sim",),
+        evaluation_seeds=evaluation_seeds(1),
+    )
+    record = perform(job, tmp_path, Silent())
+    assert record.is_whole(job) and len(record.scores) == 1
+
+
+def test_a_failed_job_says_why_and_the_others_go_on_if_they_shall(tmp_path: Path) -> None:
+    broken = replace(PLAIN, options={"observation": "conut"})
+    with pytest.raises(MeasurementError, match="conut"):
+        perform_all([broken], tmp_path, 1, Silent(), "test")
+    assert "conut" in (tmp_path / broken.name / LOG).read_text()
+    assert json.loads((tmp_path / broken.name / JOB).read_text())["setting"]["recipe"] == "direct"
+    fine = replace(PLAIN, episodes=1, every=0)
+    failures = perform_all([broken, fine], tmp_path, 1, Silent(), "test", keep_going=True)
+    assert list(failures) == [broken.name] and "conut" in failures[broken.name]
+    assert record_of(fine, tmp_path) is not None
+
+
+def test_two_drivers_do_not_train_in_one_folder(tmp_path: Path) -> None:
+    lock = locked(tmp_path)
+    with pytest.raises(OptionError, match="another process"):
+        perform_all([], tmp_path, 1, Silent(), "test")
+    lock.close()
+    perform_all([], tmp_path, 1, Silent(), "test")
+
+
+def test_a_job_ends_with_whoever_started_it(tmp_path: Path) -> None:
+    replace(PLAIN, episodes=10**6).write(tmp_path)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ugat_marl.experiments.jobs", str(tmp_path)],
+        stdin=subprocess.PIPE,
+    )
+    assert process.stdin is not None
+    process.stdin.close()
+    assert process.wait(60) == 1
+
+
+SCORE = Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1)
+
+
+def whole_record() -> Record:
+    return Record({(m, d, s): SCORE for m in (2, 4) for d in ("sim", "V4") for s in (1000, 1001)})
+
+
+def test_what_a_killed_job_was_writing_is_cleared(tmp_path: Path) -> None:
+    whole_record().write(tmp_path)  # nothing is left to do
+    PLAIN.write(tmp_path)
+    (tmp_path / ".learner.pt.x1y2z3.tmp").write_bytes(b"half")
+    command = [sys.executable, "-m", "ugat_marl.experiments.jobs", str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        assert process.wait(60) == 0  # its input stays open: it would end with whoever started it
+    assert {path.name for path in tmp_path.iterdir()} == {SCORES, JOB}
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[{}]", '{"episodes": [{"domain": "sim"}]}', '{"a": 1}', "[1]"]
+)
+def test_a_broken_record_is_an_empty_one(tmp_path: Path, content: str) -> None:
+    (tmp_path / SCORES).write_text(content)
+    assert Record.read(tmp_path) == Record()
+
+
+def test_a_job_is_done_when_everything_was_played(tmp_path: Path) -> None:
+    record = whole_record()
+    record.write(tmp_path / PLAIN.name)
+    assert record_of(PLAIN, tmp_path) == record
+    for key in record.scores:
+        part = Record({other: SCORE for other in record.scores if other != key})
+        part.write(tmp_path / PLAIN.name)
+        assert record_of(PLAIN, tmp_path) is None, key
+    assert asdict(record)["episodes"] == 0

@@ -1,0 +1,148 @@
+"""The driver: settings x domains x seeds, several at a time, resumable.
+
+A job is described in its folder and leaves its results there, so that an executor whose workers are
+elsewhere needs a file system they have in common.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from pathlib import Path
+
+from ugat_marl.data import locked
+from ugat_marl.errors import MeasurementError
+from ugat_marl.experiments.jobs import Job, Record, perform
+from ugat_marl.files import require_writable
+from ugat_marl.parallel import Stop, Workers, executor_of
+from ugat_marl.progress import Reporter
+
+LOG = "job.log"
+_TAIL = 400
+"""Letters of a failed job's log that are shown."""
+
+
+def record_of(job: Job, folder: Path) -> Record | None:
+    """Return the record of a job; None if something of it is missing.
+
+    Args:
+        job: The job.
+        folder: Folder that holds the jobs' folders.
+    """
+    record = Record.read(folder / job.name)
+    return record if record.is_whole(job) else None
+
+
+def perform_all(
+    plan: Sequence[Job],
+    folder: Path,
+    workers: Workers,
+    reporter: Reporter,
+    title: str,
+    *,
+    keep_going: bool = False,
+) -> dict[str, str]:
+    """Perform what is not done yet, each job in a process of its own.
+
+    Args:
+        plan: Jobs; those that are the same are performed once. A job waits for the one it starts
+            from.
+        folder: Folder that holds the jobs' folders.
+        workers: Jobs at a time, or an executor.
+        reporter: Shows progress.
+        title: What to call the work there.
+        keep_going: Perform the other jobs if one fails.
+
+    Returns:
+        Name of each job that failed to its reason; empty unless `keep_going`.
+
+    Raises:
+        MeasurementError: A job failed; its log says why. The others' results are kept.
+        OptionError: Another process performs jobs in that folder.
+    """
+    jobs = list({job.name: job for job in plan}.values())
+    left = [job for job in jobs if record_of(job, folder) is None]
+    running: dict[Future[None], Job] = {}
+    failures: dict[str, str] = {}
+    require_writable(folder / LOG)
+    lock, stop = locked(folder), Stop()
+    with reporter.task(title, len(jobs)) as advance, executor_of(workers) as pool:
+        for _ in range(len(jobs) - len(left)):
+            advance()
+        try:
+            while left or running:
+                waited_for = {job.name for job in (*left, *running.values())}
+                for job in [job for job in left if job.after not in waited_for]:
+                    left.remove(job)
+                    own = folder.resolve() / job.name
+                    job.write(own)
+                    running[pool.submit(_perform_apart, str(own), stop)] = job
+                # Wakes up now and then, so that Ctrl-C is heard.
+                finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    job = running.pop(future)
+                    future.result()
+                    if record_of(job, folder) is None:
+                        failures[job.name] = _failure(folder / job.name)
+                        if not keep_going:
+                            raise MeasurementError(failures[job.name])
+                    advance(note=job.short)
+        finally:
+            stop.set()
+            for future in running:
+                future.cancel()
+            lock.close()
+    return failures
+
+
+def perform_here(plan: Sequence[Job], folder: Path, reporter: Reporter) -> list[Record]:
+    """Perform jobs one after another in this process and return their records.
+
+    Args:
+        plan: Jobs; one that another starts from comes before it.
+        folder: Folder that holds the jobs' folders.
+        reporter: Shows progress.
+    """
+    records: list[Record] = []
+    for job in plan:
+        own = folder / job.name
+        job.write(own)
+        records.append(perform(job, own, reporter))
+    return records
+
+
+def _perform_apart(folder: str, stop: Stop) -> None:
+    """Perform the job in a folder in another process, until nobody waits for it any more."""
+    with Path(folder, LOG).open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "ugat_marl.experiments.jobs", folder],
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={"OMP_NUM_THREADS": "1", **os.environ},  # a job has a core
+            start_new_session=True,  # Ctrl-C is for this process; it ends the others itself
+        )
+    try:
+        while process.poll() is None and not stop.wait(0.1):
+            pass
+    finally:
+        _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Close the input of a job, which then ends itself and its simulations."""
+    assert process.stdin is not None
+    process.stdin.close()
+    try:
+        process.wait(10)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _failure(folder: Path) -> str:
+    text = (folder / LOG).read_text(errors="replace").strip()
+    return f"{folder.name} failed: {text[-_TAIL:]} (whole log: {folder / LOG})"

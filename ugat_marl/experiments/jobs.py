@@ -1,0 +1,436 @@
+"""Jobs: one setting, trained with one seed and judged in its domains, in a folder of its own.
+
+``python -m ugat_marl.experiments.jobs FOLDER`` performs what ``FOLDER/job.json`` says. It ends when
+its standard input does, so that no training outlives the command that wanted it. An interrupted job
+goes on where it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+import re
+import sys
+from collections.abc import Generator, Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+from rich.console import Console
+
+from ugat_marl.data import Run, Scores, remove_temporaries, versions_of
+from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.envs import AnyParallelEnv, parallel_env
+from ugat_marl.errors import OptionError, UgatMarlError
+from ugat_marl.experiments.evaluation import (
+    TUNING_SEED,
+    best_rules,
+    evaluate,
+    fixed_policy,
+    rule_factory,
+)
+from ugat_marl.experiments.queues import QUEUES, QueueRecord
+from ugat_marl.experiments.randomised import randomised_env
+from ugat_marl.experiments.settings import Setting
+from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
+from ugat_marl.experiments.tuning import TUNED_RULES, VERSION, tuned_rules
+from ugat_marl.files import write_whole
+from ugat_marl.grounding import RandomDelays
+from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory
+from ugat_marl.progress import Bars, Reporter
+from ugat_marl.simulation import end_with_input
+
+JOB, SCORES, POLICY, LEARNER, RULE_FILE = (
+    "job.json", "scores.json", "policy.pt", "learner.pt", "rule.txt",
+)  # fmt: skip
+
+EVALUATION_SEED = 1000
+"""First seed of the reported episodes; apart from those of training and of the search for rules."""
+
+
+def evaluation_seeds(count: int) -> tuple[int, ...]:
+    """Return the seeds of the reported episodes."""
+    return tuple(range(EVALUATION_SEED, EVALUATION_SEED + count))
+
+
+@dataclass(frozen=True)
+class Job:
+    """A setting with a scenario, a training seed, and what it is judged by.
+
+    Attributes:
+        setting: How the policy is made, and what it is called.
+        scenario: Scenario as a user names it.
+        sim: The simulation.
+        target: The real domain, if the policy depends on it.
+        seed: Seed of the training; None for a rule, which has none.
+        episodes: Training episodes in all, those of `start` included; 0 for a rule.
+        start: File of the learner it goes on from, seen from the folder that holds the jobs'
+            folders; None for a fresh one.
+        every: Episodes from one evaluation to the next; 0 to judge at the end alone.
+        last: So many of the last episodes are followed by an evaluation each.
+        options: Options of the environments.
+        rule_budget: Most episodes in which each rule is tuned, for "rule"; None to take the rules
+            with their usual numbers.
+        tuning_seeds: Episodes behind the choice among the rules.
+        domains: Domains it is judged in; no part of its identity.
+        evaluation_seeds: Seeds of the episodes of each evaluation; no part of it either.
+        device: Where it is trained; no part of it, as results agree within tolerance.
+    """
+
+    setting: Setting
+    scenario: str
+    sim: str = "sim"
+    target: str | None = None
+    seed: int | None = None
+    episodes: int = 0
+    start: str | None = None
+    every: int = 0
+    last: int = 1
+    options: Mapping[str, str | int | float | None] = field(default_factory=dict)
+    rule_budget: int | None = None
+    tuning_seeds: int = 2
+    domains: tuple[str, ...] = ()
+    evaluation_seeds: tuple[int, ...] = ()
+    device: str = "cpu"
+
+    @property
+    def marks(self) -> tuple[int, ...]:
+        """Numbers of training episodes after which it is judged, ascending."""
+        late = range(max(1, self.episodes - self.last + 1), self.episodes)
+        often = range(self.every, self.episodes, self.every) if self.every else ()
+        return tuple(sorted({*often, *late, self.episodes}))
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Everything that decides the policy: jobs with the same are the same job.
+
+        A job that is judged every few episodes stays the same when more episodes are wanted.
+
+        Raises:
+            OptionError: The learner's library is not installed.
+        """
+        worlds = sorted({w for w in (self.sim, self.target, self.setting.world) if w})
+        found = {
+            "setting": self.setting.identity,
+            "seed": self.seed,
+            "start": self.start,
+            "every": self.every,
+            "options": dict(self.options),
+            "worlds": {world: _hash(self.scenario, world) for world in worlds},
+            "versions": versions_of("eclipse-sumo", "torch"),
+        }
+        if self.setting.recipe == "rule":
+            found |= {"target": self.target, "tuning": VERSION, "rule_budget": self.rule_budget}
+            return {**found, "tuning_seeds": self.tuning_seeds}
+        if self.setting.knows_target:
+            found["target"] = self.target
+        return found if self.every else {**found, "episodes": self.episodes}
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """Ten letters for `identity`."""
+        text = json.dumps(self.identity, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+    @functools.cached_property
+    def name(self) -> str:
+        """Name of its folder: what people look for, then the digest."""
+        setting = self.setting
+        learner = "" if setting.recipe == "rule" else setting.learner.name
+        place = word(self.scenario), learner, setting.kind, setting.world or "", self.target or ""
+        parts = [*place, self._seed_word, self.digest]
+        words = (re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in parts)
+        return "-".join(part for part in words if part)
+
+    @property
+    def short(self) -> str:
+        """Name for a progress bar."""
+        return " ".join(filter(None, (self.setting.name, self.target, self._seed_word)))
+
+    @property
+    def after(self) -> str | None:
+        """Name of the job that must be done before; None if there is none."""
+        return None if self.start is None else Path(self.start).parts[0]
+
+    @property
+    def duration_s(self) -> float | None:
+        """Length of an episode in s; None for the scenario's own."""
+        duration_s = self.options.get("duration_s")
+        return None if duration_s is None else float(duration_s)
+
+    @property
+    def _seed_word(self) -> str:
+        return "" if self.seed is None else f"s{self.seed}"
+
+    def write(self, folder: Path) -> None:
+        """Write ``job.json``, whole or not at all."""
+        write_whole(folder / JOB, json.dumps(asdict(self), indent=1) + "\n")
+
+
+def word(scenario: str) -> str:
+    """Return a scenario as a part of the name of a file."""
+    return re.sub(r"[^\w.+-]+", "-", Path(scenario).name.removesuffix(".sumocfg")).strip("-")
+
+
+def file_name(name: str) -> str:
+    """Return the name of a policy as the name of a file."""
+    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
+
+
+def file_names(names: Iterable[str]) -> list[str]:
+    """Return names of files for policies, all different: a second one of a kind ends in -2."""
+    found: list[str] = []
+    for name in names:
+        own = [file_name(name), *(f"{file_name(name)}-{k}" for k in range(2, len(found) + 2))]
+        found.append(next(file for file in own if file not in found))
+    return found
+
+
+@functools.cache
+def _hash(scenario: str, domain: str) -> str:
+    return in_domain(load_scenario(scenario), domain).hash
+
+
+@dataclass
+class Record:
+    """Result of a job: every episode it was judged by, and what its training took.
+
+    Attributes:
+        scores: Scores by episodes trained, domain and seed.
+        episodes: Training episodes that `seconds` and `own_seconds` are the sum of.
+        seconds: Time of training in s, evaluations left out.
+        own_seconds: Processor time of the learner's process in it, in s.
+    """
+
+    scores: dict[tuple[int, str, int], Scores] = field(default_factory=dict)
+    episodes: int = 0
+    seconds: float = 0.0
+    own_seconds: float = 0.0
+
+    @classmethod
+    def read(cls, folder: Path) -> Record:
+        """Read what `write` wrote; an empty record if there is none, or a broken one."""
+        try:
+            content = json.loads((folder / SCORES).read_text(encoding="utf-8"))
+            scores: dict[tuple[int, str, int], Scores] = {}
+            for row in content["episodes"]:
+                key = int(row.pop("trained")), str(row.pop("domain")), int(row.pop("seed"))
+                scores[key] = Scores(**row)
+            return cls(scores, **content["training"])
+        except (OSError, ValueError, TypeError, KeyError, AttributeError):
+            return cls()
+
+    def write(self, folder: Path) -> None:
+        """Write it, whole or not at all."""
+        rows = [
+            {"trained": trained, "domain": domain, "seed": seed, **asdict(scores)}
+            for (trained, domain, seed), scores in self.scores.items()
+        ]
+        training = {name: getattr(self, name) for name in ("episodes", "seconds", "own_seconds")}
+        content = json.dumps({"training": training, "episodes": rows}, indent=1)
+        write_whole(folder / SCORES, content + "\n")
+
+    def add(self, effort: Effort) -> None:
+        """Count some episodes of training."""
+        self.episodes += effort.episodes
+        self.seconds += effort.seconds
+        self.own_seconds += effort.own_seconds
+
+    def missing(self, job: Job, mark: int) -> dict[str, list[int]]:
+        """Return the seeds that were not played after so many episodes, by domain."""
+        seeds = {
+            domain: [s for s in job.evaluation_seeds if (mark, domain, s) not in self.scores]
+            for domain in job.domains
+        }
+        return {domain: left for domain, left in seeds.items() if left}
+
+    def is_whole(self, job: Job) -> bool:
+        """Return True if nothing of the job is missing."""
+        return not any(self.missing(job, mark) for mark in job.marks)
+
+    def played(self, job: Job, mark: int, domain: str) -> list[Scores]:
+        """Return the scores of an evaluation, one per seed, in the order of the job's seeds."""
+        return [self.scores[mark, domain, seed] for seed in job.evaluation_seeds]
+
+
+def perform(job: Job, folder: Path, reporter: Reporter) -> Record:
+    """Train what is not trained yet, judge what was not judged yet, keep it.
+
+    Args:
+        job: What to do.
+        folder: Folder of the job.
+        reporter: Shows progress.
+
+    Raises:
+        OptionError: The training has gone beyond an evaluation that is missing.
+    """
+    record = Record.read(folder)
+    if record.is_whole(job):
+        return record
+    if job.setting.recipe == "rule":
+        _judge(job, 0, rule_factory(_rule(job, folder, reporter)), record, folder, reporter)
+        return record
+    trained = _grounded if job.setting.ugat is not None else _plain
+    with contextlib.closing(trained(job, folder, record, reporter)) as policies:
+        for mark, policy in policies:
+            _judge(job, mark, fixed_policy(policy), record, folder, reporter)
+    return record
+
+
+def train_job(job: Job, folder: Path, reporter: Reporter) -> Policy:
+    """Train a job without judging it, and return its policy.
+
+    Args:
+        job: What to train.
+        folder: Folder of the job.
+        reporter: Shows progress.
+    """
+    *_, (_, policy) = _plain(job, folder, Record(), reporter)
+    return policy
+
+
+def _judge(
+    job: Job, mark: int, factory: PolicyFactory, record: Record, folder: Path, reporter: Reporter
+) -> None:
+    """Play what is missing after so many episodes; keep it domain by domain."""
+    scenario = load_scenario(job.scenario)
+    for domain, seeds in record.missing(job, mark).items():
+        queues = QueueRecord()
+        found = evaluate(
+            scenario,
+            {"policy": factory},
+            [domain],
+            seeds,
+            duration_s=job.duration_s,
+            workers=1,
+            reporter=reporter,
+            title=f"evaluating in {domain}",
+            watch=queues.watch,
+        )
+        record.scores |= {(mark, domain, r.seed): r.scores for r in found.results}
+        if mark == job.episodes:
+            queues.write(folder / QUEUES, keep=True)  # before what says that these were played
+        record.write(folder)
+
+
+def _rule(job: Job, folder: Path, reporter: Reporter) -> str:
+    """Return the rule that is best in the real domain, searched on seeds of its own."""
+    saved, rules, target = folder / RULE_FILE, job.setting.rules, job.target or job.sim
+    if not saved.exists():
+        scenario = load_scenario(job.scenario)
+        common: dict[str, Any] = {
+            "seeds": [TUNING_SEED + k for k in range(job.tuning_seeds)],
+            "duration_s": job.duration_s,
+            "workers": 1,
+            "reporter": reporter,
+        }
+        if job.rule_budget is not None:
+            names = rules or TUNED_RULES
+            (best,) = tuned_rules(
+                scenario, [target], job.rule_budget, names=names, **common
+            ).values()
+        elif len(rules) == 1:
+            (best,) = rules
+        else:
+            (best,) = best_rules(
+                scenario, [target], rules=rules or STANDARD_RULES, **common
+            ).values()
+        write_whole(saved, best)
+    return saved.read_text()
+
+
+def _plain(
+    job: Job, folder: Path, record: Record, reporter: Reporter
+) -> Generator[tuple[int, Policy], None, None]:
+    """Train without grounding and yield the policy at every mark where something is missing."""
+    assert job.seed is not None
+    make = job.setting.learner.factory(job.device)
+    with contextlib.closing(_world(job)) as env:
+        learner, progress = make(env, job.seed), folder / LEARNER
+        before = _start(job, folder)
+        if progress.exists():
+            learner.load(progress)
+        elif before is not None:
+            learner.load(before)
+        marks = [mark for mark in job.marks if record.missing(job, mark) or mark == job.episodes]
+        if marks[0] < learner.episodes:
+            raise OptionError(
+                f"{folder} has no evaluation of {len(job.evaluation_seeds)} episodes after "
+                f"{marks[0]} of training and is beyond it; remove it, or name another --runs"
+            )
+
+        def keep(effort: Effort) -> None:
+            record.add(effort)
+            if job.every:
+                record.write(folder)
+            learner.save(progress)
+
+        left = max(0, job.episodes - learner.episodes)
+        with reporter.task(f"training: {job.setting.name}", left) as advance:
+            for mark, policy in train_through(
+                learner, env, marks, job.seed, on_episode=lambda *_: advance(), on_chunk=keep
+            ):
+                _save(policy, folder / POLICY)
+                yield mark, policy
+
+
+def _grounded(
+    job: Job, folder: Path, record: Record, reporter: Reporter
+) -> Generator[tuple[int, Policy], None, None]:
+    """Train by UGAT and yield the policy."""
+    del record
+    ugat, make = job.setting.ugat, job.setting.learner.factory(job.device)
+    assert ugat is not None and job.target is not None and job.seed is not None
+    scenario, options = load_scenario(job.scenario), dict[str, Any](job.options)
+    worlds = simulated_worlds(scenario, job.sim, job.target, ugat, options, workers=1)
+    with (
+        contextlib.closing(parallel_env(scenario, job.sim, **options)) as env,
+        contextlib.closing(Run(folder, job.identity, resume=True, reporter=reporter)) as run,
+    ):
+        start = _start(job, folder)
+        state = train_grounded(
+            ugat, make, env, worlds, job.seed, run, start=start, device=job.device
+        )
+    policy = state.learner.policy()
+    _save(policy, folder / POLICY)
+    yield job.episodes, policy
+
+
+def _start(job: Job, folder: Path) -> Path | None:
+    return None if job.start is None else folder.parent / job.start
+
+
+def _save(policy: Any, path: Path) -> None:
+    """Save a policy, if it is one that can be."""
+    if hasattr(policy, "save"):
+        policy.save(path)
+
+
+def _world(job: Job) -> AnyParallelEnv:
+    """Return the environment of plain training."""
+    setting, options = job.setting, dict[str, Any](job.options)
+    scenario = load_scenario(job.scenario)
+    if setting.recipe == "randomised":
+        return randomised_env(scenario, options, job.sim)
+    env = parallel_env(scenario, setting.world or job.target or job.sim, **options)
+    return RandomDelays(env, setting.most_delay_s) if setting.recipe == "delays" else env
+
+
+def main(folder: Path) -> int:
+    """Perform the job in a folder and return the exit code."""
+    end_with_input()
+    remove_temporaries(folder)
+    try:
+        job = TypeAdapter(Job).validate_json((folder / JOB).read_bytes())
+        perform(job, folder, Bars(Console(width=100)))
+    except UgatMarlError as error:
+        print(" ".join(str(error).split()), file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,463 @@
+"""Tables of the UGAT paper, and those it lacks: their rows as lists of settings, and their jobs.
+
+A table is a list of settings (`settings_of`), each trained for every seed and, if it depends on the
+real domain, for every domain (`Planner`), and put together as a `Comparison` (`compare`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ugat_marl.effects import describe, load_scenario, scenario_of
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.experiments.comparison import Comparison, Trial
+from ugat_marl.experiments.driver import perform_all, record_of
+from ugat_marl.experiments.jobs import LEARNER, Job, evaluation_seeds
+from ugat_marl.experiments.settings import (
+    CONTROL,
+    DIRECT,
+    FINE_TUNED,
+    GROUNDED_NAME,
+    ORACLE,
+    RANDOM_DELAY,
+    RANDOMISED,
+    RULE,
+    LearnerSpec,
+    Setting,
+)
+from ugat_marl.experiments.training import check_worlds
+from ugat_marl.experiments.tuning import BUDGET, LEAST_BUDGET
+from ugat_marl.grounding import (
+    MATCHED_REWARD,
+    FitConfig,
+    GateConfig,
+    InputsConfig,
+    TimedConfig,
+    UgatConfig,
+)
+from ugat_marl.parallel import Workers
+from ugat_marl.policies import DQN_NAME, DQNConfig, require_device_name
+from ugat_marl.progress import Reporter
+
+TABLES = ("main", "ablation", "alpha", "uncertainty", "gap")
+
+# --- rows ---------------------------------------------------------------------------------------
+
+
+def settings_of(
+    table: str,
+    ugat: UgatConfig,
+    sim: str,
+    groundings: Sequence[str] = ("phase", "timed"),
+    constants: Sequence[int] = (1, 2, 3, 4, 5),
+    learner: LearnerSpec | None = None,
+) -> list[Setting]:
+    """Return the rows of a table.
+
+    Args:
+        table: One of `TABLES`.
+        ugat: Settings that the rows share.
+        sim: The simulation.
+        groundings: Kinds of grounding to try: "phase", "timed".
+        constants: Constant delays in s that "main" sweeps.
+        learner: The algorithm that learns in all of them; None for DQN with its usual settings.
+
+    Raises:
+        OptionError: A grounding, delay or table that does not exist.
+    """
+    for grounding in groundings:
+        if grounding not in GROUNDED_NAME:
+            raise OptionError(f"grounding {grounding!r}: allowed are phase and timed")
+    if not groundings:
+        raise OptionError("groundings is empty; name phase, timed, or both")
+    if wrong := [seconds for seconds in constants if seconds < 1]:
+        raise OptionError(f"constants holds {wrong[0]}: delays are whole seconds, at least 1")
+    # The paper's grounding obeys its models from the start.
+    least = {"phase": None, "timed": ugat.least_accuracy}
+    alone = replace(ugat, timed=replace(ugat.timed, match=False))  # matching is a row of its own
+    bases = {g: replace(alone, grounding=g, least_accuracy=least[g]) for g in groundings}
+    direct, rule = Setting(DIRECT, "direct"), Setting(RULE, "rule")
+    if table == "main":
+        rows = [direct, *_grounded(bases), *_controls(ugat, sim, constants), rule]
+    elif table == "ablation":
+        rows = [direct, Setting(CONTROL, "further", sim)]
+        rows += [row for name, base in bases.items() for row in _ablated(name, base)]
+    elif table == "alpha":
+        rows = [direct, *(row for name, base in bases.items() for row in _alphas(name, base))]
+    elif table == "uncertainty":
+        rows = [direct, *(row for name, base in bases.items() for row in _methods(name, base))]
+    elif table == "gap":
+        rows = [direct, rule]
+    else:
+        raise OptionError(f"table {table!r}: allowed are {', '.join(TABLES)}")
+    return [replace(row, learner=learner or LearnerSpec()) for row in rows]
+
+
+def constant_name(seconds: int) -> str:
+    """Return the name of the row of a constant delay."""
+    return f"constant delay {seconds} s"
+
+
+def matched_name(grounding: str) -> str:
+    """Return the name of the row of a grounding that matches rewards."""
+    return f"{GROUNDED_NAME[grounding]}: rewards matched"
+
+
+def late_in(sim: str, seconds: int) -> str:
+    """Return the simulation with every green late by so many seconds.
+
+    Raises:
+        OptionError: It is a scenario of its own, to which no effect can be added by name.
+    """
+    if scenario_of(sim) is not None:
+        raise OptionError(
+            f"sim = {sim!r} is a scenario of its own, in which no greens can be delayed: give "
+            "--constants without any number"
+        )
+    late = f"late_green=*,{seconds}"
+    return late if describe(sim) == "sim" else f"{describe(sim)}+{late}"
+
+
+def _ugat(name: str, ugat: UgatConfig) -> Setting:
+    return Setting(name, "grounded", ugat=ugat)
+
+
+def _grounded(bases: Mapping[str, UgatConfig]) -> list[Setting]:
+    rows = [_ugat(GROUNDED_NAME[name], base) for name, base in bases.items()]
+    return rows + [row for name, base in bases.items() for row in _matching(name, base)]
+
+
+def _matching(name: str, base: UgatConfig) -> list[Setting]:
+    """Timed grounding that matches rewards; nothing for the phase's, which cannot."""
+    ugat = replace(base, timed=replace(base.timed, match=True))
+    return [_ugat(matched_name(name), ugat)] * ugat.matches
+
+
+def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Setting]:
+    seen = ugat.iterations * ugat.real_rollouts
+    return [
+        Setting(CONTROL, "further", sim),
+        Setting(RANDOMISED, "randomised"),
+        Setting(RANDOM_DELAY, "delays", sim),
+        *(Setting(constant_name(s), "further", late_in(sim, s)) for s in constants),
+        Setting(FINE_TUNED, "further", episodes=seen),
+        Setting(ORACLE, "scratch"),
+    ]
+
+
+def _ablated(name: str, base: UgatConfig) -> list[Setting]:
+    """Table 3 of the paper: static threshold, no uncertainty; and every other part alone."""
+    full = GROUNDED_NAME[name]
+    ungated = replace(base, gate=replace(base.gate, mode="infinite"))
+    variants = {
+        full: base,
+        f"{full}: α = 0.5": replace(base, gate=_static(base, 0.5)),
+        f"{full}: α from the first fit on": replace(base, gate=replace(base.gate, start="fitted")),
+        f"{full}: no gate": ungated,
+        f"{full}: no uncertainty (GAT)": replace(
+            ungated, fit=replace(base.fit, uncertainty="none")
+        ),
+    }
+    proven = replace(base, least_accuracy=0.0)
+    if base != proven:
+        variants[f"{full}: where f and h are proven"] = proven
+    rows = [_ugat(variant, ugat) for variant, ugat in variants.items()]
+    return [*rows, _other_answers(name, base), *_matching(name, base)]
+
+
+def _other_answers(name: str, base: UgatConfig) -> Setting:
+    """Another h: of the phase's one that is trained on means, of the timed one none at all."""
+    full = GROUNDED_NAME[name]
+    if name == "phase":
+        smoothed = replace(base, fit=replace(base.fit, pairs="smoothed"))
+        return _ugat(f"{full}: h on smoothed pairs", smoothed)
+    constants = replace(base, timed=replace(base.timed, answer="constant"))
+    return _ugat(f"{full}: lost times without h", constants)
+
+
+def _alphas(name: str, base: UgatConfig) -> list[Setting]:
+    full = GROUNDED_NAME[name]
+    alphas = (0.2, 0.4, 0.5, 0.6, 0.8)
+    pooled = replace(base, gate=replace(base.gate, scope="pooled"))
+    return [
+        *(_ugat(f"{full}: α = {a}", replace(base, gate=_static(base, a))) for a in alphas),
+        _ugat(full, base),
+        _ugat(f"{full}: α pooled over the network", pooled),
+    ]
+
+
+def _static(base: UgatConfig, alpha: float) -> GateConfig:
+    return replace(base.gate, mode="static", static_alpha=alpha)
+
+
+def _methods(name: str, base: UgatConfig) -> list[Setting]:
+    full = GROUNDED_NAME[name]
+    methods: dict[str, FitConfig] = {
+        "evidential": replace(base.fit, uncertainty="edl"),
+        "Concrete Dropout": replace(base.fit, uncertainty="dropout"),
+        "Deep Ensembles": replace(base.fit, uncertainty="ensemble"),
+        "none (GAT)": replace(base.fit, uncertainty="none"),
+    }
+    return [_ugat(f"{full}: {method}", replace(base, fit=fit)) for method, fit in methods.items()]
+
+
+# --- tables -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PaperConfig:
+    """Options of a table: what is trained, how often, and how it is judged.
+
+    Attributes:
+        scenario: Scenarios, one table each.
+        domains: The real domains; default: V1 to V4, for "ablation" and "alpha" only V1, as in
+            the paper.
+        sim: The simulation to train in.
+        seeds: Number of trainings of every setting, with the seeds 0, 1, ...
+        first_seed: First of these seeds.
+        episodes: Plain training before the first iteration.
+        iterations: Rounds of rolling out, fitting and grounded training.
+        grounded_episodes: Episodes of training per iteration.
+        sim_rollouts: Episodes added to D_sim per iteration.
+        real_rollouts: Episodes added to D_real per iteration.
+        groundings: Kinds of grounding: phase, timed, or both.
+        constants: Constant delays in s that "main" sweeps.
+        rows: Names of the rows to train, and direct transfer with them; default: all of the table.
+        evaluation_seeds: Episodes every policy is played for in each domain.
+        rule_budget: Most episodes in which each rule is tuned in each domain.
+        observation: What agents see.
+        reward: What agents want.
+        neighbours: How many roads away intersections are seen too.
+        duration_s: Length of an episode in s; default: the scenario's own.
+        learner: The algorithm that learns in all rows: dqn, the suite's own, or a baseline
+            (docs/how-to/learners.md).
+        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; the
+            parts of a tuple are divided by commas.
+        device: Where dqn's updates and the fits are computed: cpu, cuda, or cuda:N; all trainings
+            share it.
+        dqn: Settings of dqn.
+        inputs: What f and h see beside the intersection's own state and action.
+        fit: How f and h are fitted, but for what a row says itself.
+        gate: How alpha is found, but for what a row says itself.
+        timed: How greens are delayed, but for what a row says itself.
+    """
+
+    scenario: tuple[str, ...] = ("single-v1",)
+    domains: tuple[str, ...] = ()
+    sim: str = "sim"
+    seeds: int = 5
+    first_seed: int = 0
+    episodes: int = 60
+    iterations: int = 4
+    grounded_episodes: int = 10
+    sim_rollouts: int = 3
+    real_rollouts: int = 3
+    groundings: tuple[str, ...] = ("phase", "timed")
+    constants: tuple[int, ...] = (1, 2, 3, 4, 5)
+    rows: tuple[str, ...] = ()
+    evaluation_seeds: int = 5
+    rule_budget: int = BUDGET
+    observation: str = "count"
+    reward: str = "queue"
+    neighbours: int = 0
+    duration_s: float | None = None
+    learner: str = DQN_NAME
+    learner_settings: tuple[str, ...] = ()
+    device: str = "cpu"
+    dqn: DQNConfig = field(default_factory=DQNConfig)
+    inputs: InputsConfig = field(default_factory=InputsConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    gate: GateConfig = field(default_factory=GateConfig)
+    timed: TimedConfig = field(default_factory=TimedConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("seeds", "evaluation_seeds", "episodes"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if self.rule_budget < LEAST_BUDGET:
+            raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
+        require_device_name(self.device)
+        if not self.scenario:
+            raise OptionError("scenario is empty; name one, such as single-v1")
+        names = [describe(domain) for domain in self.domains]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
+        if describe(self.sim) in names:
+            raise OptionError(f"domain {self.sim!r} is the simulation itself; name real ones")
+        if self.timed.match:
+            raise OptionError("rewards are matched in a row of its own; leave timed.match out")
+        _ = self.ugat, self.spec  # refuse what is impossible
+
+    @property
+    def ugat(self) -> UgatConfig:
+        """Settings of the algorithm that all rows share."""
+        return UgatConfig(
+            pretrain_episodes=self.episodes,
+            iterations=self.iterations,
+            grounded_episodes=self.grounded_episodes,
+            sim_rollouts=self.sim_rollouts,
+            real_rollouts=self.real_rollouts,
+            inputs=self.inputs,
+            fit=self.fit,
+            gate=self.gate,
+            timed=self.timed,
+        )
+
+    @property
+    def spec(self) -> LearnerSpec:
+        """The learner of all rows."""
+        return LearnerSpec(self.learner, self.learner_settings, self.dqn)
+
+    @property
+    def all_episodes(self) -> int:
+        """Episodes every policy but direct transfer is trained for in all."""
+        return self.episodes + self.iterations * self.grounded_episodes
+
+    def targets(self, table: str) -> list[str]:
+        """Return the real domains of a table."""
+        default = ("V1",) if table in ("ablation", "alpha") else ("V1", "V2", "V3", "V4")
+        found = [describe(domain) for domain in self.domains or default]
+        if left := [domain for domain in found if domain != describe(self.sim)]:
+            return left
+        raise OptionError(
+            f"table {table!r} has {self.sim} alone, to which sim is set; name domains"
+        )
+
+    def settings(self, table: str) -> list[Setting]:
+        """Return the rows of a table, without those that match rewards which cannot be matched.
+
+        Raises:
+            UnknownNameError: The table has no row of that name.
+        """
+        found = settings_of(table, self.ugat, self.sim, self.groundings, self.constants, self.spec)
+        if self.reward != MATCHED_REWARD:
+            found = [setting for setting in found if not setting.matches]
+        names = [setting.name for setting in found]
+        for row in self.rows:
+            if row not in names:
+                raise UnknownNameError(f"row of table {table!r}:", row, names)
+        return [item for item in found if not self.rows or item.name in (DIRECT, *self.rows)]
+
+
+def compare(
+    table: str,
+    scenario: str,
+    config: PaperConfig,
+    folder: Path,
+    workers: Workers,
+    reporter: Reporter,
+) -> Comparison:
+    """Train and play whatever a table still lacks, and put it together.
+
+    Args:
+        table: One of `TABLES`.
+        scenario: One of the scenarios.
+        config: What is trained.
+        folder: Where the folders of the jobs lie; finished ones are used again.
+        workers: Jobs at a time, or an executor.
+        reporter: Shows progress.
+    """
+    loaded = load_scenario(scenario)
+    rows = config.settings(table)
+    config.spec.factory(config.device)  # what is not there is an error now, not in a job's log
+    timed = any(row.ugat is not None and row.ugat.grounding == "timed" for row in rows)
+    for target in config.targets(table):
+        check_worlds(loaded, config.sim, target, timed)  # an error now, not in an hour
+    planner = Planner(table, scenario, config)
+    plan = [job for row in rows for job in planner.jobs(row)]
+    perform_all(planner.bases + plan, folder, workers, reporter, f"paper {table}")
+    trials = [trial for row in rows for trial in planner.trials(row, folder)]
+    late = [constant_name(seconds) for seconds in config.constants]
+    return Comparison(
+        loaded.id,
+        loaded.hash,
+        describe(config.sim),
+        tuple(trials),
+        {"table": table, **({} if config.learner == DQN_NAME else {"learner": config.learner})},
+        constants=tuple(row.name for row in rows if row.name in late),
+        grounded=tuple(row.name for row in rows if row.recipe == "grounded"),
+    )
+
+
+class Planner:
+    """The jobs of a table: rows x domains x seeds.
+
+    Args:
+        table: One of `TABLES`.
+        scenario: One of the scenarios.
+        config: Options of the table.
+    """
+
+    def __init__(self, table: str, scenario: str, config: PaperConfig) -> None:
+        self._scenario = scenario
+        self._config = config
+        self._targets = config.targets(table)
+        self._seeds = range(config.first_seed, config.first_seed + config.seeds)
+        direct = Setting(DIRECT, "direct", learner=config.spec)
+        self._bases = {seed: self._job(direct, None, seed) for seed in self._seeds}
+
+    @property
+    def bases(self) -> list[Job]:
+        """Plain training, one per seed: what other jobs start from."""
+        return list(self._bases.values())
+
+    def jobs(self, row: Setting) -> list[Job]:
+        """Return all jobs of a row."""
+        return [job for _, job in self._columns(row)]
+
+    def trials(self, row: Setting, folder: Path) -> list[Trial]:
+        """Return the episodes of a row's finished jobs, column by column.
+
+        Args:
+            row: A setting of the table.
+            folder: Folder that holds the jobs' folders.
+        """
+        found: list[Trial] = []
+        for target, job in self._columns(row):
+            record = record_of(job, folder)
+            assert record is not None
+            for domain in sorted({self._config.sim, target}):
+                scores = record.played(job, job.episodes, domain)
+                for seed, own in zip(job.evaluation_seeds, scores, strict=True):
+                    found.append(Trial(row.name, target, describe(domain), job.seed, seed, own))
+        return found
+
+    def _columns(self, row: Setting) -> list[tuple[str, Job]]:
+        seeds: Sequence[int | None] = [None] if row.recipe == "rule" else list(self._seeds)
+        return [
+            (target, self._job(row, target if row.knows_target else None, seed))
+            for target in self._targets
+            for seed in seeds
+        ]
+
+    def _job(self, row: Setting, target: str | None, seed: int | None) -> Job:
+        config = self._config
+        base = self._bases[seed] if row.begins_with_direct and seed is not None else None
+        return Job(
+            setting=row,
+            scenario=self._scenario,
+            sim=config.sim,
+            target=target,
+            seed=seed,
+            episodes=self._episodes(row),
+            start=None if base is None else f"{base.name}/{LEARNER}",
+            options={
+                "observation": config.observation,
+                "reward": config.reward,
+                "neighbours": config.neighbours,
+                "duration_s": config.duration_s,
+            },
+            rule_budget=config.rule_budget if row.recipe == "rule" else None,
+            domains=(config.sim, target) if target else (config.sim, *self._targets),
+            evaluation_seeds=evaluation_seeds(config.evaluation_seeds),
+            device=config.device,
+        )
+
+    def _episodes(self, row: Setting) -> int:
+        """Return the number of training episodes in all."""
+        config = self._config
+        if row.episodes is not None:
+            return config.episodes + row.episodes
+        return {"direct": config.episodes, "rule": 0}.get(row.recipe, config.all_episodes)

@@ -1,0 +1,152 @@
+"""Settings: ways to come to a policy, each with the name its row has in every table."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.grounding import UgatConfig
+from ugat_marl.policies import (
+    DQN_NAME,
+    DQNConfig,
+    LearnerFactory,
+    learner_factory,
+    library_of,
+    require_known,
+    settings_of,
+)
+
+DIRECT, UGAT, TIMED = "direct transfer", "UGAT", "UGAT, timed"
+CONTROL = "more plain sim"
+CORRECTED = "corrected sim"
+RANDOMISED = "domain randomisation"
+RANDOM_DELAY = "random delay"
+FINE_TUNED = "fine-tuned on the same data"
+ORACLE = "trained in real"
+RULE = "best rule, tuned there"
+
+GROUNDED_NAME = {"phase": UGAT, "timed": TIMED}
+"""Kind of grounding to the name of its row."""
+
+MOST_DELAY_S = 5
+"""Longest of the random delays of the recipe "delays", in s."""
+
+Recipe = Literal["direct", "grounded", "further", "scratch", "randomised", "delays", "rule"]
+RECIPES: tuple[Recipe, ...] = (
+    "direct", "grounded", "further", "scratch", "randomised", "delays", "rule",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LearnerSpec:
+    """The algorithm that learns, with its settings.
+
+    Attributes:
+        name: "dqn", the suite's own, or the name of a baseline.
+        settings: Settings of a baseline as ``NAME=VALUE``.
+        dqn: Settings of "dqn".
+    """
+
+    name: str = DQN_NAME
+    settings: tuple[str, ...] = ()
+    dqn: DQNConfig = field(default_factory=DQNConfig)
+
+    def __post_init__(self) -> None:
+        require_known(self.name)
+
+    def factory(self, device: str = "cpu") -> LearnerFactory:
+        """Return what makes fresh learners.
+
+        Args:
+            device: Where "dqn" computes its updates; baselines stay on the CPU.
+
+        Raises:
+            UnknownNameError: No such setting.
+            OptionError: A value is impossible, the library is not installed, or no such device.
+        """
+        return learner_factory(self.name, self.settings, self.dqn, device)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Everything that decides what is learned.
+
+        Raises:
+            OptionError: The learner's library is not installed.
+        """
+        if self.name == DQN_NAME:
+            return {"name": self.name, "settings": asdict(self.dqn)}
+        settings = settings_of(self.name, self.settings)
+        return {"name": self.name, "settings": settings, "library": library_of(self.name)}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to come to a policy; it can be written as JSON.
+
+    Attributes:
+        name: Name of its row in a table. It decides nothing about the policy.
+        recipe: "direct" (plain training in the simulation), "grounded" (UGAT), "further" (direct
+            transfer trained on in `world`), "scratch" (all episodes in `world`), "randomised" (all
+            episodes in worlds drawn at random), "delays" (direct transfer trained on in `world`
+            while greens begin late by random times), "rule" (the best rule, no training).
+        world: Domain to train in; None for the real domain of the column, or for the simulation if
+            there is none.
+        learner: The algorithm that learns.
+        ugat: Settings of UGAT, for "grounded" alone.
+        episodes: Training episodes beyond those of direct transfer; None for as many as UGAT has.
+        most_delay_s: Longest delay of "delays", in s.
+        rules: Rules among which "rule" chooses; none for all.
+    """
+
+    name: str
+    recipe: Recipe
+    world: str | None = None
+    learner: LearnerSpec = field(default_factory=LearnerSpec)
+    ugat: UgatConfig | None = None
+    episodes: int | None = None
+    most_delay_s: int = MOST_DELAY_S
+    rules: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.recipe not in RECIPES:
+            raise UnknownNameError("recipe", self.recipe, RECIPES)
+        if (self.recipe == "grounded") != (self.ugat is not None):
+            raise OptionError(
+                f"setting {self.name!r} of recipe {self.recipe!r}: give ugat with recipe "
+                '"grounded", and with no other'
+            )
+
+    @property
+    def knows_target(self) -> bool:
+        """True if the policy depends on the real domain it is judged in."""
+        by_world = self.recipe in ("further", "scratch") and self.world is None
+        return by_world or self.recipe in ("grounded", "rule")
+
+    @property
+    def begins_with_direct(self) -> bool:
+        """True if training goes on from direct transfer."""
+        return self.recipe in ("grounded", "further", "delays")
+
+    @property
+    def matches(self) -> bool:
+        """True if the rewards of both worlds are matched."""
+        return self.ugat is not None and self.ugat.matches
+
+    @property
+    def kind(self) -> str:
+        """Recipe, or the kind of grounding, as a word for names of folders."""
+        return self.ugat.grounding if self.ugat is not None else self.recipe
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Everything that decides the policy, beside where and for how long it is trained."""
+        if self.recipe == "rule":
+            return {"recipe": self.recipe, "rules": self.rules}
+        found: dict[str, Any] = {"recipe": self.recipe, "world": self.world}
+        found |= {"learner": self.learner.identity}
+        if self.ugat is not None:
+            found["ugat"] = asdict(self.ugat)
+        if self.recipe == "delays":
+            found["most_delay_s"] = self.most_delay_s
+        return found
