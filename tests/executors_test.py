@@ -219,7 +219,9 @@ class KillingPolicy:
         marks = len(list(self._how.folder.iterdir()))
         if self._decision == 3 and marks < self._how.times:
             (self._how.folder / str(marks)).touch()
-            for child in simulators():
+            victims = list(simulators())
+            assert victims
+            for child in victims:
                 os.kill(child, signal.SIGKILL)
         return self._policy.act(observations, infos)
 
@@ -234,7 +236,7 @@ def simulators() -> Iterator[int]:
                 tables[int(folder.name)] = int(parent)
     warm = [pid for pid, parent in tables.items() if parent == os.getpid()]
     for pid, parent in tables.items():
-        if parent in warm and b"simulator_worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
+        if parent in warm and b"ugat_marl.simulation" in Path(f"/proc/{pid}/cmdline").read_bytes():
             yield pid
 
 
