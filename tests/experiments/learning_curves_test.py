@@ -90,7 +90,8 @@ def test_the_page_by_hand() -> None:
     rules = {"programme": 200.0, "fixed-time:30": 150.0, "sotl": 125.0}
     found = Curves("single-v1", "sim", curves, rules, "sotl", {})
     lines = curves_page(found, CONFIG, FACTS).splitlines()
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if "| " in line]
+    table = lines[next(i for i, line in enumerate(lines) if line.startswith("| learner")) :]
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table if "| " in line]
     half = 12.706 * np.std([120, 140], ddof=1) / np.sqrt(2)
     assert cells[1][:5] == ["ippo", "wonder 1.0", "2", "20", "5.0"]
     assert (
@@ -105,7 +106,7 @@ def test_the_page_by_hand() -> None:
         "*sotl* (best tuned rule)",
     ]
     assert [row[6] for row in cells[3:]] == ["200", "150", "125"]
-    assert "    results.py --seeds 2" in lines
+    assert "results.py --seeds 2" in lines
     rows = curves_as_csv(curves).splitlines()
     assert len(rows) == 1 + 3 * 2 and rows[2] == "ippo,wonder 1.0,3,4,120.0,10.0,5.0"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,7 +16,11 @@ from rich.text import Text
 
 from ugat_marl.data import MEASURES
 from ugat_marl.experiments import SERVED, Comparison, Interval, PairedTest
+from ugat_marl.reporting.formats import PAGE_WIDTH, command_block, listed, made_with
 from ugat_marl.reporting.tables import number
+
+CERTAIN = 0.05
+"""Level of the paired tests in the paragraph of meaning."""
 
 Cell = Callable[[str, str], str]
 """Setting and domain to the text of a cell."""
@@ -52,14 +57,24 @@ def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
         direct: The setting the others are compared with.
         facts: Command, versions and processor (`bench.machine`).
     """
-    lines = [f"# {found.scenario}: {found.notes['table']}", "", *_provenance(found, facts), ""]
+    lines = [
+        f"# {found.scenario}: {found.notes['table']}",
+        "",
+        "![Change of the gap of each setting](gaps.png)",
+        "",
+        *_meaning(found, direct),
+        "",
+        *_provenance(found, facts),
+        "",
+    ]
     for title, cell in _headlines(found, direct):
         lines += [f"## {title[0].upper()}{title[1:]}", "", *_grid(found, cell), ""]
     lines += ["## Against direct transfer, seed by seed", ""]
     lines += [
         "Difference of ATT in s (95 % interval), two-sided p of the paired t-test, and in how many "
-        "of the training seeds it is lower. All are judged on the same episodes, which intervals "
-        "and tests take as given, and so is a rule, which has no training seed.",
+        "of the training seeds it is lower. All are judged",
+        "on the same episodes, which intervals and tests take as given. So is a rule, which has no "
+        "training seed.",
         "",
         *_grid(found, lambda s, t: _tested(found.test(s, direct, t)), leave_out=direct),
         "",
@@ -68,8 +83,8 @@ def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
         "## Single episodes",
         "",
         "Median of the ATT in s over all of them in the real domain, and the share of those in "
-        f"which fewer than {100 * SERVED:.0f} % of the vehicles due arrived: where two outcomes "
-        "are possible, means and intervals say little.",
+        f"which fewer than {100 * SERVED:.0f} % of the vehicles due arrived.",
+        "Where two outcomes are possible, means and intervals say little.",
         "",
         *_grid(found, _episodes(found)),
         "",
@@ -177,18 +192,44 @@ def _against_constants(found: Comparison) -> list[str]:
     return [*lines, ""]
 
 
-def _provenance(found: Comparison, facts: Mapping[str, Any]) -> list[str]:
-    versions = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
-    seeds = ", ".join(map(str, found.training_seeds))
-    cores = "1 core" if facts["cores"] == 1 else f"{facts['cores']} cores"
-    notes = [f"{key}: {value}" for key, value in found.notes.items() if key != "table"]
-    return [
-        f"    {facts['command']}",
-        "",
-        f"Training seeds {seeds}; intervals are 95 %, Student's, over them. {facts['cpu']}, "
-        f"{cores}, Python {facts['python']}, {versions}, {facts['date'][:10]}.",
-        *(["", ". ".join(notes) + "."] if notes else []),
+def _meaning(found: Comparison, direct: str) -> list[str]:
+    """Return what the table says: who is better than direct transfer, and who is best."""
+    better = [
+        setting
+        for setting in found.settings
+        if setting != direct and _better_everywhere(found, setting, direct)
     ]
+    lowest: dict[str, list[str]] = {}
+    for target in found.targets:
+        lowest.setdefault(found.best(target), []).append(target)
+    best = listed([f"`{setting}` in {listed(targets)}" for setting, targets in lowest.items()])
+    first = (
+        f"Better than direct transfer in every domain, with p < {CERTAIN:g} in each: "
+        f"{listed([f'`{setting}`' for setting in better])}."
+        if better
+        else f"No setting is better than direct transfer in every domain with p < {CERTAIN:g}."
+    )
+    return textwrap.wrap(f"{first} Lowest mean travel time: {best}.", PAGE_WIDTH)
+
+
+def _better_everywhere(found: Comparison, setting: str, direct: str) -> bool:
+    """Return whether a setting is certainly faster than another wherever it was measured."""
+    tests = [found.test(setting, direct, t) for t in found.targets if found.has(setting, t)]
+    return all(test.difference.mean < 0 and test.p < CERTAIN for test in tests)
+
+
+def _provenance(found: Comparison, facts: Mapping[str, Any]) -> list[str]:
+    cores = "1 core" if facts["cores"] == 1 else f"{facts['cores']} cores"
+    rows = {
+        "training seeds": ", ".join(map(str, found.training_seeds)),
+        "intervals": "95 %, Student's, over training seeds",
+        "processor": f"{facts['cpu']}, {cores}",
+        "Python": facts["python"],
+        **facts["versions"],
+        "date": facts["date"][:10],
+        **{key: value for key, value in found.notes.items() if key != "table"},
+    }
+    return [*command_block(facts["command"]), "", *made_with(rows)]
 
 
 def with_interval(interval: Interval) -> str:

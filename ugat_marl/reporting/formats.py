@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
@@ -42,3 +44,35 @@ def chance(value: Any) -> str:
     if value is None:
         return "–"
     return "< 0.001" if value < 0.001 else f"{value:.2g}"
+
+
+PAGE_WIDTH = 140
+"""Characters of a line of prose in Markdown."""
+COMMAND_WIDTH = 100
+"""Characters of a line of a command in Markdown."""
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as a list in a sentence."""
+    return " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
+
+
+def command_block(command: str) -> list[str]:
+    """Return a command as a block of Markdown, with long lines continued."""
+    lines = [""]
+    for word in re.findall(r"(?:[^\s']|'[^']*')+", command):
+        if lines[-1] and len(lines[-1]) + 1 + len(word) > COMMAND_WIDTH:
+            lines[-1] += " \\"
+            lines.append(f"  {word}")
+        else:
+            lines[-1] += f" {word}" if lines[-1] else word
+    return ["```sh", *lines, "```"]
+
+
+def made_with(rows: Mapping[str, Any]) -> list[str]:
+    """Return the table of what figures were made with."""
+    return [
+        "| Made with | |",
+        "|---|---|",
+        *(f"| {name} | {value} |" for name, value in rows.items()),
+    ]

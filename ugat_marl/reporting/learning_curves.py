@@ -11,6 +11,7 @@ import numpy as np
 
 from ugat_marl.experiments import Curve, Curves, CurvesConfig, Interval
 from ugat_marl.reporting.comparison_tables import with_interval
+from ugat_marl.reporting.formats import command_block, made_with
 from ugat_marl.reporting.tables import number
 
 
@@ -28,21 +29,31 @@ def curves_page(found: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -
     by_learner: dict[str, list[Curve]] = {}
     for curve in found.curves:
         by_learner.setdefault(curve.learner, []).append(curve)
-    versions = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
+    rows = {
+        "processor": facts["cpu"],
+        "Python": facts["python"],
+        **facts["versions"],
+        "date": facts["date"][:10],
+    }
     lines = [
         f"# {found.scenario}: learners",
         "",
-        f"    {facts['command']}",
+        f"Mean travel time in `{found.domain}` that each learner reaches, in s, beside the rules.",
         "",
-        f"{facts['cpu']}, Python {facts['python']}, {versions}, {facts['date'][:10]}.",
+        *command_block(facts["command"]),
         "",
-        f"ATT in `{found.domain}`, s: mean over {config.evaluation_seeds} episodes, the same for "
-        "all, then over training seeds, with Student's 95 % interval. *Last* is the policy after "
-        f"{config.episodes} episodes of training, *best* the best of the evaluations every "
-        f"{config.evaluate_every} episodes, chosen on the very episodes it is reported on, so that "
-        "it flatters. *Fixed time* is the better of the network's own programme and a tuned "
-        "cycle. Decisions are of all agents together, while training, learning included; the time "
-        "of one is the processor time of the learner's process, which the simulation is not in.",
+        *made_with(rows),
+        "",
+        "| Column | Meaning |",
+        "|---|---|",
+        f"| episodes | {config.evaluation_seeds}, the same for all; mean over training seeds with "
+        "Student's 95 % interval |",
+        f"| last | the policy after {config.episodes} episodes of training |",
+        f"| best | the best of the evaluations every {config.evaluate_every} episodes, chosen on "
+        "the episodes it is reported on, so that it flatters |",
+        "| fixed time | the better of the network's own programme and a tuned cycle |",
+        "| decisions | of all agents together, while training, learning included |",
+        "| ms/decision | processor time of the learner's process; the simulation is not in it |",
         "",
         "| learner | library | seeds | decisions/s | ms/decision | best | last | last − fixed time "
         "| last below fixed time | last below the best rule |",
