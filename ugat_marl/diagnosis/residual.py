@@ -136,7 +136,7 @@ def log_normal_tail(value: float, mean: float, deviation: float) -> float:
 
 
 def _statistics(found: Distance, directed: Directed | None) -> dict[str, float]:
-    """Return the statistics tested: the distance of every block, its largest part, and what is directed."""
+    """Return the tested statistics: distances of blocks, largest parts, and directed ones."""
     values = dict(found.parts)
     for name in ("lane", "time"):
         values[f"{name}, largest"] = float(np.abs(found.z[name]).max(initial=0.0)) ** 2
