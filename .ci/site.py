@@ -119,7 +119,7 @@ def main() -> int:
     variables = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run(build, cwd=ROOT, env=variables, check=False)
     if done.returncode == 0:
-        print("the site is in .cache/site/html/README.html")
+        print("the site is in .cache/site/html/index.html")
     return done.returncode
 
 

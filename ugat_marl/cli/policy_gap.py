@@ -24,7 +24,7 @@ from ugat_marl.scenarios import Network
 
 @dataclass(frozen=True)
 class PolicyGap:
-    """Measures how much nearer a diagnosis brings policies to what they do in the real domain.
+    """Measure how much nearer a diagnosis brings policies to the real domain.
 
     They are played in sim, in the corrected scenario and in the real domain.
 
