@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, EVENT_FEATURES, FEATURES
-from ugat_marl.diagnosis.propose import Ray
-from ugat_marl.diagnosis.residual import Directed, Directions, Matched, Null
+from ugat_marl.diagnosis.propose import Direction
+from ugat_marl.diagnosis.residual import Directed, Directions, MatchedFilters, Null
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
@@ -83,7 +83,7 @@ def matched(
 
     def asked(off: Array) -> float:
         data = data_at(reference, off)
-        made = Matched(
+        made = MatchedFilters(
             [change(item * scale) for item in directions],
             reference,
             data,
@@ -108,7 +108,7 @@ def test_a_difference_along_a_direction_is_its_squared_size(reference: Reference
 def test_parameters_that_are_not_known_make_a_difference_smaller(reference: Reference) -> None:
     data = data_at(reference, 3.0 * unit(0))
     extra = change(3.0 * noise(reference) ** 2)  # four times the noise in all
-    found = Matched([change(unit(0))], reference, data, ("network",), extra)
+    found = MatchedFilters([change(unit(0))], reference, data, ("network",), extra)
     assert found(reference.distance(data, extra=extra)) == pytest.approx(9.0 / 4.0)
 
 
@@ -123,7 +123,7 @@ def test_a_weak_effect_on_everything_shows_only_along_its_direction(reference: R
         for days in values.reshape(400, PERIODS, WIDTH, 1):
             data = days_of(days)
             distance = reference.distance(data)
-            along = Matched([direction], reference, data, ("network",))
+            along = MatchedFilters([direction], reference, data, ("network",))
             found.append((along(distance), distance.total))
         return found
 
@@ -180,7 +180,7 @@ def test_filters_look_at_pools_and_at_single_places() -> None:
     moved[1, ROWS[0]] = 2.0
     nothing = {name: np.zeros_like(block.mean) for name, block in made.blocks.items()}
     hypothesis = Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,))
-    ray = Ray(hypothesis, (1.5,), nothing | {"lane": moved}, nothing, (1.0,))
+    ray = Direction(hypothesis, (1.5,), nothing | {"lane": moved}, nothing, (1.0,))
     values = np.tile(lane.mean[:, ROWS].T[None], (PERIODS, 1, 1))
     values[:, 0, 1] += 2.0
     data = days_of(values)
@@ -232,7 +232,7 @@ def chances(*, anew: bool) -> Array:
         streets = [together([10, model, street], PERIODS) for street in range(15)]
 
         def made(reference: Reference, data: Sequence[Tally] = streets[0]) -> Directed:
-            matched = Matched(some_directions(reference), reference, data, ("network",))
+            matched = MatchedFilters(some_directions(reference), reference, data, ("network",))
             return lambda distance: {"one effect": matched(distance)}
 
         once = made(Reference(SEVERAL, tallies))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.propose import Ray, between, propose
+from ugat_marl.diagnosis.propose import Direction, between, propose
 from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Pools, Whitener
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
@@ -41,10 +41,10 @@ def reference() -> Reference:
     return Reference(POOLS, [day(20.0 + values) for values in noise])
 
 
-def rays(seed: int = 2, size: float = 12.0) -> list[Ray]:
+def rays(seed: int = 2, size: float = 12.0) -> list[Direction]:
     """Hypotheses that move the statistics in directions of their own."""
     generator = np.random.default_rng(seed)
-    found: list[Ray] = []
+    found: list[Direction] = []
     for name, field, nominal, level in zip(NAMES, FIELDS, NOMINAL, LEVEL, strict=True):
         direction = np.zeros((1, len(FEATURES)))
         direction[0, :WIDTH] = generator.standard_normal(WIDTH)
@@ -52,7 +52,7 @@ def rays(seed: int = 2, size: float = 12.0) -> list[Ray]:
         hypothesis = Hypothesis(name, (), (field,), ((level,),), (nominal,), 0.0)
         nothing = np.zeros_like(direction)
         found.append(
-            Ray(
+            Direction(
                 hypothesis,
                 (level,),
                 {"network": direction, "time": NO_TIME},
@@ -64,7 +64,10 @@ def rays(seed: int = 2, size: float = 12.0) -> list[Ray]:
 
 
 def whitener(
-    reference: Reference, planted: dict[str, float], among: Sequence[Ray], noise: int | None = None
+    reference: Reference,
+    planted: dict[str, float],
+    among: Sequence[Direction],
+    noise: int | None = None,
 ) -> Whitener:
     """For data in which these hypotheses are present, at multiples of their rays."""
     values = reference.blocks["network"].mean[0, :WIDTH].copy()
@@ -113,7 +116,7 @@ def test_effects_that_hide_each_other_are_proposed_together(reference: Reference
         "network": -0.95 * among[0].difference["network"] + 0.3 * other.difference["network"],
         "time": NO_TIME,
     }
-    among[1] = Ray(other.hypothesis, other.level, hidden, other.variance, other.origin)
+    among[1] = Direction(other.hypothesis, other.level, hidden, other.variance, other.origin)
     target = whitener(reference, {"headway": 1.0, "min_gap": 1.0}, among)
     best = propose(among, target, PRICE)[0]
     assert set(values(best)) == {"headway", "min_gap"}
@@ -155,7 +158,7 @@ def test_rays_are_followed_only_so_far(reference: Reference) -> None:
 def test_two_strengths_of_one_hypothesis_never_stand_in_one_model(reference: Reference) -> None:
     among = rays()[:2]
     first = among[0]
-    among.append(Ray(first.hypothesis, (1.9,), rays(9)[0].difference, first.variance, (1.0,)))
+    among.append(Direction(first.hypothesis, (1.9,), rays(9)[0].difference, first.variance, (1.0,)))
     target = whitener(reference, {"headway": 0.8, "min_gap": 0.6}, among)
     for item in propose(among, target, 0.0):
         names = [hypothesis.name for hypothesis, _ in item.members]
@@ -166,7 +169,7 @@ def test_two_strengths_of_one_hypothesis_never_stand_in_one_model(reference: Ref
 def test_a_hypothesis_without_numbers_is_there_or_not(reference: Reference) -> None:
     among = rays()[:2]
     model = Hypothesis("driver_model", (("model", "IDM"),), (), ((),), None)
-    among.append(Ray(model, (), rays(5)[0].difference, among[0].variance, None))
+    among.append(Direction(model, (), rays(5)[0].difference, among[0].variance, None))
     # Its ray alone makes the difference.
     values_ = (
         reference.blocks["network"].mean[0, :WIDTH] + among[2].difference["network"][0, :WIDTH]
@@ -184,7 +187,7 @@ def test_no_rays_no_proposals(reference: Reference) -> None:
 
 def test_many_rays_are_searched_in_good_time(reference: Reference) -> None:
     among = [
-        Ray(
+        Direction(
             Hypothesis("headway", (("place", str(i)),), ("seconds",), ((1.5,),), (1.0,)),
             (1.5,),
             rays(100 + i)[0].difference,
@@ -211,8 +214,8 @@ def test_many_rays_are_searched_in_good_time(reference: Reference) -> None:
 
 def test_rays_between_two_strengths_of_one_effect() -> None:
     one, other = rays(3)[0], rays(4)[0]
-    strong = Ray(one.hypothesis, (2.0,), other.difference, one.variance, one.origin)
-    weak = Ray(one.hypothesis, (0.7,), other.difference, one.variance, one.origin)
+    strong = Direction(one.hypothesis, (2.0,), other.difference, one.variance, one.origin)
+    weak = Direction(one.hypothesis, (0.7,), other.difference, one.variance, one.origin)
     found = between([one, strong])
     assert found[:2] == [one, strong]
     assert [item.level[0] for item in found[2:]] == pytest.approx([1.665, 1.835])

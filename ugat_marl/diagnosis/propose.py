@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Ray:
+class Direction:
     """Change of the statistics under a hypothesis at one strength.
 
     Attributes:
@@ -49,7 +49,7 @@ class Ray:
         return self.hypothesis.clipped(values)
 
 
-def between(rays: Sequence[Ray]) -> list[Ray]:
+def between(rays: Sequence[Direction]) -> list[Direction]:
     """Return the rays, and further ones half-way between strengths of the same hypothesis.
 
     What an effect does is not in proportion to its strength; between two strengths that were
@@ -72,17 +72,17 @@ def between(rays: Sequence[Ray]) -> list[Ray]:
                 name: (1 - share) ** 2 * first.variance[name] + share**2 * second.variance[name]
                 for name in first.variance
             }
-            found.append(Ray(first.hypothesis, level, mixed, noise, first.origin))
+            found.append(Direction(first.hypothesis, level, mixed, noise, first.origin))
     return found
 
 
-def _side(ray: Ray) -> bool:
+def _side(ray: Direction) -> bool:
     assert ray.origin is not None
     return ray.level > ray.origin
 
 
 def propose(
-    rays: Sequence[Ray], whitener: Whitener, price: float, largest: int = 3
+    rays: Sequence[Direction], whitener: Whitener, price: float, largest: int = 3
 ) -> list[Proposed]:
     """Find sets of effects, in order of what they would leave.
 
@@ -151,7 +151,9 @@ def _least_squares(
     return np.clip(found, -THRESHOLDS.farthest, THRESHOLDS.farthest)
 
 
-def _useful(best: dict[tuple[object, ...], Proposed], rays: Sequence[Ray], count: int) -> list[int]:
+def _useful(
+    best: dict[tuple[object, ...], Proposed], rays: Sequence[Direction], count: int
+) -> list[int]:
     """Return the rays of the hypotheses in the best sets so far."""
     keys: list[str] = []
     for item in sorted(best.values(), key=lambda item: item.expected):

@@ -17,7 +17,7 @@ from scipy import special
 
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.fit import WIDE
-from ugat_marl.diagnosis.propose import Ray
+from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Residual
 from ugat_marl.diagnosis.statistics import (
     SINGLE,
@@ -153,7 +153,7 @@ def _log_moments(values: Sequence[float]) -> tuple[float, float]:
 # --- single effects -------------------------------------------------------------------------------
 
 
-class Matched:
+class MatchedFilters:
     """Matched filters: one for each known direction in which a difference may point.
 
     What an effect does is spread over many statistics, each of them within its noise. Along its own
@@ -230,18 +230,18 @@ class Directions:
         fitted: What moving the model's own parameters does.
     """
 
-    rays: tuple[Ray, ...]
+    rays: tuple[Direction, ...]
     extra: Mapping[str, Array] | None = None
     fitted: tuple[Mapping[str, Array], ...] = ()
 
-    def filters(self, reference: Reference, data: Sequence[Tally]) -> dict[str, Matched]:
+    def filters(self, reference: Reference, data: Sequence[Tally]) -> dict[str, MatchedFilters]:
         """Matched filters on what the pools show, and on what single lanes and minutes show."""
         if not self.rays:
             return {}
         wide = [ray.difference for ray in self.rays]
         single = [without_noise(ray.difference, ray.variance) for ray in self.rays]
         return {
-            name: Matched(changes, reference, data, blocks, self.extra, self.fitted)
+            name: MatchedFilters(changes, reference, data, blocks, self.extra, self.fitted)
             for name, changes, blocks in (
                 ("one effect", wide, WIDE), ("one effect, lanes", single, SINGLE)
             )

@@ -23,7 +23,7 @@ from ugat_marl.diagnosis.hypotheses import (
     settings_as_members,
 )
 from ugat_marl.diagnosis.places import Proposer
-from ugat_marl.diagnosis.propose import Ray, between, promising, propose, squared_gap
+from ugat_marl.diagnosis.propose import Direction, between, promising, propose, squared_gap
 from ugat_marl.diagnosis.records import Fitted, Located, Selected, Tested
 from ugat_marl.diagnosis.residual import Directions, Null
 from ugat_marl.diagnosis.statistics import Whitener
@@ -75,8 +75,8 @@ class Selector:
         self._reporter = reporter
         self._first = fitter.base.distance(fitter.data)
         self._seen: dict[str, Fitted] = {}
-        self._rays: tuple[Ray, ...] = ()
-        self._places: tuple[Ray, ...] = ()
+        self._rays: tuple[Direction, ...] = ()
+        self._places: tuple[Direction, ...] = ()
         self.examined: set[str] = set()
 
     def looked_closer(self, base: Tested) -> Tested:
@@ -199,7 +199,7 @@ class Selector:
                     found.append((model.cost, place))
         return [strengths[place] for _, place in sorted(found)[: THRESHOLDS.nearest]]
 
-    def _elsewhere(self, model: Fitted, rays: Sequence[Ray], number: int) -> list[Members]:
+    def _elsewhere(self, model: Fitted, rays: Sequence[Direction], number: int) -> list[Members]:
         """Propose effects at places and in windows, judged by lanes and minutes too."""
         present = {item.key for item in self._library}
         found = self._proposer.hypotheses(model.reference, model.distance, self._periods)
@@ -226,7 +226,7 @@ class Selector:
         data, base = self._fitter.data, self._fitter.base
         return Whitener(model.reference, data, THRESHOLDS.foresight, base, blocks)
 
-    def _library_rays(self, model: Fitted, number: int) -> tuple[Ray, ...]:
+    def _library_rays(self, model: Fitted, number: int) -> tuple[Direction, ...]:
         """Return rays of the library on top of a model; those of the scenario as it is are kept."""
         if number:
             return tuple(self._bank(model, self._library, number))
@@ -235,7 +235,7 @@ class Selector:
 
     def _bank(
         self, model: Fitted, hypotheses: Sequence[Hypothesis], number: int, what: str = "library"
-    ) -> list[Ray]:
+    ) -> list[Direction]:
         """Simulate hypotheses on top of a model."""
         present = {hypothesis.key: values for hypothesis, values in model.members}
         jobs: list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...] | None]] = []
@@ -247,7 +247,7 @@ class Selector:
             for hypothesis, values in model.members:
                 jobs += both_ways(hypothesis, values)
         days = self._effort.bank
-        rays: list[Ray] = []
+        rays: list[Direction] = []
         numbers = list(model.days)[:days]
         models = [merged(model.members, ((h, level),)) for h, level, _ in jobs]
         with self._reporter.task(f"round {number + 1}: {what}", len(jobs)) as advance:
@@ -262,7 +262,7 @@ class Selector:
                 if what == "library":
                     self._reporter.say(f"note: {hypothesis.name} left out: {error}")
                 continue
-            rays.append(Ray(hypothesis, level, difference, variance, origin))
+            rays.append(Direction(hypothesis, level, difference, variance, origin))
         return rays
 
     def _tried(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
