@@ -42,7 +42,7 @@ from ugat_marl.grounding import FitConfig, GateConfig, UgatConfig
 from ugat_marl.reporting import RunRecord, read_records, runs_page, style, write_pictures
 from ugat_marl.reporting import formats as words
 from ugat_marl.reporting.charts import radar_picture
-from ugat_marl.reporting.figures import Picture
+from ugat_marl.reporting.figures import NamedFigure
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Page as MadePage
 from ugat_marl.scenarios import Network
@@ -136,7 +136,7 @@ def run(tmp_path: Path) -> Path:
 @pytest.fixture
 def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures are made, and not written into pages: their writing takes most of the time."""
-    monkeypatch.setattr(Picture, "for_page", lambda _: "<svg></svg>")
+    monkeypatch.setattr(NamedFigure, "for_page", lambda _: "<svg></svg>")
 
 
 class Page(HTMLParser):
@@ -557,11 +557,11 @@ def test_the_rim_of_a_radar_is_the_best_value() -> None:
     assert radar_picture("t", {"a": [np.nan] * 5}, "n") is None
 
 
-def fills(picture: Picture) -> list[str]:
+def fills(picture: NamedFigure) -> list[str]:
     return re.findall(r'style="fill: var\(--(\w+)\)', picture.for_page())
 
 
-def texts(picture: Picture) -> list[str]:
+def texts(picture: NamedFigure) -> list[str]:
     return re.findall(r">([^<]+)</text>", picture.for_page())
 
 
@@ -586,7 +586,7 @@ def test_the_longest_queues_come_first_minute_by_minute() -> None:
 
 
 def test_the_same_picture_is_the_same_file_and_has_ids_of_its_own() -> None:
-    def drawn(name: str) -> Picture:
+    def drawn(name: str) -> NamedFigure:
         picture = radar_picture("t", {"a": [10, 100, -1, 1, 0.1]}, name)
         assert picture is not None
         return picture

@@ -15,7 +15,7 @@ from ugat_marl.experiments import Comparison, Evaluation, Interval, binned, join
 from ugat_marl.reporting.figures import (
     TOP,
     WIDTH,
-    Picture,
+    NamedFigure,
     add_axes,
     add_legend,
     add_tip,
@@ -50,7 +50,7 @@ Deviation = tuple[str, str, float, float | None]
 
 
 @styled()
-def learning_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
+def learning_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | None:
     """Draw the return per training episode, with 95 % intervals.
 
     Args:
@@ -81,7 +81,7 @@ def learning_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
 
 
 @styled()
-def travel_time_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
+def travel_time_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | None:
     """Draw ATT after each iteration by domain; with several seeds, 95 % intervals over them."""
     domains: dict[str, list[tuple[float, float, float, float]]] = {}
     for domain in _domains(records):
@@ -100,7 +100,7 @@ def travel_time_picture(records: Sequence[RunRecord], name: str) -> Picture | No
 
 
 @styled()
-def gate_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
+def gate_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | None:
     """Draw acceptance, α and u over the iterations, means over the intersections."""
     labels = {
         "gate/acceptance": "acceptance (share of decisions)",
@@ -125,7 +125,7 @@ def gate_picture(records: Sequence[RunRecord], name: str) -> Picture | None:
 
 def _plot(
     name: str, title: str, x_label: str, y_label: str, legend: Sequence[str] = ()
-) -> tuple[Picture, Any]:
+) -> tuple[NamedFigure, Any]:
     """A picture with one pair of axes and whole numbers on the horizontal one."""
     below = legend_height(legend)
     picture = new_picture(name, title, 300 + below)
@@ -154,7 +154,7 @@ def _points_wide(axes: Any) -> float:
 
 
 def _draw_curve(
-    picture: Picture,
+    picture: NamedFigure,
     axes: Any,
     number: int,
     rows: Sequence[tuple[float, float, float, float]],
@@ -199,7 +199,7 @@ def _domains(records: Sequence[RunRecord]) -> list[str]:
 @styled()
 def scores_picture(
     title: str, labels: Sequence[str], series: Mapping[str, Sequence[Estimated]], name: str
-) -> Picture | None:
+) -> NamedFigure | None:
     """Draw travel times as dots with their 95 % intervals.
 
     Args:
@@ -345,7 +345,9 @@ def _of(interval: Any) -> Estimated:
 
 
 @styled()
-def radar_picture(title: str, lines: Mapping[str, Sequence[float]], name: str) -> Picture | None:
+def radar_picture(
+    title: str, lines: Mapping[str, Sequence[float]], name: str
+) -> NamedFigure | None:
     """Draw the five measures on axes of their own; the rim is the best value on each.
 
     Args:
@@ -476,7 +478,7 @@ _STRIP = 51.0
 
 
 @styled()
-def statistics_picture(rows: Sequence[Deviation], most: float, name: str) -> Picture:
+def statistics_picture(rows: Sequence[Deviation], most: float, name: str) -> NamedFigure:
     """Draw how far measured statistics are from simulated ones, a strip for each.
 
     The scale is straight within the noise band and logarithmic far out.

@@ -33,7 +33,7 @@ _USED = re.compile(r"url\(#([^)]+)\)")
 
 
 @dataclass
-class Picture:
+class NamedFigure:
     """One picture.
 
     Attributes:
@@ -144,24 +144,24 @@ def _variable(match: re.Match[str]) -> str:
     return f"var(--{name})" if name else match[0]
 
 
-def write_png(picture: Picture, path: Path) -> None:
+def write_png(picture: NamedFigure, path: Path) -> None:
     """Write a picture as PNG under a path of its own."""
     write_whole(path, picture.png())
 
 
-def new_picture(name: str, title: str, height: float, width: float = WIDTH) -> Picture:
+def new_picture(name: str, title: str, height: float, width: float = WIDTH) -> NamedFigure:
     """Return an empty picture with its title at the top; sizes are in points."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width / 72, height / 72))
-    picture = Picture(name, title, figure)
+    picture = NamedFigure(name, title, figure)
     text = printable(shortened(title, int((width - 16) / 9.3)))
     figure.text(8 / width, 1 - 20 / height, text, fontsize=14, fontweight="bold")
     return picture
 
 
 def add_axes(
-    picture: Picture, left: float, top: float, right: float, bottom: float, **more: Any
+    picture: NamedFigure, left: float, top: float, right: float, bottom: float, **more: Any
 ) -> Any:
     """Return axes whose sides keep these distances, in points, from those of the picture."""
     width, height = picture.figure.get_size_inches() * 72
@@ -180,7 +180,7 @@ def legend_height(labels: Sequence[str], width: float = WIDTH) -> float:
     return LEGEND * -(-len(labels) // legend_columns(labels, width)) if labels else 0.0
 
 
-def add_legend(picture: Picture, labels: Sequence[str], *, lines: bool = True) -> None:
+def add_legend(picture: NamedFigure, labels: Sequence[str], *, lines: bool = True) -> None:
     """Add a legend of curves, in the order of their numbers, at the bottom."""
     from matplotlib.lines import Line2D
 

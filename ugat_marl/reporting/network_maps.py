@@ -12,7 +12,7 @@ import numpy as np
 from ugat_marl.reporting.figures import (
     TOP,
     WIDTH,
-    Picture,
+    NamedFigure,
     add_axes,
     add_tip,
     new_picture,
@@ -45,7 +45,7 @@ _CELL = 17.0
 def node_map(
     name: str, title: str, network: Network, values: Mapping[str, tuple[float, str]],
     ends: tuple[float, float], unit: str,
-) -> Picture:  # fmt: skip
+) -> NamedFigure:  # fmt: skip
     """Draw the network with its intersections coloured by a number.
 
     Args:
@@ -83,7 +83,7 @@ def node_map(
 @styled()
 def disagreement_map(
     name: str, title: str, network: Network, lanes: Mapping[str, float], tls: Iterable[str]
-) -> Picture | None:
+) -> NamedFigure | None:
     """Draw the network with its lanes coloured by the disagreement of data and simulation.
 
     Args:
@@ -119,7 +119,7 @@ def disagreement_map(
 @styled()
 def minutes_picture(
     name: str, title: str, queues: Mapping[str, Sequence[float]], most: float | None = None
-) -> Picture:
+) -> NamedFigure:
     """Draw queues of intersections over the minutes of an episode, the longest queues first.
 
     Args:
@@ -159,7 +159,7 @@ def minutes_picture(
 
 def _map(
     name: str, title: str, network: Network, points: Sequence[Point], below: float
-) -> tuple[Picture, Any, float]:
+) -> tuple[NamedFigure, Any, float]:
     """A picture with the roads around some points, its axes, and points of type per metre."""
     from matplotlib.collections import LineCollection
 
@@ -204,7 +204,7 @@ def _name(axes: Any, name: str, at: Point, down: float) -> None:
     )  # fmt: skip
 
 
-def _add_scale(picture: Picture, ends: tuple[float, float], unit: str) -> None:
+def _add_scale(picture: NamedFigure, ends: tuple[float, float], unit: str) -> None:
     """Add the key of the colours at the bottom."""
     from matplotlib.patches import Rectangle
 

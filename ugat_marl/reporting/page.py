@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ugat_marl.reporting.figures import Picture
+from ugat_marl.reporting.figures import NamedFigure
 from ugat_marl.reporting.style import DARK, LIGHT, css_variables
 
 _MANY = 7
@@ -42,7 +42,7 @@ class Grid:
 class Figure:
     """A picture and its caption."""
 
-    picture: Picture
+    picture: NamedFigure
     caption: str
 
     @property
@@ -63,9 +63,9 @@ class Page:
     """
 
     text: str = ""
-    pictures: list[Picture] = field(default_factory=list)
+    pictures: list[NamedFigure] = field(default_factory=list)
 
-    def figures(self, *pairs: tuple[Picture | None, str]) -> list[Figure]:
+    def figures(self, *pairs: tuple[NamedFigure | None, str]) -> list[Figure]:
         """Return pictures with their captions, without those that are not there."""
         made: list[Figure] = []
         for picture, caption in pairs:

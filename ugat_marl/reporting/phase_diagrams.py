@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.progress import Reporter
-from ugat_marl.reporting.figures import Picture, printable, shortened
+from ugat_marl.reporting.figures import NamedFigure, printable, shortened
 from ugat_marl.reporting.style import LIGHT, styled
 from ugat_marl.scenarios import Intersection, Link, Network, Scenario
 
@@ -108,17 +108,17 @@ def _file_name(tls: str, taken: set[str]) -> str:
     return name
 
 
-def _picture(name: str, title: str, width_in: float, height_in: float) -> Picture:
+def _picture(name: str, title: str, width_in: float, height_in: float) -> NamedFigure:
     from matplotlib.figure import Figure
 
-    picture = Picture(name, title, Figure(figsize=(width_in, height_in)))
+    picture = NamedFigure(name, title, Figure(figsize=(width_in, height_in)))
     picture.figure.text(
         0.02, 1 - 0.1 / height_in, printable(title), size=12, va="top", weight="bold"
     )  # fmt: skip
     return picture
 
 
-def _sheet(name: str, place: _Place, scenario: str, phases: range) -> Picture:
+def _sheet(name: str, place: _Place, scenario: str, phases: range) -> NamedFigure:
     """The plan of an intersection and its phases, four panels in a row."""
     item = place.item
     rows = math.ceil((len(phases) + 1) / _COLUMNS)
@@ -311,7 +311,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return ", ".join(f"{p[0]}-{p[-1]}" if len(p) > 1 else f"{p[0]}" for p in parts)
 
 
-def _overview(network: Network, scenario: str) -> Picture:
+def _overview(network: Network, scenario: str) -> NamedFigure:
     """The whole network with the names of its agents."""
     from matplotlib.collections import LineCollection
 

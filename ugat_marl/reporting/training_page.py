@@ -21,7 +21,7 @@ from ugat_marl.envs import HIDDEN, Observer
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.experiments import Estimate, Evaluation
 from ugat_marl.reporting import charts
-from ugat_marl.reporting.figures import Picture, printable
+from ugat_marl.reporting.figures import NamedFigure, printable
 from ugat_marl.reporting.formats import number, share, signed
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Figure, Grid, Page, render
@@ -85,7 +85,7 @@ def runs_page(records: Sequence[RunRecord | TableRecord], commands: Commands) ->
     return page
 
 
-def write_pictures(pictures: Sequence[Picture], directory: Path) -> None:
+def write_pictures(pictures: Sequence[NamedFigure], directory: Path) -> None:
     """Write every picture as SVG and as PNG."""
     for picture in pictures:
         picture.write(directory)
@@ -431,7 +431,7 @@ def _gate(page: Page, record: RunRecord, places: Places | str) -> dict[str, Any]
 
 def _gate_map(
     record: RunRecord, places: Places, key: str, quantity: str, unit: str
-) -> tuple[Picture | None, str]:
+) -> tuple[NamedFigure | None, str]:
     series = record.agents(key)
     last = max((rows[-1][0] for rows in series.values() if rows), default=0)
     scale = 100.0 if unit.startswith("%") else 1.0
@@ -492,7 +492,7 @@ def _worst(page: Page, record: RunRecord, places: Places | None) -> dict[str, An
         return None
     most = max(max(row) for queues in by_policy.values() for row in queues.values())
     caption = "Longest queues first; the same colours for all policies."
-    figures: list[tuple[Picture | None, str]] = []
+    figures: list[tuple[NamedFigure | None, str]] = []
     for policy, queues in by_policy.items():
         name = _file_name(record.name, "minutes", policy)
         figures.append((minutes_picture(name, f"{policy} in {domain}", queues, most), caption))
