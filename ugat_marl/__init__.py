@@ -1,6 +1,8 @@
 """Multi-agent traffic-signal environments across the gap between simulation and street.
 
-The names below are loaded when they are first used, so that importing the package is cheap.
+`parallel_env`, `env` and `vector_env` make environments, `load_scenario` reads a scenario in a
+domain, and a `TransitionLog` is what roll-outs record. Each name is loaded when it is first used,
+so that importing the package is cheap.
 """
 
 import lazy_loader

@@ -5,10 +5,11 @@
     Fitted     a set of effects, simulated, with values for its free numbers
     Selected   the set that is chosen, tested, and its rivals
     Verified   the scenario as it is and the chosen set on periods that were not fitted
+    Conclusion the verdict, with its grounds
     Diagnosis  what is said of all this: the content of ``diagnosis.json``
 
-Every stage takes the record of the one before. The first five hold simulated days and arrays and
-live as long as the diagnosis; a `Diagnosis` holds plain values alone.
+Every stage takes the record of the one before. Only a `Diagnosis` is written, and it holds plain
+values alone. The others may hold simulated days and arrays, and end with the diagnosis.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from ugat_marl.effects import Effect
 from ugat_marl.files import write_whole
 
 FILE = "diagnosis.json"
-"""Name of the file of a diagnosis in its directory."""
+"""Name of the file that a diagnosis writes into its directory."""
 CORRECTED = "corrected"
-"""Name of the corrected scenario beside it."""
+"""Name of the folder of the corrected scenario, beside that file."""
 SCHEMA = "ugat-marl/diagnosis/2"
 """Form of the file; it rises whenever the form changes."""
 
@@ -50,7 +51,8 @@ class Proposed:
 
     Attributes:
         members: Hypotheses and values of their free fields.
-        expected: Distance that is left if the statistics follow the rays, plus the price.
+        expected: Distance that should be left, by the simulated changes of the statistics
+            (`propose.Ray`), plus the price of the effects.
     """
 
     members: Members
@@ -64,7 +66,7 @@ class Fitted:
     Attributes:
         members: Its effects.
         days: Its simulated days by their numbers.
-        reference: Its statistics.
+        reference: Its statistics with their noise, from these days.
         distance: From the data that were fitted.
         cost: Distance, penalty for noise, and price of the effects: less is better.
     """
@@ -99,9 +101,9 @@ class Residual:
         distance: Total distance of the data from the model.
         floor: Total distance that 99 of 100 data sets of the model itself stay below.
         expected: Mean distance of data sets of the model itself.
-        p: Chance of a distance like this under the model: the smallest over the blocks, corrected
+        p: Chance of a difference this large under the model: the smallest in `blocks`, corrected
             for their number.
-        blocks: Chance of every statistic that is tested.
+        blocks: This chance for each statistic that is tested, uncorrected.
     """
 
     distance: float
@@ -119,7 +121,8 @@ class Tested:
         model: The model.
         residual: The test on the fitted periods.
         errors: Standard errors of its free values.
-        extra: Variances of the expected statistics, by block: from `errors`, and the tolerance.
+        extra: Variance that is added to that of the noise, by block: for `errors`, and as the
+            tolerance of the method.
     """
 
     model: Fitted
@@ -141,8 +144,8 @@ class Disagreement:
         window: Begin and end on the scenario's clock, s; None for all of the time.
         size: Measured minus simulated, in `unit`.
         unit: Unit of the statistic.
-        z: The same in standard deviations.
-        p: Chance of this under the model.
+        z: `size` in standard deviations.
+        p: Chance of a difference this large under the model.
     """
 
     tls: str | None
@@ -252,7 +255,7 @@ class EffectRecord:
 
     Attributes:
         name: Name of the effect.
-        place: Its texts, joined by ``>``; None if it has none.
+        place: Its edge, lane or detector, several joined by ``>``; None for all of the network.
         window: Begin and end on the scenario's clock, s.
         parameters: Its numbers by name.
     """
@@ -324,8 +327,8 @@ class HeldOut:
         floor: Distance that 99 of 100 data sets of the corrected model stay below.
         expected: Mean distance of data sets of the corrected model.
         shrink: Share of the gap that is gone.
-        p_before: Chance of the first under the scenario as it is.
-        p_after: Chance of the second under the corrected model.
+        p_before: Chance of a difference as large as before, under the scenario as it is.
+        p_after: Chance of a difference as large as after, under the corrected model.
     """
 
     before: float
@@ -410,7 +413,7 @@ class LaneRow:
 
 @dataclass(frozen=True)
 class CourtesyRow:
-    """The usual criteria for one model; None where there are no counts, or too few days.
+    """The criteria traffic engineers use, for one model; None without counts or with few days.
 
     Attributes:
         geh_below_5: Share of hourly counts with GEH below 5.
@@ -433,7 +436,7 @@ class CourtesyRow:
 
 @dataclass(frozen=True)
 class MeasuredHeadway:
-    """The one of these numbers that the data have themselves.
+    """The one number of a `CourtesyRow` that needs no model: it is read off the data.
 
     Attributes:
         saturation_headway_s: Mean gap of queued vehicles from the fourth on, s.
@@ -444,7 +447,7 @@ class MeasuredHeadway:
 
 @dataclass(frozen=True)
 class Courtesy:
-    """The usual criteria before and after; none of them decides anything.
+    """The criteria traffic engineers use, before and after; shown, but they decide nothing.
 
     Attributes:
         before: The scenario as it is.
@@ -556,8 +559,8 @@ class Diagnosis:
         verdict: One of five.
         sentence: The verdict for people.
         effects: The effects that are named.
-        where: Where the scenario as it is disagrees with the fitted periods.
-        left: Where the model selected still does.
+        where: Places where the scenario as it is disagrees with the fitted periods.
+        left: Places where the model selected still disagrees with them.
         alternatives: Other sets of effects that were simulated, best first.
         best: The model selected, if it has effects.
         heldout: The test on the held-out periods; None if nothing could be compared.

@@ -1,8 +1,9 @@
 """Environments: PettingZoo's `ParallelEnv` with one agent per signalised intersection.
 
-`TrafficEnv` composes observations, rewards, and the sensors, actuators and objectives that the
-effects of its scenario make. `wrappers` change what a learner sees, `vector` steps many
-environments at once in processes of a `simulation.Host`, `adapters` fit other libraries.
+`TrafficEnv` simulates a scenario. `observations` and `rewards` define what agents see and are paid.
+Effects on controllers change both, and what becomes of an action: through `sensors`, `objectives`
+and `actuators`. `wrappers` change what a learner sees, `vector` steps many environments at once in
+worker processes, `adapters` fit other libraries.
 """
 
 import lazy_loader

@@ -34,9 +34,9 @@ class UgatConfig:
         real_rollouts: Episodes added to D_real per iteration.
         rollout_epsilon: Chance of a random phase in these roll-outs.
         least_accuracy: Held-out accuracy h must have at an intersection before grounded actions
-            are taken there; f and h must beat their trivial rivals, too, which is all that 0 asks.
-            None obeys them from the start, as the paper does. With "timed" the share by which h
-            must beat a guess.
+            are taken there; f and h must also be better than trivial answers, such as "no
+            change" or the most frequent phase, which is all that 0 asks. None obeys them from the
+            start, as the paper does. With "timed" the share by which h must beat a guess.
         inputs: Inputs of f and h beside the intersection's own state and action.
         forward: Shape of f.
         inverse: Shape of h.

@@ -27,10 +27,16 @@ The comments below bear these numbers. Lines 8 and 16 are the learner's, lines 9
 environment it learns in (`wrappers.GroundedEnv`), which asks the transform (`phase`, `timed`) and
 its gate.
 
-Three things differ from the paper. D_real may be a log that was recorded before (line 4). The u of
-the last `gate.window_epochs` episodes enter alpha, those of earlier iterations included (line 7).
-And no action is grounded at an intersection before f and h beat their trivial rivals there, unless
-`least_accuracy` is None.
+With its default options this differs from the listing; the values named here restore it.
+
+- Roll-outs take random phases now and then (lines 3 and 4): `rollout_epsilon` 0.
+- h is also trained against certainty far from its data (line 6): `fit.off_data_weight` 0.
+- U keeps the last 20 episodes, also those of earlier iterations (line 7): `gate.window_epochs` E.
+- Every intersection has an alpha of its own (line 17): `gate.scope` "pooled".
+- No action is grounded at an intersection before f and h are better there than trivial answers,
+  such as "no change" or the most frequent phase (line 13): `least_accuracy` None.
+
+And D_real may be a log that was recorded before (line 4).
 """
 
 from __future__ import annotations
@@ -157,7 +163,10 @@ class Ugat:
                 advance()
 
     def _rewards(self, state: State, policy: Policy) -> EpisodeRewards:
-        """Play the policy in E_sim under each delay; return its rewards there and in E_real."""
+        """Play the policy in E_sim under each delay; return its rewards there and in E_real.
+
+        Only timed grounding that matches rewards asks for this; it is no part of Algorithm 1.
+        """
         agents = state.transform.stack.agents
         number = self.sim.roll_outs_under_delays
         with self.run.reporter.task(f"under delays, {_round(state)}", number) as advance:
@@ -184,7 +193,7 @@ class Ugat:
         return report
 
     def _prepare_gate(self, state: State, report: FitReport) -> None:
-        """Tell the gate which models to trust and which u to expect (line 7)."""
+        """Tell the gate where f and h are trusted, and which u to expect (lines 7 and 13)."""
         gate = state.transform.gate
         if self.config.least_accuracy is not None:
             gate.trust(report.trusted(self.config.least_accuracy))
