@@ -1,8 +1,9 @@
 """Sets of effects, with their strengths, that would make the measured difference.
 
-Every hypothesis is simulated at a few strengths; each is a ray in the space of statistics. Subsets
-of up to three rays are fitted to the measured difference by least squares, all of them, which costs
-no simulation: so effects that hide each other are proposed together and not one after the other.
+Every hypothesis is simulated at a few strengths, and each time the change of the statistics is a
+direction. All sets of up to three directions are fitted to the measured difference by least
+squares, which costs no simulation: so effects that hide each other are proposed together and not
+one after the other.
 """
 
 from __future__ import annotations

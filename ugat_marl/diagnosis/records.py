@@ -52,7 +52,7 @@ class Proposed:
     Attributes:
         members: Hypotheses and values of their free fields.
         expected: Distance that should be left, by the simulated changes of the statistics
-            (`propose.Ray`), plus the price of the effects.
+            (`propose.Direction`), plus the price of the effects.
     """
 
     members: Members
