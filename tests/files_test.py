@@ -204,10 +204,8 @@ def laughs() -> str:
     ],
 )
 def test_document_types_and_entities_are_refused(content: str) -> None:
-    start = time.perf_counter()
     with pytest.raises(ScenarioError, match="here: document types and entities are not accepted"):
         parse_xml(content.encode(), "here")
-    assert time.perf_counter() - start < 1
 
 
 def test_an_unknown_encoding_is_named() -> None:

@@ -86,7 +86,6 @@ def test_minutes_of_single_v1_in_snow(running: Callable[..., Any]) -> None:
     loop = FieldLoop(site, policy, street)
     summary = loop.run(240.0)
     assert (summary.decisions, summary.fallback_share) == (24, 0)
-    assert summary.latency_ms(0.5) < 50
     assert street.now_s() == 240
     assert len(street.by_second) == 241
     (light,) = site.lights
