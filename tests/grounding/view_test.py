@@ -320,15 +320,15 @@ def test_both_groundings_fit_and_ground_with_all_inputs(grounding: Any) -> None:
 def test_a_run_finds_the_neighbours_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Begun(Exception):
+    class ResetResult(Exception):
         pass
 
     def begun(_ugat: Ugat, state: State) -> None:
-        raise Begun(state.transform)
+        raise ResetResult(state.transform)
 
     monkeypatch.setattr(Ugat, "train", begun)
     config = TransferConfig("grid2x2-v1", ugat=UgatConfig(inputs=InputsConfig(history=2, hops=1)))
-    with pytest.raises(Begun) as told:
+    with pytest.raises(ResetResult) as told:
         transfer(config, tmp_path / "run")
     (made,) = told.value.args
     near = made.local.near

@@ -14,10 +14,10 @@ from .traffic_env import env as env
 from .traffic_env import parallel_env as parallel_env
 from .types import Actions as Actions
 from .types import AnyParallelEnv as AnyParallelEnv
-from .types import Begun as Begun
 from .types import Infos as Infos
 from .types import Observations as Observations
-from .types import Stepped as Stepped
+from .types import ResetResult as ResetResult
+from .types import StepResult as StepResult
 from .vector.environment import Batch as Batch
 from .vector.environment import VectorEnv as VectorEnv
 from .vector.environment import vector_env as vector_env

@@ -21,11 +21,11 @@ Actions = dict[str, int]
 AnyParallelEnv = ParallelEnv[str, Any, Any]
 
 
-Begun = tuple[dict[str, Any], dict[str, dict[str, Any]]]
+ResetResult = tuple[dict[str, Any], dict[str, dict[str, Any]]]
 """What an environment's `reset` returns: observations and infos, by agent."""
 
 
-Stepped = tuple[
+StepResult = tuple[
     dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
 ]
 """What its `step` returns: observations, rewards, terminations, truncations and infos."""

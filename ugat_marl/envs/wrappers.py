@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.envs.actions import checked_phases
-from ugat_marl.envs.types import AnyParallelEnv, Begun, Stepped
+from ugat_marl.envs.types import AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
 
 Vectors = Mapping[str, NDArray[np.float32]]
@@ -125,14 +125,14 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
         """The space of an agent's actions, the same object at each call."""
         return self.action_spaces[agent]
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Start an episode of the environment within."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._begin()
         told = self._told(infos)
         return self._seen(observations, told), told
 
-    def step(self, actions: dict[str, Any]) -> Stepped:
+    def step(self, actions: dict[str, Any]) -> StepResult:
         """Pass actions on, and observations back.
 
         Raises:

@@ -15,7 +15,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
 from ugat_marl.effects import SETTINGS, Domain, Effect, in_domain
-from ugat_marl.envs import AgentSet, Begun, TrafficEnv, parallel_env
+from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import numpy_generator
@@ -97,7 +97,7 @@ class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
         self._agents = AgentSet.of(self.env)
         self._generator = numpy_generator(0, "worlds")
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Start an episode in a world of its own.
 
         Args:

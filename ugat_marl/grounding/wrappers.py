@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from pettingzoo.utils import BaseParallelWrapper
 
-from ugat_marl.envs import AnyParallelEnv, Begun, Stepped
+from ugat_marl.envs import AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, OptionError
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import Moment
@@ -52,7 +52,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         self.transform = transform
         self._earlier: deque[Moment] = deque(maxlen=transform.inputs.history - 1)
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Start an episode of the wrapped environment."""
         self.transform.gate.end_epoch()
         observations, infos = self.env.reset(seed=seed, options=options)
@@ -60,7 +60,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         self._notice(observations, infos)
         return observations, _extended(infos, self.env.agents)
 
-    def step(self, actions: dict[str, Any]) -> Stepped:
+    def step(self, actions: dict[str, Any]) -> StepResult:
         """Ground the actions and execute the outcome.
 
         Raises:
@@ -163,14 +163,14 @@ class RandomDelays(BaseParallelWrapper[str, Any, Any]):
         self._always_s = always_s
         self._generator = numpy_generator(0, "delays")
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Start an episode; `seed` decides the delays, too."""
         if seed is not None:
             self._generator = numpy_generator(seed, "delays")
         self._chance = self._generator.uniform(LEAST_CHANCE, 1.0)
         return self.env.reset(seed=seed, options=options)
 
-    def step(self, actions: dict[str, Any]) -> Stepped:
+    def step(self, actions: dict[str, Any]) -> StepResult:
         """Execute the actions with delays."""
         agents = list(self.env.agents)
         if not agents:  # after the last step; the environment itself says so

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from ugat_marl.data import AgentLayout, Scores
-from ugat_marl.envs import Stepped
+from ugat_marl.envs import StepResult
 from ugat_marl.errors import ActionError, EpisodeError
 
 CAPACITY = 20
@@ -107,7 +107,7 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         self._queue = {a: np.zeros(self.layouts[a].features, np.int64) for a in self.agents}
         return self._observe(), self._infos()
 
-    def step(self, actions: Mapping[str, int]) -> Stepped:
+    def step(self, actions: Mapping[str, int]) -> StepResult:
         """Show the chosen phases for one interval."""
         if not actions and self._scores is not None:
             return {}, {}, {}, {}, {}

@@ -25,7 +25,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from torch import Tensor, nn
 
 from ugat_marl.data import read_checkpoint, write_checkpoint
-from ugat_marl.envs import AgentSet, AnyParallelEnv, Begun, Stepped
+from ugat_marl.envs import AgentSet, AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.learners.scaling import InputScale, RewardScale, places
 from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
@@ -162,7 +162,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         self._places = places(self._agents)
         self._allowed: NDArray[np.bool_] | None = None
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Begun:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Start the next episode; its number decides the seed, whatever is given."""
         seed = derive_seed(self._seed, "learner", "episode", self._learner.episodes)
         observations, infos = self.env.reset(seed=seed, options=options)
@@ -170,7 +170,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         self._return = 0.0
         return self._seen(observations), infos
 
-    def step(self, actions: dict[str, Any]) -> Stepped:
+    def step(self, actions: dict[str, Any]) -> StepResult:
         """Execute actions; rewards come back centred and scaled."""
         if not self.env.agents or self._allowed is None:  # the environment itself says so
             return self.env.step(actions)
