@@ -25,7 +25,7 @@ from ugat_marl.effects import (
     known_effects,
 )
 from ugat_marl.effects.actuators import PHASE_ORDERS
-from ugat_marl.envs import HIDDEN
+from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.files import xml_bytes
 from ugat_marl.grounding import METHODS, FitConfig
 from ugat_marl.scenarios import validated
@@ -136,7 +136,7 @@ def test_every_effect_on_controllers_is_documented_with_its_fields_and_ranges() 
             assert parameter.unit in cell
     for rule in PHASE_ORDERS:
         assert f"`{rule}`" in page
-    for name in HIDDEN:
+    for name in OBJECTIVE_MEASURES:
         assert f"| `{name}` |" in page
     for name in OBJECTIVES:
         assert name in rows["objective"]

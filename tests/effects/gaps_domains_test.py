@@ -29,7 +29,7 @@ from ugat_marl.effects import (
 )
 from ugat_marl.effects.actuators import successors
 from ugat_marl.effects.sensors import DeadDetectors
-from ugat_marl.envs import HIDDEN, TrafficEnv
+from ugat_marl.envs import OBJECTIVE_MEASURES, TrafficEnv
 from ugat_marl.envs.sensors import Sensors
 from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.scenarios import signals
@@ -367,7 +367,7 @@ def check_queue_model(trace: Trace, metres: float) -> None:
 
 
 def check_objective(trace: Trace, wanted: str) -> None:
-    assert set(trace.scores.hidden) == set(HIDDEN), wanted
+    assert set(trace.scores.hidden) == set(OBJECTIVE_MEASURES), wanted
     assert trace.scores.hidden["cost"] > 0
 
 

@@ -12,7 +12,7 @@ import ugat_marl
 from ugat_marl.data import Scores
 from ugat_marl.effects import OBJECTIVES, in_domain, load_scenario, parse_domain
 from ugat_marl.effects.objectives import NORMS
-from ugat_marl.envs import HIDDEN
+from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.envs.objectives import PERSONS, PERSONS_IN_A_CAR, Objectives, gini, hidden_measures
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.simulation import Trips, read_trips
@@ -61,7 +61,7 @@ def test_hidden_measures() -> None:
     assert found["delay_p95_s"] == pytest.approx(38.0)
     assert found["delay_gini"] == pytest.approx(0.4)
     assert (found["collisions"], found["hard_brakings"]) == (250.0, 2000.0)
-    assert {"cost", *found} == set(HIDDEN)
+    assert {"cost", *found} == set(OBJECTIVE_MEASURES)
 
 
 @pytest.mark.parametrize("wanted", OBJECTIVES)
@@ -130,7 +130,7 @@ def test_traffic_rewards_and_observations_stay() -> None:
     plain = episode("sim")
     judged = episode("objective=emissions")
     assert plain.scores.hidden == {}
-    assert set(judged.scores.hidden) == set(HIDDEN)
+    assert set(judged.scores.hidden) == set(OBJECTIVE_MEASURES)
     for ours, theirs in zip(judged.moments, plain.moments, strict=True):
         for agent in theirs.observations:
             assert np.array_equal(ours.observations[agent], theirs.observations[agent])

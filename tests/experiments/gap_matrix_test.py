@@ -12,7 +12,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.cli.evaluate import Evaluate
 from ugat_marl.data import Scores
 from ugat_marl.effects import NAMED, load_scenario
-from ugat_marl.envs import HIDDEN
+from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
 from ugat_marl.experiments.scores import Result
 from ugat_marl.reporting import hidden_tables, matrix_table
@@ -22,7 +22,7 @@ BASE = Scores(100.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 5.0)
 
 
 def scores(att_s: float, cost: float | None = None) -> Scores:
-    hidden = {} if cost is None else dict.fromkeys(HIDDEN, 1.0) | {"cost": cost}
+    hidden = {} if cost is None else dict.fromkeys(OBJECTIVE_MEASURES, 1.0) | {"cost": cost}
     return replace(BASE, att_s=att_s, hidden=hidden)
 
 

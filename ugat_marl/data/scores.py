@@ -30,7 +30,7 @@ class Scores:
         due: Vehicles scheduled to depart before the end.
         departed: Vehicles that entered the network.
         backlog: Vehicles due at the end that never entered.
-        hidden: Measures of a domain with an objective; see `ugat_marl.envs.HIDDEN`.
+        hidden: Measures of a domain with an objective; see `ugat_marl.envs.OBJECTIVE_MEASURES`.
     """
 
     att_s: float

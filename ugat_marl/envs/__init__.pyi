@@ -3,7 +3,7 @@ from .adapters.sb3 import AgentsVecEnv as AgentsVecEnv
 from .agents import AgentSet as AgentSet
 from .agents import Mask as Mask
 from .agents import groups_of as groups_of
-from .objectives import HIDDEN as HIDDEN
+from .objectives import OBJECTIVE_MEASURES as OBJECTIVE_MEASURES
 from .observations import UNITS as UNITS
 from .observations import WAITING_SCALE_S as WAITING_SCALE_S
 from .observations import Observer as Observer

@@ -14,7 +14,7 @@ from ugat_marl.effects import Cost, Effect
 from ugat_marl.scenarios import Scenario
 from ugat_marl.simulation import Trips
 
-HIDDEN: dict[str, str] = {
+OBJECTIVE_MEASURES: dict[str, str] = {
     "cost": "cost",
     "co2_g": "CO2 [g/veh]",
     "delay_gini": "Gini of delay",
@@ -84,7 +84,7 @@ class Objectives:
 
 
 def hidden_measures(trips: Trips) -> dict[str, float]:
-    """Return the measures of `HIDDEN`, without the cost.
+    """Return the measures of `OBJECTIVE_MEASURES`, without the cost.
 
     CO2 is the mean over vehicles that entered, of what each emitted until it arrived or the episode
     ended (SUMO's emission model HBEFA, by the emission class of the vehicle's type). The Gini

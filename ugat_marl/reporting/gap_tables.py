@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from ugat_marl.envs import HIDDEN
+from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
 from ugat_marl.reporting.tables import number
 
@@ -57,7 +57,7 @@ def hidden_tables(found: Evaluation) -> list[RenderableType]:
     for policy in found.policies:
         costs = (found.estimate(policy, domain, "cost").mean for domain in domains)
         table.add_row(Text(policy), *map(number, costs))
-    legend = ", ".join(HIDDEN[name] for name in _SHORT)
+    legend = ", ".join(OBJECTIVE_MEASURES[name] for name in _SHORT)
     return [
         table,
         *_measured(found, domains),

@@ -17,7 +17,7 @@ from typing import Any
 
 from ugat_marl.data import MEASURES
 from ugat_marl.effects import in_domain, load_scenario
-from ugat_marl.envs import HIDDEN, Observer
+from ugat_marl.envs import OBJECTIVE_MEASURES, Observer
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.experiments import Estimate, Evaluation
 from ugat_marl.reporting import charts
@@ -391,7 +391,7 @@ def _scores(page: Page, record: RunRecord, evaluation: Evaluation) -> dict[str, 
 def _measures(evaluation: Evaluation) -> Grid:
     hidden = list(dict.fromkeys(name for r in evaluation.results for name in r.scores.hidden))
     headings = ["policy", "domain", *MEASURES.values(), "never entered [veh]"]
-    headings += [HIDDEN.get(name, name) for name in hidden]
+    headings += [OBJECTIVE_MEASURES.get(name, name) for name in hidden]
     rows = [
         [
             policy,
