@@ -2,7 +2,7 @@ from .baseline import BaselineArgs as BaselineArgs
 from .baseline import Result as Result
 from .baseline import baseline_command as baseline_command
 from .baseline import train_baseline as train_baseline
-from .comparison import SERVED as SERVED
+from .comparison import LEAST_SHARE_ARRIVED as LEAST_SHARE_ARRIVED
 from .comparison import Comparison as Comparison
 from .comparison import Trial as Trial
 from .driver import perform_all as perform_all

@@ -18,7 +18,7 @@ import numpy as np
 from ugat_marl.data import MEASURES, MORE_IS_BETTER, Scores
 from ugat_marl.experiments.statistics import Floats, Interval, PairedTest
 
-SERVED = 0.9
+LEAST_SHARE_ARRIVED = 0.9
 """Share of the vehicles due that arrive in an episode that did not break down."""
 
 
@@ -123,9 +123,9 @@ class Comparison:
         return float(np.median([own.att_s for own in self.episodes(setting, target)]))
 
     def unserved(self, setting: str, target: str) -> float:
-        """Return the share of episodes in the target in which less than `SERVED` arrived."""
+        """Return the share of episodes in the target in which less than `LEAST_SHARE_ARRIVED` arrived."""
         found = self.episodes(setting, target)
-        return sum(own.throughput < SERVED * own.due for own in found) / len(found)
+        return sum(own.throughput < LEAST_SHARE_ARRIVED * own.due for own in found) / len(found)
 
     def estimate(
         self, setting: str, target: str, measure: str, domain: str | None = None

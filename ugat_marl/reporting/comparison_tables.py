@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ugat_marl.data import MEASURES
-from ugat_marl.experiments import SERVED, Comparison, Interval, PairedTest
+from ugat_marl.experiments import LEAST_SHARE_ARRIVED, Comparison, Interval, PairedTest
 from ugat_marl.reporting.formats import PAGE_WIDTH, command_block, listed, made_with
 from ugat_marl.reporting.tables import number
 
@@ -83,7 +83,7 @@ def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
         "## Single episodes",
         "",
         "Median of the ATT in s over all of them in the real domain, and the share of those in "
-        f"which fewer than {100 * SERVED:.0f} % of the vehicles due arrived.",
+        f"which fewer than {100 * LEAST_SHARE_ARRIVED:.0f} % of the vehicles due arrived.",
         "Where two outcomes are possible, means and intervals say little.",
         "",
         *_grid(found, _episodes(found)),
