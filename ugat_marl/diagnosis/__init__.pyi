@@ -8,11 +8,11 @@ from .places import Routes as Routes
 from .records import CORRECTED as CORRECTED
 from .records import FILE as FILE
 from .records import Conclusion as Conclusion
-from .records import Courtesy as Courtesy
-from .records import CourtesyRow as CourtesyRow
+from .records import CriteriaRow as CriteriaRow
 from .records import Diagnosis as Diagnosis
 from .records import Disagreement as Disagreement
 from .records import EffectRecord as EffectRecord
+from .records import EngineeringCriteria as EngineeringCriteria
 from .records import Explanation as Explanation
 from .records import FitEvidence as FitEvidence
 from .records import Fitted as Fitted

@@ -412,7 +412,7 @@ class LaneRow:
 
 
 @dataclass(frozen=True)
-class CourtesyRow:
+class CriteriaRow:
     """The criteria traffic engineers use, for one model; None without counts or with few days.
 
     Attributes:
@@ -436,7 +436,7 @@ class CourtesyRow:
 
 @dataclass(frozen=True)
 class MeasuredHeadway:
-    """The one number of a `CourtesyRow` that needs no model: it is read off the data.
+    """The one number of a `CriteriaRow` that needs no model: it is read off the data.
 
     Attributes:
         saturation_headway_s: Mean gap of queued vehicles from the fourth on, s.
@@ -446,7 +446,7 @@ class MeasuredHeadway:
 
 
 @dataclass(frozen=True)
-class Courtesy:
+class EngineeringCriteria:
     """The criteria traffic engineers use, before and after; shown, but they decide nothing.
 
     Attributes:
@@ -455,8 +455,8 @@ class Courtesy:
         measured: The data.
     """
 
-    before: CourtesyRow
-    after: CourtesyRow
+    before: CriteriaRow
+    after: CriteriaRow
     measured: MeasuredHeadway
 
 
@@ -486,7 +486,7 @@ class Tables:
 
     statistics: tuple[StatisticRow, ...] = ()
     lanes: tuple[LaneRow, ...] = ()
-    courtesy: Courtesy | None = None
+    courtesy: EngineeringCriteria | None = None
     travel_time: TravelTimes | None = None
 
 
@@ -601,7 +601,7 @@ class Diagnosis:
     evidence: FitEvidence | None
     statistics: tuple[StatisticRow, ...]
     lanes: tuple[LaneRow, ...]
-    courtesy: Courtesy | None
+    courtesy: EngineeringCriteria | None
     travel_time: TravelTimes | None
     next_measurement: str | None
     complete: bool

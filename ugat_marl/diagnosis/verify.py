@@ -10,8 +10,8 @@ import numpy as np
 from ugat_marl.diagnosis.criteria import fhwa, geh, hourly
 from ugat_marl.diagnosis.features import FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.records import (
-    Courtesy,
-    CourtesyRow,
+    CriteriaRow,
+    EngineeringCriteria,
     LaneRow,
     MeasuredHeadway,
     StatisticRow,
@@ -103,7 +103,7 @@ def _rms(z: Array) -> float:
     return float(np.sqrt((used**2).mean())) if len(used) else 0.0
 
 
-def courtesy(study: Study, base: Tested, best: Tested) -> Courtesy:
+def courtesy(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
     """Compute what traffic engineers are used to see: GEH, FHWA's criteria, discharge headway.
 
     None of them decides anything here. GEH and headways are those of the held-out days; what
@@ -111,12 +111,12 @@ def courtesy(study: Study, base: Tested, best: Tested) -> Courtesy:
     """
     data, every = added(study.heldout), study.all_days
 
-    def row(model: Tested) -> CourtesyRow:
+    def row(model: Tested) -> CriteriaRow:
         tallies = model.model.tallies
         values = geh(hourly(data), hourly(added(tallies)))
         criteria = fhwa(every, tallies, study.pools.together)
         some = len(values) > 0
-        return CourtesyRow(
+        return CriteriaRow(
             geh_below_5=float((values < 5).mean()) if some else None,
             geh_largest=float(values.max()) if some else None,
             within_2_sigma=criteria and criteria.within_2_sigma,
@@ -126,7 +126,7 @@ def courtesy(study: Study, base: Tested, best: Tested) -> Courtesy:
             saturation_headway_s=_headway(tallies),
         )
 
-    return Courtesy(row(base), row(best), MeasuredHeadway(_headway(study.heldout)))
+    return EngineeringCriteria(row(base), row(best), MeasuredHeadway(_headway(study.heldout)))
 
 
 def _headway(days: Sequence[Tally]) -> float | None:
