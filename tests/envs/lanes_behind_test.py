@@ -19,7 +19,7 @@ from ugat_marl.field import Site
 from ugat_marl.files import Document
 from ugat_marl.grounding import UgatConfig
 from ugat_marl.policies import controller_for
-from ugat_marl.scenarios import NOTHING_BEHIND, Network, Scenario, sumo_program, survey
+from ugat_marl.scenarios import NO_UPSTREAM_LANES, Network, Scenario, sumo_program, survey
 from ugat_marl.scenarios.junctions import Upstream, behind_of
 
 NODES = {"M": (0, 0), "N": (0, 200), "S": (0, -200), "W": (-200, 0), "w": (-11, 0), "E": (200, 0)}
@@ -229,7 +229,7 @@ def test_whose_waiting_vehicles_are_counted() -> None:
 
 def test_other_networks_are_measured_as_before() -> None:
     table = Network.read(load_scenario("single-v1")).lane_table()
-    assert table.behind == NOTHING_BEHIND
+    assert table.behind == NO_UPSTREAM_LANES
     assert np.all(table.capacity > 1)
 
 

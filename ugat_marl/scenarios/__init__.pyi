@@ -26,9 +26,9 @@ from .inspection import IntersectionFacts as IntersectionFacts
 from .inspection import Survey as Survey
 from .inspection import survey as survey
 from .junctions import Link as Link
-from .lanes import NOTHING_BEHIND as NOTHING_BEHIND
-from .lanes import Behind as Behind
+from .lanes import NO_UPSTREAM_LANES as NO_UPSTREAM_LANES
 from .lanes import LaneTable as LaneTable
+from .lanes import UpstreamLanes as UpstreamLanes
 from .naming import edge_of as edge_of
 from .naming import group_names as group_names
 from .naming import member_names as member_names

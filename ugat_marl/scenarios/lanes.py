@@ -13,7 +13,7 @@ Shares = tuple[tuple[tuple[str, float], ...], ...]
 """For each measured lane names of others, each with a share in (0, 1]."""
 
 
-class Behind(NamedTuple):
+class UpstreamLanes(NamedTuple):
     """Lanes and roads counted with lanes shorter than an agent's sight (`junctions.behind_of`).
 
     Attributes:
@@ -26,7 +26,7 @@ class Behind(NamedTuple):
     roads: Shares = ()
 
 
-NOTHING_BEHIND = Behind()
+NO_UPSTREAM_LANES = UpstreamLanes()
 """No lane is counted with another."""
 
 
@@ -44,7 +44,7 @@ class LaneTable:
     ids: tuple[str, ...]
     capacity: NDArray[np.float64]
     speed_mps: NDArray[np.float64]
-    behind: Behind = NOTHING_BEHIND
+    behind: UpstreamLanes = NO_UPSTREAM_LANES
 
     def indices(self, lanes: Sequence[str]) -> NDArray[np.int64]:
         """Positions of `lanes` in the arrays, int64."""

@@ -22,7 +22,7 @@ from ugat_marl.scenarios.junctions import (
     right_on_red_of,
     yields_of,
 )
-from ugat_marl.scenarios.lanes import NOTHING_BEHIND, Behind, LaneTable
+from ugat_marl.scenarios.lanes import NO_UPSTREAM_LANES, LaneTable, UpstreamLanes
 from ugat_marl.scenarios.phases import (
     RightOfWay,
     conflict_free_phases,
@@ -197,12 +197,12 @@ class Network:
             names,
             np.array([self.lanes[name].capacity for name in names]),
             np.array([self.lanes[name].speed_mps for name in names]),
-            Behind(
+            UpstreamLanes(
                 tuple(tuple(item.lanes.items()) for item in behind),
                 tuple(tuple(item.roads.items()) for item in behind),
             )
             if any(item.lanes or item.roads for item in behind)
-            else NOTHING_BEHIND,
+            else NO_UPSTREAM_LANES,
         )
 
 

@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.files import write_whole
-from ugat_marl.scenarios import NOTHING_BEHIND, Behind, Document, Scenario, Segment, edge_of
+from ugat_marl.scenarios import (
+    NO_UPSTREAM_LANES,
+    Document,
+    Scenario,
+    Segment,
+    UpstreamLanes,
+    edge_of,
+)
 from ugat_marl.simulation.host import one_line
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes, refuse_in_queues
 from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
@@ -60,7 +67,7 @@ class Launch:
     files: tuple[tuple[str, bytes], ...] = ()
     zone_m: float = 0.0
     persons: tuple[tuple[str, float], ...] = ()
-    behind: Behind = NOTHING_BEHIND
+    behind: UpstreamLanes = NO_UPSTREAM_LANES
 
     @property
     def segment_m(self) -> float:
@@ -136,7 +143,7 @@ def launch_of(
     gui: bool = False,
     zone_m: float = 0.0,
     persons: Mapping[str, float] | None = None,
-    behind: Behind = NOTHING_BEHIND,
+    behind: UpstreamLanes = NO_UPSTREAM_LANES,
 ) -> Launch:
     """List SUMO's options and the files to be written for it; write nothing.
 
@@ -404,7 +411,7 @@ def _near_the_end(lanes: Sequence[str], taken: Sequence[str], zone_m: float) -> 
 
 
 def _add_those_behind(
-    behind: Behind,
+    behind: UpstreamLanes,
     measured: tuple[
         NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
     ],
