@@ -22,7 +22,7 @@ from tyro.conf import arg
 
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError, UgatMarlError
-from ugat_marl.experiments import CurvesConfig, learn_curves, machine_facts, word
+from ugat_marl.experiments import CurvesConfig, file_stem, learn_curves, machine_facts
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import curves_as_csv, curves_page
@@ -55,9 +55,9 @@ class Results:
         console, failures = Console(), dict[str, str]()
         scenarios = {name: load_scenario(name) for name in self.scenarios}
         for name in scenarios:  # what is wrong is said before anything is trained
-            require_writable(self.out / f"{word(name)}.md")
+            require_writable(self.out / f"{file_stem(name)}.md")
         for name, scenario in scenarios.items():
-            page = self.out / f"{word(name)}.md"
+            page = self.out / f"{file_stem(name)}.md"
             found = learn_curves(scenario, name, self.config, self.runs, self.jobs, Bars(console))
             failures |= found.failures
             if found.curves and found.best:

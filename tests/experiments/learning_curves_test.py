@@ -20,7 +20,6 @@ from ugat_marl.experiments import (
     Record,
     learn_curves,
     record_of,
-    word,
 )
 from ugat_marl.policies import BASELINES
 from ugat_marl.progress import Silent
@@ -76,8 +75,8 @@ def test_all_learners_have_a_seed_before_one_has_two() -> None:
 
 
 def test_names_of_scenarios_are_parts_of_names_of_files() -> None:
-    assert word("resco:cologne3") == "resco-cologne3"
-    assert word("/there/mine.sumocfg") == "mine"
+    assert file_stem("resco:cologne3") == "resco-cologne3"
+    assert file_stem("/there/mine.sumocfg") == "mine"
 
 
 def test_the_page_by_hand() -> None:

@@ -24,7 +24,7 @@ from .jobs import RULE_FILE as RULE_FILE
 from .jobs import Job as Job
 from .jobs import Record as Record
 from .jobs import evaluation_seeds as evaluation_seeds
-from .jobs import word as word
+from .jobs import file_stem as file_stem
 from .learning_curves import Curve as Curve
 from .learning_curves import Curves as Curves
 from .learning_curves import CurvesConfig as CurvesConfig

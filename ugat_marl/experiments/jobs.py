@@ -140,7 +140,13 @@ class Job:
         """Name of its folder: what people look for, then the digest."""
         setting = self.setting
         learner = "" if setting.recipe == "rule" else setting.learner.name
-        place = word(self.scenario), learner, setting.kind, setting.world or "", self.target or ""
+        place = (
+            file_stem(self.scenario),
+            learner,
+            setting.kind,
+            setting.world or "",
+            self.target or "",
+        )
         parts = [*place, self._seed_word, self.digest]
         words = (re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in parts)
         return "-".join(part for part in words if part)
@@ -170,7 +176,7 @@ class Job:
         write_whole(folder / JOB, json.dumps(asdict(self), indent=1) + "\n")
 
 
-def word(scenario: str) -> str:
+def file_stem(scenario: str) -> str:
     """Return a scenario as a part of the name of a file."""
     return re.sub(r"[^\w.+-]+", "-", Path(scenario).name.removesuffix(".sumocfg")).strip("-")
 
