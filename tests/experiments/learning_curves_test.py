@@ -18,6 +18,7 @@ from ugat_marl.experiments import (
     Curves,
     CurvesConfig,
     Record,
+    file_stem,
     learn_curves,
     record_of,
 )

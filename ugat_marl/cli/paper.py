@@ -17,9 +17,9 @@ from ugat_marl.experiments import (
     Comparison,
     PaperConfig,
     compare,
+    file_stem,
     machine_facts,
     matched_name,
-    word,
 )
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import device_of
@@ -65,7 +65,7 @@ class _Paper:
             )
         device_of(self.config.device)  # what is not there is an error now, not in a job's log
         for scenario in self.config.scenario:
-            folder = self.out / word(scenario) / self.table
+            folder = self.out / file_stem(scenario) / self.table
             require_writable(folder / "table.md")
             with workers_of(self.jobs, self.ray, "--jobs") as workers:
                 found = compare(

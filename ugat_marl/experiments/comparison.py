@@ -123,7 +123,7 @@ class Comparison:
         return float(np.median([own.att_s for own in self.episodes(setting, target)]))
 
     def unserved(self, setting: str, target: str) -> float:
-        """Return the share of episodes in the target in which less than `LEAST_SHARE_ARRIVED` arrived."""
+        """Return the share of episodes in which less than `LEAST_SHARE_ARRIVED` arrived."""
         found = self.episodes(setting, target)
         return sum(own.throughput < LEAST_SHARE_ARRIVED * own.due for own in found) / len(found)
 
