@@ -1,4 +1,12 @@
-"""The field loop: a policy at a real street, behind what keeps it safe."""
+"""The field loop: a policy drives the lights of a real street, behind checks that keep it safe.
+
+- `site`: the intersections, and the observation that the policy needs.
+- `street`: the interface of a street, and a running SUMO in its place.
+- `watchdog`: checks of the counts.
+- `safety`: signal machines, the fixed-time plan, and the trust in the policy.
+- `answering`: calls of the policy with a deadline.
+- `loop`: the loop, its log and its summary.
+"""
 
 import lazy_loader
 

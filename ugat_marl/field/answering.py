@@ -14,7 +14,7 @@ _Answers = queue.SimpleQueue[tuple[Any, BaseException | None]]
 
 
 class NoAnswer(Exception):
-    """The function raised; the message says what."""
+    """The function raised an exception; the message names it."""
 
 
 class Late(NoAnswer):
@@ -24,8 +24,9 @@ class Late(NoAnswer):
 class Answering:
     """Caller of functions, one at a time, that waits for each until a deadline.
 
-    A thread cannot be ended from outside. A late function is left to finish, its answer is thrown
-    away, and no other is called before. The thread does not keep the program alive.
+    A thread cannot be ended from outside. A late function therefore runs to its end, and its answer
+    is thrown away. No other function is called before that end. The thread does not keep the
+    program alive.
     """
 
     def __init__(self) -> None:
@@ -39,8 +40,8 @@ class Answering:
         """Call a function and return its answer.
 
         Raises:
-            Late: None within `within_s`, or the last question has not been answered yet.
-            NoAnswer: The function raised, be it `SystemExit`.
+            Late: No answer came within `within_s`, or an earlier function is still running.
+            NoAnswer: The function raised an exception; `SystemExit` counts as one.
         """
         while self._owed:
             try:

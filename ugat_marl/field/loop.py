@@ -1,7 +1,8 @@
-"""Field loop: once per decision it reads counts, checks them, decides and acts.
+"""Field loop: once per decision it reads counts, checks them, decides and sets the lights.
 
-A decision is ready within `Limits.answer_ms`, with or without an answer of the policy. Every answer
-goes through the signal machines of `ugat_marl.field.safety`.
+A decision is ready within `Limits.answer_ms`. If the policy has not answered by then, the lights
+follow the fixed-time plan. Every answer goes through the signal machines of
+`ugat_marl.field.safety`.
 """
 
 from __future__ import annotations
@@ -39,11 +40,11 @@ class Decision:
     """One decision for all lights.
 
     Attributes:
-        time_s: When, on the street's clock.
+        time_s: Time of the decision on the street's clock, s.
         phases: Traffic light to the phase asked for.
-        fallback: Lights that follow the fixed-time plan, and why.
-        read_ms: Time it took to read the counts.
-        latency_ms: From the start of reading until every light had its plan.
+        fallback: Traffic light that follows the fixed-time plan to the reason.
+        read_ms: Time spent on reading and checking the counts, ms.
+        latency_ms: Time from the start of reading until every light had its plan, ms.
     """
 
     time_s: float
@@ -76,15 +77,16 @@ class Decision:
 class DecisionLog:
     """File with one line of JSON per decision, whole at any moment.
 
-    It is written anew beside its place and renamed, after a decision and at most once a second, so
-    that a killed loop leaves all lines but those of its last second. Lines that are there stay.
-    Where it cannot be written for a while, the lights go on and it is tried again.
+    At most once a second the whole file is written beside its place and renamed. A killed loop
+    therefore loses only the lines of its last second. Lines that the file already holds are kept.
+    If the file cannot be written for a while, the lights go on, and the next decision tries again.
 
     Args:
         path: The file.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
+        OptionError: The file does not end with a whole line.
     """
 
     def __init__(self, path: Path) -> None:
@@ -96,14 +98,14 @@ class DecisionLog:
         self._written = time.monotonic()
 
     def add(self, decision: Decision) -> None:
-        """Add a line."""
+        """Add the line of a decision; write the file if the last write is a second old."""
         self._content += decision.line().encode() + b"\n"
         if time.monotonic() - self._written >= _WRITE_EVERY_S:
             with contextlib.suppress(OSError):  # a full disk does not stop the lights
                 self.write()
 
     def write(self) -> None:
-        """Write what there is."""
+        """Write all lines to the file."""
         write_whole(self.path, self._content)
         self._written = time.monotonic()
 
@@ -113,10 +115,10 @@ class Summary:
     """Counts of a run: decisions, latencies, faults.
 
     Attributes:
-        decisions: Decisions made.
-        latencies_ms: Of each of them.
-        light_decisions: Decisions times lights.
-        reasons: Kind of fault to the decisions of single lights it sent to the plan.
+        decisions: Number of decisions.
+        latencies_ms: Latency of each decision, ms.
+        light_decisions: Number of decisions times number of lights.
+        reasons: Kind of fault to the number of times it sent a single light to the plan.
     """
 
     decisions: int = 0
@@ -133,11 +135,11 @@ class Summary:
 
     @property
     def fallback_share(self) -> float:
-        """Share of single lights' decisions that were the plan's, 0 to 1."""
+        """Share of the decisions of single lights that the plan made, 0 to 1."""
         return sum(self.reasons.values()) / max(self.light_decisions, 1)
 
     def latency_ms(self, quantile: float) -> float:
-        """Return a quantile of the latencies; NaN before the first decision."""
+        """Return a quantile of the latencies, ms; NaN before the first decision."""
         if not self.latencies_ms:
             return float("nan")
         return float(np.quantile(self.latencies_ms, quantile))
@@ -147,14 +149,14 @@ class FieldLoop:
     """Control of a street's lights by a policy, as long as counts and policy can be trusted.
 
     Args:
-        site: The place, with the policy's observation.
+        site: The intersections, with the policy's observation.
         policy: The policy; it runs in a thread of its own.
-        street: The street that is read and set.
-        limits: Limits of trust.
-        log: Log of the decisions, or None.
+        street: The street whose counts are read and whose lights are set.
+        limits: Limits of trust; None for the default values.
+        log: Log of the decisions; None for no log.
 
     Raises:
-        OptionError: The street lacks a light, or shows what none of its lights can show.
+        OptionError: The street lacks a light, or a light shows a state that it cannot have.
     """
 
     def __init__(
@@ -188,7 +190,7 @@ class FieldLoop:
         """Drive the street for `seconds`, rounded up to whole decisions.
 
         Raises:
-            SimulatorError: The street is gone; the lights cannot be set any more.
+            SimulatorError: The connection to the street is lost; no light can be set any more.
         """
         until = self._street.now_s() + seconds - 1e-6
         try:
@@ -203,10 +205,10 @@ class FieldLoop:
         return self.summary
 
     def decide(self) -> tuple[Decision, dict[str, list[Segment]]]:
-        """Read, check and decide; the street has not been touched yet.
+        """Read the counts, check them and decide; no light is set yet.
 
         Returns:
-            The decision, and what each light is to show in the coming interval.
+            The decision, and traffic light to its states in the coming interval.
         """
         begun = time.perf_counter()
         now = float(self._street.now_s())
@@ -228,11 +230,11 @@ class FieldLoop:
         return decision, plans
 
     def _act(self, decision: Decision, plans: Mapping[str, list[Segment]]) -> None:
-        """Show the plans; no state is shown for less than its time, however late the street is."""
+        """Show the plans. Each state gets its full time, even if the street is late."""
         for index, (duration, states) in enumerate(merged(plans)):
             self._street.show(states)
             until = self._street.now_s() + duration
-            if index == 0:  # the lights do not wait for it
+            if index == 0:  # after the first states are set, so that lights do not wait for a disk
                 self._record(decision)
                 self._held = _without_green(self._site, plans)
             self._street.wait(until)
@@ -243,11 +245,14 @@ class FieldLoop:
             self._log.add(decision)
 
     def close(self) -> None:
-        """Let the policy's thread end; lights stay as they are."""
+        """Let the policy's thread end; the lights keep their states."""
         self._asked.close()
 
     def _look(self, now: float) -> tuple[dict[str, LaneCount], dict[str, str]]:
-        """Return trusted counts, and the lights that see others or are not taken over yet."""
+        """Return the trusted counts, and light to its fault.
+
+        A light is at fault if it needs a count that is not trusted, or if it is not taken over yet.
+        """
         try:
             counts = dict(self._street.read())
             wrong = self._watchdog.faults(counts, now, self._held)
@@ -266,7 +271,10 @@ class FieldLoop:
     def _ask(
         self, counts: Mapping[str, LaneCount], now: float, begun: float
     ) -> tuple[list[int], str]:
-        """Return the policy's phases in the order of the lights, or the reason for none."""
+        """Return the policy's phases in the order of the lights, or the reason why there are none.
+
+        `begun` is the start of the decision by `time.perf_counter`, s.
+        """
         limits = self._limits
         phases = [light.phase for light in self.lights.values()]
         observations = self._site.observe(counts, now, phases)
@@ -292,7 +300,7 @@ class FieldLoop:
         }
 
     def _warm_up(self, policy: Policy) -> None:
-        """Ask the policy once before it counts: the first answer of a network takes longest."""
+        """Ask the policy once before the first decision: a network's first answer takes longest."""
         try:
             nothing = self._site.observe({}, self._street.now_s(), [0] * len(self.lights))
             for function, arguments in (
@@ -302,7 +310,7 @@ class FieldLoop:
             ):
                 self._asked.ask(function, *arguments, within_s=_WARM_UP_S)
         except NoAnswer:
-            return  # it will fail again when it matters, and say so then
+            return  # the first decision meets the same failure and reports it
 
 
 def _answer_of(policy: Policy, site: Site) -> Callable[..., list[int]]:

@@ -1,8 +1,8 @@
 """Safety under any request of a policy: signal machines, a fixed-time plan, and trust.
 
-No input, no output, no clock of its own. The signal machine is that of the environments
-(`ugat_marl.scenarios.signals`); here it also begins from whatever a light shows when it is taken
-over.
+This module reads nothing, writes nothing and has no clock. The signal machine is that of the
+environments (`ugat_marl.scenarios.signals`). Here it can also begin from any state that a light
+shows when it is taken over.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ugat_marl.policies import ControlledNetwork, FixedTime
 from ugat_marl.scenarios import Network, Segment, SignalState, SignalTiming, signals
 
 _ENDING = frozenset("yYoO")
-"""Yellow, and off: traffic may be in the junction, so that yellow is shown (again) in full."""
+"""Yellow and off. Traffic may be in the junction, so the light shows a full yellow (again)."""
 _NOT_GREEN = str.maketrans("yYoOu", "rrrrr")
 
 
@@ -26,13 +26,14 @@ class Light:
     """Signal machine of one traffic light.
 
     Args:
-        phases: The green phases it may show.
-        timing: Minimum green and clearance.
-        shown: Its state when it is taken over, any state of SUMO's. A state that is none of the
-            phases is held for the minimum green, since its begin is unknown, and cleared like one.
+        phases: The green phases that the light may show, in SUMO's letters.
+        timing: Minimum green and clearance, s.
+        shown: State of the light when it is taken over, in SUMO's letters. A state that is none of
+            the phases is held for the minimum green, because its begin is unknown. Then it is
+            cleared like a phase.
 
     Raises:
-        OptionError: `shown` is of another light.
+        OptionError: `shown` does not fit the phases, so it belongs to another light.
     """
 
     def __init__(self, phases: Sequence[str], timing: SignalTiming, shown: str) -> None:
@@ -53,16 +54,20 @@ class Light:
 
     @property
     def taken_over(self) -> bool:
-        """True once it shows, or clears towards, a phase of its own."""
+        """True once the light shows one of its phases or clears towards one."""
         return self._state.phase < len(self.phases)
 
     @property
     def phase(self) -> int:
-        """The phase it shows or clears towards; 0 as long as it is not taken over."""
+        """The phase that the light shows or clears towards; 0 until it is taken over."""
         return self._state.phase if self.taken_over else 0
 
     def free(self, within_s: float) -> NDArray[np.int8]:
-        """Return 1 for every phase that would begin within `within_s`, else 0, ``(phases,)``."""
+        """Return 1 for every phase that can begin within `within_s` seconds, else 0.
+
+        Returns:
+            int8, ``(phases,)``.
+        """
         mask = np.ones(len(self.phases), dtype=np.int8)
         left = within_s - self._ending_s
         if self.taken_over and not signals.free_to_change(self._state, self._timing, left):
@@ -71,7 +76,7 @@ class Light:
         return mask
 
     def advance(self, requested: int, seconds: float) -> list[Segment]:
-        """Return the segments of the next `seconds`, with `requested` asked for from now on."""
+        """Return the segments of the next `seconds`, if phase `requested` is asked for now."""
         shown: list[Segment] = []
         if self._ending_s > 0:
             part = min(self._ending_s, seconds)
@@ -89,8 +94,9 @@ class Trust:
     """Trust in the policy, per light: lost at a fault, regained after some good decisions.
 
     Args:
-        lights: The lights.
-        return_after: Good decisions in a row that a light spends on the plan after a fault.
+        lights: Names of the traffic lights.
+        return_after: Number of good decisions in a row that a light spends on the plan after a
+            fault.
     """
 
     def __init__(self, lights: Iterable[str], return_after: int) -> None:
@@ -99,10 +105,10 @@ class Trust:
         self._last: dict[str, str] = {}
 
     def judge(self, faults: Mapping[str, str]) -> dict[str, str]:
-        """Return the lights that follow the plan in this decision, and why.
+        """Return light to reason, for the lights that follow the plan in this decision.
 
         Args:
-            faults: Light to what is wrong with its data or the policy, ``<kind>: <details>``.
+            faults: Light to the fault of its data or of the policy, ``<kind>: <details>``.
         """
         found: dict[str, str] = {}
         for light, good in self._good.items():
@@ -123,8 +129,14 @@ def fixed_time(
 ) -> FixedTime:
     """Return the fallback plan: a smallest set of phases that serves every link, in turn.
 
-    Its answers are by traffic light. One clock drives all lights, so that the plan is the same
-    whenever a light joins.
+    The plan answers by traffic light. One clock drives all lights, so a light that joins later
+    follows the same plan.
+
+    Args:
+        network: The network.
+        decision_interval_s: Time between decisions, s.
+        clearance_s: Yellow and all-red together, s.
+        green_s: Time of a phase, s, its clearance included.
     """
     streets = ControlledNetwork(
         {item.id: item for item in network.intersections},
@@ -137,7 +149,11 @@ def fixed_time(
 
 
 def merged(plans: Mapping[str, Sequence[Segment]]) -> list[tuple[float, dict[str, str]]]:
-    """Merge the plans of all lights: durations in s, and the lights that change at their start."""
+    """Merge the plans of all lights into common pieces of time.
+
+    Returns:
+        For each piece its duration in s, and the state of each light that changes at its start.
+    """
     changes: dict[float, dict[str, str]] = {}
     end = 0.0
     for light, segments in plans.items():

@@ -1,4 +1,4 @@
-"""The controlled place: network, timing, and the observation of a policy."""
+"""The controlled site: network, timing, and the observation of a policy."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Site:
     """Intersections, their timing, and the observation of one policy.
 
     Attributes:
-        network: Static facts.
-        observer: Makes the policy's observations of counts.
-        timing: Minimum green and clearance of all lights.
+        network: Lanes, links and phases of the intersections.
+        observer: Maker of the policy's observations from counts.
+        timing: Minimum green and clearance of all lights, s.
         decision_interval_s: Seconds from one decision to the next.
-        sees: Traffic light to the lanes its agent observes, those of neighbours included.
-        halting: Whether the observation needs the standing vehicles as well.
+        sees: Traffic light to the lanes that its agent observes, those of its neighbours included.
+        halting: True if the observation needs the number of standing vehicles as well.
     """
 
     network: Network
@@ -46,7 +46,8 @@ class Site:
         """Return the site of a scenario, for a policy that relies on `env_options`.
 
         Raises:
-            OptionError: The policy needs what no detector tells, or does not choose phases.
+            OptionError: The policy needs data that no detector measures, or it does not choose
+                phases, or the scenario counts vehicles upstream of the lanes at the lights.
         """
         name, hops = env_options.get("observation", "count"), env_options.get("neighbours", 0)
         if name == "waiting":
@@ -96,13 +97,13 @@ class Site:
 
     @cached_property
     def capacity(self) -> dict[str, float]:
-        """Lane that must be counted to the vehicles that fit on it."""
+        """Lane that must be counted to the number of vehicles that fit on it."""
         lanes = dict.fromkeys(lane for own in self.sees.values() for lane in own)
         return {lane: self.network.lanes[lane].capacity for lane in lanes}
 
     @cached_property
     def spaces(self) -> dict[str, Discrete]:
-        """Agent to its actions."""
+        """Agent to its action space, one action per phase."""
         items = zip(self.observer.agents, self.network.intersections, strict=True)
         return {agent: Discrete(len(item.phases)) for agent, item in items}
 
@@ -112,10 +113,10 @@ class Site:
         """Return the observations of all agents.
 
         Args:
-            counts: Trusted counts. A lane without one is taken to be empty; agents that see it must
-                not be obeyed.
-            now_s: The street's clock.
-            phases: Phase each light shows or clears towards.
+            counts: Lane to its trusted count. A lane without a count is taken to be empty. The
+                caller must ignore the answers of agents that observe such a lane.
+            now_s: Time on the street's clock, s.
+            phases: Phase that each light shows or clears towards, in the order of the lights.
         """
         lanes = self._lanes.ids
         nobody = LaneCount(now_s, 0.0, 0.0)

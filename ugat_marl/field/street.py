@@ -1,7 +1,7 @@
 """Interface of a street: counts with their time, lights to set, a clock.
 
-`TraciStreet` puts a SUMO that runs elsewhere in its place, `StartedSumo` a SUMO of this process.
-Another street is a class with the five methods of `Street` (docs/how-to/field.md has one).
+`TraciStreet` uses a running SUMO as the street. `StartedSumo` starts such a SUMO. A real street is
+a class with the five methods of `Street`; docs/how-to/field.md shows one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ugat_marl.scenarios import Scenario, sumo_program
 from ugat_marl.simulation import Trips, launch_of, read_trips
 
 CountSource = Literal["lanes", "areas"]
-"""Where SUMO counts: on whole lanes, or on its lane-area detectors."""
+"""Source of SUMO's counts: whole lanes, or its lane-area detectors."""
 
 _RETRY_S = 0.05
 
@@ -44,9 +44,9 @@ class LaneCount(NamedTuple):
     """Count of one lane.
 
     Attributes:
-        time_s: When it was counted, on the street's clock.
-        vehicles: Vehicles on the lane; an estimate need not be whole.
-        halting: Standing vehicles among them; NaN where that is not measured.
+        time_s: Time of the count on the street's clock, s.
+        vehicles: Number of vehicles on the lane; an estimate need not be whole.
+        halting: Number of standing vehicles among them; NaN if it is not measured.
     """
 
     time_s: float
@@ -55,34 +55,34 @@ class LaneCount(NamedTuple):
 
 
 class Street(Protocol):
-    """Interface of a street. Only `read` may fail without ending the loop."""
+    """Interface of a street. The loop survives an error of `read`, but of no other method."""
 
     def now_s(self) -> float:
         """Return the street's clock, s."""
         ...
 
     def shown(self) -> Mapping[str, str]:
-        """Traffic light to the state it shows now, one letter of SUMO's per link."""
+        """Return traffic light to the state that it shows now, one letter of SUMO per link."""
         ...
 
     def read(self) -> Mapping[str, LaneCount]:
-        """Lane to its last count, without waiting for a new one; lanes may be left out."""
+        """Return lane to its last count, without waiting for a new one; lanes may be missing."""
         ...
 
     def show(self, states: Mapping[str, str]) -> None:
-        """Set lights, which stay so until the next call; those left out are not touched."""
+        """Set lights. They keep their state until a later call sets them again."""
         ...
 
     def wait(self, until_s: float) -> None:
-        """Return when the clock shows at least `until_s`."""
+        """Wait until the clock shows at least `until_s`."""
         ...
 
 
 class TraciStreet:
     """Running ``sumo --remote-port PORT`` in place of the street.
 
-    Counts are subscribed to, so that they come with every step, as detectors send them, and
-    `read` costs no round trip. The simulation goes on when the loop waits, and only then.
+    The counts are subscribed to: they come with every step, and `read` costs no round trip. The
+    simulation advances only in `wait`.
 
     Args:
         lanes: Lanes to count on.
@@ -139,7 +139,7 @@ class TraciStreet:
         return self._time_s
 
     def shown(self) -> dict[str, str]:
-        """State of every traffic light of the simulation."""
+        """Return traffic light to its state, for all lights of the simulation."""
         with self._told("SUMO does not say what its lights show"):
             api = self._connection.trafficlight
             return {name: api.getRedYellowGreenState(name) for name in api.getIDList()}
@@ -160,23 +160,24 @@ class TraciStreet:
                 self._connection.trafficlight.setRedYellowGreenState(light, state)
 
     def wait(self, until_s: float) -> None:
-        """Simulate until then."""
+        """Simulate until `until_s`."""
         if until_s > self._time_s:
             with self._told(f"the street is gone after {self._time_s:g} s"):
                 self._connection.simulationStep(until_s)
                 self._time_s = float(self._connection.simulation.getTime())
 
     def close(self) -> None:
-        """Hang up, upon which SUMO ends; may be called again."""
+        """Close the connection, which ends SUMO; further calls do nothing."""
         with contextlib.suppress(TraCIException, FatalTraCIError, OSError):
             if self._amid and self._connection._socket is not None:
-                self._connection._socket.close()  # goodbye would be answered by what is under way
+                # In the middle of a command, SUMO's next answer belongs to that command.
+                self._connection._socket.close()
                 self._connection._socket = None
             self._connection.close(False)
 
     @contextlib.contextmanager
     def _told(self, what: str) -> Iterator[None]:
-        self._amid = True  # and stays so after Ctrl-C
+        self._amid = True  # stays True if Ctrl-C interrupts the command
         try:
             yield
             self._amid = False
@@ -191,7 +192,7 @@ _COUNTED = (tc.LAST_STEP_VEHICLE_NUMBER, tc.LAST_STEP_VEHICLE_HALTING_NUMBER)
 def _connected(
     port: int, host: str, process: subprocess.Popen[bytes] | None, patience_s: float
 ) -> Any:
-    """Return a connection outside of traci's pool, which belongs to the user."""
+    """Return a connection that is not in traci's pool, because the pool belongs to the user."""
     connect: Callable[..., Any] = traci.connect
     until = time.monotonic() + patience_s
     while True:
@@ -209,9 +210,10 @@ def _connected(
 
 
 class StartedSumo:
-    """Scenario in a ``sumo --remote-port`` that runs while its block does.
+    """Scenario in a ``sumo --remote-port`` that runs as long as the ``with`` block.
 
-    SUMO ends when its one client hangs up, or (under Linux) when this process dies before.
+    SUMO ends when its one client closes the connection. Under Linux it also ends when this process
+    dies.
 
     Args:
         scenario: The scenario, in its domain.
@@ -219,8 +221,8 @@ class StartedSumo:
         port: Port to listen on; None for a free one.
 
     Attributes:
-        port: Its port.
-        process: Its process.
+        port: Port on which SUMO listens.
+        process: SUMO's process.
 
     Raises:
         OptionError: The scenario's lights turn green late, which SUMO does not do by itself.
@@ -246,16 +248,16 @@ class StartedSumo:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for this process, which ends the other by itself
+            start_new_session=True,  # Ctrl-C reaches only this process, which then ends SUMO
             preexec_fn=_tied_to(os.getpid()) if sys.platform == "linux" else None,
         )
         return self
 
     def trips(self) -> Trips:
-        """Return the trips of every vehicle due, once the client has hung up.
+        """Return the trips of every vehicle due; the client must have closed the connection.
 
         Raises:
-            SimulatorError: SUMO has not written it.
+            SimulatorError: SUMO has not written the trips.
         """
         self._wait()
         return read_trips(self._trips)
@@ -266,7 +268,7 @@ class StartedSumo:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.process.kill()  # its files go with it
+        self.process.kill()  # its files are deleted below, so it need not write them
         self._wait()
         self._directory.cleanup()
 
@@ -289,8 +291,8 @@ def _free_port() -> int:
 
 
 def _tied_to(parent: int) -> Callable[[], None]:
-    """Return a function for the child: it is killed when `parent` dies."""
-    prctl: Any = ctypes.CDLL(None).prctl  # loaded before the fork, where little is allowed
+    """Return a function to run in the child process: the child is killed when `parent` dies."""
+    prctl: Any = ctypes.CDLL(None).prctl  # loaded here, since little is allowed after the fork
 
     def tie() -> None:
         prctl(_DIE_WITH_PARENT, int(signal.SIGKILL))

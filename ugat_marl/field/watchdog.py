@@ -1,4 +1,4 @@
-"""Plausibility of counts: limits, and the watchdog that holds counts to them."""
+"""Plausibility of counts: the limits, and the watchdog that checks counts against them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ugat_marl.field.street import LaneCount
 
 _MAY_BE_ENDLESS = ("frozen_after_s", "silent_after_s", "over_capacity")
 _FULL = 0.8
-"""Share of its capacity from which a lane may be full, so that its count may stand still."""
+"""Share of a lane's capacity from which it may be full. The count of a full lane may not change."""
 
 
 @dataclass(frozen=True)
@@ -19,17 +19,17 @@ class Limits:
     """Limits beyond which counts and policy are not trusted.
 
     Attributes:
-        answer_ms: Time from reading the counts until every light has its plan, ms.
-        reserve_ms: Part of it that is kept for the steps after the policy; the policy has the rest.
-        stale_after_s: Counts older than this are not used.
-        frozen_after_s: Time after which an unchanged count, not 0, of a lane with green is a fault,
-            and after which unchanged counts of all lanes are. Queues at red do not move, nor do
-            full lanes.
-        silent_after_s: Time after which a lane that counts no vehicle is at fault, if it has
-            counted one before and others move; inf where roads are empty for hours.
-        over_capacity: Multiple of the vehicles that fit on a lane from which a count is absurd; not
-            1, since motorcycles need less room than the vehicles that capacity is counted in.
-        return_after: Good decisions in a row before the policy drives a light again.
+        answer_ms: Longest time from reading the counts until every light has its plan, ms.
+        reserve_ms: Part of `answer_ms` for the steps after the policy, ms.
+        stale_after_s: Age from which a count is not used, s.
+        frozen_after_s: Time, s, after which an unchanged count above 0 is a fault. It runs only
+            while the lane has green and is not full, because queues at red and full lanes do not
+            move. If no count of any lane changes for this time, all lanes are at fault.
+        silent_after_s: Time, s, after which a lane that counts no vehicle is at fault, if it has
+            counted one before and other lanes move. Use inf where roads are empty for hours.
+        over_capacity: Multiple of a lane's capacity above which a count is absurd. It is above 1
+            because motorcycles need less room than the vehicles that define the capacity.
+        return_after: Number of good decisions in a row before the policy drives a light again.
         green_s: Time of a phase of the fixed-time plan, s, its clearance included.
     """
 
@@ -58,8 +58,8 @@ class Watchdog:
     """Check of the counts of every decision.
 
     Args:
-        capacity: Lane that must be counted to the vehicles that fit on it.
-        halting: Whether the number of standing vehicles must be known as well.
+        capacity: Lane that must be counted to the number of vehicles that fit on it.
+        halting: True if the number of standing vehicles must be known as well.
         limits: Limits of trust.
     """
 
@@ -76,12 +76,12 @@ class Watchdog:
     def faults(
         self, counts: Mapping[str, LaneCount], now_s: float, held: Collection[str] = ()
     ) -> dict[str, str]:
-        """Return the lanes whose counts are not trusted, and why: ``<kind>: <details>``.
+        """Return lane to fault, ``<kind>: <details>``, for the lanes whose count is not trusted.
 
         Args:
-            counts: The counts.
-            now_s: The street's clock.
-            held: Lanes without green since the last look, which no vehicle could leave.
+            counts: Lane to its count.
+            now_s: Time on the street's clock, s.
+            held: Lanes without green since the last call; no vehicle could leave them.
         """
         found: dict[str, str] = {}
         elapsed, self._looked_s = now_s - self._looked_s, now_s
@@ -95,13 +95,13 @@ class Watchdog:
                 waits = lane in held or count.vehicles >= _FULL * capacity
                 self._note(lane, count, now_s, 0.0 if waits else elapsed)
                 continue
-            self._value.pop(lane, None)  # what it will say next is new
+            self._value.pop(lane, None)  # the lane's next good count is a change
         return self._stuck(now_s) | found
 
     def _wrong(self, count: LaneCount, capacity: float, now_s: float) -> str:
         try:
             return self._absurd(count, capacity) or self._stale(count, now_s)
-        except (TypeError, ValueError, AttributeError):  # a driver need not be typed
+        except (TypeError, ValueError, AttributeError):  # a driver may return anything
             return f"absurd: {count!r} is no count"
 
     def _absurd(self, count: LaneCount, capacity: float) -> str:
@@ -116,7 +116,7 @@ class Watchdog:
 
     def _stale(self, count: LaneCount, now_s: float) -> str:
         age = now_s - count.time_s
-        if not abs(age) <= self._limits.stale_after_s:  # NaN is stale; so is a clock that is ahead
+        if not abs(age) <= self._limits.stale_after_s:  # NaN and times in the future are stale too
             return f"stale: a count {age:g} s old"
         return ""
 
@@ -131,7 +131,7 @@ class Watchdog:
             self._counted.add(lane)
 
     def _stuck(self, now_s: float) -> dict[str, str]:
-        """Return counts that do not move; an empty road at night is no fault at first."""
+        """Return lane to fault, for counts that do not change; a count of 0 may stay for long."""
         limits, still = self._limits, now_s - self._moved_s
         if still > limits.frozen_after_s and any(vehicles for vehicles, _ in self._value.values()):
             return {
