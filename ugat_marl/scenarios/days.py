@@ -1,8 +1,8 @@
 """Other days of the same expected demand, drawn by a Poisson bootstrap over vehicles.
 
-Between two days of a street the vehicles differ, and with them every count and every gap. A
-simulation that repeats one list of vehicles has less noise than the street, so that comparisons
-find differences where there are none.
+On a street, vehicles differ from day to day, and so do counts and gaps. A simulation that repeats
+one list of vehicles has less noise than the street. Comparisons would then find differences that do
+not exist.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from ugat_marl.scenarios.settings import seconds_of
 from ugat_marl.seeding import numpy_generator
 
 JITTER_S = 120.0
-"""Departures move by up to this much either way: profiles of the day stay, minutes do not."""
+"""Greatest shift of a departure, earlier or later, s; small enough to keep the profile of a day."""
 DEFAULT_SPEED = (1.0, 0.1, 0.2, 2.0)
-"""SUMO's distribution of speedFactor for passenger cars: mean, deviation, least, greatest."""
+"""SUMO's normal distribution of speedFactor for cars: mean, standard deviation, least, greatest."""
 
 _TYPES, _VEHICLES = "types.add.xml", "vehicles.rou.xml"
 _NORMAL = re.compile(r"norm(c?)\(([^)]*)\)")
@@ -34,7 +34,17 @@ _NORMAL = re.compile(r"norm(c?)\(([^)]*)\)")
 
 @dataclass(frozen=True)
 class _Vehicles:
-    """Vehicles of a demand as text, ready to be written in any order."""
+    """Vehicles of a demand as text, ready to be written in any order.
+
+    Attributes:
+        types: Additional file with the vehicle types.
+        depart_s: Departures, s, ``(vehicles,)``.
+        names: Ids.
+        heads: Remaining attributes of each ``<vehicle>`` tag, up to its ``>``.
+        tails: Children of each ``<vehicle>``.
+        speeds: Mean, deviation, least and greatest speedFactor, ``(vehicles, 4)``; the mean is NaN
+            if SUMO draws the factor.
+    """
 
     types: Document
     depart_s: NDArray[np.float64]
@@ -47,12 +57,12 @@ class _Vehicles:
 def another_day(scenario: Scenario, seed: int) -> Scenario:
     """Draw another day: a Poisson number of copies of every vehicle, departures jittered.
 
-    The same seed gives the same vehicles, names and speedFactors, whatever effects are applied
-    afterwards, so that two models can be compared on the same day.
+    The same seed gives the same vehicles, names and speedFactors. Effects applied afterwards do not
+    change them, so two models can be compared on the same day.
 
     Args:
-        scenario: Any scenario; `as_vehicles` is applied if need be.
-        seed: Which day; any non-negative integer.
+        scenario: Any scenario; `as_vehicles` turns its trips and flows into vehicles.
+        seed: Number of the day, a non-negative integer.
     """
     scenario = as_vehicles(scenario)
     vehicles = _vehicles(tuple(document.read() for document in scenario.routes))
@@ -72,7 +82,7 @@ def another_day(scenario: Scenario, seed: int) -> Scenario:
         departs = np.where((departs >= end) & (vehicles.depart_s < end), 2 * end - departs, departs)
         departs = np.maximum(departs, begin)
         factors = np.clip(mean + deviation * draws[copy], least, greatest)
-        suffix = f"~{seed}.{copy}"  # effects that choose by name choose others every day
+        suffix = f"~{seed}.{copy}"  # new names: effects choose other vehicles every day
         for index in np.flatnonzero(copies > copy).tolist():
             name = quoteattr(vehicles.names[index] + suffix)
             factor = factors[index]
@@ -96,7 +106,7 @@ def another_day(scenario: Scenario, seed: int) -> Scenario:
 
 @functools.lru_cache(maxsize=8)
 def _vehicles(routes: tuple[bytes, ...]) -> _Vehicles:
-    """Take route files of single vehicles apart; cached, since days are drawn many times."""
+    """Split route files into single vehicles; cached because many days use the same files."""
     types = ET.Element("additional")
     depart: list[float] = []
     names: list[str] = []
@@ -133,7 +143,7 @@ def _attributes(item: ET.Element) -> str:
 
 
 def _speed_of(attributes: Mapping[str, str]) -> tuple[float, float, float, float]:
-    """Return mean, deviation, least and greatest speedFactor of a type; NaN if SUMO draws it."""
+    """Return mean, deviation, least and greatest speedFactor of a type; NaN if SUMO must draw."""
     text, deviation = attributes.get("speedFactor"), attributes.get("speedDev")
     passenger = attributes.get("vClass", "passenger") == "passenger"
     try:

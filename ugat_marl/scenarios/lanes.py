@@ -1,4 +1,4 @@
-"""The measured lanes of a network, in the order of every array about them."""
+"""The measured lanes of a network. Their order is the order of all arrays about lanes."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 Shares = tuple[tuple[tuple[str, float], ...], ...]
-"""For each measured lane names of others, each with a share in (0, 1]."""
+"""For each measured lane: names of other lanes or roads, each with a share in (0, 1]."""
 
 
 class UpstreamLanes(NamedTuple):
-    """Lanes and roads counted with lanes shorter than an agent's sight (`junctions.behind_of`).
+    """Lanes and roads counted with lanes shorter than the reach (see `junctions.behind_of`).
 
     Attributes:
-        lanes: For each measured lane the lanes upstream of it, inside junctions and outside.
-        roads: For each the roads on which it or those begin: vehicles due there that find no room
-            to enter the network stand behind them.
+        lanes: For each measured lane, the lanes upstream of it, inside and outside of junctions.
+        roads: For each measured lane, the roads whose waiting vehicles count: those that are due
+            on the road but find no space to enter the network.
     """
 
     lanes: Shares = ()
@@ -32,13 +32,13 @@ NO_UPSTREAM_LANES = UpstreamLanes()
 
 @dataclass(frozen=True)
 class LaneTable:
-    """Measured lanes, in the order of every array of a `Snapshot`.
+    """Measured lanes, in the order of all arrays of a `Snapshot`.
 
     Attributes:
-        ids: Lane ids of SUMO, ``(lanes,)``.
-        capacity: Vehicles that fit on the lane, ``(lanes,)``, float64.
+        ids: Lane ids of SUMO.
+        capacity: Number of vehicles that fit on the lane, ``(lanes,)``, float64.
         speed_mps: Speed limit, ``(lanes,)``, float64.
-        behind: Lanes and roads counted with lanes that are too short.
+        behind: Upstream lanes and roads counted with short lanes.
     """
 
     ids: tuple[str, ...]
@@ -47,6 +47,6 @@ class LaneTable:
     behind: UpstreamLanes = NO_UPSTREAM_LANES
 
     def indices(self, lanes: Sequence[str]) -> NDArray[np.int64]:
-        """Positions of `lanes` in the arrays, int64."""
+        """Return the positions of `lanes` in the arrays, int64."""
         position = {lane: index for index, lane in enumerate(self.ids)}
         return np.array([position[lane] for lane in lanes], dtype=np.int64)

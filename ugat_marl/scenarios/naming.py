@@ -1,4 +1,4 @@
-"""Names of agents, with a prefix per kind of agent, and of SUMO's lanes."""
+"""Names of agents and of SUMO's lanes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ def group_names(kinds: Sequence[Hashable]) -> dict[str, list[int]]:
         kinds: The kind of each item.
 
     Returns:
-        ``"signal"`` if all are of one kind, else ``"signala"``, ``"signalb"``, ..., each with the
-        positions of its items.
+        Group name to the positions of its items. The name is ``"signal"`` if there is one kind,
+        else ``"signala"``, ``"signalb"``, ...
     """
     distinct = list(dict.fromkeys(kinds))
     names = (
@@ -42,5 +42,5 @@ def letters(number: int) -> str:
 
 
 def edge_of(lane: str) -> str:
-    """Return the edge of a lane, by SUMO's naming; empty if it is not a lane's name."""
+    """Return the edge in a lane's name ``<edge>_<n>``; empty if there is no underscore."""
     return lane.rpartition("_")[0]

@@ -33,7 +33,7 @@ from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import GREEN, STATES, check_phases
 
 VEHICLE_SPACE_M = 7.5
-"""Room of a queued default vehicle: 5 m length plus 2.5 m gap."""
+"""Space of a queued default vehicle: 5 m length plus 2.5 m gap."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,13 @@ class Lane:
 
     Attributes:
         id: SUMO id.
-        edge: Its edge.
+        edge: SUMO id of its edge.
         length_m: Length.
         speed_mps: Speed limit.
         shape: Centre line, ``((x, y), ...)`` in m.
-        behind: Lanes and roads counted with it, where it is shorter than an agent's sight.
-        room_m: Length on which vehicles are measured: lanes behind included, and the reach.
+        behind: Upstream lanes and roads counted with this lane, if it is shorter than the reach.
+        room_m: Length on which vehicles are counted, upstream lanes and reach included; 0 for lanes
+            that are long enough or not at an agent.
     """
 
     id: str
@@ -60,7 +61,7 @@ class Lane:
 
     @property
     def capacity(self) -> float:
-        """Default vehicles that fit on the lane and those behind, at least one."""
+        """Number of default vehicles that fit on the lane and its upstream lanes, at least one."""
         return max(1.0, max(self.length_m, self.room_m) / VEHICLE_SPACE_M)
 
 
@@ -70,13 +71,13 @@ class Intersection:
 
     Attributes:
         id: SUMO id of the traffic light.
-        incoming_lanes: Lanes that lead to a link, in order of link index.
-        outgoing_lanes: Lanes that links lead to, in order of link index.
-        links: All links by index.
+        incoming_lanes: Lanes at the start of a link, in order of link index.
+        outgoing_lanes: Lanes at the end of a link, in order of link index.
+        links: Links for vehicles, in order of index.
         phases: Green states the agent chooses from.
         programme: The network's own programme, ``(duration_s, state)``.
-        neighbours: Traffic lights one road away, in either direction.
-        position: Mean of the junctions' coordinates, m.
+        neighbours: Other agents one road away, in either direction.
+        position: Mean over the links of their junction's coordinates, m.
         crossings: Links for people on foot.
     """
 
@@ -98,7 +99,7 @@ class Network:
     Attributes:
         lanes: Lanes outside of junctions by id.
         intersections: Traffic lights with at least two green phases, in the order of their ids.
-        uncontrolled: Traffic lights with fewer green phases; they run their own programme.
+        uncontrolled: Traffic lights with fewer than two green phases; they run their own programme.
     """
 
     lanes: Mapping[str, Lane]
@@ -110,8 +111,9 @@ class Network:
         """Read and check the network of a scenario.
 
         Raises:
-            ScenarioError: Not a network, no traffic light to control, phases that cannot be shown
-                or whose greens conflict, or settings for a traffic light that does not exist.
+            ScenarioError: The file is no network or has no traffic light to control. Or phases
+                cannot be shown or have conflicting greens. Or settings name an unknown traffic
+                light.
         """
         document = scenario.network
         root = parse_xml(document.read(), document.source)
@@ -207,7 +209,7 @@ class Network:
 
 
 def within_hops(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str, tuple[str, ...]]:
-    """Return for each name the others at most `hops` roads away, nearest first."""
+    """Return, for each name, the other names at most `hops` roads away, nearest first."""
     found: dict[str, tuple[str, ...]] = {}
     for name in neighbours:
         reached, frontier = [name], [name]
@@ -220,7 +222,7 @@ def within_hops(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str,
 
 
 def signal_widths(scenario: Scenario) -> dict[str, int]:
-    """Return the number of letters in the state of each traffic light, an agent's or not.
+    """Return the number of letters in the state of each traffic light, agent or not.
 
     Raises:
         ScenarioError: The network is not well-formed.
@@ -236,16 +238,16 @@ def signal_widths(scenario: Scenario) -> dict[str, int]:
 
 
 def _source_of(scenario: Scenario, tls: str) -> str | Sequence[str]:
-    """Return the source of a traffic light's phases; the states if they are listed."""
+    """Return the source of a traffic light's phases, or the states if the settings list them."""
     own = scenario.settings.intersections.get(tls)
     return own.phases if own and own.phases is not None else scenario.control.phases
 
 
 def _choices(phases: Sequence[str], links: Sequence[Link], source: str | Sequence[str]) -> int:
-    """Count the phases among which an agent that sees vehicles can choose.
+    """Count the phases an agent can choose from.
 
-    At a light for a crossing alone an agent would never stop the vehicles. Such a light keeps its
-    programme, unless its phases are listed.
+    Derived phases count only if they give green to vehicles. An agent sees vehicles alone, so at a
+    light with only a crossing it would never stop them. Listed phases all count.
     """
     if not isinstance(source, str):
         return len(phases)
@@ -287,10 +289,7 @@ def _check_programme(
     foes: Mapping[str, Sequence[int]],
     where: str,
 ) -> int:
-    """Refuse an impossible programme and return the number of letters of its states.
-
-    There may be more letters than links of vehicles: crossings for people on foot have letters too.
-    """
+    """Refuse an impossible programme and return the number of letters of its states."""
     letters = len(programme[0][1])
     for index, (_, state) in enumerate(programme):
         what = f"{where}: state {index} of its programme ({state!r})"
@@ -348,7 +347,7 @@ def _lanes(root: ET.Element) -> dict[str, Lane]:
 def _with_room(
     lanes: dict[str, Lane], root: ET.Element, agents: Container[str], reach_m: float
 ) -> dict[str, Lane]:
-    """Return the lanes; short ones at lights with the lanes that are counted with them."""
+    """Return the lanes; add to short lanes at lights the upstream lanes counted with them."""
     lengths_m = {name: lane.length_m for name, lane in lanes.items()}
     for name, own in behind_of(root, lengths_m, max(reach_m, VEHICLE_SPACE_M), agents).items():
         behind = own if reach_m else Upstream(own.lanes)
@@ -364,7 +363,7 @@ def _shape(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[float, str], ...]]:
-    """Return the programmes SUMO runs: the last one defined, additional files after the network."""
+    """Return the programmes SUMO runs: the last definition, additional files after the network."""
     programmes: dict[str, tuple[tuple[float, str], ...]] = {}
     parts = chain.from_iterable(document.parts() for document in scenario.additional)
     for tree in chain((root,), parts):

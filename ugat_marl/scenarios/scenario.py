@@ -1,8 +1,8 @@
 """A scenario: road network, demand, timing and signal rules, as one immutable value.
 
-On disk it is a directory with a ``scenario.toml`` and SUMO files, or a plain ``.sumocfg``. Effects
-(see `ugat_marl.effects`) map scenarios to scenarios; a derived one keeps its edited files in memory
-until it is written or simulated.
+On disk a scenario is a directory with a ``scenario.toml`` and SUMO files, or a plain ``.sumocfg``.
+Effects (see `ugat_marl.effects`) map scenarios to scenarios. The new scenario holds its edited
+files itself until it is written or simulated.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class Scenario:
     """A road network with demand and rules, ready to be simulated.
 
     Attributes:
-        id: Name, ending in ``-vN`` for shipped scenarios.
+        id: Name; the name of a shipped scenario ends in ``-vN``.
         network: The ``.net.xml``.
         routes: Route files (vehicles, trips, flows).
-        additional: Additional files.
-        settings: Everything else, as in ``scenario.toml``.
+        additional: SUMO's additional files.
+        settings: All settings of ``scenario.toml``.
         applied: Descriptions of the effects that made this scenario out of another one.
     """
 
@@ -73,7 +73,10 @@ class Scenario:
 
     @functools.cached_property
     def hash(self) -> str:
-        """SHA-256 over the content of all files and all settings, as 64 hex digits."""
+        """SHA-256 over all files and settings, as 64 hex digits.
+
+        The description and the names of the files do not count.
+        """
         digest = hashlib.sha256()
         settings = self.settings.model_dump(mode="json")
         for cosmetic in ("description", "network", "routes", "additional"):
@@ -98,7 +101,7 @@ class Scenario:
         return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
 
     def write(self, directory: Path) -> Path:
-        """Write a scenario directory that any SUMO and `read_scenario` can use.
+        """Write a scenario directory that SUMO and `read_scenario` can use.
 
         Returns:
             `directory`.
@@ -122,15 +125,17 @@ class Scenario:
 
 
 def read_scenario(name: str | Path) -> Scenario:
-    """Load a scenario; effects listed in its ``scenario.toml`` are kept in its settings.
+    """Load a scenario.
+
+    Effects listed in its ``scenario.toml`` stay in its settings. They are not applied here.
 
     Args:
         name: Id of a shipped scenario (``"grid4x4-v1"``), a directory with a ``scenario.toml``, a
             ``.sumocfg``, or ``"resco:<map>"`` for a network of an installed `sumo-rl` wheel.
 
     Raises:
-        UnknownNameError: No such scenario.
-        ScenarioError: A file is missing, or the description is not valid.
+        UnknownNameError: There is no such scenario.
+        ScenarioError: A file is missing, or the ``scenario.toml`` is not valid.
     """
     text = str(name)
     if text.startswith("resco:"):
@@ -260,7 +265,10 @@ def _names(text: str, directory: Path) -> list[str]:
 
 
 def resco_maps() -> dict[str, Path]:
-    """Return the RESCO networks of an installed sumo-rl, read as files and never imported."""
+    """Return the ``.sumocfg`` of each RESCO network of an installed sumo-rl.
+
+    The package sumo-rl is located, but not imported.
+    """
     spec = importlib.util.find_spec("sumo_rl")
     roots = list(spec.submodule_search_locations or []) if spec else []
     files = [file for root in roots for file in Path(root).glob("nets/RESCO/*/*.sumocfg")]
@@ -280,7 +288,7 @@ def _resco_configuration(name: str) -> Path:
 
 
 def _quiet(document: Document) -> Document:
-    """Return the document without outputs, which would be written beside the user's files."""
+    """Return the document with its outputs discarded; SUMO would write them beside user files."""
     if not any("file" in tag.attributes for tag in document.scan()):
         return document
     draft = None
@@ -295,7 +303,7 @@ def _quiet(document: Document) -> Document:
 
 
 def _quoted(value: Any) -> str:
-    """Return a value as TOML, which agrees with JSON but for the character DEL."""
+    """Return a value as TOML: JSON text, with the character DEL escaped."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -307,8 +315,8 @@ def scenario_toml(settings: Mapping[str, Any], applied: Sequence[str] = ()) -> s
     """Return the text of a ``scenario.toml``.
 
     Args:
-        settings: Its keys and values; tables are nested.
-        applied: Descriptions of the effects that made the scenario, kept as comments.
+        settings: Keys and values; nested mappings become tables.
+        applied: Descriptions of the effects that made the scenario, written as comments.
     """
     lines = [f"# made by applying {text}" for text in applied]
     tables: list[str] = []

@@ -12,9 +12,13 @@ from pydantic import Field
 from ugat_marl.errors import ScenarioError, nearest
 
 PhaseSource = Literal["programme", "conflict-free", "permitted"] | tuple[str, ...]
-"""Where an intersection's green phases come from: the network's own signal programme, all maximal
-conflict-free sets of movements, the same with left turns that let the traffic opposite pass, or an
-explicit list of SUMO states."""
+"""Source of an intersection's green phases.
+
+- ``programme``: the network's own signal programme.
+- ``conflict-free``: all maximal sets of movements without conflicts.
+- ``permitted``: the same, with left turns that give way to opposite traffic.
+- A list: SUMO states.
+"""
 
 _SET_BY_THE_SUITE = frozenset(
     {
@@ -28,7 +32,7 @@ _STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class ControlSettings(pydantic.BaseModel):
-    """Signal timing. Greens, yellows and all-reds are in seconds."""
+    """Signal timing of a scenario. Times are in seconds, the reach is in metres."""
 
     model_config = _STRICT
 
@@ -38,9 +42,9 @@ class ControlSettings(pydantic.BaseModel):
     min_green_s: Annotated[float, Field(ge=0, le=600)] = 5.0
     phases: PhaseSource = "programme"
     late_green_s: Annotated[float, Field(ge=0, le=60, exclude_if=lambda value: value == 0)] = 0.0
-    """Delay of traffic behind every green, s; agents do not see it."""
+    """Seconds by which every green is shown late; agents do not see this delay."""
     reach_m: Annotated[float, Field(ge=0, le=2000, exclude_if=lambda value: value == 0)] = 0.0
-    """Distance upstream of a stop line within which vehicles are counted, on shorter lanes too."""
+    """Distance upstream of a stop line, m, within which vehicles count beyond short lanes too."""
 
 
 class IntersectionSettings(pydantic.BaseModel):
@@ -77,11 +81,11 @@ def validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
 
     Args:
         raw: Keys and values.
-        source: What to call it in errors.
+        source: Name of the file in errors.
 
     Raises:
-        ScenarioError: An unknown or missing key, an impossible value, or values that contradict
-            each other.
+        ScenarioError: A key is unknown or missing, a value is impossible, or values contradict each
+            other.
     """
     try:
         settings = ScenarioFile.model_validate(raw)
@@ -121,13 +125,13 @@ def validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
 
 
 def may_be_given(option: str) -> bool:
-    """Return True for an option of SUMO that a scenario may set; the suite sets the others."""
+    """Return True if a scenario may set this option of SUMO; the suite sets the other options."""
     words = set(re.split("[-.]", option))
     return option not in _SET_BY_THE_SUITE and not words & _INPUT_AND_OUTPUT
 
 
 def seconds_of(text: str) -> float:
-    """Return the seconds of a time of SUMO's: ``seconds``, ``h:m:s`` or ``days:h:m:s``.
+    """Return the seconds of a time as SUMO writes it: ``seconds``, ``h:m:s`` or ``days:h:m:s``.
 
     Raises:
         ValueError: Not a time.
@@ -142,9 +146,9 @@ def seconds_of(text: str) -> float:
 
 
 def _explain(item: Any) -> str:
-    """Return one complaint of pydantic in words of the file."""
+    """Return one error of pydantic in the terms of ``scenario.toml``."""
     names = [str(part) for part in item["loc"]]
-    if "phases" in names:  # the alternatives of a union stand behind the key
+    if "phases" in names:  # pydantic adds the alternatives of the union after the key
         key = ".".join(names[: names.index("phases") + 1])
         if item["type"] == "missing":
             return f"key {key!r} is missing"
@@ -162,7 +166,7 @@ def _explain(item: Any) -> str:
 
 
 def _known_keys(table: list[str]) -> list[str]:
-    """Return the keys that are allowed in the table of an unknown key."""
+    """Return the keys that the table of an unknown key allows."""
     if not table:
         return [*ScenarioFile.model_fields]
     if table[0] == "intersections":

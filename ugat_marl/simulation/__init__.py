@@ -1,12 +1,15 @@
-"""Simulation: SUMO in this process or in a process of its own, and what is measured in it.
+"""Simulation: SUMO in this process or in a separate process, and its measurements.
 
-The only room that imports libsumo. A simulator advances by some seconds with one signal state per
-second and returns a `Snapshot`; at the end of an episode it returns `Trips`.
+Only this room imports libsumo. A simulator advances by some seconds under planned signal states and
+returns a `Snapshot`. At the end of an episode it returns `Trips`.
 
-`simulator` runs SUMO in this process, with `mesoscopic` for SUMO's queue model; `process` runs it
-in another one. `host` starts and ends processes for `process` and for vectors of environments,
-`worker` is what runs in them, `channel` the line between the two. `snapshots`, `trips` and
-`detectors` hold what is measured.
+- `simulator`: SUMO in this process.
+- `mesoscopic`: lane measurements in SUMO's mesoscopic model.
+- `process`: SUMO in a separate process.
+- `host`: start and end of processes, for `process` and for vectors of environments.
+- `worker`: the program of these processes.
+- `channel`: messages to and from a worker.
+- `snapshots`, `trips`, `detectors`: measurements.
 """
 
 import lazy_loader

@@ -1,6 +1,6 @@
-"""Messages between a worker and its user: JSON with float64 arrays behind it.
+"""Messages between a worker and its user: JSON, followed by float64 arrays.
 
-No pickle: what arrives is data, whoever sent it.
+Nothing is unpickled, so a message cannot run code.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Message:
     """A JSON object and arrays.
 
     Attributes:
-        header: The object; its key ``"shapes"`` is the channel's own.
+        header: The object; the channel reserves its key ``"shapes"``.
         arrays: float64 arrays of any shape.
     """
 
@@ -42,9 +42,9 @@ class Channel:
     """One end of a two-way byte stream.
 
     Args:
-        reader: Where the other end's bytes arrive.
-        writer: Where bytes for the other end go.
-        close_writer: Tells the other end that nothing more will come.
+        reader: Stream of bytes from the other end.
+        writer: Stream of bytes to the other end.
+        close_writer: Function that tells the other end that no more bytes will come.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Channel:
     def hang_up(self, patience_s: float) -> bool:
         """Close this end; return True if the other end closed within `patience_s` seconds.
 
-        There is no thread in it: none can be started while the interpreter shuts down.
+        This uses no thread, because none can be started while the interpreter shuts down.
         """
         with contextlib.suppress(OSError, ValueError):
             self._writer.flush()
@@ -102,7 +102,7 @@ class Channel:
         deadline = time.monotonic() + patience_s
         with contextlib.suppress(OSError, ValueError):
             descriptor = self._reader.fileno()
-            waiting = select.poll()  # select.select knows no descriptor above 1023
+            waiting = select.poll()  # select.select accepts no descriptor above 1023
             waiting.register(descriptor, select.POLLIN)
             while (left := deadline - time.monotonic()) > 0:
                 if waiting.poll(1000 * left) and not os.read(descriptor, 65536):

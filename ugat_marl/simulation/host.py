@@ -1,12 +1,12 @@
-"""Processes that work for this one: a warm parent that forks workers, and the line to each worker.
+"""Worker processes: a warm parent that forks them, and the connection to each of them.
 
-A `Host` starts workers of one `Service`. The warm parent, started with the first worker and gone
-with the last host, has loaded the service and forks a fresh process each time: starting is cheap,
-and no worker sees what another one did. Where processes cannot fork, every worker is a new
-interpreter. Neither looks at the user's ``__main__``. Parent and workers end with the user's
-process, however that ends; see `ugat_marl.simulation.worker` for their side.
+A `Host` starts workers of one `Service`. The warm parent starts with the first worker and ends with
+the last host. It has loaded the service and forks a fresh process for each worker. Starting a
+worker is therefore cheap, and workers share no state. Where processes cannot fork, every worker is
+a new interpreter. Neither kind imports the user's ``__main__``. Parent and workers end with the
+user's process, even if that is killed; `ugat_marl.simulation.worker` is their side.
 
-Messages are JSON with float64 arrays behind it. There is no pickle: what arrives is data.
+Messages are JSON, followed by float64 arrays. Nothing is unpickled, so messages cannot run code.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from ugat_marl.simulation.channel import Channel, ChannelClosed, Message
 
 StartMethod = Literal["forkserver", "spawn"]
 Order = Mapping[str, Any]
-"""Plain values for JSON that say what a worker is for. The folder of its key ``"directory"``, if
-there is one, is removed when the worker ends."""
+"""Task of a worker, as plain values for JSON. The worker removes the folder named by the key
+``"directory"``, if there is one, when it ends."""
 
 LENGTH = struct.Struct("<I")
-"""Number of bytes of an order, before the order."""
+"""Prefix of an order: its number of bytes."""
 
 PATIENCE_S = 10.0
-"""Seconds in which a process that is asked to end has to do so; then it is killed."""
+"""Seconds that a process has to end after a request; then it is killed."""
 
 _CAN_FORK = hasattr(os, "fork") and hasattr(socket, "send_fds")
 _PROGRAM = "ugat_marl.simulation.worker"
@@ -50,30 +50,30 @@ _PROGRAM = "ugat_marl.simulation.worker"
 class Service(Protocol):
     """Work of the workers of a host: a class without arguments, named ``"module:Class"``.
 
-    The warm parent makes one object, whose state its workers inherit when they are forked.
+    The warm parent makes one object. Its workers inherit the state of that object when they fork.
     """
 
     def prepare(self, order: dict[str, Any]) -> None:
-        """Get ready for a worker; in the warm parent, before it forks."""
+        """Prepare for a worker; runs in the warm parent before it forks."""
         ...
 
     def open(
         self, order: dict[str, Any], descriptors: Sequence[int]
     ) -> Callable[[Message], Message]:
-        """Return what answers the questions to a worker; in the worker.
+        """Return a function that answers the questions to a worker; runs in the worker.
 
         Args:
-            order: As given to `Host.start`.
-            descriptors: Open files that were given with it.
+            order: The order given to `Host.start`.
+            descriptors: Open files given with the order.
         """
         ...
 
     def told(self, order: dict[str, Any]) -> None:
-        """Take note of what `Host.tell` was given; in the warm parent."""
+        """Receive a message of `Host.tell`; runs in the warm parent."""
         ...
 
     def abandoned(self) -> None:
-        """Tidy up; in the warm parent, when the user's process has died."""
+        """Clean up after the user's process has died; runs in the warm parent."""
         ...
 
 
@@ -85,7 +85,7 @@ class Host:
         start_method: ``"forkserver"`` (the default where processes can fork) or ``"spawn"``.
 
     Raises:
-        OptionError: Another method, or one that this system does not have.
+        OptionError: The method is unknown, or this system does not have it.
     """
 
     def __init__(self, service: str, start_method: StartMethod | None = None) -> None:
@@ -99,10 +99,10 @@ class Host:
         self._parent: _WarmParent | None = None
 
     def start(self, order: Order, descriptors: Sequence[int] = ()) -> Worker:
-        """Start a worker; a warm parent that was killed is replaced.
+        """Start a worker; replace the warm parent if it was killed.
 
         Args:
-            order: Passed to the service.
+            order: The order for the service.
             descriptors: Open files the worker inherits; only with ``"forkserver"``.
 
         Raises:
@@ -122,18 +122,18 @@ class Host:
         )
 
     def warm(self) -> _WarmParent:
-        """Start the warm parent, if there is none; `start` does so itself."""
+        """Start the warm parent, if there is none. `start` calls this itself."""
         if self._parent is None or not self._parent.alive:
             self._parent = _WarmParent.acquire(self._service)
         return self._parent
 
     def tell(self, order: Order) -> None:
-        """Tell the warm parent something, if there is one."""
+        """Send a message to the warm parent, if there is one."""
         if self._parent is not None:
             self._parent.tell({"what": "tell", "order": order})
 
     def close(self) -> None:
-        """Give the warm parent up, which ends with its last host; workers go on."""
+        """Release the warm parent, which ends with its last host. Workers continue."""
         parent, self._parent = self._parent, None
         if parent is not None:
             parent.release()
@@ -143,9 +143,9 @@ class Worker:
     """The user's end of one worker process.
 
     Args:
-        channel: The line to it.
-        said: File with everything it prints.
-        pid: Its number.
+        channel: The connection to the worker.
+        said: File with everything the worker prints.
+        pid: Process number of the worker.
         process: The process, if it is a child of this one.
     """
 
@@ -165,15 +165,15 @@ class Worker:
 
     @classmethod
     def spawn(cls, service: str, order: Order) -> Worker:
-        """Start a new interpreter that is served on its standard streams."""
-        said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the worker
+        """Start a new interpreter; messages use its standard input and output."""
+        said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
         process: subprocess.Popen[bytes] = subprocess.Popen(
             _command("spawned", service, str(os.getpid()), json.dumps(order)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=said,
             env=_environment(),
-            start_new_session=True,  # Ctrl-C reaches the user's process alone, which ends this one
+            start_new_session=True,  # so Ctrl-C reaches only the user's process, which ends this
         )
         assert process.stdin is not None
         assert process.stdout is not None
@@ -182,7 +182,7 @@ class Worker:
 
     @property
     def running(self) -> bool:
-        """True until it is ended, in the process that started it; False in one forked from that."""
+        """True until the worker is ended; always False in a fork of the process that started it."""
         return self._owner == os.getpid() and not self._ended
 
     def ask(self, what: str, arrays: Sequence[NDArray[Any]] = (), **arguments: Any) -> None:
@@ -204,14 +204,14 @@ class Worker:
 
         Raises:
             ChannelClosed: The process died, see `obituary`.
-            UgatMarlError: The service raised it; the process has been ended.
-            WorkerError: The service raised something else; the process has been ended.
+            UgatMarlError: The service raised this error; the process has been ended.
+            WorkerError: The service raised another exception; the process has been ended.
         """
         try:
             reply = self._channel.receive()
         except (ChannelClosed, OSError):
             raise ChannelClosed from None
-        except BaseException:  # Ctrl-C between question and answer: the two no longer match
+        except BaseException:  # Ctrl-C here: the next question would get the answer to this one
             self.end(patience_s=0.0)
             raise
         if "error" in reply.header:
@@ -221,10 +221,10 @@ class Worker:
         return reply
 
     def end(self, patience_s: float = PATIENCE_S) -> None:
-        """Close the line, so that the process exits, and wait for that; may be called again.
+        """Close the connection and wait until the process exits. A second call does nothing.
 
         Args:
-            patience_s: After this many seconds the process is killed.
+            patience_s: Seconds after which the process is killed.
         """
         if not self.running:
             return
@@ -243,7 +243,11 @@ class Worker:
         self._said.close()
 
     def obituary(self, doing: str) -> str:
-        """Return what is known of a process that died, and end what is left of it."""
+        """Return a message about a process that died, and release its resources.
+
+        Args:
+            doing: The question during which it died.
+        """
         status = ""
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -257,11 +261,11 @@ class Worker:
         )
 
     def _raised(self, reply: dict[str, Any]) -> UgatMarlError:
-        """Return the exception a process reports, of the nearest kind that takes a message."""
+        """Return the exception that a process reports, as the nearest class that takes a message."""
         for name in reply["kinds"]:
             kind = getattr(errors, name, None)
             if kind is not None and name != "UnknownNameError":
-                # SUMO's error log may have only the end of what it printed.
+                # SUMO's error log may hold only the end of SUMO's output.
                 words, error = self._words(), reply["error"]
                 return kind(error if words in error else f"{error} {words}")
         return WorkerError(
@@ -275,7 +279,7 @@ class Worker:
 
 
 class _WarmParent:
-    """The process that forks the workers of a service; one for all hosts of a user's process."""
+    """Process that forks the workers of a service; all hosts of a user's process share it."""
 
     _lock: ClassVar[threading.RLock] = threading.RLock()
     _current: ClassVar[dict[str, _WarmParent]] = {}
@@ -298,7 +302,7 @@ class _WarmParent:
 
     @classmethod
     def acquire(cls, service: str) -> _WarmParent:
-        """Return the parent of this process, started if need be."""
+        """Return the warm parent of this process; start one if there is none."""
         if not cls._told_of_forks:
             os.register_at_fork(after_in_child=cls._forget)
             cls._told_of_forks = True
@@ -311,17 +315,20 @@ class _WarmParent:
 
     @classmethod
     def _forget(cls) -> None:
-        """Forget the parents in a forked child; a thread that is not in it may hold the lock."""
+        """Forget the parents in a forked child.
+
+        The lock is new too: a thread that does not exist in the child may hold the old one.
+        """
         cls._lock = threading.RLock()
         cls._current = {}
 
     @property
     def alive(self) -> bool:
-        """True if it belongs to this process and runs."""
+        """True if the parent belongs to this process and runs."""
         return self._owner == os.getpid() and self._process.poll() is None
 
     def release(self) -> None:
-        """Give the parent up; the last one to do so ends it."""
+        """Release the parent; the last release ends it."""
         with self._lock:
             self._users -= 1
             if self._users == 0:
@@ -334,9 +341,9 @@ class _WarmParent:
                 self._socket.sendall(b"f" + _framed(message))
 
     def fork(self, order: Order, descriptors: Sequence[int]) -> Worker | None:
-        """Return a fresh worker, or None if the parent is gone."""
+        """Return a fresh worker, or None if the parent has ended."""
         mine, its = socket.socketpair()
-        said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the worker
+        said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
         pid = b""
         with its, self._lock:
             try:
@@ -345,7 +352,7 @@ class _WarmParent:
                 pid = self._socket.recv(8)
             except OSError:
                 pass
-            except BaseException:  # Ctrl-C: the answer to come would be taken for the next one's
+            except BaseException:  # Ctrl-C: the next call would read the answer to this one
                 self.end()
                 raise
         if not pid:
@@ -362,7 +369,7 @@ class _WarmParent:
         return Worker(Channel(reader, writer, hang_up), said, int.from_bytes(pid, "little"))
 
     def end(self) -> None:
-        """End the process; its workers go on. May be called again."""
+        """End the process; its workers continue. A second call does nothing."""
         if self._owner != os.getpid():
             return
         self.tell({"what": "bye"})
@@ -381,7 +388,7 @@ class _WarmParent:
 
 
 def one_line(text: str) -> str:
-    """Return what SUMO printed as one line, without its formulas."""
+    """Return SUMO's output as one line, without its standard phrases."""
     lines = [line.strip().removeprefix("Error: ") for line in text.splitlines()]
     return " ".join(line for line in lines if line and line != "Quitting (on error).")
 
@@ -396,6 +403,6 @@ def _command(*arguments: str) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment, with this process's import path for what its user imports."""
+    """Return the environment variables, with this process's import path for the user's modules."""
     path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
     return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}

@@ -1,7 +1,7 @@
-"""The simulator in a process of its own, so that any number of simulations live at once.
+"""A simulator in a separate process, so that many simulations can run at once.
 
-Both ends of the conversation stand here: `ProcessSimulator` in the user's process, and
-`Simulations` in the workers. There is one round trip per decision.
+This file holds both ends: `ProcessSimulator` in the user's process and `Simulations` in the
+workers. Each decision takes one round trip.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ SERVICE = "ugat_marl.simulation.process:Simulations"
 
 
 class ProcessSimulator:
-    """SUMO in a worker process; a fresh one for every episode.
+    """SUMO in a worker process, a fresh one for every episode.
 
-    A process that is forked while a simulation is under way does not own it: there the simulator
-    begins anew with the next `start`, and the simulation of the first process goes on.
+    A process forked during a simulation does not own that simulation. Its copy of this object needs
+    a new `start`, and the simulation of the first process continues.
 
     Args:
         start_method: ``"forkserver"`` (the default where processes can fork) or ``"spawn"``.
 
     Raises:
-        OptionError: Another method, or one that this system does not have.
+        OptionError: The method is unknown, or this system does not have it.
     """
 
     def __init__(self, start_method: StartMethod | None = None) -> None:
@@ -45,14 +45,14 @@ class ProcessSimulator:
         self._worker: Worker | None = None
 
     def start(self, launch: Launch) -> Snapshot:
-        """Start a simulation in a fresh process; one that is under way is ended first.
+        """Start a simulation in a fresh process; end a running one first.
 
         Raises:
             SimulatorError: SUMO refuses; its own words are in the message.
             SimulatorCrashed: The process died.
         """
         self._end_worker()
-        # The worker removes the folder when it ends, so it knows of it before there is one.
+        # Tell the worker the folder before it exists, so that the worker removes it in any case.
         self._worker = self._host.start({"directory": launch.directory})
         launch.write()
         return _snapshot(self._ask("start", launch=launch.as_dict()))
@@ -82,7 +82,7 @@ class ProcessSimulator:
         return Trips(table[0], table[1], table[2] > 0, table[3] > 0, *hidden)
 
     def close(self) -> None:
-        """End the simulation and its process; the warm parent goes with the last simulator."""
+        """End the simulation and its process. The warm parent ends with the last simulator."""
         self._end_worker()
         self._host.close()
 
@@ -108,7 +108,7 @@ class ProcessSimulator:
 
 
 def simulator_of(option: str) -> Simulator:
-    """Return a simulator by the name that `EnvOptions` has for its kind."""
+    """Return the simulator for an option of `EnvOptions`: inprocess, spawn or another name."""
     if option == "inprocess":
         return LibsumoSimulator()
     return ProcessSimulator("spawn" if option == "spawn" else None)
@@ -131,7 +131,7 @@ def _snapshot(reply: Message) -> Snapshot:
 
 
 class Simulations:
-    """The service of simulations: one in each worker."""
+    """Service that runs one simulator in each worker."""
 
     def prepare(self, order: dict[str, Any]) -> None:
         """Do nothing: SUMO is loaded with this module."""
@@ -139,13 +139,13 @@ class Simulations:
     def open(
         self, order: dict[str, Any], descriptors: Sequence[int]
     ) -> Callable[[Message], Message]:
-        """Return what answers for a fresh simulator."""
+        """Return a function that answers questions to a fresh simulator."""
         del order, descriptors
         simulator = LibsumoSimulator()
         return lambda question: _answer(simulator, question.header)
 
     def told(self, order: dict[str, Any]) -> None:
-        """Do nothing: no host of simulations tells anything."""
+        """Do nothing: hosts of simulations send no messages here."""
 
     def abandoned(self) -> None:
         """Do nothing: workers remove their own folders."""

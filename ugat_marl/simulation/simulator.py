@@ -1,7 +1,8 @@
-"""SUMO in this process: the only file that calls libsumo.
+"""SUMO in this process: the only file that imports libsumo.
 
-libsumo holds one simulation per process, and a second start replaces the first without a word; here
-it is refused. `ugat_marl.simulation.process` gives the same interface in a process of its own.
+libsumo holds one simulation per process. A second start would silently replace the first one, so it
+is refused here. `ugat_marl.simulation.process` has the same interface and runs SUMO in a separate
+process.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
 from ugat_marl.simulation.trips import measuring_options, read_trips
 
 Plans = Mapping[str, Sequence[Segment]]
-"""Traffic light to what it shows in the coming seconds; lights left out go on as before."""
+"""Traffic light to its states for the coming seconds. Lights left out continue as before."""
 
 _Floats = NDArray[np.float64]
 _TRIPS, _ERRORS = "trips.xml", "errors.log"
@@ -41,20 +42,22 @@ _TRIPS, _ERRORS = "trips.xml", "errors.log"
 
 @dataclass(frozen=True)
 class Launch:
-    """Start of a simulation, in plain values that can be sent to a process.
+    """Options of one simulation, as plain values that can be sent to a process.
 
     Attributes:
         arguments: Options of SUMO, without the name of the program.
-        directory: A folder for this simulation's own files; whoever runs it may remove it.
+        directory: Folder for this simulation's own files. The runner of the simulation may remove
+            it afterwards.
         begin_s: Start of the simulation on the scenario's clock.
         lanes: Lanes to measure.
-        waiting: Whether to measure waiting times as well.
-        crossings: Whether to look every second for vehicles that leave a lane's road.
-        gui: Whether to open a window.
+        waiting: True to measure waiting times as well.
+        crossings: True to look every second for vehicles that left a lane's road.
+        gui: True to open a window.
         files: Names and content of the scenario's edited files.
-        zone_m: Length of what is measured apart at the end of each lane, or 0 for nothing.
-        persons: Vehicle types with the persons in each vehicle; what is hidden is then measured.
-        behind: As in `ugat_marl.scenarios.lanes.LaneTable`.
+        zone_m: Length of a zone at the end of each lane that is measured separately; 0 for none.
+        persons: Vehicle types with the persons in each vehicle. If given, the hidden measures of
+            `Trips` (CO2, persons, dangers) are taken.
+        behind: Upstream lanes and roads, as in `ugat_marl.scenarios.lanes.LaneTable`.
     """
 
     arguments: tuple[str, ...]
@@ -71,19 +74,19 @@ class Launch:
 
     @property
     def segment_m(self) -> float:
-        """Length of a segment of the mesoscopic model; 0 with car following."""
+        """Length of a segment of the mesoscopic model, m; 0 with car following."""
         if "--mesosim" not in self.arguments:
             return 0.0
         return float(self.arguments[self.arguments.index("--meso-edgelength") + 1])
 
     def write(self) -> None:
-        """Make the folder and put the files into it."""
+        """Create the folder and write the files into it."""
         Path(self.directory).mkdir(mode=0o700, exist_ok=True)
         for name, content in self.files:
             write_whole(Path(self.directory) / name, content)
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields for JSON, without the files, which have been written by then."""
+        """Return the fields for JSON. The files are left out because `write` has stored them."""
         return {**asdict(replace(self, files=())), "files": ()}
 
 
@@ -92,8 +95,8 @@ class VehiclePicture:
     """Positions of the vehicles, for drawing.
 
     Attributes:
-        position: Front bumpers, m, ``(vehicles, 2)``.
-        angle_deg: Heading, 0 is north, clockwise, ``(vehicles,)``.
+        position: Coordinates of the front bumpers, m, ``(vehicles, 2)``.
+        angle_deg: Headings, 0 is north, clockwise, ``(vehicles,)``.
         length_m: Lengths, ``(vehicles,)``.
         speed_mps: Speeds, ``(vehicles,)``.
     """
@@ -108,7 +111,7 @@ class Simulator(Protocol):
     """One simulation at a time; start, advance repeatedly, finish."""
 
     def start(self, launch: Launch) -> Snapshot:
-        """Start a simulation; one that is under way is ended first."""
+        """Start a simulation; end a running one first."""
         ...
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
@@ -116,11 +119,11 @@ class Simulator(Protocol):
         ...
 
     def vehicles(self) -> VehiclePicture:
-        """Positions of all vehicles now."""
+        """Return the positions of all vehicles now."""
         ...
 
     def signals(self) -> dict[str, str]:
-        """State of every traffic light now, including those that run their own programme."""
+        """Return the state of every traffic light now, uncontrolled ones included."""
         ...
 
     def finish(self) -> Trips:
@@ -128,7 +131,7 @@ class Simulator(Protocol):
         ...
 
     def close(self) -> None:
-        """End the simulation, if there is one; may be called again."""
+        """End the simulation, if there is one. A second call does nothing."""
         ...
 
 
@@ -145,19 +148,20 @@ def launch_of(
     persons: Mapping[str, float] | None = None,
     behind: UpstreamLanes = NO_UPSTREAM_LANES,
 ) -> Launch:
-    """List SUMO's options and the files to be written for it; write nothing.
+    """Collect SUMO's options and the files it needs; write nothing.
 
     Args:
-        scenario: What to simulate.
-        seed: SUMO's seed; any 31-bit integer.
-        directory: A folder for the simulation alone; it is made when the simulation starts.
+        scenario: The scenario to simulate.
+        seed: SUMO's seed; its lowest 31 bits are used.
+        directory: Folder for this simulation alone. It is created when the simulation starts.
         lanes: Lanes to measure.
-        waiting: Whether to measure waiting times.
-        crossings: Whether to look every second for vehicles that leave a lane's road.
-        gui: Whether to open a window.
-        zone_m: Length of what is to be measured apart at the end of each lane, or 0 for nothing.
-        persons: Vehicle type to its persons, "" for all others, if what is hidden is measured.
-        behind: As in `ugat_marl.scenarios.lanes.LaneTable`.
+        waiting: True to measure waiting times.
+        crossings: True to look every second for vehicles that left a lane's road.
+        gui: True to open a window.
+        zone_m: Length of a zone at the end of each lane that is measured separately; 0 for none.
+        persons: Vehicle type to the persons in each vehicle, "" for all other types. If given, the
+            hidden measures of `Trips` (CO2, persons, dangers) are taken.
+        behind: Upstream lanes and roads, as in `ugat_marl.scenarios.lanes.LaneTable`.
     """
     settings = scenario.settings
     if "mesosim" in settings.sumo:
@@ -208,7 +212,10 @@ def launch_of(
 
 
 def _on_disk(document: Document, directory: Path, written: dict[str, bytes]) -> str:
-    """Return a path SUMO can open, of a copy if need be: a comma ends a name for SUMO."""
+    """Return a path SUMO can open.
+
+    Edited documents and paths with a comma get an entry in `written`: SUMO ends a name at a comma.
+    """
     if document.path is not None and "," not in str(document.path.resolve()):
         return str(document.path.resolve())
     name = document.name.removesuffix(".gz").replace(",", "_")
@@ -221,8 +228,8 @@ def _on_disk(document: Document, directory: Path, written: dict[str, bytes]) -> 
 class LibsumoSimulator:
     """SUMO inside this process.
 
-    Restarting in one process is not always reproducible to the bit (seen on RESCO cologne1); use
-    `ugat_marl.simulation.process.ProcessSimulator` where that matters.
+    A second simulation in one process is not always equal to the bit (seen on RESCO cologne1). Use
+    `ugat_marl.simulation.process.ProcessSimulator` if that matters.
     """
 
     def __init__(self) -> None:
@@ -238,7 +245,7 @@ class LibsumoSimulator:
         """Start a simulation.
 
         Raises:
-            SimulatorBusy: This process already runs a simulation of somebody else.
+            SimulatorBusy: This process already runs a simulation of another object.
             SimulatorError: SUMO refuses; its own words are in the message.
         """
         self.close()
@@ -269,7 +276,7 @@ class LibsumoSimulator:
         return self._snapshot()
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
-        """Simulate `seconds`, showing the planned signal states.
+        """Simulate `seconds` and show the planned signal states.
 
         Raises:
             SimulatorError: SUMO failed; its own words are in the message.
@@ -304,7 +311,7 @@ class LibsumoSimulator:
         return replace(snapshot, mean_left=mean_left) if instants else snapshot
 
     def vehicles(self) -> VehiclePicture:
-        """Positions of all vehicles now."""
+        """Return the positions of all vehicles now."""
         api = libsumo.vehicle
         names = api.getIDList()
         return VehiclePicture(
@@ -315,7 +322,7 @@ class LibsumoSimulator:
         )
 
     def signals(self) -> dict[str, str]:
-        """State of every traffic light now."""
+        """Return the state of every traffic light now."""
         api = libsumo.trafficlight
         return {name: api.getRedYellowGreenState(name) for name in api.getIDList()}
 
@@ -330,12 +337,12 @@ class LibsumoSimulator:
         """End the simulation of this object, if there is one."""
         if self._launch is not None:
             self._launch = None
-            # A forked child has a copy of the simulation and the parent's open files.
+            # A forked child shares the parent's open files, so only the owner may close them.
             if self._owner == os.getpid() and libsumo.simulation.isLoaded():
                 libsumo.simulation.close()
 
     def _count_left(self, left: NDArray[np.float64]) -> None:
-        """Add to `left`, ``(lanes,)``, the vehicles that have left a lane's road since then."""
+        """Add to `left`, ``(lanes,)``, the vehicles that left a lane's road since the last call."""
         assert self._launch is not None
         now: dict[str, tuple[int, str]] = {}
         for index, lane in enumerate(self._launch.lanes):
@@ -361,7 +368,7 @@ class LibsumoSimulator:
         names = [lanes[index] for index in taken.tolist()]
 
         def measure(what: Callable[[str], float], empty: _Floats) -> _Floats:
-            """Ask only lanes with vehicles; most of a network is empty at any instant."""
+            """Return values of all lanes, asking SUMO only about lanes with vehicles."""
             values = empty.copy()
             values[taken] = np.fromiter(map(what, names), np.float64, len(names))
             return values
@@ -390,12 +397,12 @@ class LibsumoSimulator:
 
 
 def _near_the_end(lanes: Sequence[str], taken: Sequence[str], zone_m: float) -> NDArray[np.float64]:
-    """Return vehicles, halting ones and waiting time at the end of each lane, ``(3, lanes)``.
+    """Return vehicles, halting vehicles and waiting times at the end of each lane, ``(3, lanes)``.
 
     Args:
         lanes: All lanes.
-        taken: Those of them with vehicles.
-        zone_m: How many metres; 0 for nothing, an empty array.
+        taken: Lanes with vehicles.
+        zone_m: Length of the zone in metres; with 0 the result is an empty array.
     """
     if not zone_m:
         return np.empty(0)
@@ -416,12 +423,12 @@ def _add_those_behind(
         NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
     ],
 ) -> None:
-    """Count vehicles behind a lane that is too short for them as if they were on it.
+    """Count vehicles upstream of short lanes as if they were on the short lanes.
 
-    Those that wait to enter the network halt; their waiting time is that since they were due.
+    Vehicles that wait to enter the network count as halting, since the time they were due.
 
     Args:
-        behind: As in `ugat_marl.scenarios.lanes.LaneTable`.
+        behind: Upstream lanes and roads, as in `ugat_marl.scenarios.lanes.LaneTable`.
         measured: Vehicles, halting vehicles, mean speed in m/s and waiting times in s (may be
             empty) per lane, each ``(lanes,)``; changed in place.
     """
@@ -453,11 +460,11 @@ def _add_those_behind(
 
 
 def _errors_of(directory: Path) -> str:
-    """SUMO's error log in one line."""
+    """Return SUMO's error log as one line."""
     path = directory / _ERRORS
     return one_line(path.read_text(errors="replace")) if path.exists() else ""
 
 
 def simulates_here() -> bool:
-    """Return True if this process runs a simulation itself."""
+    """Return True if libsumo runs a simulation in this process."""
     return bool(libsumo.simulation.isLoaded())

@@ -1,8 +1,8 @@
 """The program of a host's processes: the warm parent, its workers, and how they end.
 
-``parent`` has its service loaded and forks a worker for every order that arrives. ``spawned`` is a
-worker in an interpreter of its own. All of them end when their line closes, or when the user's
-process is gone though a child it forked still holds the line open.
+``parent`` has loaded its service and forks a worker for every order. ``spawned`` is a worker in a
+new interpreter. All of them end when their connection closes or when the user's process has ended.
+The second check is needed because a child of the user's process may hold the connection open.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
     from ugat_marl.simulation.host import Service
 
 LOOK_EVERY_S = 1.0
-"""Seconds between two looks whether the user's process is still there."""
+"""Seconds between two checks of the user's process."""
 
 _MOST_DESCRIPTORS = 8
-"""Open files that come with an order at most."""
+"""Largest number of open files with an order."""
 
 
 def end_with_input() -> None:
-    """End this process, with exit code 1, once standard input ends: its starter is gone.
+    """End this process with exit code 1 when standard input ends, because its starter has ended.
 
-    Standard input is read past `sys.stdin`, whose lock would be in the way of an orderly end.
+    The thread reads the descriptor, not `sys.stdin`: the lock of `sys.stdin` could block the exit.
     """
 
     def watch() -> None:
@@ -52,24 +52,24 @@ def end_with_input() -> None:
 def _abandoned(parent: int, user: int) -> bool:
     """Return True if this process lost its parent because the user's process ended.
 
-    A warm parent may be killed alone; then its workers go on.
+    If only the warm parent was killed, its workers continue.
     """
     if os.getppid() == parent:
         return False
     try:
         os.kill(user, 0)
-    except (ProcessLookupError, PermissionError):  # gone, or its number is somebody else's by now
+    except (ProcessLookupError, PermissionError):  # it ended; its number may have a new owner
         return True
     return False
 
 
 class _Life:
-    """Ends a worker with the user's process, and leaves no files behind.
+    """Watch that ends a worker with the user's process and removes its folder.
 
     Args:
         parent: Number of the process that started this one.
         user: Number of the user's process.
-        directory: Folder to remove at the end.
+        directory: Folder to remove at the end, or None.
     """
 
     def __init__(self, parent: int, user: int, directory: str | None) -> None:
@@ -98,7 +98,7 @@ def _work(
     parent: int,
     user: int,
 ) -> NoReturn:
-    """Answer questions until the line closes, then exit."""
+    """Answer questions until the connection closes, then exit."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     life = _Life(parent, user, order.get("directory"))
     answer = service.open(order, descriptors)
@@ -114,12 +114,12 @@ def _answered(answer: Callable[[Message], Message], question: Message) -> Messag
     except UgatMarlError as error:
         kinds = [kind.__name__ for kind in type(error).__mro__]
         return Message({"error": str(error), "kinds": kinds}, [])
-    except Exception:  # noqa: BLE001 - of the user's reward or wrapper; the user is told all
+    except Exception:  # noqa: BLE001 - the user's reward or wrapper may raise anything
         return Message({"error": traceback.format_exc(limit=-5), "kinds": []}, [])
 
 
 def _serve(service: Service, user: int, descriptor: int) -> None:
-    """Fork a worker for every order that arrives."""
+    """Fork a worker for every order, until the host says goodbye or is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # workers leave no zombies
     here = os.getpid()
@@ -150,7 +150,7 @@ def _serve(service: Service, user: int, descriptor: int) -> None:
 
 
 def _next(control: socket.socket, user: int) -> tuple[dict[str, Any], list[int]] | None:
-    """Return the next message and the open files with it; None if the user's process is gone."""
+    """Return the next message and its open files; None if the user's process has ended."""
     control.settimeout(LOOK_EVERY_S)
     while True:
         try:
@@ -177,7 +177,10 @@ def _exactly(control: socket.socket, count: int) -> bytes:
 
 
 def _spawned(service: Service, user: int, order: dict[str, Any]) -> None:
-    """Work in an interpreter of its own: SUMO may print, so the line leaves standard output."""
+    """Work in a new interpreter.
+
+    Messages move to copies of the standard streams, because SUMO may print to standard output.
+    """
     reader, writer = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     service.prepare(order)
