@@ -1,16 +1,16 @@
 """Grounding: actions of the simulation that do what the policy's action does in reality.
 
-Forward model f, inverse model h, uncertainty and gate make up a transform; `ugat` is Algorithm 1 of
-the UGAT paper. From data to the algorithm:
+A transform holds forward model f, inverse model h and gate. `ugat` is Algorithm 1 of the UGAT
+paper. The modules, from data to the algorithm:
 
-- `stacked`, `view`: transitions of unequal intersections as tensors; what models see of neighbours.
-- `networks`, `forward`, `inverse`, `uncertainty`: the models, and methods by which h is unsure.
-- `fitting`, `reports`: training of the models, and what it was worth.
-- `gate`: the grounded action or the policy's own, by u and alpha.
+- `stacked`, `view`: transitions of unequal intersections as tensors; inputs from neighbours.
+- `networks`, `forward`, `inverse`, `uncertainty`: the models; methods for the uncertainty of h.
+- `fitting`, `reports`: training of the models; their errors on held-out data.
+- `gate`: choice between the grounded action and the policy's action, by u and alpha.
 - `transform`: base of all groundings; `phase` (another phase, with `joint` for neighbours) and
   `timed` (a delayed green, by the estimates of `delays`).
-- `wrappers`: the grounded environment, and greens late by chance.
-- `worlds`, `controls`: sources of D_sim and D_real, and negative controls.
+- `wrappers`: the grounded environment; greens with random delays.
+- `worlds`, `controls`: sources of D_sim and D_real; negative controls.
 - `config`, `state`, `ugat`: settings, checkpoint, Algorithm 1.
 """
 

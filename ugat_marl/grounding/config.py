@@ -25,18 +25,18 @@ class UgatConfig:
     """Settings of the algorithm.
 
     Attributes:
-        grounding: What a grounded action is: "phase", another phase, as in the paper; "timed", the
-            policy's own phase with a green that begins later.
+        grounding: Kind of the grounded action: "phase" is another phase, as in the paper; "timed"
+            is the policy's own phase with a green that begins later.
         pretrain_episodes: M, episodes in plain sim before the first iteration.
         iterations: I, rounds of rolling out, fitting and grounded training.
         grounded_episodes: E, episodes of training in the grounded sim per iteration.
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
         rollout_epsilon: Chance of a random phase in these roll-outs.
-        least_accuracy: Held-out accuracy h must have at an intersection before grounded actions
-            are taken there; f and h must also be better than trivial answers, such as "no
-            change" or the most frequent phase, which is all that 0 asks. None obeys them from the
-            start, as the paper does. With "timed" the share by which h must beat a guess.
+        least_accuracy: Smallest held-out accuracy of h with which grounded actions are taken at an
+            intersection. With "timed": the share by which h must beat a guess. f and h must also
+            be better than trivial answers, such as "no change" or the most frequent phase; 0
+            requires only this. None takes grounded actions from the start, as the paper does.
         inputs: Inputs of f and h beside the intersection's own state and action.
         forward: Shape of f.
         inverse: Shape of h.
@@ -62,12 +62,12 @@ class UgatConfig:
 
     @property
     def most_delay_s(self) -> int:
-        """Longest of the random delays in the roll-outs for D_sim; 0 for none."""
+        """Longest random delay in the roll-outs for D_sim, in s; 0 for none."""
         return self.timed.most_s if self.grounding == "timed" else 0
 
     @property
     def matches(self) -> bool:
-        """True if delays are sought by which rewards match those of the street."""
+        """True if the delays are chosen so that rewards match those of the real domain."""
         return self.grounding == "timed" and self.timed.match
 
     def transform(
@@ -80,7 +80,7 @@ class UgatConfig:
 
         Args:
             layouts: Agent to the division of its observation.
-            seed: Decides the initial weights.
+            seed: Seed of the initial weights.
             neighbours: Agent to the agents one road away (`grounding.view.neighbours_of`); needed
                 for inputs with hops.
         """

@@ -1,8 +1,9 @@
-"""Negative controls: data or models that hold nothing, with which grounding must do nothing.
+"""Negative controls: data or models that hold nothing. Grounding must win nothing with them.
 
-`same-world`: D_real comes from the simulation itself. `shuffled`: in D_real, what followed is dealt
-out anew among the rows of an agent (`ShuffledWorld`), so that it says nothing of state and
-action. `noise`: f answers with noise of the scale of the data.
+- `same-world`: D_real comes from the simulation itself.
+- `shuffled`: the outcomes in D_real are permuted among the rows of an agent (`ShuffledWorld`), so
+  they do not depend on state and action.
+- `noise`: f answers with noise of the scale of the data.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ PLACEBOS: tuple[str, ...] = get_args(Placebo)
 def answer_with_noise(model: ForwardModel, seed: int) -> None:
     """Make f answer with noise, before and after it is fitted.
 
-    f answers in units of its scale, the root mean square of the changes it was fitted to: standard
-    normal noise is as large as what happens. It is drawn anew for every question but decided by
-    question and seed, so that a resumed run hears the same.
+    f answers in units of its scale, the root mean square of the changes it was fitted to. Standard
+    normal noise is therefore as large as the changes. Question and seed decide the noise, so a
+    resumed run gets the same answers.
 
     Args:
-        model: Changed in place.
-        seed: Of the noise.
+        model: Forward model, changed in place.
+        seed: Seed of the noise.
     """
     learnt = model.read
 
@@ -41,20 +42,20 @@ def answer_with_noise(model: ForwardModel, seed: int) -> None:
         answer = learnt(inputs)
         question = zlib.crc32(inputs.cpu().numpy().tobytes())
         drawn = torch.randn(answer.shape, generator=torch_generator(seed, "placebo", question))
-        # Training goes on, and shows nowhere.
+        # 0 * answer keeps the gradient graph, so training runs without an effect.
         return 0.0 * answer + drawn.to(answer.device) * model.valid_outputs
 
-    model.read = noise  # every way of asking f leads through it, and its network is made anew
+    model.read = noise  # all predictions call it; `renew` replaces the network but not this
 
 
 class ShuffledWorld:
-    """Another world whose transitions lead anywhere.
+    """World that returns the transitions of another world with permuted outcomes.
 
-    Among the rows of an agent, outcomes are dealt out anew. States and outcomes stay as likely as
-    they were, but no outcome belongs to its state any more.
+    Outcomes are permuted among the rows of an agent. The frequencies of states and of outcomes stay
+    the same, but outcomes do not depend on their states.
 
     Args:
-        world: Where the transitions come from.
+        world: Source of the transitions.
     """
 
     def __init__(self, world: World) -> None:
@@ -66,23 +67,23 @@ class ShuffledWorld:
         return None if log is None else shuffled(log, derive_seed(seed, "shuffled", iteration))
 
     def stop(self) -> None:
-        """End what is under way in the other world."""
+        """Stop the roll-outs of the other world."""
         self._world.stop()
 
     def close(self) -> None:
-        """Give up what the other world holds."""
+        """Close the other world."""
         self._world.close()
 
 
 def shuffled(log: TransitionLog, seed: int) -> TransitionLog:
     """Return the log with the outcomes of each agent's rows in random order.
 
-    What is seen next and what was served belong together, and stay so; state, action and reward
-    stay where they are.
+    Next observation and served features of a row move together. State, action and reward stay in
+    their rows.
 
     Args:
         log: Any log; it does not change.
-        seed: Of the order.
+        seed: Seed of the order.
     """
     outcomes = ["next_observation", "served_features"]
     parts: list[pl.DataFrame] = []

@@ -1,20 +1,19 @@
-"""Estimates of how late greens begin on the street: by lost time, and by rewards.
+"""Estimates of the delay of greens on the street (the real domain): by lost time, and by rewards.
 
-**Lost time.** A model of the simulation knows what a green does that begins so many seconds late.
-The street's changes are compared with it in the mean over all transitions of a phase, lane by lane:
-single ones are mostly noise. Not by the sum of squared errors, which also counts the errors of the
-model, and so prefers the delays it happens to know best. And not by a model trained to guess the
-delay from a noisy transition: the best guess under noise is the middle of the range.
+**Lost time.** A model of the simulation predicts the changes after a green with a given delay. The
+mean changes on the street are compared with it, by phase and lane, because single transitions are
+mostly noise. Two other estimates fail. The sum of squared errors also counts the errors of the
+model, so it prefers delays that the model knows best. A model that guesses the delay from a noisy
+transition answers with the middle of the range.
 
-**Matched rewards.** Lost time is what a street's first intervals say. Slow vehicles lose more while
-the green lasts. No delay of a beginning is that, but a longer one can make up for it: with the
-delay found here the same policy has, over whole episodes, the same reward in both worlds. Rewards
-do not say why: any other difference of the worlds is charged to the delay, too. And it has to be
-the same policy, so that logs of another one do not do.
+**Matched rewards.** Lost time describes only the start of a green; slow vehicles also lose time
+later. A longer delay can make up for this loss. With the matched delay, a policy gets the same
+reward over whole episodes in both worlds. Every other difference between the worlds enters this
+delay, too. Both rewards must come from the same policy.
 
-An hour of traffic is one sample, and some delay fits best even where no green is late. So greens
-are moved only where chance does not explain the difference between the street's rewards and those
-of the simulation with the lost time alone.
+An hour of traffic is one sample, so some delay fits best even where no green is late. Greens are
+therefore moved only if chance does not explain the difference between the rewards of the street and
+those of the simulation with the lost time alone.
 """
 
 from __future__ import annotations
@@ -39,11 +38,11 @@ from ugat_marl.grounding.stacked import StackedTransitions
 # --- lost time
 
 STEP_S = 0.1
-"""Resolution of the estimates."""
+"""Resolution of the estimates, in s."""
 LEAST_ROWS = 5
-"""Transitions of a phase below which their mean is not used."""
+"""Smallest number of transitions of a phase from which its mean is used."""
 LEAST_S = 0.5
-"""Delays below this are 0 when rounded to whole seconds."""
+"""Smallest delay, in s, that does not round to 0 s."""
 LEVEL = 3.84
 """95 % quantile of chi-squared with one degree of freedom."""
 
@@ -53,10 +52,10 @@ class LostTime:
     """Delays that fit measured transitions best, in s.
 
     Attributes:
-        phase_s: ``(agents, phases)``, those of single phases, drawn to their intersection's.
-        best_s: ``(agents,)``, one for all phases of an intersection.
-        low_s: ``(agents,)`` lower end of its 95 % interval; ``high_s`` the upper.
-        switches: ``(agents,)``, the number of transitions behind them.
+        phase_s: ``(agents, phases)``, delays of single phases, pulled to their intersection's.
+        best_s: ``(agents,)``, common delay of all phases of an intersection.
+        low_s: ``(agents,)``, lower end of the 95 % interval of `best_s`; `high_s` is the upper.
+        switches: ``(agents,)``, number of transitions used.
     """
 
     phase_s: Tensor
@@ -69,19 +68,19 @@ class LostTime:
     def shown(self) -> NDArray[np.bool_]:
         """Intersections with a lost time, ``(agents,)`` bool.
 
-        The others are those where 0 s fits as well and the best delay is 0 in whole seconds: that
-        is chance, and would be made up for in every green of training.
+        At the others 0 s lies in the interval and the best delay rounds to 0 s. Such a delay may be
+        chance, and would act on every green of the training.
         """
         return (self.low_s > 0.0) | (self.best_s >= LEAST_S)
 
 
 @dataclass(frozen=True)
 class ModelErrors:
-    """Errors that a model of the simulation leaves, and the rows behind each delay.
+    """Errors of a model of the simulation, and the number of rows of each delay.
 
     Attributes:
-        spread: ``(agents, outputs)``, root mean square error, in units of its scale.
-        rows: ``(agents, phases, delays)``, rows it was fitted to, by whole seconds.
+        spread: ``(agents, outputs)``, root mean square error, in units of the model's scale.
+        rows: ``(agents, phases, delays)``, number of training rows, by delay in whole seconds.
     """
 
     spread: Tensor
@@ -90,7 +89,7 @@ class ModelErrors:
     @classmethod
     @torch.no_grad()
     def of(cls, model: DelayedForward, data: StackedTransitions) -> ModelErrors:
-        """Measure a fitted model; the rows with weight are those it was fitted to."""
+        """Measure a fitted model on its training rows, those with weight."""
         change = model.change(data.observation, data.outcome) / model.scale
         seen = model.view.of(data)
         error = model(seen, data.executed, model.extra(data.delay_s)) - change
@@ -107,13 +106,18 @@ class ModelErrors:
 def lost_time(
     model: DelayedForward, data: StackedTransitions, known: ModelErrors, phase_s: float
 ) -> LostTime:
-    """Estimate the delays: by phase and lane, mean changes as the street has them.
+    """Estimate the delays with which the model explains the mean changes on the street best.
+
+    For a delay d, with the mean error m of every output over the rows of a phase, and its variance
+    v = spread^2 (1 / rows on the street + 1 / rows of the simulation near d):
+
+        misfit(d) = sum m^2 / v,    cost(d) = misfit(d) + sum log v
 
     Args:
-        model: Of the simulation.
-        data: Of the street; rows with weight are those in which a green begins.
-        known: What the model leaves open.
-        phase_s: Expected distance of single phases from their intersection, in s.
+        model: Fitted model of the simulation.
+        data: Transitions of the street; rows with weight are those in which a green begins.
+        known: Errors and row numbers of the model.
+        phase_s: Expected distance of single phases from their intersection's delay, in s.
     """
     stack, seen = model.stack, model.view.of(data)
     grid = torch.linspace(0.0, model.most_s, round(model.most_s / STEP_S) + 1)
@@ -132,7 +136,7 @@ def lost_time(
         chance = (chance[..., None] * known.spread[:, None] ** 2).double()
         misfit[:, :, place] = (use * mean**2 / chance).sum(-1)
         cost[:, :, place] = misfit[:, :, place] + (use * chance.log()).sum(-1)
-    # What no delay explains is the model's own error; it makes the delays less certain.
+    # The misfit at the best delay is the model's own error; it makes the delays less certain.
     excess = (misfit.sum(1).amin(-1) / use.sum((1, 2)).clamp(min=1.0)).clamp(min=1.0)[:, None]
     total = cost.sum(1)
     likely = (total - total.amin(-1, keepdim=True)) / excess
@@ -159,7 +163,7 @@ def _by_phase(values: Tensor, phase: Tensor, rows: Tensor) -> Tensor:
 
 
 def _between(rows: Tensor, seconds: float) -> Tensor:
-    """Return the rows near a delay: those of the whole seconds beside it, by distance."""
+    """Return the number of rows at a delay, interpolated between whole seconds."""
     below = min(int(seconds), rows.shape[-1] - 2)
     share = seconds - below
     return rows[..., below] * (1.0 - share) + rows[..., below + 1] * share
@@ -168,15 +172,15 @@ def _between(rows: Tensor, seconds: float) -> Tensor:
 # --- matched rewards
 
 MATCHED_REWARD = "queue"
-"""The reward that can be matched: it falls with every delay, and an episode's mean is one of many
-moments. Differences of waiting times add up to what is left at the end."""
+"""Reward that can be matched: it falls with every delay, and its mean covers the whole episode. A
+sum of differences of waiting times contains only the waiting time at the end."""
 CHANCE = 0.05
-"""Probability under the lost time alone below which rewards speak against it."""
+"""p-value of the lost time alone below which delays are moved to match rewards."""
 
 
 @dataclass(frozen=True)
 class EpisodeRewards:
-    """Mean rewards per decision that one policy got in single episodes.
+    """Mean rewards per decision of one policy in single episodes.
 
     Attributes:
         street: ``(episodes, agents)``.
@@ -196,10 +200,9 @@ class MatchedDelays:
     """Delays of greens by which rewards match.
 
     Attributes:
-        delay_s: ``(agents,)``, with which the simulation pays what the street pays, in s.
-        chance: How likely the street's rewards are under the lost time alone (`chance_of`).
-        beyond_s: ``(agents,)``, what greens are to be later by than the lost time; 0 where chance
-            explains the rewards.
+        delay_s: ``(agents,)``, delays in s with which rewards are equal in both worlds.
+        chance: p-value of the street's rewards under the lost time alone (`chance_of`).
+        beyond_s: ``(agents,)``, delay in s beyond the lost time; 0 if chance explains the rewards.
     """
 
     delay_s: Floats
@@ -208,11 +211,11 @@ class MatchedDelays:
 
 
 def match_delays(rewards: EpisodeRewards, lost_s: Floats) -> MatchedDelays:
-    """Find how much later than by their lost time greens have to be for rewards to match.
+    """Find the delay beyond the lost time with which rewards match.
 
     Args:
-        rewards: Of one policy, in both worlds.
-        lost_s: ``(agents,)``, what greens lose when they begin, in s.
+        rewards: Rewards of one policy in both worlds.
+        lost_s: ``(agents,)``, lost time of greens, in s.
     """
     delay_s = matching_delays(rewards.street.mean(0), rewards.simulated.mean(1))
     chance = chance_of(rewards, lost_s)
@@ -227,17 +230,22 @@ def episode_rewards(log: TransitionLog, agents: Sequence[str]) -> Floats:
 
 
 def chance_of(rewards: EpisodeRewards, delay_s: Floats) -> float:
-    """Return how likely the street's rewards are if its greens are late by these delays only.
+    """Return the p-value of the street's rewards if its greens have these delays only.
 
-    Two-sided, by Student's t, of the sum over the network: what an hour's traffic does to rewards
-    it does to all intersections. Episodes are taken to vary in proportion to their mean.
+    The test is a two-sided t-test of the sum over the network, because an hour's traffic affects
+    all intersections together. The standard deviation of episodes is taken as proportional to their
+    mean; `varies` is its share of the mean:
+
+        t = (street - expected) / (varies * hypot(street / sqrt(n), expected / sqrt(m)))
+
+    n and m are the numbers of episodes on the street and, per delay, in the simulation.
 
     Args:
-        rewards: Of one policy, in both worlds.
+        rewards: Rewards of one policy in both worlds.
         delay_s: ``(agents,)``, delays in s.
 
     Returns:
-        A p-value; 1 where no two episodes tell how much rewards vary.
+        A p-value; 1 if there are too few episodes to measure how much rewards vary.
     """
     delays, episodes, _ = rewards.simulated.shape
     late = np.arange(delays, dtype=np.float64)
@@ -259,24 +267,24 @@ def chance_of(rewards: EpisodeRewards, delay_s: Floats) -> float:
 
 
 def _relative_squares(group: Floats) -> float:
-    """Return the sum of squared distances from the mean, as shares of it; 0 if it is 0."""
+    """Return sum(((x - mean) / mean)^2); 0 if the mean is 0."""
     mean = float(group.mean())
     return float((((group - mean) / mean) ** 2).sum()) if mean else 0.0
 
 
 def matching_delays(street: Floats, simulated: Floats) -> Floats:
-    """Return the delay at which the simulation pays as much as the street.
+    """Return the delay at which the simulation gives the same reward as the street.
 
-    Rewards are taken to fall with the delay: where they rise by chance, neighbours are averaged
-    (isotonic regression). Between whole seconds they lie on a line.
+    Rewards should fall with the delay. Isotonic regression averages neighbours where they rise by
+    chance. Rewards between whole seconds are interpolated linearly.
 
     Args:
         street: Mean rewards ``(agents,)``.
-        simulated: The same with greens late by 0, 1, 2, ... s, ``(delays, agents)``.
+        simulated: Mean rewards with greens late by 0, 1, 2, ... s, ``(delays, agents)``.
 
     Returns:
-        Delays in s, ``(agents,)``, of several that pay the same the shortest; 0 where the street
-        pays more than the simulation at its best, that of its worst where it pays less.
+        Delays in s, ``(agents,)``; the shortest if several fit. 0 if the street's reward is above
+        all simulated ones; the delay of the smallest simulated reward if it is below all.
     """
     pairs = zip(street, simulated.T, strict=True)
     return np.array([_matching(paid, falling(curve)) for paid, curve in pairs], dtype=np.float64)
@@ -288,7 +296,7 @@ def falling(values: Floats) -> Floats:
 
 
 def _matching(paid: float, curve: Floats) -> float:
-    after = int(np.argmax(curve <= max(paid, curve[-1])))  # the shortest of those that pay the same
+    after = int(np.argmax(curve <= max(paid, curve[-1])))  # the first, so the shortest delay
     if after == 0 or curve[after] > paid:
         return float(after)
     return after - (paid - curve[after]) / (curve[after - 1] - curve[after])

@@ -1,7 +1,9 @@
 """Forward models f_i: the outcome of a state and an action in the real world.
 
-One multi-layer perceptron per intersection, all of them computed as one batch. A model predicts
-the *change* of the features over one decision interval: knowing nothing is predicting no change.
+Each intersection has one multi-layer perceptron; all are computed as one batch. A model predicts
+the *change* of the features over one decision interval, so an uninformed model predicts no change:
+
+    features of s' = features of s + scale * network(s, a)
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ class ForwardConfig:
 
     Attributes:
         hidden: Sizes of the hidden layers.
-        include_phase: True if the phase of s' is predicted, too. Off: it is known from the action,
-            and with it an inverse model could only answer the action that made it.
+        include_phase: True if the phase of s' is predicted, too. Off by default: the action gives
+            this phase, so an inverse model that sees it can only answer with that action.
     """
 
     hidden: tuple[int, ...] = (128, 128)
@@ -49,7 +51,7 @@ class ForwardModel(TrainableModel):
         config: Shape of the models.
         generator: Source of the initial weights.
         extra: Number of further inputs.
-        view: What the models see beside s and a; nothing unless given.
+        view: Inputs of the models beside s and a; none by default.
     """
 
     scale: Tensor
@@ -88,15 +90,15 @@ class ForwardModel(TrainableModel):
 
     @property
     def parts(self) -> int:
-        """The agents, which share no weight."""
+        """Number of agents; they share no weight."""
         return len(self.stack.agents)
 
     def loss_by_part(self, loss: Tensor) -> Tensor:
-        """Return the loss of every agent as it is."""
+        """Return the loss of every agent unchanged."""
         return loss
 
     def renew(self, generator: torch.Generator) -> None:
-        """Forget everything: make a new network with weights from `generator`."""
+        """Make a new network with weights from `generator`; the model counts as unfitted."""
         self.network = BatchedMLP(self._fan_in, self.config.hidden, self._outputs, generator)
         self.fitted.fill_(False)
 
@@ -104,23 +106,23 @@ class ForwardModel(TrainableModel):
         """Predict the change in units of ``scale``: ``(agents, batch, outputs)``, 0 in padding.
 
         Args:
-            observation: ``(agents, batch, view.width)``, as `view` makes it.
-            action: ``(agents, batch)`` int64.
-            extra: ``(agents, batch, extra)`` float32, the further inputs; none is zeros.
+            observation: ``(agents, batch, view.width)`` inputs from `view`.
+            action: ``(agents, batch)`` int64 phases.
+            extra: ``(agents, batch, extra)`` float32 further inputs; zeros if not given.
         """
         return self.read(self.inputs(observation, action, extra))
 
     def read(self, inputs: Tensor) -> Tensor:
-        """Predict as `forward` does, from ``(agents, batch, width)`` of `inputs`."""
+        """Predict as `forward` does, from the ``(agents, batch, width)`` tensor of `inputs`."""
         return self.network(inputs) * self.valid_outputs
 
     def read_all(self, inputs: Tensor) -> Tensor:
-        """Predict as `read` does, for any number of rows: some after the others."""
+        """Predict as `read` does, for any number of rows, in parts to limit memory."""
         parts = inputs.split(rows_at_once(len(inputs)), dim=1)
         return torch.cat([self.read(part) for part in parts], 1)
 
     def inputs(self, observation: Tensor, action: Tensor, extra: Tensor | None = None) -> Tensor:
-        """Return the network's inputs, ``(agents, batch, width)``; arguments as of `forward`."""
+        """Return the network's inputs, ``(agents, batch, width)``, for arguments of `forward`."""
         inputs = nn.functional.pad(
             self.standardise(observation), (0, self.width - observation.shape[-1])
         )
@@ -141,7 +143,10 @@ class ForwardModel(TrainableModel):
         return (next_observation[..., :size] - observation[..., :size]) * self.valid_outputs
 
     def fit_scale(self, observation: Tensor, change: Tensor, weight: Tensor) -> None:
-        """Take the statistics of inputs and of changes from the training rows."""
+        """Set the statistics of the inputs and the scale from the training rows.
+
+        The scale of an agent is the root mean square of its changes, over rows and features.
+        """
         self.standardise.fit(observation, weight)
         share = (weight / weight.sum(1, keepdim=True))[..., None]
         outputs = self.valid_outputs.sum(-1, keepdim=True)
@@ -152,16 +157,16 @@ class ForwardModel(TrainableModel):
 class DelayedForward(ForwardModel):
     """Model of the simulation: (s, a, delay of a's green) -> change of the features.
 
-    The effect of a delay bends where queues and greens end, and jumps where one more vehicle gets
-    through. So every whole second has an input of its own; a delay between two of them counts for
-    both.
+    The effect of a delay is not linear: it bends where queues and greens end, and jumps where one
+    vehicle more passes. So every whole second has its own input. A delay between two seconds is
+    divided between both.
 
     Args:
         stack: The agents.
         config: Shape of the models.
-        most_s: Longest delay.
+        most_s: Longest delay, in s.
         generator: Source of the initial weights.
-        view: What the models see beside s, a and the delay; nothing unless given.
+        view: Inputs of the models beside s, a and the delay; none by default.
     """
 
     def __init__(
@@ -176,6 +181,9 @@ class DelayedForward(ForwardModel):
         self.most_s = most_s
 
     def extra(self, delay_s: Tensor) -> Tensor:
-        """Return the further inputs for delays ``(agents, batch)``."""
+        """Return the further inputs for delays in s, ``(agents, batch)``.
+
+        Input k = 1, ..., most_s is max(0, 1 - |delay - k|).
+        """
         seconds = torch.arange(1.0, self.most_s + 1.0)
         return (1.0 - (delay_s[..., None] - seconds).abs()).clamp(min=0.0)

@@ -1,10 +1,9 @@
-"""The gate: per intersection and step, the policy's action or the grounded one.
+"""Gate: the choice between the policy's action and the grounded action, per agent and step.
 
-A grounded action is taken where the inverse model's uncertainty u is below the threshold alpha. In
-UGAT alpha starts at infinity (everything is taken) and is then the mean of the u that were logged;
-it can start at the mean that the first fit leads to expect. A fixed alpha and an infinite one (GAT,
-no gate) are the paper's ablations. Where every u was 0, there is no uncertainty to gate by, and
-alpha stays infinite.
+The gate takes a grounded action where the uncertainty u of h is below the threshold alpha. In UGAT
+alpha starts at infinity, so every grounded action is taken. Later alpha is the mean of the logged
+u. Alpha can also start at the mean u of the first fit. The paper's ablations have a fixed alpha, or
+an infinite one (GAT, no gate). Where every u was 0, alpha keeps its value.
 """
 
 from __future__ import annotations
@@ -35,10 +34,10 @@ class GateConfig:
             "dynamic" with the mean of the u logged before the last update.
         static_alpha: Threshold in (0, 1], for mode "static".
         scope: One alpha per intersection, or one pooled over all.
-        window_epochs: The number of epochs (episodes of grounded training) whose u enter the mean,
-            the last ones, those of earlier iterations and of their h included.
+        window_epochs: Number of the last epochs (episodes of grounded training) whose u enter the
+            mean. Epochs of earlier iterations count, too.
         start: Alpha of "dynamic" before any u is logged: "open" is infinite, as in the paper;
-            "fitted" is the mean u of the first fit, of h's answers to what f predicts.
+            "fitted" is the mean u of h's answers to the predictions of f after the first fit.
     """
 
     mode: Literal["infinite", "static", "dynamic"] = "dynamic"
@@ -65,15 +64,15 @@ class GateReport:
     """Decisions of the gate since the last update; arrays over the agents.
 
     Attributes:
-        agents: Names.
+        agents: Names of the agents.
         iteration: Number of updates before these decisions.
-        decisions: Decisions per agent.
-        alpha: Threshold these decisions were compared with.
+        decisions: Number of decisions.
+        alpha: Threshold of these decisions.
         acceptance: Share of decisions in which the grounded action was taken.
-        mean_u: Mean uncertainty.
-        change_rate: Share of decisions in which another action than the policy's was executed.
-        trusted: Agents whose models may be obeyed at all (`Gate.trust`).
-        warning: A sentence if the gate let everything or nothing through, else "".
+        mean_u: Mean uncertainty, in [0, 1].
+        change_rate: Share of decisions with a grounded action other than the policy's.
+        trusted: True for agents whose grounded actions may be taken (`Gate.trust`).
+        warning: A sentence if the gate accepted everything or nothing, else "".
     """
 
     agents: tuple[str, ...]
@@ -116,18 +115,18 @@ class Gate:
         self._counts = np.zeros((4, len(self.agents)))  # decisions, accepted, changed, sum of u
 
     def trust(self, agents: NDArray[np.bool_]) -> None:
-        """Set the agents, ``(agents,)`` bool, whose models may be obeyed at all.
+        """Set the agents, ``(agents,)`` bool, whose grounded actions may be taken.
 
-        Alpha is infinite at first, so a poor h would be obeyed everywhere, and make a policy worse.
-        All agents are trusted until this is called; `FitReport.trusted` knows whom to trust.
+        Alpha is infinite at first, so the gate would take every answer of a poor h. All agents are
+        trusted until this is called; `FitReport.trusted` gives the agents to trust.
         """
         self.trusted = np.asarray(agents, bool).copy()
 
     def begin(self, mean_u: NDArray[np.float64]) -> None:
-        """Tell a gate that starts "fitted" which u to expect; later iterations have logged theirs.
+        """Set the first alpha of a gate that starts "fitted"; later iterations use logged u.
 
         Args:
-            mean_u: ``(agents,)`` means; where one is 0 there is nothing to gate by.
+            mean_u: ``(agents,)`` mean u to expect; where it is 0, alpha is infinite.
         """
         if self.config.mode != "dynamic" or self.config.start != "fitted" or self.iteration:
             return
@@ -141,7 +140,7 @@ class Gate:
     def accepts(
         self, u: NDArray[np.floating[Any]], permitted: NDArray[np.bool_] | None = None
     ) -> NDArray[np.bool_]:
-        """Return the grounded actions that `decide` would take, bool; nothing is logged."""
+        """Return true where `decide` would take the grounded action; nothing is logged."""
         accepted = (u < self.alpha) & self.trusted
         return accepted if permitted is None else accepted & permitted
 
@@ -163,7 +162,7 @@ class Gate:
             asked: ``(agents,)`` false where there is nothing to ground; these are not logged.
 
         Returns:
-            ``(agents,)`` bool: u < alpha, permitted, asked, and the agent's models trusted.
+            ``(agents,)`` bool: u < alpha, and the agent is permitted, asked and trusted.
         """
         accepted = self.accepts(u, permitted)
         one = np.ones_like(u) if asked is None else asked.astype(u.dtype)
@@ -173,16 +172,16 @@ class Gate:
         return accepted
 
     def end_epoch(self) -> None:
-        """Close an epoch: its u count as one of the window's epochs. Empty ones do not."""
+        """Close an epoch and add its u to the window; an epoch without decisions is not added."""
         if self._running[1].any():
             self._epochs.append(self._running)
             self._running = np.zeros_like(self._running)
 
     def update(self) -> GateReport:
-        """End an iteration: report, move a dynamic alpha, and start counting anew.
+        """End an iteration: report, set a dynamic alpha to mean(u), and reset the counts.
 
-        Warns (UserWarning) if, after the first iteration, some intersections took everything or
-        nothing, unless that is the mode's purpose.
+        Warns (UserWarning) if, after the first iteration, intersections took every grounded action
+        or none. Mode "infinite" does not warn.
         """
         self.end_epoch()
         report = self.report()
@@ -234,7 +233,7 @@ class Gate:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything needed to go on as if never interrupted."""
+        """Return the complete state, from which a gate continues without a difference."""
         epochs = np.array(self._epochs).reshape(-1, 2, len(self.agents))
         return {
             "agents": list(self.agents),
@@ -252,7 +251,7 @@ class Gate:
         """Restore `state_dict`.
 
         Raises:
-            CheckpointError: Of other agents, incomplete, or with impossible numbers.
+            CheckpointError: The state has other agents, is incomplete or has impossible numbers.
         """
         if state.get("agents") != list(self.agents):
             raise CheckpointError(

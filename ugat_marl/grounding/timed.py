@@ -1,9 +1,9 @@
-"""Timed grounding: the policy's phase, with a green that begins as late as it does in reality.
+"""Timed grounding: the policy's phase, with a green that begins later.
 
-The paper's grounded action is another phase, which cannot say "the same green, but it is of less
-use": what slow vehicles lose. Here the grounded action is the policy's own phase and a delay of its
-green. h answers with the delay that makes the simulation do what f expects of the street; where h
-is not trusted, the delay is the one that fits all the street's transitions best.
+Slow vehicles use less of a green. The paper's grounded action, another phase, cannot express this.
+Here the grounded action is the policy's own phase and a delay of its green. f predicts the change
+in the real domain ("the street"). h answers with the delay that causes this change in the
+simulation. Where h is not trusted, the delay is the one that fits all real transitions best.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from ugat_marl.policies import one_thread
 from ugat_marl.seeding import torch_generator
 
 END_S = 0.5
-"""A best delay so close to the longest one tried may well be longer."""
+"""Distance in s from the longest delay tried; a best delay within it may in truth be longer."""
 
 ANSWERS = ("state", "constant")
 
@@ -60,17 +60,17 @@ class TimedConfig:
     """Settings of timed grounding.
 
     Attributes:
-        most_s: Longest delay of a green, in whole s; roll-outs for D_sim try all up to it. What is
-            longer than the green that clearance leaves of a decision interval cannot be told apart.
-        answer: "state" asks h in every state, as far as the gate lets it; "constant" takes the
-            delay that fits all transitions best, per intersection and phase.
-        spread_s: Expected distance, in s, of delays of single phases and states from those of their
-            intersection and phase. Where the data say little, delays stay close.
-        target_noise: Noise on the changes that h learns to read, in units of what the simulation
-            leaves unpredicted: f, too, is fitted to finitely many transitions.
-        match: True if the delays of an intersection are raised or lowered together until the
-            simulation pays the policy in training what the street pays it
-            (`delays.match_delays`); needs roll-outs of that policy in both.
+        most_s: Longest delay of a green, in whole s. Roll-outs for D_sim use all delays from 0 to
+            it. Delays longer than the green within one decision interval look all the same.
+        answer: "state" asks h in every state and applies the gate; "constant" takes the delay that
+            fits all transitions best, per intersection and phase.
+        spread_s: Expected distance, in s, of delays of single phases and states from the delay of
+            their intersection and phase. With few data, delays stay close to it.
+        target_noise: Noise on the changes from which h learns, in units of the root mean square
+            error of the model of the simulation. It stands for the error of f.
+        match: True if the delays of an intersection are moved together until the policy gets the
+            same reward in both domains (`delays.match_delays`). This needs roll-outs of the policy
+            in both.
     """
 
     most_s: int = 5
@@ -91,11 +91,11 @@ class TimedConfig:
 
 
 class _Constants(nn.Module):
-    """Delays in s that are taken where h is not trusted.
+    """Delays in s for greens of agents whose h is not trusted.
 
     Attributes:
-        delay_s: What greens lose when they begin, ``(agents, phases)``.
-        beyond_s: What all of an intersection are later by, to match rewards, ``(agents, 1)``.
+        delay_s: Lost time at the start of a green, ``(agents, phases)``.
+        beyond_s: Further delay of all greens of an intersection, to match rewards, ``(agents, 1)``.
     """
 
     delay_s: Tensor
@@ -104,7 +104,7 @@ class _Constants(nn.Module):
     def __init__(self, stack: Stack, match: bool) -> None:
         super().__init__()
         self.register_buffer("delay_s", torch.zeros(len(stack.agents), stack.actions))
-        # Without matching there is nothing to load, so that other checkpoints are refused.
+        # Not stored without matching, so checkpoints with matching are refused then.
         self.register_buffer("beyond_s", torch.zeros(len(stack.agents), 1), persistent=match)
 
 
@@ -113,7 +113,7 @@ class TimedTransform(Transform):
 
     Args:
         layouts: Agent to the division of its observation, in the environment's order.
-        seed: Decides the initial weights.
+        seed: Seed of the initial weights.
         forward: Shape of the forward models, of the street and of the simulation.
         inverse: Shape of the inverse models.
         gate: Settings of alpha.
@@ -144,7 +144,7 @@ class TimedTransform(Transform):
         super().__init__(layouts, seed, forward, gate, inputs, neighbours)
         self.timed = timed or TimedConfig()
         most_s = self.timed.most_s
-        # What the street does is compared with it, so that both see the same.
+        # Its predictions are compared with the street, so it has the same view as f.
         self.simulated = DelayedForward(
             self.stack, forward, most_s, torch_generator(seed, "simulated"), self.forward.view
         )
@@ -180,14 +180,14 @@ class TimedTransform(Transform):
         """Fit f on the street, a model with delays and h on the simulation, and the constants.
 
         Args:
-            real: Transitions of the world to be matched.
+            real: Transitions of the real domain.
             simulated: Transitions of the simulation under random delays.
-            fitter: How to train.
-            rewards: Rewards of the policy in both worlds. With them all delays of an intersection
-                are moved together until it gets the same, where lost time does not explain it.
+            fitter: Settings, seed and device of the training.
+            rewards: Rewards of the policy in both worlds. If lost time does not explain their
+                difference, all delays of an intersection are moved together until they match.
 
         Raises:
-            LogError: As `Transform.fit`.
+            LogError: The logs are refused by `Transform.fit`.
         """
         refuse_mismatch(real, simulated)
         stack, model = self.stack, self.simulated
@@ -203,7 +203,7 @@ class TimedTransform(Transform):
         known = ModelErrors.of(model, replace(data, weight=rows.train * begins))
         street = replace(street, weight=street.weight * _begins(street, stack))
         lost = lost_time(model, street, known, self.timed.spread_s)
-        # Models that know nothing of a street or of the simulation know of no lost time either.
+        # A lost time counts only if both models have learnt something.
         learnt = f.learnt & g.learnt
         matched = self._set_constants(lost, learnt, rewards)
         data = replace(data, weight=data.weight * begins)
@@ -214,7 +214,7 @@ class TimedTransform(Transform):
     def _set_constants(
         self, lost: LostTime, learnt: NDArray[np.bool_], rewards: EpisodeRewards | None
     ) -> MatchedDelays | None:
-        """Take the best constants where models have learnt something; return those of rewards."""
+        """Set the constant delays where models have learnt something; return the matched delays."""
         found = learnt & lost.shown
         self.constants.delay_s.copy_(lost.phase_s * torch.from_numpy(found)[:, None])
         if rewards is None:
@@ -227,11 +227,12 @@ class TimedTransform(Transform):
     def _fit_inverse(
         self, data: StackedTransitions, rows: Split, spread: Tensor, fitter: Fitter
     ) -> TimedInverseReport:
-        """Fit h to the change that a model of the simulation expects in every state under a delay.
+        """Fit h to the changes that a model of the simulation predicts under random delays.
 
-        Not to single transitions: from one of those the delay can hardly be told, and the best
-        guess under noise is the middle of the range. f, whose output h is to read, predicts means,
-        and so does the model.
+        Single transitions are too noisy: the best guess of their delay is the middle of the range.
+        h later reads the predictions of f. These are means, as are those of the model:
+
+            change = (g(s, a, delay) + target_noise * noise) * scale
         """
         model, simulated, seed = self.inverse, self.simulated, fitter.seed
         seen = model.view.of(data)
@@ -257,13 +258,13 @@ class TimedTransform(Transform):
         record: TrainingRecord,
         generator: torch.Generator,
     ) -> TimedInverseReport:
-        """Measure h on the held-out rows of its lesson and on single transitions."""
+        """Measure h on its held-out questions and on single transitions."""
         model = self.inverse
         seconds = torch.arange(model.most_s + 1, dtype=torch.float32)
         answer = model.answer(lesson.inputs)
         happened = self.simulated.change(data.observation, data.outcome)
         single = model.predict(model.view.of(data), data.executed, happened)
-        held = rows.held_out * data.weight  # nothing is known of an agent that had to take all rows
+        held = rows.held_out * data.weight  # 0 for agents that had to train without such rows
         count = int(held.sum(1).max().clamp(min=1))
         drawn = lesson.off_data.draw(count, generator, state_share=1.0)
         missed = answer.action != lesson.answers
@@ -282,7 +283,7 @@ class TimedTransform(Transform):
 
     @torch.no_grad()
     def _mean_u(self, street: StackedTransitions) -> Floats:
-        """Return the mean u of h's answers to what f predicts, per agent, by weights of rows."""
+        """Return the weighted mean u of h's answers to the predictions of f, per agent."""
         seen, local = self.forward.view.of(street), self.local.of(street)
         u = self.delays(seen, local, street.executed)[1]
         mean = (u * street.weight).sum(1) / street.weight.sum(1)
@@ -297,8 +298,8 @@ class TimedTransform(Transform):
     ) -> Grounding:
         """Return the policy's phases, with a delay where they change.
 
-        Line numbers are those of Algorithm 1 (`ugat`). The gate sees delays in whole seconds; an
-        action counts as changed if h's delay is another than the one taken without h.
+        Line numbers are those of Algorithm 1 (`ugat`). The gate gets delays in whole seconds. An
+        action counts as changed if the delay of h differs from the constant delay.
         """
         asked = torch.from_numpy(actions)[:, None]
         usual = self._later(self.constants.delay_s.gather(1, asked))
@@ -306,7 +307,7 @@ class TimedTransform(Transform):
         if self.timed.answer == "constant":
             delay = np.where(switched, usual[:, 0].numpy(), 0.0).astype(np.float32)
             return Grounding(actions, actions, np.zeros_like(delay), np.ones_like(switched), delay)
-        # No phase is changed, so that it is known at once what runs at the neighbours.
+        # Grounding keeps all phases, so those of the neighbours are known in advance.
         phases = torch.from_numpy(running(actions, permitted))[:, None]
         found, u = self.delays(  # lines 11 and 12
             self.forward.view.seen(observations, phases, earlier),
@@ -324,38 +325,40 @@ class TimedTransform(Transform):
         return Grounding(actions, actions, u[:, 0].numpy(), accepted, delay)
 
     def delays(self, seen: Tensor, local: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return h's delays in s, drawn to the best constants, and its u: ``(agents, batch)``.
+        """Return the delays of h in s, pulled to the constant delays, and u: ``(agents, batch)``.
 
         Args:
-            seen: ``(agents, batch, forward.view.width)``, the observations as f sees them.
-            local: ``(agents, batch, local.width)``, the same as h sees them.
+            seen: ``(agents, batch, forward.view.width)`` observations in the view of f.
+            local: ``(agents, batch, local.width)`` the same observations in the view of h.
             actions: ``(agents, batch)`` int64, phases that turn green.
         """
         change = self.forward(seen, actions) * self.forward.scale
         answer = self.inverse.predict(local, actions, change)
         usual = self.constants.delay_s.gather(1, actions)
-        # h says what a green loses when it begins, in some states more and in others less.
+        # h estimates the lost time alone, so matching is added afterwards.
         found = likely_delay(answer.probability, usual, self.timed.spread_s)
         return self._later(found), answer.u
 
     def _later(self, delay_s: Tensor) -> Tensor:
-        """Return delays ``(agents, batch)`` after all of an intersection have been moved."""
+        """Return delays ``(agents, batch)`` plus `beyond_s`, limited to 0 to `most_s` s."""
         return (delay_s + self.constants.beyond_s).clamp(0.0, float(self.timed.most_s))
 
 
 def likely_delay(probability: Tensor, expected_s: Tensor, spread_s: float) -> Tensor:
-    """Return the likeliest delay in s, ``(...)``, if delays are expected around some value.
+    """Return the likeliest delay in s, ``(...)``, given a normal prior around an expected delay.
 
-    Where h does not know, its even odds leave the expected delay as it is.
+        argmax_d  log p(d) - (d - expected_s)^2 / (2 spread_s^2)
+
+    With equal probabilities the answer is the expected delay.
 
     Args:
-        probability: ``(..., classes)`` of delays of 0, 1, 2, ... s.
-        expected_s: ``(...)``.
-        spread_s: Standard deviation around it.
+        probability: ``(..., classes)`` probabilities of delays of 0, 1, 2, ... s.
+        expected_s: ``(...)`` expected delays, in s.
+        spread_s: Standard deviation of the prior, in s.
     """
     seconds = torch.arange(probability.shape[-1], dtype=torch.float32)
     fine = torch.linspace(0.0, float(seconds[-1]), 10 * (len(seconds) - 1) + 1)
-    # Log-probabilities between whole seconds, on the line between their neighbours.
+    # Log-probabilities are interpolated linearly between whole seconds.
     below = fine.floor().long().clamp(max=len(seconds) - 2)
     share = fine - below
     log = probability.clamp(min=1e-12).log()
@@ -367,21 +370,21 @@ def likely_delay(probability: Tensor, expected_s: Tensor, spread_s: float) -> Te
 def _alike(
     one: StackedTransitions, two: StackedTransitions
 ) -> tuple[StackedTransitions, StackedTransitions]:
-    """Return both with the features that were served, or both without."""
+    """Return both with the served features, or both without."""
     if one.served_features is None or two.served_features is None:
         return replace(one, served_features=None), replace(two, served_features=None)
     return one, two
 
 
 def _begins(data: StackedTransitions, stack: Stack) -> Tensor:
-    """Return bool ``(agents, n)``, true where a green begins: elsewhere it cannot be late."""
+    """Return bool ``(agents, n)``, true where a green begins; only these greens can be late."""
     return stack.current_phase(data.observation) != data.executed
 
 
 def _where(begins: Tensor, rows: Split) -> Split:
-    """Return the rows in which a green begins; all of an agent's if it lacks them on one side.
+    """Return the rows in which a green begins; all rows of an agent that lacks such rows.
 
-    The head of h is shared: without rows of one agent the loss of all would be no number.
+    The head of h is shared. An agent without rows would make the loss of all agents NaN.
     """
     train, held_out = rows.train * begins, rows.held_out * begins
     enough = (train.any(1) & held_out.any(1))[:, None]
@@ -397,14 +400,15 @@ def _where(begins: Tensor, rows: Split) -> Split:
 
 @dataclass(frozen=True)
 class TimedInverseReport(InverseReport):
-    """Held-out quality of h, per agent where an array; delays and errors in s.
+    """Held-out quality of h; delays and errors in s, arrays ``(agents,)``.
+
+    `calibration` compares u with answers that name a wrong second.
 
     Attributes:
-        error_s: Mean absolute error on the changes it was trained to read, of held-out states;
-            `calibration` is that of u against naming another second.
-        error_on_transitions_s: The same on single transitions as they happened, whose noise no
-            answer can see through.
-        guess_s: Mean absolute error of always answering the middle of the range.
+        error_s: Mean absolute error on predicted changes of held-out states.
+        error_on_transitions_s: Mean absolute error on single held-out transitions. Their noise
+            limits every answer.
+        guess_s: Mean absolute error of the middle of the range as the constant answer.
     """
 
     error_s: Floats
@@ -421,14 +425,15 @@ class TimedInverseReport(InverseReport):
 
 @dataclass(frozen=True)
 class TimedReport(FitReport):
-    """Worth of the parts of timed grounding.
+    """Held-out quality of the models of timed grounding, and the estimated delays.
 
     Attributes:
-        inverse: h. `mean_u_on_predictions` is of its answers where greens begin on the street.
-        simulated: The model of the simulation with delays, on held-out simulated transitions.
-        lost: The delays that fit the street best.
-        most_s: Longest delay tried.
-        matched: The delays by which rewards match, if they were given.
+        inverse: Quality of h. `mean_u_on_predictions` is over real transitions in which a green
+            begins.
+        simulated: Quality of the model with delays, on held-out simulated transitions.
+        lost: Delays that fit the street best.
+        most_s: Longest delay tried, in s.
+        matched: Delays with which rewards match; None without rewards.
     """
 
     inverse: TimedInverseReport
@@ -438,7 +443,7 @@ class TimedReport(FitReport):
     matched: MatchedDelays | None = None
 
     def doubts(self) -> Iterator[str]:
-        """Yield sentences on what is wrong, some of them empty."""
+        """Yield sentences about problems; some of them are empty."""
         yield from self.forward.doubts("f", self.agents)
         yield from self.simulated.doubts("the model of the simulation", self.agents)
         yield complaint(
@@ -459,20 +464,20 @@ class TimedReport(FitReport):
 
     @property
     def _delay_s(self) -> Floats:
-        """Mean delay of greens, per agent."""
+        """Delay of greens in s, ``(agents,)``: lost time plus matching."""
         beyond_s = 0.0 if self.matched is None else self.matched.beyond_s
         return self.lost.best_s * self._found + beyond_s
 
     @property
     def _found(self) -> NDArray[np.bool_]:
-        """Agents with a lost time by models that have learnt something."""
+        """Agents with a lost time, if their models have learnt something."""
         return self.forward.learnt & self.simulated.learnt & self.lost.shown
 
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
-        """Return the agents whose h may be obeyed, for `Gate.trust`; the others take the constant.
+        """Return the agents with a trusted h, for `Gate.trust`; the others take the constant delay.
 
-        f and the model of the simulation have learnt something, there is a lost time for h to
-        refine, and h, on its own task, beats a guess by the share `least_accuracy`.
+        An agent is trusted if f and the model of the simulation have learnt something, a lost time
+        was found, and error_s < (1 - least_accuracy) * guess_s.
         """
         return self._found & (self.inverse.error_s < (1.0 - least_accuracy) * self.inverse.guess_s)
 

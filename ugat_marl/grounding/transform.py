@@ -1,8 +1,8 @@
 """Base of all groundings: models and gate of a network, fitted, asked, saved and loaded.
 
-For the policy's action a in state s: s' = f(s, a) is what the real world would do; a' = h(s, s') is
-the action with which the simulation does the same; the gate takes a' where h is sure enough. What a
-grounded action is, another phase or a delay, is up to `PhaseTransform` and `TimedTransform`.
+The policy chooses action a in state s. f predicts the next state of the real domain, s' = f(s, a).
+h answers with the action that leads to s' in the simulation, a' = h(s, s'). The gate takes a' where
+h is sure enough. In `PhaseTransform` a' is another phase; in `TimedTransform` it is a delay.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class Grounding:
     """Grounded actions of all agents at one step; arrays ``(agents,)``.
 
     Attributes:
-        executed: int64, what the simulation is told to do.
-        grounded: int64, what the inverse model answered.
-        u: float32, its uncertainty.
-        accepted: bool, whether the grounded action was taken.
-        delay_s: float32, for how long the greens are held back.
+        executed: int64, the phases that the simulation executes.
+        grounded: int64, the answers of the inverse model.
+        u: float32, uncertainties of these answers, in [0, 1].
+        accepted: bool, true where the grounded action was taken.
+        delay_s: float32, delays of the greens, in s.
     """
 
     executed: NDArray[np.int64]
@@ -60,7 +60,7 @@ class Transform(abc.ABC):
 
     Args:
         layouts: Agent to the division of its observation, in the environment's order.
-        seed: Decides the initial weights.
+        seed: Seed of the initial weights.
         forward: Shape of the forward models.
         gate: Settings of alpha.
         inputs: Inputs of the models beside the intersection's own state and action.
@@ -68,11 +68,11 @@ class Transform(abc.ABC):
 
     Attributes:
         stack: The agents.
-        inputs: What the models see.
-        local: The view of h: the neighbours, if there are hops; f's view has the history, too.
+        inputs: Inputs of the models.
+        local: View of h: neighbours, if there are hops. The view of f has the history, too.
         forward: f of every intersection.
         inverse: h of every intersection.
-        gate: Keeps or takes what h answers.
+        gate: Choice between the policy's actions and the answers of h.
     """
 
     inverse: AnswerModel
@@ -103,7 +103,7 @@ class Transform(abc.ABC):
 
     @property
     def fitted(self) -> bool:
-        """True once f and h have been fitted; before that there is nothing to ground with."""
+        """True once f and h have been fitted; actions cannot be grounded before."""
         return bool(self.forward.fitted) and bool(self.inverse.fitted)
 
     @abc.abstractmethod
@@ -117,16 +117,16 @@ class Transform(abc.ABC):
         """Fit f on the real log and h on the simulated log, and measure both.
 
         Args:
-            real: Transitions of the world to be matched, D_real; f learns what the *asked* action
-                does there.
-            simulated: Transitions of the simulation, D_sim; h learns which *executed* action, or
-                delay, did what.
-            fitter: How to train.
+            real: Transitions of the real domain, D_real. f learns the outcomes of the *asked*
+                actions.
+            simulated: Transitions of the simulation, D_sim. h learns the *executed* action, or the
+                delay, from the outcome.
+            fitter: Settings, seed and device of the training.
             rewards: Rewards of the policy in both worlds, for a grounding that matches them.
 
         Raises:
-            LogError: A log is of other agents, or too short to be split, or the logs differ in
-                scenario, observation or decision interval.
+            LogError: A log has other agents or is too short to be split, or the logs differ in
+                observation or decision interval.
         """
 
     @abc.abstractmethod
@@ -137,7 +137,7 @@ class Transform(abc.ABC):
         permitted: NDArray[np.bool_] | None,
         earlier: Sequence[Moment],
     ) -> Grounding:
-        """Ground as `__call__` does; the models are fitted."""
+        """Ground one action per agent with fitted models; the arguments are those of `__call__`."""
 
     @abc.abstractmethod
     def fresh_inverse(self, method: Method) -> AnswerModel:
@@ -158,7 +158,7 @@ class Transform(abc.ABC):
             observations: ``(agents, 1, width)`` float32, padded (`Stack.observations`).
             actions: ``(agents,)`` the policy's actions.
             permitted: ``(agents, phases)`` action masks; a masked grounded action is not taken.
-            earlier: The decisions of this episode before, latest first, for models with a history.
+            earlier: Earlier decisions of this episode, latest first, for models with a history.
 
         Raises:
             EpisodeError: The models have not been fitted.
@@ -181,10 +181,12 @@ class Transform(abc.ABC):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore `state_dict`, with the method of uncertainty h had; on an error nothing changes.
+        """Restore `state_dict`, including the method of uncertainty of h.
+
+        An error leaves this transform unchanged.
 
         Raises:
-            CheckpointError: Of other agents or shapes, incomplete, or not finite.
+            CheckpointError: The state has other agents or shapes, is incomplete or not finite.
         """
         layouts = state.get("layouts")
         own = [(agent, list(_sizes(layout))) for agent, layout in self.stack.layouts.items()]
@@ -213,15 +215,15 @@ class Transform(abc.ABC):
         """Write `state_dict` to a file, whole or not at all.
 
         Raises:
-            CheckpointError: A weight is not finite; a file at `path` is left as it was.
+            CheckpointError: A weight is not finite; an existing file at `path` stays unchanged.
         """
         write_checkpoint(path, KIND, self.state_dict())
 
     def load(self, path: Path) -> None:
-        """Restore what `save` wrote.
+        """Restore a file of `save`.
 
         Raises:
-            CheckpointError: Unreadable, of other agents or shapes, or not finite.
+            CheckpointError: The file is unreadable, has other agents or shapes, or is not finite.
         """
         state = read_checkpoint(path, KIND)
         try:
@@ -241,7 +243,7 @@ def _method(state: Mapping[str, Any]) -> Method:
 
 
 def _sights(inputs: InputsConfig, local: View) -> dict[str, Any]:
-    """Return what models see, in plain values."""
+    """Return the inputs of the models and their neighbours as plain values."""
     return {**asdict(inputs), "near": {agent: list(near) for agent, near in local.near.items()}}
 
 
@@ -250,7 +252,7 @@ def _sizes(layout: AgentLayout) -> tuple[int, int, int]:
 
 
 def _refuse_foreign(name: str, found: Any, own: Mapping[str, Tensor]) -> None:
-    """Refuse parts of a model that are not those of `own`, by name, shape and finiteness."""
+    """Refuse parts of a model whose names or shapes differ from `own`, or that are not finite."""
     if not isinstance(found, Mapping) or set(found) != set(own):
         raise CheckpointError(f"the {name} model in the checkpoint has other parts than this one")
     for part, value in own.items():

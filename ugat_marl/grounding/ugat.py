@@ -15,28 +15,28 @@ for Traffic Signal Control, CDC 2023.
      8      for e = 1, ..., E episodes:
      9          for each step t:
     10              a_t = pi(s_t)
-    11              s'_(t+1) = f(s_t, a_t)                  what the real world would do
-    12              a'_t, u_t = h(s'_(t+1), s_t)            the action with which E_sim does so
+    11              s'_(t+1) = f(s_t, a_t)                  the next state in E_real
+    12              a'_t, u_t = h(s'_(t+1), s_t)            the action that leads to it in E_sim
     13              if u_t >= alpha: a'_t = a_t             reject
     14              execute a'_t in E_sim
     15              append u_t to U
     16              update pi
     17      alpha = mean of U
 
-The comments below bear these numbers. Lines 8 and 16 are the learner's, lines 9 to 15 those of the
-environment it learns in (`wrappers.GroundedEnv`), which asks the transform (`phase`, `timed`) and
+The comments below give these line numbers. The learner does lines 8 and 16. The environment it
+trains in (`wrappers.GroundedEnv`) does lines 9 to 15; it asks the transform (`phase`, `timed`) and
 its gate.
 
-With its default options this differs from the listing; the values named here restore it.
+The default options differ from the listing; the values named here restore it.
 
 - Roll-outs take random phases now and then (lines 3 and 4): `rollout_epsilon` 0.
-- h is also trained against certainty far from its data (line 6): `fit.off_data_weight` 0.
+- h is also trained to be unsure far from its data (line 6): `fit.off_data_weight` 0.
 - U keeps the last 20 episodes, also those of earlier iterations (line 7): `gate.window_epochs` E.
-- Every intersection has an alpha of its own (line 17): `gate.scope` "pooled".
-- No action is grounded at an intersection before f and h are better there than trivial answers,
+- Every intersection has its own alpha (line 17): `gate.scope` "pooled".
+- Actions of an intersection are grounded only if f and h are better there than trivial answers,
   such as "no change" or the most frequent phase (line 13): `least_accuracy` None.
 
-And D_real may be a log that was recorded before (line 4).
+D_real may also be a log that was recorded earlier (line 4).
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ CHUNK = 10
 """Episodes of plain training between two checkpoints."""
 
 DIRECT_LEARNER = "direct-learner.pt"
-"""The learner as it was after plain training, in the run's folder: where controls start from."""
+"""File of the learner after plain training, in the run's folder; controls start from it."""
 
 Probe = Callable[[Policy], Mapping[str, float]]
-"""Measures a policy between iterations; the numbers are logged and never decide anything."""
+"""Measurement of a policy between iterations; the numbers are only logged."""
 
 
 @dataclass(frozen=True)
@@ -77,14 +77,14 @@ class Ugat:
     """Algorithm 1 on one network.
 
     Attributes:
-        env: E_sim, to train in.
-        sim: E_sim, to fill D_sim.
-        real: E_real, or a log of it, to fill D_real.
+        env: E_sim for the training.
+        sim: E_sim for the roll-outs of D_sim.
+        real: E_real, or a log of it, for the roll-outs of D_real.
         config: Settings.
         seed: Root of every random choice.
-        run: Where metrics and checkpoints go.
-        probe: Measures the policy after every iteration.
-        device: Where f and h are fitted (`policies.device_of`); the learner has its own.
+        run: Folder of metrics and checkpoints.
+        probe: Measurement of the policy after every iteration.
+        device: Device for the fit of f and h (`policies.device_of`); the learner has its own.
     """
 
     env: AnyParallelEnv
@@ -105,7 +105,7 @@ class Ugat:
         Returns:
             The policy after the last iteration.
         """
-        device = device_of(self.device)  # a GPU that is not there is refused before anything runs
+        device = device_of(self.device)  # refuses a missing GPU before anything runs
         self._pretrain(state)  # line 1
         grounded_env = GroundedEnv(self.env, state.transform)
         while state.iteration < self.config.iterations:  # line 2
@@ -123,7 +123,7 @@ class Ugat:
         return state.learner.policy()
 
     def _pretrain(self, state: State) -> None:
-        """Train in plain E_sim for M episodes; the policy is kept as direct transfer (line 1)."""
+        """Train in plain E_sim for M episodes; keep the policy as direct transfer (line 1)."""
         wanted = self.config.pretrain_episodes
         while state.pretrained < wanted:
             episodes = min(CHUNK, wanted - state.pretrained)
@@ -151,7 +151,7 @@ class Ugat:
             ]
             try:
                 while concurrent.futures.wait(running, timeout=0.2).not_done:
-                    pass  # wakes up now and then, so that Ctrl-C is heard
+                    pass  # a timeout lets Ctrl-C interrupt the wait
             except BaseException:
                 for world in worlds:
                     world.stop()
@@ -163,9 +163,9 @@ class Ugat:
                 advance()
 
     def _rewards(self, state: State, policy: Policy) -> EpisodeRewards:
-        """Play the policy in E_sim under each delay; return its rewards there and in E_real.
+        """Run the policy in E_sim under each delay; return its rewards there and in E_real.
 
-        Only timed grounding that matches rewards asks for this; it is no part of Algorithm 1.
+        Only timed grounding with matched rewards needs this; it is not part of Algorithm 1.
         """
         agents = state.transform.stack.agents
         number = self.sim.roll_outs_under_delays
@@ -176,7 +176,7 @@ class Ugat:
         return EpisodeRewards(street, simulated, before)
 
     def _fit(self, state: State, device: torch.device, rewards: EpisodeRewards | None) -> FitReport:
-        """Update f with D_real and h with D_sim (lines 5 and 6); say what is doubtful."""
+        """Update f with D_real and h with D_sim (lines 5 and 6); print warnings of the fit."""
         d_real, d_sim = map(TransitionLog.concatenate, (state.real, state.simulated))
         config, seed = self.config.fit, derive_seed(self.seed, "fit", state.iteration)
         most_epochs = 3 * config.epochs  # f, a model of the simulation, and h
@@ -193,7 +193,7 @@ class Ugat:
         return report
 
     def _prepare_gate(self, state: State, report: FitReport) -> None:
-        """Tell the gate where f and h are trusted, and which u to expect (lines 7 and 13)."""
+        """Give the gate the trusted agents and the u to expect (lines 7 and 13)."""
         gate = state.transform.gate
         if self.config.least_accuracy is not None:
             gate.trust(report.trusted(self.config.least_accuracy))
