@@ -4,7 +4,7 @@
 - `figures`: a matplotlib figure as SVG for a page, as an SVG file and as PNG.
 - `charts`, `network_maps`, `phase_diagrams`: records as figures.
 - `page`, ``templates/``: pages of HTML; `training_page` and `diagnosis_page` fill them in.
-- `run_records`, `run_groups`: trainings as they lie in their folders.
+- `run_records`, `run_groups`: trainings, read from their folders and put into groups.
 - `tables`, `gap_tables`, `comparison_tables`, `diagnosis_tables`, `learning_curves`: tables for
   the terminal, as Markdown and as CSV.
 - `formats`, `diagnosis_words`: numbers and verdicts as texts.

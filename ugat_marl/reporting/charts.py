@@ -36,14 +36,15 @@ MEASURES: dict[str, tuple[str, str]] = {
     "queue": ("queue", "veh"),
     "delay": ("delay, 1 − v/vmax", ""),
 }
-"""The paper's five measures on a radar, with their units."""
+"""The paper's five measures, as named on a radar, with their units."""
 _ROW = 30.0
+"""Height of a row of dots, in points."""
 
 Estimated = tuple[float, float, float]
-"""Mean, low, high."""
+"""Mean, lower end and upper end of its interval."""
 
 Deviation = tuple[str, str, float, float | None]
-"""Statistic, remark, deviation before and after."""
+"""Statistic, remark, and deviation before and after, in standard deviations."""
 
 
 # --- curves of trainings --------------------------------------------------------------------------
@@ -54,9 +55,12 @@ def learning_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | N
     """Draw the return per training episode, with 95 % intervals.
 
     Args:
-        records: Trainings that differ in their seed alone; one of them has intervals over the
-            episodes of a stretch, several have intervals over the seeds.
+        records: Trainings that differ in their seed alone. For one training, the intervals are over
+            the episodes of a stretch; for several, they are over the seeds.
         name: Name of the picture.
+
+    Returns:
+        The picture; None if no return was logged.
     """
     series = [rows for record in records if (rows := record.series("episode", "return"))]
     rows = binned(series)
@@ -82,7 +86,7 @@ def learning_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | N
 
 @styled()
 def travel_time_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | None:
-    """Draw ATT after each iteration by domain; with several seeds, 95 % intervals over them."""
+    """Draw ATT after each iteration by domain, with 95 % intervals if there are several seeds."""
     domains: dict[str, list[tuple[float, float, float, float]]] = {}
     for domain in _domains(records):
         series = [record.series("iteration", f"att_s/{domain}") for record in records]
@@ -101,7 +105,7 @@ def travel_time_picture(records: Sequence[RunRecord], name: str) -> NamedFigure 
 
 @styled()
 def gate_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | None:
-    """Draw acceptance, α and u over the iterations, means over the intersections."""
+    """Draw acceptance, α and u over the iterations, each as the mean over the intersections."""
     labels = {
         "gate/acceptance": "acceptance (share of decisions)",
         "gate/mean_u": "mean u",
@@ -126,7 +130,7 @@ def gate_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | None:
 def _plot(
     name: str, title: str, x_label: str, y_label: str, legend: Sequence[str] = ()
 ) -> tuple[NamedFigure, Any]:
-    """A picture with one pair of axes and whole numbers on the horizontal one."""
+    """Return a picture with one pair of axes; the horizontal axis has whole numbers."""
     below = legend_height(legend)
     picture = new_picture(name, title, 300 + below)
     axes = add_axes(picture, 58, 54, 14, 46 + below)
@@ -137,7 +141,7 @@ def _plot(
 
 
 def _label(axes: Any, x_label: str, y_label: str) -> None:
-    """Labels at the ends of both axes, the vertical one read without turning one's head."""
+    """Label both axes at their ends; the label of the vertical axis is horizontal text."""
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
     axes.set_xlabel(x_label, loc="right")
@@ -161,7 +165,10 @@ def _draw_curve(
     *,
     markers: bool = True,
 ) -> None:
-    """Draw a curve with its interval; it is interrupted where there is no value."""
+    """Draw a curve with its interval; the curve has a gap where there is no value.
+
+    Each row holds x, mean, and lower and upper end of the interval.
+    """
     x, mean, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
     style = curve_style(number)
     marker = style.pop("marker")
@@ -203,9 +210,9 @@ def scores_picture(
     """Draw travel times as dots with their 95 % intervals.
 
     Args:
-        title: What they are of.
+        title: Title of the picture.
         labels: Labels of the rows.
-        series: Domain to the mean and interval of every row; nan where there is none.
+        series: Domain to the mean and interval of every row, s; nan for a missing value.
         name: Name of the picture.
     """
     if not any(math.isfinite(v) for rows in series.values() for row in rows for v in row):
@@ -224,7 +231,7 @@ def _draw_estimates(
     axes: Any, labels: Sequence[str], series: Mapping[str, Sequence[Estimated]], unit: str,
     *, named: bool = True,
 ) -> None:  # fmt: skip
-    """Draw a row for every label, in it a dot with an interval for every series."""
+    """Draw a row for every label, and in each row a dot with an interval for every series."""
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
     for number, (group, estimates) in enumerate(series.items()):
@@ -251,8 +258,8 @@ def transfer_picture(found: Evaluation, metrics: Metrics, path: Path) -> None:
 
     Args:
         found: The final evaluation.
-        metrics: The run's metrics; its iterations are drawn.
-        path: Where to write.
+        metrics: The run's metrics, with ATT after each iteration.
+        path: File to write.
     """
     labels = [f"in {domain}" for domain in found.domains]
     height = max(270.0, TOP + 22 + _ROW * len(found.policies) + 66)
@@ -286,7 +293,7 @@ def transfer_picture(found: Evaluation, metrics: Metrics, path: Path) -> None:
 
 
 def travel_times(found: Evaluation) -> dict[str, list[Estimated]]:
-    """Return travel times in every domain, with intervals, by policy."""
+    """Return domain to the travel time of each policy, s, with its interval."""
     return {
         f"in {domain}": [_of(found.estimate(p, domain, "att_s")) for p in found.policies]
         for domain in found.domains
@@ -306,7 +313,7 @@ def gap_picture(found: Comparison, path: Path) -> None:
 
     Args:
         found: The comparison.
-        path: Where to write.
+        path: File to write.
     """
     below = legend_height(found.targets, 2 * WIDTH)
     row = max(24.0, 11.0 * len(found.targets) + 6)
@@ -351,8 +358,8 @@ def radar_picture(
     """Draw the five measures on axes of their own; the rim is the best value on each.
 
     Args:
-        title: What is compared.
-        lines: Label to a value for each of `MEASURES`; one without all of them is left out.
+        title: Title of the picture.
+        lines: Label to a value for each of `MEASURES`. A line with a missing value is not drawn.
         name: Name of the picture.
     """
     known = {label: row for label, row in lines.items() if all(map(math.isfinite, row))}
@@ -372,8 +379,8 @@ def comparison_radar(found: Comparison, settings: Sequence[str], path: Path) -> 
 
     Args:
         found: The comparison.
-        settings: Rows to draw; the first is drawn in the simulation, too.
-        path: Where to write.
+        settings: Settings to draw. The first one is drawn in the simulation, too.
+        path: File to write.
     """
     columns = min(len(found.targets), 2)
     rows = math.ceil(len(found.targets) / columns)
@@ -403,7 +410,10 @@ def comparison_radar(found: Comparison, settings: Sequence[str], path: Path) -> 
 
 
 def radar_lines(found: Evaluation, real: str) -> dict[str, list[float]]:
-    """Return direct transfer in the simulation, then its rivals in `real`."""
+    """Return the lines of a radar: direct transfer in the simulation, then policies in `real`.
+
+    These policies are direct transfer, those of UGAT and the best rule, five at most.
+    """
     sim, policies = found.domains[0], found.policies
     rule = f"rule {found.notes.get(f'best rule in {real}')}"
     shown = [policies[0], *(p for p in policies if p.startswith("UGAT") and p != policies[0])]
@@ -417,11 +427,14 @@ def radar_lines(found: Evaluation, real: str) -> dict[str, list[float]]:
 
 
 def goodness(values: NDArray[np.float64], more_is_better: bool) -> NDArray[np.float64]:
-    """Return values in (0, 1] with 1 for the best: ratios to it, by size where negative.
+    """Return how good each value is, in [0, 1], with 1 for the best.
+
+    With the sizes ``s = |values|``, the result is ``s / max(s)`` if more is better, else
+    ``min(s) / s``.
 
     Args:
         values: ``(n,)``, all of one sign.
-        more_is_better: Whether the largest size is the best.
+        more_is_better: True if the largest size is the best.
     """
     sizes = np.abs(values)
     best = np.nanmax(sizes) if more_is_better else np.nanmin(sizes)
@@ -431,7 +444,7 @@ def goodness(values: NDArray[np.float64], more_is_better: bool) -> NDArray[np.fl
 
 
 def _draw_radar(axes: Any, rows: Sequence[Sequence[float]]) -> None:
-    """Draw lines on polar axes, one axis for each of `MEASURES`; rows of nan are left out."""
+    """Draw lines on polar axes, one axis for each of `MEASURES`; skip rows with a nan."""
     table = np.array(rows, dtype=float)
     scaled = np.stack([goodness(table[:, i], m == "throughput") for i, m in enumerate(MEASURES)])
     angles = np.linspace(0, 2 * np.pi, len(MEASURES), endpoint=False)
@@ -475,17 +488,18 @@ def _best(column: NDArray[np.float64], measure: str) -> str:
 BAND = 2.0
 """Half of the noise band, in standard deviations."""
 _STRIP = 51.0
+"""Height of the strip of one statistic, in points."""
 
 
 @styled()
 def statistics_picture(rows: Sequence[Deviation], most: float, name: str) -> NamedFigure:
     """Draw how far measured statistics are from simulated ones, a strip for each.
 
-    The scale is straight within the noise band and logarithmic far out.
+    The scale is asinh(z / `BAND`): almost linear within the noise band and logarithmic far out.
 
     Args:
-        rows: Statistics with their deviations in standard deviations.
-        most: Largest deviation on the scale.
+        rows: Statistics with their deviations.
+        most: Largest deviation on the scale, in standard deviations; at least 10 is taken.
         name: Name of the picture.
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
@@ -537,14 +551,14 @@ def statistics_picture(rows: Sequence[Deviation], most: float, name: str) -> Nam
 
 @styled()
 def calibration_picture(metrics: Metrics, path: Path) -> bool:
-    """Draw the worth of u: risk against coverage, and u on and off the data, as PNG.
+    """Draw how well u predicts errors: risk against coverage, and u on and off the data, as PNG.
 
     Args:
         metrics: The metrics of a run.
-        path: Where to write.
+        path: File to write.
 
     Returns:
-        Whether there was an iteration to draw; if not, nothing is written.
+        True if there was an iteration to draw; otherwise no file is written.
     """
     steps: dict[int, dict[str, float]] = {}
     for stage, step, name, value in metrics.rows:
@@ -587,5 +601,5 @@ def _draw_levels(axes: Any, steps: Mapping[int, Mapping[str, float]]) -> None:
         (("mean_u", "on held-out data"), ("mean_u_off_data", "off the data"))
     ):
         axes.plot(order, [steps[s][name] for s in order], **curve_style(number), label=label)
-    axes.set_xlim(order[0] - 0.5, order[-1] + 0.5)  # one alone has no width of its own
+    axes.set_xlim(order[0] - 0.5, order[-1] + 0.5)  # a single iteration gives no range
     axes.set_ylim(0, 1.03)

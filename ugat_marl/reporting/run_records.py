@@ -1,9 +1,9 @@
 """Records of trainings, read from their folders as far as possible.
 
-Missing and broken files are named in the record; they raise nothing.
+A missing or damaged file raises no error. The record names it.
 
 A folder is one of three things: a run of ``ugat-marl train``, a job of ``ugat-marl paper``, or a
-finished table of it. A folder of such folders stands for all of them.
+finished table of ``ugat-marl paper``. A folder that contains such folders stands for all of them.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from ugat_marl.experiments import QUEUES, Evaluation, read_queues, result_of
 RUN, JOB, TABLE, SCORES = "run.json", "job.json", "table.json", "scores.json"
 TABLE_CSV, TABLE_MD = "table.csv", "table.md"
 _DEPTH = 4
+"""Levels of folders that are searched."""
 _LONGEST = 200_000_000
-"""Bytes of a file beyond which it is none of ours."""
+"""Size, in bytes, above which a file is not read: no file of the suite is so large."""
 
 T = TypeVar("T")
 
@@ -37,18 +38,19 @@ class RunRecord:
     """One training.
 
     Attributes:
-        name: What the page calls it.
-        directory: Where it lies.
-        job: Whether it is a job of ``ugat-marl paper``.
-        settings: All options that are on record, nested as in the configuration; empty for none.
-        hashes: Domain to hash of the scenario in it.
+        name: Name of the training on the page.
+        directory: Folder of the training.
+        job: True for a job of ``ugat-marl paper``.
+        settings: All recorded options, nested as in the configuration; empty for none.
+        hashes: Domain to hash of the scenario in that domain.
         versions: Package to version.
-        evaluation: How its policies did.
-        metrics: What was logged.
-        state: How far it had come at the last checkpoint: ``pretrained``, ``iteration``.
-        queues: Halting vehicles by policy, domain, minute and intersection.
-        missing: What is not there or cannot be read, a sentence each.
-        written: When a file in it was last written, in seconds since 1970; nan for never.
+        evaluation: Scores of its policies; None if there are none yet.
+        metrics: Values logged during the training.
+        state: Progress at the last checkpoint: ``pretrained`` episodes and ``iteration``.
+        queues: Number of halting vehicles by policy, domain, minute and intersection.
+        missing: One sentence for each file that is missing or cannot be read.
+        written: Time of the last change of a file in the folder, in seconds since 1970; nan if
+            there is no file.
     """
 
     name: str
@@ -66,18 +68,18 @@ class RunRecord:
 
     @property
     def scenario(self) -> str:
-        """Name that the user gave; "" if it is not known."""
+        """Name of the scenario as the user gave it; "" if it is not known."""
         found = self.settings.get("scenario") or (self.evaluation and self.evaluation.scenario)
         return str(found or "")
 
     @property
     def sim(self) -> str:
-        """The simulation it was trained in."""
+        """Domain of the simulation in which the policy was trained."""
         return str(self.settings.get("sim", "sim"))
 
     @property
     def real(self) -> str:
-        """The real domain, "" for none."""
+        """The real domain; "" for none."""
         if self.evaluation is not None and len(self.evaluation.domains) == 2:
             return self.evaluation.domains[1]
         return str(self.settings.get("target" if self.job else "real") or "")
@@ -95,7 +97,7 @@ class RunRecord:
 
     @property
     def setting(self) -> str:
-        """Name that the setting of a job carries; "" for none."""
+        """Name of the setting of a job; "" for none."""
         return str(self.settings.get("name", ""))
 
     @property
@@ -109,12 +111,15 @@ class RunRecord:
         return self.evaluation is not None
 
     def series(self, stage: str, name: str) -> list[tuple[int, float]]:
-        """Return the values logged under a name, the last of each episode or iteration."""
+        """Return the steps and values logged under a name, one per episode or iteration.
+
+        If several values were logged in one step, the last one counts.
+        """
         rows = self.metrics.rows if self.metrics is not None else []
         return sorted({step: v for s, step, n, v in rows if (s, n) == (stage, name)}.items())
 
     def agents(self, name: str) -> dict[str, list[tuple[int, float]]]:
-        """Return by agent the values logged by iteration under ``name/agent``."""
+        """Return agent to the iterations and values logged under ``name/agent``."""
         found: dict[str, dict[int, float]] = {}
         for stage, step, key, value in self.metrics.rows if self.metrics is not None else []:
             if stage == "iteration" and key.startswith(f"{name}/"):
@@ -127,11 +132,11 @@ class TableRecord:
     """A finished table of ``ugat-marl paper``.
 
     Attributes:
-        name: What the page calls it.
-        directory: Where it lies.
-        rows: As `comparison.Comparison.rows` makes them.
-        command: How it was made, "" where that is not known.
-        missing: What is not there or cannot be read, a sentence each.
+        name: Name of the table on the page.
+        directory: Folder of the table.
+        rows: Rows as returned by `ugat_marl.experiments.Comparison.rows`.
+        command: Command that made the table; "" if it is not known.
+        missing: One sentence for each file that is missing or cannot be read.
     """
 
     name: str
@@ -143,18 +148,18 @@ class TableRecord:
 
 @dataclass
 class _Reader:
-    """A reader of the files of one folder, with a list of what went wrong."""
+    """A reader of the files of one folder that collects a sentence for each failure."""
 
     directory: Path
     missing: list[str] = field(default_factory=list)
 
     def read(self, name: str, how: Callable[[Path], T], without: str) -> T | None:
-        """Return a file's content, or None after noting a sentence.
+        """Return a file's content; if it cannot be read, note why and return None.
 
         Args:
-            name: Of the file.
-            how: Reads it; what it raises is kept.
-            without: What cannot be said without it.
+            name: Name of the file.
+            how: Function that reads it; its usual exceptions are noted, not raised.
+            without: Second half of the noted sentence: what is unknown without the file.
         """
         path = self.directory / name
         try:
@@ -174,7 +179,7 @@ def read_records(paths: Sequence[Path]) -> list[RunRecord | TableRecord]:
     """Return the records of all folders, in their order, each once.
 
     Raises:
-        OptionError: A path is no folder, or nothing of the suite lies in it.
+        OptionError: A path is no folder, or it contains no file of the suite.
     """
     found: dict[Path, Path] = {}
     for path in paths:
@@ -197,7 +202,7 @@ def read_records(paths: Sequence[Path]) -> list[RunRecord | TableRecord]:
 
 
 def as_number(value: Any) -> float:
-    """Return a number of a record, nan where there is none."""
+    """Return a value of a record as a number; nan if it is none."""
     if isinstance(value, bool) or not isinstance(value, int | float | str) or value == "":
         return math.nan
     try:
@@ -219,7 +224,7 @@ def _folders(path: Path, depth: int) -> Iterable[Path]:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """The shortest endings of the paths that differ."""
+    """Return the shortest endings of the paths that differ from each other."""
     parts = [folder.resolve().parts for folder in folders]
     for length in range(1, max(map(len, parts), default=1) + 1):
         names = ["/".join(one[-length:]) for one in parts]
@@ -241,7 +246,7 @@ def _run(directory: Path, name: str) -> RunRecord:
     kept = reader.read(JOB if job else SETTINGS, _object, "its settings are unknown") or {}
     settings = kept.get("settings", kept)
     settings = settings if isinstance(settings, dict) else {}
-    if isinstance(setting := settings.get("setting"), dict):  # of a job, with its name
+    if isinstance(setting := settings.get("setting"), dict):  # a job nests its setting and its name
         settings = {**settings, **setting}
     if job:
         evaluation = reader.read(
@@ -285,7 +290,7 @@ def _texts(value: Any) -> dict[str, str]:
 
 
 def _metrics(reader: _Reader) -> Metrics | None:
-    """The metrics, or those of the last checkpoint."""
+    """Return the metrics of the run or, without them, those of its last checkpoint."""
     without = "no learning curves, nothing of the gate"
     found = reader.read(METRICS, Metrics.read, without)
     if found is None and (reader.directory / CHECKPOINT / METRICS).is_file():
@@ -306,7 +311,7 @@ def _state(reader: _Reader) -> dict[str, int] | None:
 
 
 def _written(directory: Path) -> float:
-    """Time at which the newest of the files that tell the state was written."""
+    """Return the time of the newest of the files that tell the state, in s since 1970."""
     times: list[float] = []
     for name in (RUN, JOB, TABLE, SCORES, METRICS, f"{CHECKPOINT}/state.json"):
         with contextlib.suppress(OSError):

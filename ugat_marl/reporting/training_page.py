@@ -1,7 +1,7 @@
-"""Trainings as one page of HTML that needs nothing else, and its pictures as files.
+"""Trainings as one page of HTML that needs no other file, and its pictures as files.
 
-The page is made of whatever is there: a training under way, one that was broken off, files cut
-short. Missing parts are named in their place.
+Trainings may be unfinished and files may be damaged. The page shows all that can be read, and names
+each missing part in its place.
 """
 
 from __future__ import annotations
@@ -30,17 +30,18 @@ from ugat_marl.reporting.run_records import RunRecord, TableRecord, as_number
 from ugat_marl.scenarios import Network
 
 Commands = Mapping[Path, Sequence[str]]
-"""Folder to the commands that run it again."""
+"""Folder of a training to the commands that repeat the training."""
 Queues = Mapping[str, Sequence[float]]
 """Intersection to its mean queue in each minute."""
 Cells = Mapping[tuple[str, str], Mapping[str, Any]]
 """Setting and domain to a row of a table."""
 
 _ARTICLES = 12
-"""With more trainings than this only those with a gate have a part of their own."""
+"""Largest number of trainings of which each has a section; of more, only those with a gate do."""
 _OPEN = 4
-"""With more, those parts are folded."""
+"""Largest number of sections that are shown unfolded."""
 _WORST = 10
+"""Number of intersections in the table of the longest queues."""
 _RADARS = ("direct transfer", "UGAT", "trained in real", "best rule")
 _RADAR = "Every axis is scaled by its best value, at the rim; the middle is worst."
 _STRETCH = "Mean of a stretch of episodes, with its 95 % interval over "
@@ -50,8 +51,8 @@ def runs_page(records: Sequence[RunRecord | TableRecord], commands: Commands) ->
     """Return the page of some trainings.
 
     Args:
-        records: Records of their folders.
-        commands: How to run them again.
+        records: Records of the trainings and tables.
+        commands: Folder to the commands that repeat its training.
     """
     page = Page()
     runs = [record for record in records if isinstance(record, RunRecord)]
@@ -92,7 +93,7 @@ def write_pictures(pictures: Sequence[NamedFigure], directory: Path) -> None:
 
 
 def _file_name(*parts: str) -> str:
-    """Texts as the name of a file, without an ending."""
+    """Return the name of a file made from some texts, without an ending."""
     text = re.sub(r"[^A-Za-z0-9_=+.]+", "-", "-".join(filter(None, parts)))
     return text.strip("-.")[-80:].strip("-.") or "picture"
 
@@ -107,7 +108,7 @@ def _title(records: Sequence[RunRecord | TableRecord]) -> str:
 
 
 def _heading(runs: Sequence[RunRecord], tables: Sequence[TableRecord]) -> tuple[str, str]:
-    """Heading and note of a page of several."""
+    """Return heading and note of a page of several trainings."""
     counted = [f"{len(runs)} trainings" * bool(runs), f"{len(tables)} tables" * bool(tables)]
     scenarios = list(dict.fromkeys(r.scenario for r in runs if r.scenario))
     text = " and ".join(filter(None, counted))
@@ -121,7 +122,7 @@ def _left_out(names: Sequence[str]) -> str:
 
 
 def _status(record: RunRecord) -> tuple[str, str]:
-    """The class of a training's badge, and the text on it."""
+    """Return the CSS class of a training's badge, and the text on it."""
     if record.finished:
         return ("mixed", "incomplete") if record.missing else ("good", "whole")
     if record.metrics is not None or record.state is not None or record.settings:
@@ -130,7 +131,7 @@ def _status(record: RunRecord) -> tuple[str, str]:
 
 
 def _progress(record: RunRecord) -> str:
-    """Progress of an unfinished training; "" for a finished one."""
+    """Return the progress of an unfinished training; "" for a finished one."""
     if record.finished:
         return ""
     state, parts = record.state or {}, list[str]()
@@ -150,7 +151,7 @@ def _progress(record: RunRecord) -> str:
 
 
 def _headline(record: RunRecord) -> str:
-    """The outcome in one sentence."""
+    """Return the outcome of a training in one sentence."""
     evaluation = record.evaluation
     title = f"{record.scenario or record.name}: {record.sim}"
     title += f" → {record.real}" if record.real else ""
@@ -170,7 +171,7 @@ def _headline(record: RunRecord) -> str:
 
 
 def _overview(records: Sequence[RunRecord]) -> Grid:
-    """All trainings side by side."""
+    """Return a table with a row per training."""
     headings = (
         "training", "scenario", "domains", "policy", "seed", "state", "in sim, s",
         "direct transfer, s", "in real, s", "best rule, s", "accepted",
@@ -214,7 +215,7 @@ def _table(page: Page, record: TableRecord, commands: Commands) -> dict[str, Any
 
 
 def _settings(page: Page, title: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Tables and pictures of settings in several real domains."""
+    """Return tables and pictures of settings in several real domains."""
     labels = list(dict.fromkeys(str(row["setting"]) for row in rows))
     domains = list(dict.fromkeys(str(row["domain"]) for row in rows))
     cells = {(str(row["setting"]), str(row["domain"])): row for row in rows}
@@ -274,7 +275,7 @@ def _radar_lines(labels: Sequence[str], cells: Cells, domain: str) -> dict[str, 
 
 
 def _seeds(page: Page, runs: Sequence[RunRecord]) -> list[Figure]:
-    """Curves of trainings that differ in their seed alone."""
+    """Return curves of trainings that differ in their seed alone."""
     figures: list[Figure] = []
     over = "Mean over the seeds, with its 95 % interval."
     for own in seeds_of_one(runs):
@@ -320,7 +321,7 @@ def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, An
 
 
 def _boxes(record: RunRecord) -> list[tuple[str, str]]:
-    """The numbers one asks for first."""
+    """Return the most important numbers with their labels, for boxes at the top."""
     evaluation = record.evaluation
     if evaluation is None or record.job or len(evaluation.domains) < 2 or not evaluation.policies:
         return []
@@ -339,7 +340,7 @@ def _boxes(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def _main_policies(evaluation: Evaluation) -> list[str]:
-    """Direct transfer, UGAT and the best rule, of those there are."""
+    """Return those of direct transfer, UGAT and the best rule that were evaluated."""
     rule = f"rule {evaluation.notes.get(f'best rule in {evaluation.domains[-1]}')}"
     return [
         name
@@ -349,7 +350,7 @@ def _main_policies(evaluation: Evaluation) -> list[str]:
 
 
 def _scores(page: Page, record: RunRecord, evaluation: Evaluation) -> dict[str, Any]:
-    """Travel times with gap and regret, and all measures."""
+    """Return travel times with gap and regret, and all measures."""
     first, *others = evaluation.domains
     headings = ["policy", f"in {first}, s"]
     for domain in others:
@@ -407,7 +408,7 @@ def _measures(evaluation: Evaluation) -> Grid:
 
 
 def _gate(page: Page, record: RunRecord, places: Places | str) -> dict[str, Any] | None:
-    """The gate over the iterations and, in the last one, by intersection."""
+    """Return the gate over the iterations and, for the last iteration, by intersection."""
     curve = charts.gate_picture([record], _file_name(record.name, "gate"))
     if curve is None:
         return None
@@ -477,7 +478,7 @@ def _of_gate(key: str, value: float) -> str:
 
 
 def _worst(page: Page, record: RunRecord, places: Places | None) -> dict[str, Any] | None:
-    """Places and minutes in which vehicles stood, in the real domain."""
+    """Return the intersections and minutes with the longest queues in the real domain."""
     if record.queues is None or record.evaluation is None:
         return None
     domain, known = record.evaluation.domains[-1], record.evaluation.policies
@@ -510,7 +511,7 @@ def _worst(page: Page, record: RunRecord, places: Places | None) -> dict[str, An
 
 
 def _worst_grid(by_policy: Mapping[str, Queues]) -> Grid:
-    """The intersections with the longest queues; the first policy decides the order."""
+    """Return the intersections with the longest queues, in the order of the first policy."""
     policies = list(by_policy)
     means = {p: {tls: sum(q) / len(q) for tls, q in by_policy[p].items() if q} for p in policies}
     order = sorted(means[policies[0]], key=lambda tls: -means[policies[0]][tls])[:_WORST]
@@ -533,7 +534,7 @@ def _worst_grid(by_policy: Mapping[str, Queues]) -> Grid:
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Settings by their paths, such as ``ugat.gate.mode``."""
+    """Return settings by their paths, such as ``ugat.gate.mode``."""
     rows: list[tuple[str, str]] = []
     for key, value in settings.items():
         if isinstance(value, Mapping) and value:
@@ -545,21 +546,21 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]
 
 
 def _with_interval(estimate: Estimate) -> str:
-    """A mean with its interval, if it has one."""
+    """Return a mean with its interval, if it has one."""
     if not math.isfinite(estimate.low) or estimate.low == estimate.high:
         return number(estimate.mean)
     return f"{number(estimate.mean)} {_ends(estimate.low, estimate.high)}"
 
 
 def _with_half(estimate: Estimate) -> str:
-    """A mean with half of its interval, if it has one, where there is little room."""
+    """Return a mean with half of its interval, if it has one, for narrow columns."""
     if not math.isfinite(estimate.low) or estimate.low == estimate.high:
         return number(estimate.mean)
     return f"{number(estimate.mean)} ±{number((estimate.high - estimate.low) / 2, 2)}"
 
 
 def _ends(low: float, high: float) -> str:
-    """An interval that stays on one line."""
+    """Return an interval with spaces at which no browser breaks the line."""
     return f"({number(low)}\u00a0to\u00a0{number(high)})"
 
 
@@ -568,12 +569,12 @@ def _ends(low: float, high: float) -> str:
 
 @dataclass(frozen=True)
 class Places:
-    """A network and its agents.
+    """A network and the traffic lights of its agents.
 
     Attributes:
         network: The network.
         intersection_of: Agent to SUMO's id of its traffic light.
-        note: What a reader must know of it; "" for nothing.
+        note: Remark on the map for the reader; "" for none.
     """
 
     network: Network
@@ -582,13 +583,14 @@ class Places:
 
 
 def places_of(record: RunRecord) -> Places | str:
-    """Return the places of a training's agents, or why they are not known."""
+    """Return the places of a training's agents, or the reason why they are not known."""
     if not record.scenario:
         return "no map: the scenario is not on record"
     options: Any = record.settings.get("options") if record.job else record.settings
     options = options if isinstance(options, Mapping) else {}
     try:
-        # A job notes the scenario itself, a training the one it drove, with its own duration.
+        # A job records the hash of the scenario itself. A training records the hash of the scenario
+        # with the training's own duration.
         duration_s = None if record.job else options.get("duration_s")
         network, own_hash = _network(record.scenario, record.sim, duration_s)
         neighbours = int(options.get("neighbours") or 0)

@@ -1,4 +1,4 @@
-"""Episodes as videos: every second of traffic a frame, two policies side by side if asked for."""
+"""Episodes as videos: one frame per second of traffic, several policies side by side."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ Frame = NDArray[np.uint8]
 _PILLOW = {".gif": "GIF", ".webp": "WEBP"}
 _FFMPEG = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 _CAPTION_PX = 46
-_WIDE = 1.6  # times as wide as high: pictures then stand below each other
+_WIDE = 1.6
+"""Ratio of width to height above which pictures stand below each other, not side by side."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,9 @@ class Scene:
     """One instant of an episode.
 
     Attributes:
-        time_s: On the scenario's clock.
-        vehicles: Where everybody is.
-        states: Traffic light to the state it shows.
+        time_s: Time on the scenario's clock, s.
+        vehicles: Positions and speeds of all vehicles.
+        states: Traffic light to the state that it shows.
     """
 
     time_s: float
@@ -59,8 +60,8 @@ class Film:
     Attributes:
         title: Name of the policy.
         domain: Name of the domain.
-        env: Whose network is drawn.
-        scenes: One per second.
+        env: Environment whose network is drawn.
+        scenes: One scene per second.
     """
 
     title: str
@@ -70,12 +71,12 @@ class Film:
 
 
 class Filmed:
-    """A simulator that is looked at in every second of a stretch of the episode.
+    """A simulator that keeps a scene of every second in one stretch of the episode.
 
     Args:
-        inner: Does the work.
-        begin_s: Where the stretch begins, in s from the beginning of the episode.
-        end_s: Where it ends.
+        inner: Simulator that does the work.
+        begin_s: Begin of the stretch, in s from the beginning of the episode.
+        end_s: End of the stretch, in s from the beginning of the episode.
     """
 
     def __init__(self, inner: Simulator, begin_s: float, end_s: float) -> None:
@@ -85,13 +86,13 @@ class Filmed:
         self.scenes: list[Scene] = []
 
     def start(self, launch: Launch) -> Snapshot:
-        """Starts a simulation; see `Simulator`."""
+        """Start a simulation; see `Simulator`."""
         self._start_s = self._now_s = launch.begin_s
         self.scenes = []
         return self._inner.start(launch)
 
     def advance(self, seconds: float, plans: Plans) -> Snapshot:
-        """Simulates `seconds`, in one go outside of the stretch, second by second inside."""
+        """Simulate `seconds`: in one call outside of the stretch, second by second inside."""
         begin_s, end_s = (self._start_s + edge for edge in self._stretch)
         if self._now_s + seconds <= begin_s or self._now_s >= end_s:
             self._now_s += seconds
@@ -125,7 +126,7 @@ class Filmed:
 
 
 def between(plans: Plans, begin_s: float, end_s: float) -> dict[str, list[tuple[float, str]]]:
-    """The part of some signal plans between two times from their beginning."""
+    """Return the part of signal plans between two times, in s from the beginning of the plans."""
     found: dict[str, list[tuple[float, str]]] = {}
     for tls, segments in plans.items():
         start, own = 0.0, list[tuple[float, str]]()
@@ -142,18 +143,18 @@ def between(plans: Plans, begin_s: float, end_s: float) -> dict[str, list[tuple[
 def film(
     env: TrafficEnv, policy: Policy, seed: int, begin_s: float, length_s: float, title: str
 ) -> Film:
-    """Plays an episode up to the end of a stretch and keeps every second of that.
+    """Play an episode up to the end of a stretch and keep a scene of every second in it.
 
     Args:
         env: An environment made with the policy's `env_options`, not yet reset.
-        policy: Who acts.
-        seed: Fixes the episode.
-        begin_s: Where the stretch begins, in s from the beginning of the episode.
-        length_s: How long it is.
-        title: What to call the policy.
+        policy: Policy that acts.
+        seed: Seed of the episode.
+        begin_s: Begin of the stretch, in s from the beginning of the episode.
+        length_s: Length of the stretch, s.
+        title: Name of the policy in the caption.
 
     Raises:
-        OptionError: The episode is over before the stretch is.
+        OptionError: The stretch does not lie within the episode, or is shorter than 1 s.
     """
     duration_s = env.scenario.decisions * env.decision_interval_s
     if begin_s < 0 or length_s < 1 or begin_s + length_s > duration_s:
@@ -174,11 +175,13 @@ def film(
 
 
 def frames(films: Sequence[Film], size_px: int) -> Iterator[Frame]:
-    """The pictures of one film, or of several side by side.
+    """Yield the frames of one film, or of several films in one picture.
+
+    Films of wide networks stand below each other, other films side by side.
 
     Args:
-        films: Of the same stretch of the same network.
-        size_px: Longer side of each picture.
+        films: Films of the same stretch of the same network.
+        size_px: Longer side of each picture, in pixels.
     """
     pictures = [Picture(each.env.network, each.env.intersection_of, size_px) for each in films]
     write = _Captions()
@@ -192,10 +195,10 @@ def frames(films: Sequence[Film], size_px: int) -> Iterator[Frame]:
 
 
 def require_video(path: Path) -> None:
-    """Refuses a file that cannot become a video here.
+    """Refuse the name of a file that cannot become a video on this machine.
 
     Raises:
-        OptionError: An unknown ending, or one that needs ffmpeg where there is none.
+        OptionError: The ending is unknown, or it needs ffmpeg and there is none.
     """
     ending = path.suffix.lower()
     if ending not in (*_PILLOW, *_FFMPEG):
@@ -212,13 +215,14 @@ def write_video(pictures: Iterable[Frame], path: Path, per_second: float) -> Non
     """Write frames of one size as a video, whole or not at all.
 
     Args:
-        pictures: uint8 ``(height, width, 3)``, both even.
-        path: Its ending decides the form: .mp4, .mkv, .mov by ffmpeg; .gif and .webp by Pillow.
+        pictures: Frames, uint8 ``(height, width, 3)``; height and width are even.
+        path: File to write. Its ending decides the format: .mp4, .mkv and .mov are made by ffmpeg,
+            .gif and .webp by Pillow.
         per_second: Frames per second.
 
     Raises:
         OptionError: See `require_video`.
-        OutputError: ffmpeg failed; its own words are in the message.
+        OutputError: ffmpeg failed; the message holds its own error text.
     """
     require_video(path)
     with replacing(path) as temporary:
@@ -229,7 +233,7 @@ def write_video(pictures: Iterable[Frame], path: Path, per_second: float) -> Non
 
 
 class _Captions:
-    """Write above each picture whose it is, what time it is and how many vehicles stand."""
+    """Write above each picture the policy, the domain, the time and the number of vehicles."""
 
     def __init__(self) -> None:
         import matplotlib as mpl
@@ -258,7 +262,7 @@ def _by_pillow(pictures: Iterable[Frame], path: Path, form: str, per_second: flo
     from PIL import Image
 
     images = (Image.fromarray(picture) for picture in pictures)
-    if form == "GIF":  # few colours are in use; dithering would only flicker
+    if form == "GIF":  # the pictures have few colours; dithering would make them flicker
         images = (i.quantize(256, dither=Image.Dither.NONE) for i in images)
     first = next(images)
     first.save(
@@ -287,7 +291,7 @@ def _by_ffmpeg(pictures: Iterable[Frame], path: Path, form: str, per_second: flo
             process.stdin.write(picture.tobytes())
         process.stdin.close()
     except BrokenPipeError:
-        pass  # it says why
+        pass  # ffmpeg has ended; its error text is read below
     except BaseException:
         process.kill()
         process.wait()
@@ -298,9 +302,9 @@ def _by_ffmpeg(pictures: Iterable[Frame], path: Path, form: str, per_second: flo
 
 
 def _ffmpeg() -> str | None:
-    """The program of the package imageio-ffmpeg, or the system's own."""
+    """Return the ffmpeg of the package imageio-ffmpeg, or the system's own; None for none."""
     if importlib.util.find_spec("imageio_ffmpeg") is not None:
         module: Any = importlib.import_module("imageio_ffmpeg")
-        with contextlib.suppress(RuntimeError):  # it is there, but not for this system
+        with contextlib.suppress(RuntimeError):  # the package has no program for this system
             return str(module.get_ffmpeg_exe())
     return shutil.which("ffmpeg")
