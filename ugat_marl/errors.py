@@ -1,7 +1,7 @@
 """Exceptions of the suite.
 
-Messages name the thing, the value, what is allowed and the way out; the command line prints them
-as one line and leaves with exit code 2.
+A message names the thing, its value, the allowed values and the way out. The command line prints it
+as one line and ends with exit code 2.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import difflib
 from collections.abc import Iterable
 
 LISTED = 32
-"""So many names an error lists: the nearest, if there are more."""
+"""Most names in one error message. If there are more, the message lists the nearest ones."""
 
 
 class UgatMarlError(Exception):
@@ -25,10 +25,10 @@ class UnknownNameError(UgatMarlError, ValueError):
     """A name (scenario, domain, observation, option ...) that does not exist.
 
     Args:
-        kind: What was asked for, e.g. ``"domain"``.
-        name: The name as given.
+        kind: Kind of thing that was requested, such as ``"domain"``.
+        name: The requested name.
         allowed: All names that exist.
-        hint: A sentence on the way out, appended to the message.
+        hint: Sentence with a way out, added to the message.
     """
 
     def __init__(self, kind: str, name: str, allowed: Iterable[str], hint: str = "") -> None:
@@ -60,11 +60,11 @@ class ActionError(UgatMarlError, ValueError):
 
 
 class SimulatorError(UgatMarlError, RuntimeError):
-    """SUMO refused to start, or failed while running; the message holds SUMO's own words."""
+    """SUMO refused to start or failed while it ran. The message quotes SUMO."""
 
 
 class SimulatorBusy(SimulatorError):
-    """A second simulation was asked for in a process that already runs one."""
+    """A second simulation was requested in a process that already runs one."""
 
 
 class SimulatorCrashed(SimulatorError):
@@ -76,7 +76,7 @@ class WorkerError(UgatMarlError, RuntimeError):
 
 
 class EpisodeError(UgatMarlError, RuntimeError):
-    """`step`, `state` or `scores` was called while it has no meaning."""
+    """A call does not fit the state of the episode, such as `step` before `reset`."""
 
 
 class OutputError(UgatMarlError, OSError):
@@ -92,7 +92,7 @@ class MeasuredDataError(UgatMarlError):
 
 
 class MeasurementError(UgatMarlError):
-    """A measured process of a bench failed, or did other work than its counterpart."""
+    """A measured process of a benchmark failed, or did different work from its counterpart."""
 
 
 class BlindTestError(UgatMarlError):
@@ -104,7 +104,7 @@ class CheckpointError(UgatMarlError):
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str | None:
-    """The spelling in `allowed` closest to `name`, or None if nothing is close."""
+    """Return the name in `allowed` closest to `name`, or None if none is close."""
     by_lower = {candidate.lower(): candidate for candidate in allowed}
     found = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
     return by_lower[found[0]] if found else None

@@ -1,8 +1,8 @@
 """Files that are whole or absent, and safe reading of XML.
 
-Everything the suite writes goes through `write_whole`: a killed run leaves the old file or the new
-one, never half of either. Everything it reads as XML goes through one parser, which refuses
-entities and document types.
+The suite writes files with `replacing` or `write_whole`: a killed run leaves the old file or the
+new one, never half of either. It reads XML with one parser, which refuses entities and document
+types.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from ugat_marl.progress import Reporter, Silent, usual, watched
 
 _PIECE = 1 << 20
 _KEPT = 8 << 20
-"""Bytes of an edited document from which it is kept in a file and not in memory."""
+"""Bytes of an edited document above which it is kept in a file instead of in memory."""
 _INDENT = "    "
 _END = "\0"
-"""Stands behind the children of an element while it is written; no XML holds it."""
+"""Mark after each child of an element during writing. XML cannot contain this character."""
 
 
 @contextlib.contextmanager
@@ -55,7 +55,7 @@ def require_writable(path: Path) -> None:
     """Refuse a path that cannot become a file, and make its folder.
 
     Raises:
-        OutputError: It is a folder, or its own folder cannot be made or written to.
+        OutputError: The path is a folder, or its parent cannot be made or written to.
     """
     if path.is_dir() or not path.name:
         raise OutputError(f"{str(path)!r} is a folder; give the name of a file")
@@ -70,17 +70,17 @@ def require_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write `content` to `path` so that a reader sees the old file or the new one."""
+    """Write `content` to `path`. A reader sees either the old file or the whole new one."""
     with replacing(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @contextlib.contextmanager
 def scratch() -> Iterator[None]:
-    """Context in which files are written to the folder for temporary files.
+    """Context for writing into the folder for temporary files.
 
     Raises:
-        OutputError: That is full, or missing.
+        OutputError: That folder is full or missing.
     """
     try:
         yield
@@ -92,13 +92,13 @@ def scratch() -> Iterator[None]:
 
 
 def user_cache(name: str) -> Path:
-    """Return the folder that keeps results of the kind `name` between runs, in the user's cache."""
+    """Return the folder in the user's cache that keeps results of the kind `name` between runs."""
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "ugat_marl" / name
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of `path`, unpacked if its name ends in ``.gz``.
+    """Return the content of `path`, unpacked if its name ends in ``.gz``.
 
     Raises:
         ScenarioError: The file is missing, unreadable or a broken archive.
@@ -122,12 +122,12 @@ def read_bytes(path: Path) -> bytes:
 
 
 class Tag(NamedTuple):
-    """The start of an element of a long XML document.
+    """Start of an element of a long XML document.
 
     Attributes:
-        name: Its tag.
+        name: Tag of the element.
         attributes: Its attributes.
-        line: Where it stands, from 1.
+        line: Its line in the document, from 1.
     """
 
     name: str
@@ -136,11 +136,11 @@ class Tag(NamedTuple):
 
 
 def chunks_of(path: Path, reporter: Reporter | None = None) -> Iterator[bytes]:
-    """The content of `path` piece by piece, unpacked if its name ends in ``.gz``.
+    """Yield the content of `path` piece by piece, unpacked if its name ends in ``.gz``.
 
     Args:
         path: The file.
-        reporter: Shows progress where that takes long.
+        reporter: Shows progress if reading takes long.
 
     Raises:
         ScenarioError: As for `read_bytes`.
@@ -160,11 +160,11 @@ def chunks_of(path: Path, reporter: Reporter | None = None) -> Iterator[bytes]:
 
 
 def scan_xml(pieces: Iterable[bytes], name: str) -> Iterator[Tag]:
-    """The elements of a document of any length, each at its start, in little memory.
+    """Yield the start of every element of a document of any length, in little memory.
 
     Args:
         pieces: The document, cut anywhere.
-        name: What to call it in errors, usually its path.
+        name: Name of the document in errors, usually its path.
 
     Raises:
         ScenarioError: As for `parse_xml`.
@@ -189,10 +189,11 @@ def parse_xml(content: bytes, name: str) -> ET.Element:
 
     Args:
         content: The document.
-        name: What to call it in errors, usually its path.
+        name: Name of the document in errors, usually its path.
 
     Raises:
-        ScenarioError: Not well-formed (a truncated file, say), or declares a document type.
+        ScenarioError: The document is not well-formed (perhaps cut short), or declares a document
+            type or an entity.
     """
     parser, builder = _building_parser(name)
     _parse(parser, content, True, name)
@@ -202,11 +203,11 @@ def parse_xml(content: bytes, name: str) -> ET.Element:
 def parts_of_xml(pieces: Iterable[bytes], name: str) -> Iterator[ET.Element]:
     """Yield a document of any length as trees: copies of its root, each with the next children.
 
-    Every child stands whole in one of the parts, of which there is at least one.
+    Each part holds only whole children. There is at least one part.
 
     Args:
         pieces: The document, cut anywhere.
-        name: What to call it in errors, usually its path.
+        name: Name of the document in errors, usually its path.
 
     Raises:
         ScenarioError: As for `parse_xml`.
@@ -272,7 +273,7 @@ def xml_bytes(root: ET.Element) -> bytes:
 
 
 def child_texts(root: ET.Element) -> list[str]:
-    """The children of an element as `xml_bytes` writes them, each without what is around it."""
+    """Return each child of an element as text, indented as in `xml_bytes`."""
     root.text = None
     for child in root:
         child.tail = _END
@@ -283,13 +284,14 @@ def child_texts(root: ET.Element) -> list[str]:
 
 @dataclass(frozen=True)
 class Document:
-    """One SUMO input file: on disk as it was found, or edited.
+    """One SUMO input file: unchanged on disk, or edited.
 
     Attributes:
         name: File name, without directories.
-        path: Where it lies, or None if it exists only in memory.
-        content: The edited bytes, or None if the file on disk is meant.
-        home: Holds the file of an edited document too long for memory, which goes with it.
+        path: Path of the file on disk, or None if the document exists only in memory.
+        content: The edited bytes, or None if the file on disk is used.
+        home: Folder of an edited document that is too long for memory. The folder is removed with
+            this object.
     """
 
     name: str
@@ -300,7 +302,7 @@ class Document:
     def __reduce__(self) -> tuple[Any, ...]:
         if self.home is None:
             return Document, (self.name, self.path, self.content)
-        return Document, (self.name, None, self.read())  # the file may be gone before the copy is
+        return Document, (self.name, None, self.read())  # a copy may outlive the file
 
     @property
     def source(self) -> str:
@@ -308,17 +310,17 @@ class Document:
         return self.name if self.path is None or self.home is not None else str(self.path)
 
     def read(self) -> bytes:
-        """The (unpacked) bytes."""
+        """Return the unpacked bytes."""
         if self.content is not None:
             return self.content
         assert self.path is not None
         return read_bytes(self.path)
 
     def pieces(self, reporter: Reporter | None = None) -> Iterator[bytes]:
-        """The (unpacked) bytes piece by piece, in little memory.
+        """Yield the unpacked bytes piece by piece, in little memory.
 
         Args:
-            reporter: Shows progress where the document is a long file.
+            reporter: Shows progress if the document is a long file.
         """
         if self.content is not None:
             yield self.content
@@ -327,28 +329,28 @@ class Document:
         yield from chunks_of(self.path, reporter)
 
     def scan(self, reporter: Reporter | None = None) -> Iterator[Tag]:
-        """The starts of its elements with their lines, in little memory.
+        """Yield the starts of the elements with their lines, in little memory.
 
         Args:
-            reporter: Shows progress where the document is a long file; by default as the program
-                does it everywhere.
+            reporter: Shows progress if the document is a long file; by default the program's usual
+                reporter.
         """
         return scan_xml(self.pieces(reporter or usual()), self.source)
 
     def parse(self) -> ET.Element:
-        """The document as an element tree, a fresh one at each call."""
+        """Return the document as an element tree, a fresh one at each call."""
         return parse_xml(self.read(), self.source)
 
     def parts(self) -> Iterator[ET.Element]:
-        """The document as trees, see `parts_of_xml`; shows progress where it is a long file."""
+        """Yield the document as trees (see `parts_of_xml`); show progress if it is a long file."""
         return parts_of_xml(self.pieces(usual()), self.source)
 
     def edited(self, content: bytes) -> Document:
-        """The same document with other content."""
+        """Return a document with the same name and other content."""
         return Document(self.name.removesuffix(".gz"), None, content)
 
     def write(self, path: Path) -> None:
-        """Put the document at `path`, packed as it was found."""
+        """Write the document to `path`; an unchanged file is copied, still packed if it was."""
         with replacing(path) as temporary:
             if self.content is not None:
                 temporary.write_bytes(self.content)
@@ -362,7 +364,7 @@ class Draft:
 
     Args:
         name: File name.
-        root: Its root, whose children are not looked at.
+        root: Root of the document; its children are ignored.
     """
 
     def __init__(self, name: str, root: ET.Element) -> None:
@@ -375,7 +377,7 @@ class Draft:
         self._file.write(b"<?xml version='1.0' encoding='UTF-8'?>\n")
 
     def add(self, *children: str) -> None:
-        """Write children, see `child_texts`."""
+        """Write children, given as texts from `child_texts`."""
         if not children:
             return
         start = f"{self._start.removesuffix(' />')}>" if self._empty else ""
@@ -400,16 +402,16 @@ class Draft:
 
 
 class OwnDirectory:
-    """A fresh folder for every simulation; the one before is removed.
+    """Source of fresh folders, one at a time; each new folder replaces the one before.
 
-    The last one goes with this object; not when a forked child lets go of its copy, however.
+    The last folder is removed with this object, but not by a forked child with a copy of it.
     """
 
     def __init__(self) -> None:
         self._remove: weakref.finalize[..., OwnDirectory] | None = None
 
     def fresh(self) -> Path:
-        """Return the path of another folder, which the caller has to make."""
+        """Return the path of a new folder, which the caller has to make."""
         self.remove()
         directory = Path(tempfile.gettempdir()) / f"ugat_marl-{secrets.token_hex(8)}"
         self._remove = weakref.finalize(self, _remove_tree, directory, os.getpid())

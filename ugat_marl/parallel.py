@@ -1,10 +1,9 @@
-"""Work in parts, on this machine's cores or by any standard executor.
+"""Parallel work, on this machine's cores or with any standard executor.
 
-Everything that plays many episodes takes ``workers``: a number, None for one per usable core, or a
-`concurrent.futures.Executor` that the caller made and closes. With a number the parts are threads,
-each of which drives simulations in processes of their own. What a part is given and gives back can
-be pickled by whoever does that, so that pools of processes and clusters work as well; Ray is made
-an executor here.
+Functions that run many episodes take ``workers``: a number, None for one per usable core, or a
+`concurrent.futures.Executor` that the caller makes and closes. With a number, each part is a thread
+that controls simulations in separate processes. Arguments and results of a part can be pickled, so
+pools of processes and clusters work as well. `RayExecutor` makes Ray a standard executor.
 """
 
 from __future__ import annotations
@@ -31,21 +30,20 @@ from typing import Any, TypeVar
 from ugat_marl.errors import OptionError, SimulatorCrashed
 
 Workers = int | Executor | None
-"""Parts at a time, None for the number of usable cores; or an executor."""
+"""Number of parts at a time, None for the number of usable cores, or an executor."""
 
 Done = TypeVar("Done")
 
 RETRIES = 3
-"""So often work is taken up again whose process died."""
+"""Number of times work is repeated if its process died."""
 
 
 def persistently(work: Callable[[], Done], death: type[Exception] = SimulatorCrashed) -> Done:
-    """Call a function, and again if a process that it needs died meanwhile.
+    """Call a function, and repeat the call if a process it needs died.
 
     Args:
-        work: What to do; an episode, say.
-        death: What it raises when the process died; by default that of a simulator. Raised if it
-            died each time.
+        work: The function, such as one episode.
+        death: Exception that means the process died. It is raised if every call fails so.
     """
     for _ in range(RETRIES):
         with contextlib.suppress(death):
@@ -54,21 +52,21 @@ def persistently(work: Callable[[], Done], death: type[Exception] = SimulatorCra
 
 
 class Stop(threading.Event):
-    """Flag that nobody waits for the work any more; a copy in another process is never set."""
+    """Flag that no one waits for the work any more. A copy in another process is never set."""
 
     def __reduce__(self) -> tuple[type[Stop], tuple[()]]:
         return Stop, ()
 
 
 def usable_cores() -> int:
-    """Cores this process may run on."""
+    """Return the number of cores this process may run on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def parts_at_a_time(workers: Workers) -> int:
-    """Return the number of parts done at once; a guess for executors that do not say."""
+    """Return the number of parts done at once; for unknown executors the usable cores."""
     if isinstance(workers, Executor):
         return getattr(workers, "parts_at_a_time", None) or getattr(
             workers, "_max_workers", usable_cores()
@@ -83,7 +81,7 @@ def in_this_process(workers: Workers) -> bool:
 
 @contextlib.contextmanager
 def executor_of(workers: Workers) -> Iterator[Executor]:
-    """The executor; one that is made here is closed, one that was given is not."""
+    """Yield the executor. One made here is closed afterwards; one that was given stays open."""
     if isinstance(workers, Executor):
         yield workers
         return
@@ -97,16 +95,16 @@ def as_done(
     parts: Iterable[tuple[Any, ...]],
     stop: Stop,
 ) -> Iterator[tuple[int, Done]]:
-    """Do all parts; yield the number and result of each, in the order they are done.
+    """Do all parts; yield the number and the result of each part in the order they finish.
 
-    The first failure is raised. What was not begun then is given up, and `stop` is set, as it is
-    when the loop is left early or interrupted.
+    The first failure is raised. At the end, or if the loop stops early, `stop` is set and parts
+    that have not begun are cancelled.
 
     Args:
-        workers: Who does it.
-        work: Does one, called with the part's values.
-        parts: Values.
-        stop: What the parts look at now and then.
+        workers: Number of workers, or the executor.
+        work: Function that does one part, called with the values of the part.
+        parts: Values of each part.
+        stop: Flag that the parts may check to end early.
     """
     with executor_of(workers) as pool:
         numbers: dict[Future[Done], int] = {}
@@ -114,7 +112,7 @@ def as_done(
             for number, part in enumerate(parts):
                 numbers[pool.submit(work, *part)] = number
             left = set(numbers)
-            while left:  # wakes up now and then, so that Ctrl-C is heard
+            while left:  # the timeout lets Ctrl-C through
                 done, left = wait(left, timeout=0.2, return_when=FIRST_COMPLETED)
                 for future in done:
                     yield numbers[future], future.result()
@@ -125,14 +123,14 @@ def as_done(
 
 
 class LocalProcesses(Executor):
-    """Executor with an interpreter per core, for many cores that one interpreter cannot use.
+    """Executor with one interpreter per worker, for more cores than one interpreter can use.
 
-    Each takes seconds to start and as much memory as the suite with torch. A script that makes them
-    guards its code by ``if __name__ == "__main__":``. Where a process dies, another begins its part
-    anew; a pool of the standard library would be broken for good.
+    Each interpreter takes seconds to start and needs the memory of the suite with torch. A script
+    that uses this class guards its code with ``if __name__ == "__main__":``. If a process dies,
+    another process repeats its part. A pool of the standard library would stay broken.
 
     Args:
-        workers: Processes; None for one per usable core.
+        workers: Number of processes; None for one per usable core.
     """
 
     def __init__(self, workers: int | None = None) -> None:
@@ -150,7 +148,7 @@ class LocalProcesses(Executor):
         return self._threads.submit(persistently, lambda: self._done(part), BrokenProcessPool)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes after the submitted parts, or after the current ones."""
+        """End the processes after the submitted parts, or after the running ones if cancelled."""
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
         self._is_open = False
         while self._idle:
@@ -175,17 +173,18 @@ class LocalProcesses(Executor):
 
 
 class RayExecutor(Executor):
-    """Ray as a standard executor; every part is a task that needs one core.
+    """Ray as a standard executor; every part is a task on one core.
 
-    Ray takes up a task whose process or machine died; what it computes depends on what it is given
-    alone. The suite must be installed on all machines.
+    Ray repeats a task if its process or machine died. A repeated task gives the same result,
+    because results depend only on the arguments. The suite must be installed on all machines.
 
     Args:
         address: ``"local"`` starts Ray on this machine; ``"auto"``, ``"host:port"`` or
-            ``"ray://host:port"`` joins a cluster. A Ray that this process has joined is used as is.
+            ``"ray://host:port"`` joins a cluster. If this process has joined a Ray already, that
+            one is used.
 
     Raises:
-        OptionError: Ray is not installed, or there is none at the address.
+        OptionError: Ray is not installed, or does not answer at the address.
     """
 
     def __init__(self, address: str = "local") -> None:
@@ -220,7 +219,7 @@ class RayExecutor(Executor):
 
     @property
     def parts_at_a_time(self) -> int:
-        """Cores of the cluster."""
+        """Number of cores in the cluster."""
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -236,7 +235,7 @@ class RayExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Wait for submitted parts, unless told not to, and end the Ray that was started here."""
+        """Wait for or cancel the submitted parts, and end the Ray that was started here."""
         self._is_open = False
         with self._lock:
             running = list(self._running)
@@ -249,7 +248,7 @@ class RayExecutor(Executor):
             self._ray.shutdown()
 
     def _settle(self, future: Future[Any], found: Future[Any]) -> None:
-        """Pass a result on; Ray's error is the part's own with Ray's words around it."""
+        """Pass a result or an error on. Ray wraps the part's own error, so unwrap it."""
         with self._lock:
             self._running.pop(future, None)
         if not future.set_running_or_notify_cancel():
@@ -272,5 +271,5 @@ def _call(fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any])
 
 
 def _import_path() -> str:
-    """This process's import path, for the workers: they import what their user imports."""
+    """Return this process's import path, so that workers can import the same modules."""
     return os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)

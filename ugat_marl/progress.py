@@ -1,4 +1,4 @@
-"""Progress of long work: bars in a terminal, a line now and then elsewhere."""
+"""Progress of long work: bars in a terminal, occasional lines elsewhere."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ Advance = Callable[..., None]
 """Called as ``advance()`` or ``advance(note="...")`` when a unit of work is done."""
 
 _QUIET_S = 60.0
-"""Least seconds from one line of a task to the next where there is no terminal."""
+"""Least seconds between two lines of a task if there is no terminal."""
 
 _PATIENCE_S = 1.0
-"""Seconds after which reading a file is worth a bar."""
+"""Seconds of reading a file after which a bar appears."""
 
 
 class Reporter(Protocol):
@@ -38,12 +38,12 @@ class Reporter(Protocol):
         ...
 
     def say(self, text: str) -> None:
-        """A line that stays."""
+        """Show a line that stays."""
         ...
 
 
 class Silent:
-    """Show nothing."""
+    """Reporter that shows nothing."""
 
     @contextlib.contextmanager
     def task(self, name: str, total: int) -> Iterator[Advance]:
@@ -56,13 +56,13 @@ class Silent:
 
 
 class Bars:
-    """Progress bars with the time left.
+    """Reporter with progress bars and the time left.
 
-    Where there is no terminal, as in a log, a bar is printed when its task ends, and before that
-    at most once a minute.
+    Without a terminal, as in a log, a bar is printed when its task ends and at most once a minute
+    before.
 
     Args:
-        console: Where to write.
+        console: The console to write to.
     """
 
     def __init__(self, console: Console) -> None:
@@ -93,10 +93,10 @@ class Bars:
                     self._console.print(progress.make_tasks_table(progress.tasks))
 
             yield advance
-            progress.update(bar, completed=total)  # the work may have ended early, by its own rule
+            progress.update(bar, completed=total)  # the work may end early by its own rule
 
     def _rest(self) -> Column:
-        """Return the width the other columns leave, so that a note does not squeeze them."""
+        """Return the column of the note, as wide as the other columns leave space."""
         return Column(no_wrap=True, overflow="ellipsis", max_width=max(self._console.width - 74, 6))
 
     def say(self, text: str) -> None:
@@ -108,13 +108,13 @@ _shown: list[Reporter] = [Silent()]
 
 
 def usual() -> Reporter:
-    """Return the reporter of work that was passed none: a silent one, except in `showing`."""
+    """Return the default reporter: the one of `showing`, else a silent one."""
     return _shown[-1]
 
 
 @contextlib.contextmanager
 def showing(reporter: Reporter) -> Iterator[None]:
-    """Make a reporter the usual one of the whole program for a while."""
+    """Make a reporter the default of the whole program inside the block."""
     _shown.append(reporter)
     try:
         yield
@@ -123,11 +123,11 @@ def showing(reporter: Reporter) -> Iterator[None]:
 
 
 def watched(pieces: Iterable[bytes], file: IO[bytes], reporter: Reporter) -> Iterator[bytes]:
-    """The pieces of a file, with a bar as soon as they take longer than a second.
+    """Yield the pieces of a file, with a bar if reading takes longer than a second.
 
     Args:
-        pieces: What is read from the file, perhaps unpacked.
-        file: Where it stands says how much of it has been read.
+        pieces: Content of the file, unpacked or not.
+        file: The open file; its position shows how much has been read.
         reporter: Shows the bar.
     """
     size, name = os.fstat(file.fileno()).st_size, Path(file.name).name

@@ -1,7 +1,6 @@
 """Seeds derived from seeds: the same path of numbers gives the same stream.
 
-A run that is resumed asks for the stream of "iteration 3, episode 2" and gets it, without any
-generator state having been saved.
+No generator state is saved. A resumed run derives the stream of "iteration 3, episode 2" again.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def derive_seed(seed: int, *path: int | str) -> int:
-    """A 31-bit seed, independent for every `path` below the same root `seed`."""
+    """Return a 31-bit seed, independent for every `path` below the same root `seed`."""
     words = [seed & 0xFFFFFFFF, (seed >> 32) & 0xFFFFFFFF]
     for part in path:
         words.extend(part.encode() if isinstance(part, str) else [part & 0xFFFFFFFF])
@@ -24,12 +23,12 @@ def derive_seed(seed: int, *path: int | str) -> int:
 
 
 def numpy_generator(seed: int, *path: int | str) -> np.random.Generator:
-    """A numpy generator for the stream `path` below `seed`."""
+    """Return a numpy generator for the stream `path` below `seed`."""
     return np.random.default_rng(derive_seed(seed, *path))
 
 
 def torch_generator(seed: int, *path: int | str) -> torch.Generator:
-    """A torch CPU generator for the stream `path` below `seed`."""
-    import torch  # most processes that need a seed simulate, and need no torch
+    """Return a torch CPU generator for the stream `path` below `seed`."""
+    import torch  # imported late: most processes that need a seed need no torch
 
     return torch.Generator().manual_seed(derive_seed(seed, *path))

@@ -1,4 +1,4 @@
-"""Detectors as SUMO has them: instant induction loops, written as XML and read back."""
+"""Detectors as SUMO's instant induction loops: written as XML, and their passages read back."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Detector, DetectorKind, Document, Lane, Network, Passages
 
 STOP_SETBACK_M = 2.5
-"""Upstream of the stop line: the first vehicle of a queue stands on the detector, and its rear
-leaves it once it has really started. Closer to the line the times flip by seconds."""
+"""Distance of stop detectors upstream of the stop line. The first vehicle of a queue stands on the
+detector, and its rear leaves the detector after a real start. Closer to the line, small changes
+shift the times by seconds."""
 ADVANCE_SETBACK_M = 50.0
 EXIT_DISTANCE_M = 10.0
 
@@ -49,12 +50,12 @@ def loops_document(
 ) -> Document:
     """Return an additional file with the loops of the detectors, which write to `file`.
 
-    A zone has two loops: its front end tells when a vehicle comes, its rear end when it has gone.
+    A zone has two loops: vehicles enter it at its upstream end and leave it at its downstream end.
 
     Args:
-        detectors: What to detect.
-        lanes: Lanes by id, which keep a zone's end on its lane; or None.
-        file: An absolute path.
+        detectors: Detectors to simulate.
+        lanes: Lanes by id, used to keep the end of a zone on its lane; or None.
+        file: Absolute path of SUMO's output.
     """
     root = ET.Element("additional")
     for detector in detectors:
@@ -76,7 +77,13 @@ def loops_document(
 def read_loops(
     file: Path, detectors: Sequence[Detector], begin_s: float, end_s: float
 ) -> dict[str, Passages]:
-    """Read the passages that detectors saw between two times.
+    """Read the passages over detectors between two times; detectors without passages are left out.
+
+    Args:
+        file: SUMO's output.
+        detectors: The detectors of `loops_document`.
+        begin_s: Begin, on the scenario's clock.
+        end_s: End, on the scenario's clock.
 
     Raises:
         SimulatorError: SUMO did not write the file.
@@ -102,7 +109,7 @@ def _passages(
     front: list[tuple[float, bool, bytes, float, float]],
     rear: list[tuple[float, bool, bytes, float, float]],
 ) -> Passages:
-    """Pair the entering of each vehicle at the front end with its leaving at the rear end."""
+    """Pair the entry of each vehicle at the upstream end with its exit at the downstream end."""
     left: dict[bytes, tuple[float, float]] = {
         vehicle: (time, speed) for time, enters, vehicle, speed, _ in rear if not enters
     }
@@ -111,7 +118,7 @@ def _passages(
         if enters:
             off, speed_off = left.pop(vehicle, (np.inf, speed))
             rows.append((time, off, speed_off, length))
-    # A vehicle that was inserted on the loop, or changed lanes onto it, leaves without entering.
+    # A vehicle inserted on the loop, or one that changed lanes onto it, leaves without entering.
     rows += [(-np.inf, time, speed, np.nan) for time, speed in left.values()]
     if not rows:
         return Passages.none()
@@ -120,11 +127,11 @@ def _passages(
 
 
 def _clipped(passages: Passages, begin_s: float, end_s: float) -> Passages:
-    """Return the part between two times; an end outside of it is unknown."""
+    """Return the passages between two times; times outside of them become NaN."""
     if not len(passages):
         return passages
     inside = (passages.off_s >= begin_s) & (passages.on_s < end_s)
-    # A leaving without an entering has no place in time but its own.
+    # An exit without an entry counts by its own time.
     inside &= np.isfinite(passages.on_s) | (passages.off_s < end_s)
     kept = passages.at(inside)
     return Passages(

@@ -261,7 +261,7 @@ class Worker:
         )
 
     def _raised(self, reply: dict[str, Any]) -> UgatMarlError:
-        """Return the exception that a process reports, as the nearest class that takes a message."""
+        """Return the exception a process reports, as the nearest class that takes a message."""
         for name in reply["kinds"]:
             kind = getattr(errors, name, None)
             if kind is not None and name != "UnknownNameError":

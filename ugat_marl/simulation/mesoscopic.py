@@ -1,8 +1,8 @@
-"""Measured lanes in SUMO's mesoscopic model, which has neither lanes nor positions.
+"""Lane measurements in SUMO's mesoscopic model, which has no lanes and no positions on them.
 
-There an edge is a chain of segments, and a vehicle knows its segment, its route, and for how long
-it has been kept from leaving. From these follow the same numbers as lanes have in car following, so
-that observations mean the same in both.
+In that model an edge is a chain of segments. A vehicle knows its segment, its route and the time it
+has been held up. This file derives the lane numbers of car following from them, so observations
+mean the same in both models.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class _Stay:
     """A vehicle in one segment.
 
     Attributes:
-        position_m: Where the segment begins on its edge.
-        since_s: Time at which the vehicle got there, about.
-        lanes: Positions of the lanes that lead to its next edge.
-        lane: Position of the lane it counts on; -1 while that is not known.
+        position_m: Begin of the segment on its edge.
+        since_s: Estimated time at which the vehicle entered the segment.
+        lanes: Indices of the lanes that lead to the vehicle's next edge.
+        lane: Index of the lane on which the vehicle counts; -1 if not known yet.
     """
 
     position_m: float
@@ -43,12 +43,12 @@ class _Road:
     """An edge whose lanes are measured.
 
     Attributes:
-        edge: Its name.
-        lanes: Positions of its lanes.
-        towards: Following edge to the positions of the lanes that lead there.
-        segment_s: Time through a segment at the speed limit.
-        last_m: Segments that begin after this are the last one.
-        stays: Vehicles that were there at the last measurement.
+        edge: Name of the edge.
+        lanes: Indices of its lanes.
+        towards: Following edge to the indices of the lanes that lead there.
+        segment_s: Driving time through a segment at the speed limit.
+        last_m: A segment that begins after this position is the last one.
+        stays: Vehicles on the edge at the last measurement.
     """
 
     edge: str
@@ -60,26 +60,27 @@ class _Road:
 
 
 class MesoscopicLanes:
-    """Measures the lanes of a running mesoscopic simulation, from its single vehicles.
+    """Lane measurements of a running mesoscopic simulation, from its single vehicles.
 
-    A vehicle counts on the lane that leads to the next edge of its route; where several do, on the
-    one in whose queue SUMO has it, or else on the one with the fewest vehicles. It waits when it
-    has been in its segment for longer than that takes at the speed limit: as SUMO counts it, only
-    the first of a queue is held up. When it got there is known to within the time
-    between two measurements.
+    A vehicle counts on the lane that leads to the next edge of its route. If several lanes do, it
+    counts on the lane of its queue in SUMO, or else on the lane with the fewest vehicles.
 
-    A waiting vehicle halts, except near the stop line while the queue drives off. In car following
-    a queue starts at about one vehicle per second and serves one every two seconds: as many
-    vehicles move behind the line as have left since the first one was last seen held up.
+    A vehicle waits if it has been in its segment for longer than the drive at the speed limit
+    takes. SUMO's own waiting time covers only the first vehicle of a queue. The time of entry lies
+    between two measurements and is estimated.
 
-    A call to SUMO takes longer than everything else here. A vehicle is therefore asked only for
-    what may have changed: its route when it enters an edge, its queue when it enters a segment,
-    nothing more while it waits in the last one.
+    A waiting vehicle halts, unless the queue drives off and the vehicle is near the stop line. In
+    car following, about one vehicle per second starts and one leaves every two seconds. So as many
+    vehicles move upstream of the line as have left since the first one was last held up.
+
+    Calls to SUMO take most of the time. A vehicle is therefore asked only for values that may have
+    changed: its route when it enters an edge, its queue when it enters a segment, and nothing
+    while it waits in the last segment.
 
     Args:
-        api: The module `libsumo`, with a simulation under way.
+        api: The module `libsumo`, with a running simulation.
         lanes: Lanes to measure.
-        segment_m: Length of a segment that was asked for.
+        segment_m: Requested length of a segment.
     """
 
     def __init__(self, api: Any, lanes: Sequence[str], segment_m: float) -> None:
@@ -100,10 +101,10 @@ class MesoscopicLanes:
         self._left = [0] * self._count  # since the first vehicle of the lane was last held up
 
     def measure(self, time_s: float, limits: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return vehicles, halting ones, mean speed and waiting time of all lanes, ``(4, lanes)``.
+        """Return vehicles, halting vehicles, mean speed (m/s) and waiting time (s), ``(4, lanes)``.
 
         Args:
-            time_s: Now.
+            time_s: Current time of the simulation.
             limits: Speed of an empty lane, m/s, ``(lanes,)``.
         """
         vehicles, halting, speeds, waits = ([0.0] * self._count for _ in range(4))
@@ -135,7 +136,7 @@ class MesoscopicLanes:
                 speed = speed_mps(name)
                 speeds[lane] += speed
                 halting[lane] += speed < HALTING_MPS
-                if speed == 0:  # as SUMO has it, whoever it holds up has no speed
+                if speed == 0:  # SUMO gives speed 0 to vehicles it holds up
                     waits[lane] += waiting_s(name)
             for name, stay in before.items():
                 self._left[stay.lane] += name not in road.stays
@@ -164,7 +165,7 @@ class MesoscopicLanes:
         """Return the lane on which a vehicle counts, given the vehicles counted so far."""
         if len(stay.lanes) == 1:
             return stay.lanes[0]
-        # Where an edge has but one successor, SUMO has one queue for all its lanes.
+        # If an edge has only one successor, SUMO has one queue for all its lanes.
         if len(road.towards) > 1:
             queue = self._api.vehicle.getLaneIndex(name)
             for place in stay.lanes:
@@ -176,10 +177,14 @@ class MesoscopicLanes:
 
 
 def refuse_in_queues(scenario: str, **requested: bool) -> None:
-    """Refuse what needs positions on lanes.
+    """Refuse options that need positions on lanes.
+
+    Args:
+        scenario: Id of the scenario.
+        requested: ``crossings``, ``zone`` and ``gui``: True if requested.
 
     Raises:
-        OptionError: Crossings, zones or a window are asked for in the mesoscopic model.
+        OptionError: One of them is requested.
     """
     words = {
         "crossings": "when vehicles cross stop lines (crossings, timed grounding)",

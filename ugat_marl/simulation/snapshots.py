@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 HALTING_MPS = 0.1
-"""A vehicle slower than this stands in a queue (SUMO's definition of halting, m/s)."""
+"""Speed in m/s below which a vehicle halts (SUMO's definition)."""
 
 
 @dataclass(frozen=True)
@@ -18,18 +18,19 @@ class Snapshot:
     Attributes:
         time_s: Time on the scenario's clock.
         vehicles: Number of vehicles per lane, ``(lanes,)``.
-        halting: Of these, slower than `HALTING_MPS`, ``(lanes,)``.
-        mean_speed_mps: Mean speed per lane; the speed limit the lane had at the start of the
-            episode where it is empty, ``(lanes,)``.
-        waiting_s: Sum over the lane's vehicles of the seconds since each last moved, ``(lanes,)``;
-            empty unless the simulator was started with `waiting`.
+        halting: Vehicles slower than `HALTING_MPS` per lane, ``(lanes,)``.
+        mean_speed_mps: Mean speed per lane, ``(lanes,)``. An empty lane has the speed limit it had
+            at the start of the episode.
+        waiting_s: Sum over the lane's vehicles of the seconds since each last moved, ``(lanes,)``.
+            Empty unless the simulator was started with `waiting`.
         departed: Vehicles that entered the network since the start of the episode.
-        backlog: Vehicles due but not yet in the network, for want of space.
-        mean_left: Vehicles that had left the lane's road, from this lane, averaged over the seconds
-            since the last snapshot, ``(lanes,)``: how many, and how early. Empty unless the
-            simulator was started with `crossings`, and in the first snapshot.
-        near: Vehicles, halting ones and waiting time as above of those in the last metres of the
-            lane, ``(3, lanes)``. Empty unless the simulator was started with `zone_m`.
+        backlog: Vehicles that are due but found no space to enter the network.
+        mean_left: Number of vehicles that had left the lane's road from this lane, averaged over
+            the seconds since the last snapshot, ``(lanes,)``. It is larger if vehicles leave
+            earlier. Empty unless the simulator was started with `crossings`, and in the first
+            snapshot.
+        near: Vehicles, halting vehicles and waiting time in the last `zone_m` metres of each lane,
+            ``(3, lanes)``. Empty unless the simulator was started with `zone_m`.
     """
 
     time_s: float
@@ -58,10 +59,10 @@ class Trips:
         delay_s: Time loss inside the network plus departure delay, ``(vehicles,)``.
         finished: Whether the vehicle arrived, bool ``(vehicles,)``.
         entered: Whether the vehicle got into the network, bool ``(vehicles,)``.
-        co2_g: What the vehicle emitted, in g, ``(vehicles,)``. This and what follows is empty
+        co2_g: CO2 emitted by the vehicle, g, ``(vehicles,)``. This array and the next two are empty
             unless the simulator was started with `persons`.
         persons: Persons in the vehicle, ``(vehicles,)``.
-        dangers: Collisions and hard brakings in the episode, ``(2,)``.
+        dangers: Numbers of collisions and of hard brakings in the episode, ``(2,)``.
     """
 
     travel_time_s: NDArray[np.float64]

@@ -12,11 +12,11 @@ from ugat_marl.errors import SimulatorError
 from ugat_marl.simulation.snapshots import Trips
 
 STATISTICS = "statistics.xml"
-"""Where SUMO writes how many collisions and hard brakings there were, beside its report."""
+"""SUMO's file with the numbers of collisions and hard brakings, beside the tripinfo file."""
 
 
 def measuring_options(directory: Path) -> list[str]:
-    """Return options of SUMO for emissions and safety; the traffic is the same with them."""
+    """Return options of SUMO that record emissions and safety. They do not change the traffic."""
     return [
         "--device.emissions.probability", "1",
         "--statistic-output", str(directory / STATISTICS),
@@ -29,11 +29,11 @@ def read_trips(path: Path, persons: Mapping[str, float] | None = None) -> Trips:
 
     Args:
         path: The file.
-        persons: Vehicle type to the persons in each vehicle, "" for all others, if SUMO was started
-            with `measuring_options`; what they measure is then read too.
+        persons: Vehicle type to the persons in each vehicle, "" for all other types. If given, SUMO
+            must have run with `measuring_options`, and emissions and dangers are read too.
 
     Raises:
-        SimulatorError: SUMO did not write it, or not all of it.
+        SimulatorError: The file is missing or incomplete.
     """
     try:
         return _trips_in(path, persons or {})
@@ -77,7 +77,7 @@ def _trips_in(path: Path, persons: Mapping[str, float]) -> Trips:
 
 
 def _dangers(path: Path) -> tuple[float, float]:
-    """Collisions and hard brakings."""
+    """Return the numbers of collisions and of hard brakings."""
     safety = ET.parse(path).getroot().find("safety")
     counts = {} if safety is None else safety.attrib
     return float(counts.get("collisions", "0")), float(counts.get("emergencyBraking", "0"))
