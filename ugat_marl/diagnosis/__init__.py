@@ -1,7 +1,8 @@
 """Diagnosis of a gap: places where simulation and data disagree, and the effects that are missing.
 
-The stages hand records on: Located, Proposed, Fitted, Selected, Verified; a `Diagnosis` is what is
-written of them. `diagnose` runs all stages from data to a corrected scenario.
+`diagnose` runs all stages, from measured data to a corrected scenario. Each stage hands a record to
+the next one: Located, Proposed, Fitted, Selected, Verified. The result is a `Diagnosis`, the
+content of ``diagnosis.json``.
 
     records        the records, and the form of ``diagnosis.json``
     thresholds     every number of the method, with its unit and its reason
@@ -9,10 +10,10 @@ written of them. `diagnose` runs all stages from data to a corrected scenario.
     features       features of one period, from detections or from counts
     statistics     statistics of several periods, their noise, distances, whitening
     replay         simulated days under the measured signals, with measured arrivals
-    engine         simulated days in parallel, remembered, within a budget
+    engine         simulated days in parallel, with a cache, within a budget of time
     hypotheses     the library of effects, and sets of them
     locate         disagreements by place, regime and window
-    propose        sets of effects along simulated directions
+    propose        sets of effects, from simulated changes of the statistics
     places         effects at places, in windows and of detectors
     fit            values of a set of effects, and their errors
     residual       the test of what a model leaves

@@ -1,15 +1,15 @@
-"""Records that the stages of a diagnosis hand on, and the record that is written.
+"""Records of the stages of a diagnosis, and the record that is written to disk.
 
-    Located    where the scenario as it is disagrees with the data
+    Located    places where the scenario as it is disagrees with the data
     Proposed   a set of effects that is worth a simulation
     Fitted     a set of effects, simulated, with values for its free numbers
-    Selected   the set that is chosen, tested, and its rivals
-    Verified   the scenario as it is and the chosen set on periods that were not fitted
+    Selected   the chosen set of effects with its test, and its rivals
+    Verified   tests of the scenario as it is and of the chosen set on held-out periods
     Conclusion the verdict, with its grounds
-    Diagnosis  what is said of all this: the content of ``diagnosis.json``
+    Diagnosis  the content of ``diagnosis.json``
 
-Every stage takes the record of the one before. Only a `Diagnosis` is written, and it holds plain
-values alone. The others may hold simulated days and arrays, and end with the diagnosis.
+Every stage takes the record of the stage before. Only a `Diagnosis` is written, and it holds only
+plain values. The other records may hold simulated days and arrays, and are never written.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Proposed:
 
     Attributes:
         members: Hypotheses and values of their free fields.
-        expected: Distance that should be left, by the simulated changes of the statistics
-            (`propose.Direction`), plus the price of the effects.
+        expected: Predicted distance of the data from this set, plus the price of its effects. The
+            prediction uses the simulated changes of the statistics (`propose.Direction`).
     """
 
     members: Members
@@ -64,11 +64,11 @@ class Fitted:
     """A model that was simulated.
 
     Attributes:
-        members: Its effects.
-        days: Its simulated days by their numbers.
+        members: Hypotheses and values of their free fields.
+        days: Tallies of its simulated days, by number of the day.
         reference: Its statistics with their noise, from these days.
-        distance: From the data that were fitted.
-        cost: Distance, penalty for noise, and price of the effects: less is better.
+        distance: Distance of the fitted data from the model.
+        cost: Distance, plus penalty for noise, plus price of the effects; less is better.
     """
 
     members: Members
@@ -79,7 +79,7 @@ class Fitted:
 
     @property
     def tallies(self) -> tuple[Tally, ...]:
-        """Its simulated days."""
+        """Tallies of the simulated days."""
         return tuple(self.days.values())
 
     @property
@@ -89,7 +89,7 @@ class Fitted:
 
     @property
     def values(self) -> Array:
-        """All free values, one after the other."""
+        """All free values, one after the other, ``(free values,)``."""
         return np.array([value for _, values in self.members for value in values])
 
 
@@ -101,9 +101,9 @@ class Residual:
         distance: Total distance of the data from the model.
         floor: Total distance that 99 of 100 data sets of the model itself stay below.
         expected: Mean distance of data sets of the model itself.
-        p: Chance of a difference this large under the model: the smallest in `blocks`, corrected
-            for their number.
-        blocks: This chance for each statistic that is tested, uncorrected.
+        p: Chance of a difference this large under the model: the smallest value of `blocks` times
+            their number, at most 1.
+        blocks: The chance for each tested statistic, not corrected for their number.
     """
 
     distance: float
@@ -115,14 +115,14 @@ class Residual:
 
 @dataclass(frozen=True, eq=False)
 class Tested:
-    """A fitted model with the test of what it leaves.
+    """A fitted model with the test of the remaining difference.
 
     Attributes:
         model: The model.
         residual: The test on the fitted periods.
-        errors: Standard errors of its free values.
-        extra: Variance that is added to that of the noise, by block: for `errors`, and as the
-            tolerance of the method.
+        errors: Standard errors of its free values, ``(free values,)``.
+        extra: Variance that is added to the noise, by block. It covers `errors` and the tolerance
+            of the method.
     """
 
     model: Fitted
@@ -136,11 +136,11 @@ class Disagreement:
     """One place and regime in which data and model differ.
 
     Attributes:
-        tls: Traffic light, or None for all of the network.
-        approach: Edge, or None for all.
-        lane: Lane, or None for all.
+        tls: SUMO id of the traffic light; None for all of the network.
+        approach: SUMO id of the edge; None for all.
+        lane: SUMO id of the lane; None for all.
         regime: discharge, free flow, approach to red, yellow, storage, volume or vehicles.
-        statistic: The one that differs most.
+        statistic: The statistic that differs most there.
         window: Begin and end on the scenario's clock, s; None for all of the time.
         size: Measured minus simulated, in `unit`.
         unit: Unit of the statistic.
@@ -162,13 +162,14 @@ class Disagreement:
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """The scenario as it is against the data.
+    """Comparison of the scenario as it is with the data.
 
     Attributes:
         base: The scenario as it is, tested.
-        disagreements: Places and regimes, strongest first; none if `base` is not contradicted.
-        complete: False if the budget ended before single effects were looked for.
-        examined: Names of effects that were simulated for it.
+        disagreements: Places and regimes, strongest first; empty if the data do not contradict
+            `base`.
+        complete: False if the budget ended before the test along single effects.
+        examined: Names of the effects that were simulated for this test.
     """
 
     base: Tested
@@ -182,10 +183,10 @@ class Selected:
     """Result of the search.
 
     Attributes:
-        best: The model selected; without effects if none was worth its price.
-        rivals: Other sets of effects that were fitted, best first.
-        complete: Whether the search ended by itself, and not by the budget.
-        examined: Names of effects that were simulated, or for which no place came into question.
+        best: The selected model; without effects if no effect was worth its price.
+        rivals: All sets of effects that were simulated, least cost first.
+        complete: True if the search ended by itself, False if the budget ended it.
+        examined: Names of effects that were simulated, or for which no place was suspicious.
     """
 
     best: Tested
@@ -196,13 +197,14 @@ class Selected:
 
 @dataclass(frozen=True)
 class Verified:
-    """The held-out periods under both models.
+    """Tests of both models on the held-out periods.
 
     Attributes:
         before: Test of the scenario as it is.
-        after: Test of the corrected model; the same test if there is none.
-        shrink: Share of the gap that is gone, the noise taken off on both sides; None without a
-            gap or without a corrected model.
+        after: Test of the corrected model; `before` again if there is none.
+        shrink: Share of the gap that is gone: 1 minus the excess distance after over the excess
+            distance before. The excess is the distance minus its expected value, at least 0. None
+            without a gap or without a corrected model.
     """
 
     before: Residual
@@ -215,11 +217,12 @@ class Conclusion:
     """A verdict with its grounds.
 
     Attributes:
-        verdict: One of five.
-        best: The model it speaks of; the scenario as it is where nothing is found.
-        indistinct: Other models that fit as well.
-        sentence: The verdict for people.
-        next_measurement: What would tell the rivals apart, or show what is missing.
+        verdict: One of the five values of `Verdict`.
+        best: The model that the verdict is about; the scenario as it is if nothing is found.
+        indistinct: Other models that fit equally well.
+        sentence: The verdict as a sentence.
+        next_measurement: A measurement that would separate the rivals, or show the missing effect;
+            None if none is needed.
     """
 
     verdict: Verdict
@@ -229,7 +232,7 @@ class Conclusion:
     next_measurement: str | None
 
 
-# --- what is written ----------------------------------------------------------------------------
+# --- the written record -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -239,7 +242,7 @@ class Parameter:
     Attributes:
         value: The value.
         low: Begin of its 95 % interval; None if it was not estimated.
-        high: End of the interval.
+        high: End of its 95 % interval; None if it was not estimated.
         unit: Unit of all three.
     """
 
@@ -251,13 +254,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class EffectRecord:
-    """An effect as it is written.
+    """An effect in ``diagnosis.json``.
 
     Attributes:
         name: Name of the effect.
-        place: Its edge, lane or detector, several joined by ``>``; None for all of the network.
-        window: Begin and end on the scenario's clock, s.
-        parameters: Its numbers by name.
+        place: Its edge, lane or detector, several joined by ``>``, or ``*`` for every place; None
+            without a place.
+        window: Begin and end on the scenario's clock, s; None for all of the time.
+        parameters: Numbers of the effect by name.
     """
 
     name: str
@@ -271,9 +275,9 @@ class SearchGrounds:
     """Grounds for an effect that the search found.
 
     Attributes:
-        distance: Distance of the data from the model that holds it.
-        runner_up_is_worse_by: Cost by which the best other set of effects is worse, if there is
-            one.
+        distance: Distance of the data from the model with this effect.
+        runner_up_is_worse_by: Cost by which the best other set of effects is worse; None if there
+            is no other.
     """
 
     distance: float
@@ -285,7 +289,7 @@ class LogGrounds:
     """Grounds for an effect that is read off the data.
 
     Attributes:
-        source: The file it is read from.
+        source: The data it is read from.
     """
 
     source: str
@@ -296,7 +300,7 @@ class NamedEffect(EffectRecord):
     """An effect that a diagnosis names.
 
     Attributes:
-        evidence: Its grounds.
+        evidence: Grounds for naming it.
     """
 
     evidence: SearchGrounds | LogGrounds
@@ -308,8 +312,8 @@ class Explanation:
 
     Attributes:
         effects: The effects, without intervals.
-        distance: Distance of the fitted data from it.
-        cost: The same with the penalty for noise and the price of the effects.
+        distance: Distance of the fitted data from the model with these effects.
+        cost: This distance, plus the penalty for noise, plus the price of the effects.
     """
 
     effects: tuple[EffectRecord, ...]
@@ -323,12 +327,12 @@ class HeldOut:
 
     Attributes:
         before: Distance of the data from the scenario as it is.
-        after: Distance from the corrected model.
+        after: Distance of the data from the corrected model.
         floor: Distance that 99 of 100 data sets of the corrected model stay below.
         expected: Mean distance of data sets of the corrected model.
-        shrink: Share of the gap that is gone.
-        p_before: Chance of a difference as large as before, under the scenario as it is.
-        p_after: Chance of a difference as large as after, under the corrected model.
+        shrink: Share of the gap that is gone; see `Verified`.
+        p_before: Chance of a difference this large under the scenario as it is.
+        p_after: Chance of a difference this large under the corrected model.
     """
 
     before: float
@@ -359,8 +363,8 @@ class FitEvidence:
     """Chances on the fitted periods.
 
     Attributes:
-        p_fit: Chance of the data under the scenario as it is.
-        p_fit_after: Chance under the model selected.
+        p_fit: Chance of a difference this large under the scenario as it is.
+        p_fit_after: Chance of a difference this large under the selected model.
     """
 
     p_fit: float
@@ -372,15 +376,15 @@ class StatisticRow:
     """A statistic of the network on the held-out periods.
 
     Attributes:
-        statistic: Its name.
-        regime: Its regime.
-        unit: Unit of `measured` to `noise`.
+        statistic: Name of the statistic.
+        regime: Regime of the statistic.
+        unit: Unit of `measured`, `before`, `after` and `noise`.
         measured: Mean of the data.
         before: Mean of the scenario as it is.
         after: Mean of the corrected model; None if nothing was observed there.
-        noise: Standard deviation of chance in data sets of this size.
-        z_before: Measured minus simulated before, in standard deviations.
-        z_after: The same after.
+        noise: Standard deviation of `measured` by chance under the corrected model.
+        z_before: Data minus scenario as it is, in standard deviations.
+        z_after: Data minus corrected model, in standard deviations.
     """
 
     statistic: str
@@ -399,10 +403,10 @@ class LaneRow:
     """Disagreement of a lane on the held-out periods.
 
     Attributes:
-        lane: SUMO id.
-        tls: Its traffic light.
+        lane: SUMO id of the lane.
+        tls: SUMO id of its traffic light.
         before: Root mean square of its standardised differences from the scenario as it is.
-        after: The same from the corrected model.
+        after: Root mean square of its standardised differences from the corrected model.
     """
 
     lane: str
@@ -413,15 +417,15 @@ class LaneRow:
 
 @dataclass(frozen=True)
 class CriteriaRow:
-    """The criteria traffic engineers use, for one model; None without counts or with few days.
+    """Usual criteria of traffic engineers for one model; None without counts or with few days.
 
     Attributes:
         geh_below_5: Share of hourly counts with GEH below 5.
         geh_largest: Largest GEH.
         within_2_sigma: Criterion I of FHWA, see `Criteria`.
-        within_1_sigma: Criterion II.
-        absolute_error: Criterion III.
-        systematic_error: Criterion IV.
+        within_1_sigma: Criterion II of FHWA.
+        absolute_error: Criterion III of FHWA.
+        systematic_error: Criterion IV of FHWA.
         saturation_headway_s: Mean gap of queued vehicles from the fourth on, s.
     """
 
@@ -436,7 +440,7 @@ class CriteriaRow:
 
 @dataclass(frozen=True)
 class MeasuredHeadway:
-    """The one number of a `CriteriaRow` that needs no model: it is read off the data.
+    """Saturation headway of the data: the only number of a `CriteriaRow` that needs no model.
 
     Attributes:
         saturation_headway_s: Mean gap of queued vehicles from the fourth on, s.
@@ -447,12 +451,12 @@ class MeasuredHeadway:
 
 @dataclass(frozen=True)
 class EngineeringCriteria:
-    """The criteria traffic engineers use, before and after; shown, but they decide nothing.
+    """Usual criteria of traffic engineers, before and after; for information only.
 
     Attributes:
-        before: The scenario as it is.
-        after: The corrected model.
-        measured: The data.
+        before: Criteria of the scenario as it is.
+        after: Criteria of the corrected model.
+        measured: Saturation headway of the data.
     """
 
     before: CriteriaRow
@@ -462,11 +466,11 @@ class EngineeringCriteria:
 
 @dataclass(frozen=True)
 class TravelTimes:
-    """Mean simulated travel time of the measured days; None if nobody arrived.
+    """Mean simulated travel times of the measured days; None if no vehicle has one.
 
     Attributes:
-        before_s: Under the scenario as it is, s.
-        after_s: Under the corrected model, s.
+        before_s: Mean travel time in the scenario as it is, s.
+        after_s: Mean travel time in the corrected model, s.
     """
 
     before_s: float | None
@@ -478,10 +482,10 @@ class Tables:
     """Both models side by side.
 
     Attributes:
-        statistics: The statistics of the network.
-        lanes: The lanes with detectors.
-        courtesy: The usual criteria.
-        travel_time: Mean travel times.
+        statistics: Rows for the statistics of the network.
+        lanes: Rows for the lanes with detectors.
+        courtesy: Usual criteria of traffic engineers.
+        travel_time: Mean simulated travel times.
     """
 
     statistics: tuple[StatisticRow, ...] = ()
@@ -495,8 +499,8 @@ class Splits:
     """Ids of the measured periods.
 
     Attributes:
-        fit: Those that models were fitted to.
-        heldout: The others.
+        fit: Ids of the periods that models were fitted to.
+        heldout: Ids of the held-out periods.
     """
 
     fit: tuple[str, ...]
@@ -505,12 +509,12 @@ class Splits:
 
 @dataclass(frozen=True)
 class TravelTimeEstimate:
-    """A mean travel time with its 95 % interval, s; None for a single episode.
+    """A mean travel time with its 95 % interval.
 
     Attributes:
-        mean: The mean.
-        low: Begin of the interval.
-        high: End of the interval.
+        mean: The mean, s.
+        low: Begin of the interval, s; None for a single episode.
+        high: End of the interval, s; None for a single episode.
     """
 
     mean: float
@@ -520,15 +524,15 @@ class TravelTimeEstimate:
 
 @dataclass(frozen=True)
 class PolicyGap:
-    """Travel times of one policy: promised, promised after the correction, and real.
+    """Travel times of one policy: before the correction, after it, and in the real domain.
 
     Attributes:
-        sim: In the scenario as it is.
-        corrected: In the corrected scenario.
-        real: In the real world.
-        before: Distance of the first promise from the real world, s.
-        after: Distance of the second.
-        shrink: Share of the gap that is gone; None where no gap is to be seen before.
+        sim: Travel time in the scenario as it is.
+        corrected: Travel time in the corrected scenario.
+        real: Travel time in the real domain.
+        before: Difference between `sim` and `real`, s.
+        after: Difference between `corrected` and `real`, s.
+        shrink: Share of the gap that is gone; None if there is no visible gap before.
     """
 
     sim: TravelTimeEstimate
@@ -544,36 +548,36 @@ class Diagnosis:
     """The content of ``diagnosis.json``.
 
     Attributes:
-        schema: Form of the file.
+        schema: Name and version of the file's form.
         scenario: Id of the scenario.
-        seed: Root of the simulated days.
+        seed: Root seed of the simulated days.
         alpha: Level of the tests.
         budget_s: Wall time after which no simulation was begun, s.
-        left_out: Effects that were not examined on request.
-        ruled_out: Effects that the data cannot show.
-        findings: Remarks of the check of the files.
-        periods: Measured periods.
+        left_out: Names of effects that the user excluded.
+        ruled_out: Names of effects that the data cannot show.
+        findings: Remarks from the check of the data.
+        periods: Ids of the measured periods.
         verified_on_fitted_periods: True if no period was held out.
         hashes: SHA-256 of the scenario and of the data.
         versions: Versions of the software.
-        verdict: One of five.
-        sentence: The verdict for people.
-        effects: The effects that are named.
+        verdict: One of the five values of `Verdict`.
+        sentence: The verdict as a sentence.
+        effects: The named effects.
         where: Places where the scenario as it is disagrees with the fitted periods.
-        left: Places where the model selected still disagrees with them.
+        left: Places where the selected model still disagrees with the fitted periods.
         alternatives: Other sets of effects that were simulated, best first.
-        best: The model selected, if it has effects.
+        best: The selected model; None if it has no effects.
         heldout: The test on the held-out periods; None if nothing could be compared.
         evidence: Chances on the fitted periods; None if nothing could be compared.
-        statistics: The statistics of the network, before and after.
-        lanes: The lanes with detectors, before and after.
-        courtesy: The usual criteria, before and after.
-        travel_time: Mean travel times, before and after.
-        next_measurement: What would decide between rivals, or show what is missing.
-        complete: Whether the search ended by itself, and not by the budget.
-        untried: Effects that were not examined for lack of time.
+        statistics: Statistics of the network, before and after the correction.
+        lanes: Lanes with detectors, before and after.
+        courtesy: Usual criteria of traffic engineers, before and after.
+        travel_time: Mean simulated travel times, before and after.
+        next_measurement: A measurement that would separate the rivals, or show the missing effect.
+        complete: True if the diagnosis ended by itself, False if the budget ended it.
+        untried: Names of effects that were not examined for lack of time.
         corrected: Name of the folder of the corrected scenario; None if nothing is corrected.
-        policy_gap: Policy to its travel times, once `ugat-marl policy-gap` has measured them.
+        policy_gap: Travel times by policy; None until `ugat-marl policy-gap` has measured them.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -610,12 +614,12 @@ class Diagnosis:
     policy_gap: dict[str, PolicyGap] | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values for JSON, numbers rounded to nine digits; None for no number."""
+        """Return plain values for JSON: numbers with nine digits, None for NaN and infinity."""
         return _plain(asdict(self))
 
     @classmethod
     def from_json(cls, content: Any) -> Self:
-        """Make the record from what `to_json` returned.
+        """Make the record from the result of `to_json`.
 
         Raises:
             ValueError: A key is missing or unknown, or a value has another type.
@@ -632,8 +636,8 @@ class Diagnosis:
         """Read the file in a directory.
 
         Raises:
-            OSError: There is none.
-            ValueError: It is no diagnosis of this version.
+            OSError: There is no such file.
+            ValueError: The file is no diagnosis of this version.
         """
         return cls.from_json(json.loads((directory / FILE).read_text(encoding="utf-8")))
 
@@ -644,7 +648,7 @@ def _adapter(record: type[Any]) -> TypeAdapter[Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return the value with numbers rounded to nine digits, and without what JSON cannot say."""
+    """Return the value with numbers of nine digits, and None for numbers that JSON cannot hold."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""One diagnosis: the scenario, the data, the simulated days, and how much time there is."""
+"""Inputs of one diagnosis: the scenario, the data, the simulated days and the budget of time."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class DiagnosisConfig:
 
     Attributes:
         budget_s: Wall time after which no further simulation is begun, s.
-        alpha: Chance of naming an effect where there is none.
-        seed: Root of the simulated days.
-        leave_out: Effects that are not examined.
-        cache: Folder of remembered days; None for the user's cache folder.
-        workers: Simulations at a time, None for the number of cores; or an executor.
-        effort: Numbers of simulated days; None for what suits the size of the network.
+        alpha: Level of the tests: chance of naming an effect where there is none.
+        seed: Root seed of the simulated days.
+        leave_out: Names of effects that are not examined.
+        cache: Folder of the remembered days; None for the user's cache folder.
+        workers: Simulations at a time, None for one per core; or an executor.
+        effort: Numbers of simulated days; None for those that suit the size of the network.
     """
 
     budget_s: float = 600.0
@@ -68,20 +68,20 @@ class Study:
 
     Attributes:
         scenario: The scenario as it is.
-        network: Its network.
-        measured: The data.
-        config: How the diagnosis is made.
-        site: Measured lanes.
-        engine: Simulates days.
-        pools: How lanes pool.
-        allowed: Effects that are examined.
-        hypotheses: Those about the whole network.
-        effort: Numbers of days.
-        fit: Tallies of the periods models are fitted to.
-        heldout: Tallies of the others; of the same ones if there are no others.
-        other_days: Simulates days with other vehicles than those the signals answered; None where
-            the signals did not follow the traffic.
-        ruled_out: Effects the data cannot show.
+        network: The network of the scenario.
+        measured: The measured data of the street.
+        config: Options of the diagnosis.
+        site: Measured lanes, with their signals and detectors.
+        engine: Simulator of days.
+        pools: Pools of lanes: network, intersections, lanes.
+        allowed: Names of the effects that are examined.
+        hypotheses: Hypotheses about the whole network.
+        effort: Numbers of simulated days.
+        fit: Tallies of the periods that models are fitted to.
+        heldout: Tallies of the held-out periods; `fit` again if no period is held out.
+        other_days: Simulator of days that keep the model's own arrivals; None if the signals did
+            not follow the traffic, since `engine` does the same then.
+        ruled_out: Names of the effects that the data cannot show.
     """
 
     scenario: Scenario
@@ -110,8 +110,8 @@ class Study:
         """Prepare a diagnosis; nothing is simulated yet.
 
         Raises:
-            MeasuredDataError: The data hold nothing to compare, or nothing that vehicles of the
-                scenario could.
+            MeasuredDataError: The data hold nothing to compare, or no vehicle of the scenario
+                reaches a measured lane.
         """
         network = Network.read(scenario)
         detectors = heard(measured)
@@ -164,10 +164,10 @@ class Study:
         return self.measured.has_speeds
 
     def base(self, reporter: Reporter) -> Tested:
-        """Simulate the scenario as it is, and test if the data could be its own.
+        """Simulate the scenario as it is, and test if it could have made the data.
 
         Raises:
-            OutOfTime: The budget does not suffice even for this.
+            OutOfTime: The budget does not suffice for these days.
             MeasuredDataError: The scenario's vehicles do not reach the measured lanes.
         """
         with reporter.task("the scenario as it is", self.effort.base) as advance:
@@ -175,7 +175,7 @@ class Study:
         if self.other_days is not None:
             numbers = range(min(THRESHOLDS.doubt_days, self.effort.base))
             with reporter.task("the same with other vehicles", len(numbers)) as advance:
-                self.other_days.replicates([], numbers, advance)  # remembered for `doubt`
+                self.other_days.replicates([], numbers, advance)  # `doubt` takes them from memory
         aside = self.engine.usual.set_aside
         known = {number: day.tally for number, day in enumerate(days) if number not in aside}
         tallies = list(known.values())
@@ -198,16 +198,18 @@ class Study:
         directions: Directions | None = None,
         effects: tuple[Effect, ...] = (),
     ) -> Null:
-        """Make the distribution of chance from a model's own days, seen as far as the data see.
+        """Make the distribution of chance from a model's own days.
+
+        Only features and bins that the data hold too are used of these days.
 
         Args:
-            tallies: The model's days.
-            periods: Periods in a data set.
-            directions: Where single effects would show; None to look at the whole only.
-            effects: The model's.
+            tallies: Tallies of the model's days.
+            periods: Number of periods in a data set.
+            directions: Changes of the statistics under single effects; None to test without them.
+            effects: Effects of the model.
 
         Raises:
-            OutOfTime: The budget does not suffice for what is in `doubt`.
+            OutOfTime: The budget does not suffice for the days that `doubt` needs.
         """
         data = added(self.fit)
         counted, known = data.sums[..., 1:] > 0, data.counted >= data.days
@@ -236,14 +238,17 @@ class Study:
         )
 
     def doubt(self, effects: tuple[Effect, ...] = ()) -> Mapping[str, Array] | None:
-        """Variances for what measured arrivals leave open, by block; None where none are used.
+        """Return variances for errors of the measured arrivals, by block.
 
-        Detectors see arrivals near the lights and not where queues end. What days with other
-        vehicles would have in other places is known only as far as that. Queues are long under one
-        model and short under another, so that every model has doubts of its own.
+        Detectors see arrivals near the traffic lights, not at the end of queues. So arrivals in
+        long queues are known only roughly. The error is estimated by days with the model's own
+        arrivals. It depends on the length of queues, so each model has its own.
 
         Args:
-            effects: The model's; none for the scenario as it is.
+            effects: Effects of the model; none for the scenario as it is.
+
+        Returns:
+            None if no measured arrivals are used.
 
         Raises:
             OutOfTime: The budget does not suffice.
@@ -268,7 +273,7 @@ class Study:
         return Proposer(self.site, Routes.of(self.scenario), self.allowed)
 
     def fitter(self, base: Tested) -> Fitter:
-        """Make the fitter of single models; `selector` tries the whole library."""
+        """Make the fitter of single models; see `selector` for the search."""
         return Fitter(
             self.engine,
             self.pools,
@@ -300,9 +305,10 @@ def effort_for(intersections: int) -> Effort:
 
 
 def heard(measured: Measured) -> tuple[Detector, ...]:
-    """Return the detectors to compare: if half of them never saw anything, only the others.
+    """Return the detectors to compare.
 
-    So many are missing from the recording, and silence is no count of zero.
+    If at least half of the detectors never saw a vehicle, they count as missing from the recording,
+    and only the others are compared. Otherwise a silent detector counted zero vehicles.
     """
     if not measured.has_events:
         return measured.detectors
@@ -320,7 +326,7 @@ def _tallies(
     return tuple(counts_tally(site, period, measured.counts, whole) for period in periods)
 
 
-# --- demand that does not come where vehicles were measured ---------------------------------------
+# --- measured edges without demand ----------------------------------------------------------------
 
 _NAMED = 6
 
@@ -328,12 +334,12 @@ _NAMED = 6
 def unreached(
     scenario: Scenario, measured: Measured, detectors: Sequence[Detector]
 ) -> tuple[Finding, ...]:
-    """Return a finding on edges where detectors counted vehicles, and which no route leads over.
+    """Return a finding on edges where detectors counted vehicles but no route of the demand leads.
 
     Args:
         scenario: The scenario as it is.
-        measured: The data.
-        detectors: Those that are compared.
+        measured: The measured data.
+        detectors: Detectors that are compared.
 
     Raises:
         MeasuredDataError: No route leads over any of the measured edges.

@@ -1,7 +1,7 @@
 """The diagnosis from data to a corrected scenario: locate, propose, fit, select, verify, correct.
 
-Every simulated day is remembered, so that a diagnosis that was interrupted goes on where it was,
-and one of the same scenario under the same signals needs few simulations.
+Every simulated day is kept in a cache. An interrupted diagnosis continues from there, and another
+diagnosis of the same scenario under the same signals needs few simulations.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
 ALTERNATIVES = 12
-"""Other sets of effects that are written."""
+"""Most other sets of effects that ``diagnosis.json`` lists."""
 
 
 def diagnose(
@@ -61,15 +61,16 @@ def diagnose(
     """Find where scenario and data disagree, name the missing effects, and add them.
 
     Args:
-        scenario: The simulation.
-        measured: The data; see `ugat_marl.data.measured.reading.read_measured`.
-        directory: ``diagnosis.json`` and the scenario ``corrected`` go there.
-        config: Budget, level of the tests, seed.
-        reporter: Shows progress.
+        scenario: The scenario to correct.
+        measured: The measured data; see `ugat_marl.data.measured.reading.read_measured`.
+        directory: Folder for ``diagnosis.json`` and the corrected scenario ``corrected``.
+        config: Options such as budget, level of the tests and seed; None for the defaults.
+        reporter: Display of progress; None for no display.
 
     Returns:
         The content of ``diagnosis.json``; docs/explanation/diagnosis.md explains every key. The
-        policy gap of an earlier diagnosis in `directory` is kept where the same was found.
+        policy gap of an earlier diagnosis in `directory` is kept if its inputs, versions and
+        effects were the same.
 
     Raises:
         MeasuredDataError: The data hold nothing to compare.
@@ -90,12 +91,12 @@ def diagnose(
         diagnosis, found = _compared(study, base, timing, reporter)
         named += found
     place = directory / CORRECTED
-    if (place / "scenario.toml").is_file():  # of an earlier diagnosis
+    if (place / "scenario.toml").is_file():  # written by an earlier diagnosis
         shutil.rmtree(place)
     if named:
         apply_effects(scenario, named).write(place)
         diagnosis = replace(diagnosis, corrected=CORRECTED)
-    written = Diagnosis.from_json(diagnosis.to_json())  # as precise as the file
+    written = Diagnosis.from_json(diagnosis.to_json())  # numbers rounded like those of the file
     written = replace(written, policy_gap=_known_gap(directory, written))
     written.write(directory)
     return written
@@ -104,7 +105,7 @@ def diagnose(
 def _compared(
     study: Study, base: Tested, timing: tuple[Effect, ...], reporter: Reporter
 ) -> tuple[Diagnosis, tuple[Effect, ...]]:
-    """Run all stages, once the scenario as it is has been simulated.
+    """Run all stages after the simulation of the scenario as it is.
 
     Returns:
         The record, and the effects that the search names.
@@ -131,7 +132,7 @@ def _compared(
 
 
 def locate_gap(study: Study, base: Tested, selector: Selector) -> Located:
-    """Test the scenario as it is, and find where it is contradicted."""
+    """Test the scenario as it is, and find the places where the data contradict it."""
     complete = True
     if base.residual.p > study.config.alpha:
         try:
@@ -155,7 +156,7 @@ def disagreements(study: Study, model: Tested) -> tuple[Disagreement, ...]:
 def _beside_the_log(
     study: Study, located: Located, conclusion: Conclusion, timing: tuple[Effect, ...]
 ) -> Conclusion:
-    """Add to a conclusion without effects those that are read off the signal log."""
+    """Add the effects read off the signal log to a conclusion that names no effects."""
     if not timing:
         return conclusion
     alone = unchallenged(located, study.ruled_out, timing)
@@ -176,7 +177,7 @@ def _record(
     *,
     tables: bool = True,
 ) -> Diagnosis:
-    """Gather what the stages found."""
+    """Make the record from the results of all stages."""
     base, best = located.base, conclusion.best
     complete = located.complete if selected is None else selected.complete
     examined = located.examined if selected is None else selected.examined
@@ -203,7 +204,7 @@ def _record(
 
 
 def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> Diagnosis:
-    """Make the record of a budget that does not suffice for the scenario as it is."""
+    """Make the record for a budget that ended before the scenario as it is was simulated."""
     sentence = (
         f"The budget of {study.config.budget_s:g} s ended after {study.engine.known} of "
         f"{study.effort.base} simulated days of the scenario as it is, before anything could be "
@@ -219,17 +220,17 @@ def _begun(
     sentence: str,
     examined: Collection[str] | None,
 ) -> Diagnosis:
-    """Make a record of all that needs no simulation.
+    """Make a record of everything that needs no simulation.
 
     Args:
-        study: The diagnosis.
+        study: The inputs of the diagnosis.
         timing: Effects that are read off the signal log.
         verdict: The verdict.
-        sentence: The same for people.
-        examined: Effects that were examined before the budget ended; None if it did not.
+        sentence: The verdict as a sentence.
+        examined: Names of effects examined before the budget ended; None if it did not end.
     """
     measured = study.measured
-    # Effects of the signal log are read off it at once.
+    # Effects of the signal log need no search, so they are never untried.
     left = () if examined is None else study.allowed.difference(examined, IN_THE_LOG)
     return Diagnosis(
         schema=SCHEMA,
@@ -268,9 +269,10 @@ def _begun(
 
 
 def _named(best: Tested, selected: Selected) -> tuple[NamedEffect, ...]:
-    """Write the effects of the model selected, with intervals and grounds.
+    """Return records of the effects of the selected model, with intervals and grounds.
 
-    The grounds are by how much the model is better than the best one without its effects.
+    The grounds are the model's distance, and the cost by which the best model with another set of
+    effect names is worse.
     """
     names = {hypothesis.name for hypothesis, _ in best.model.members}
     others = [
@@ -290,7 +292,7 @@ def _named(best: Tested, selected: Selected) -> tuple[NamedEffect, ...]:
 
 
 def _from_the_log(effect: Effect) -> NamedEffect:
-    """Write an effect that is read off the signal log, which is as certain as the log."""
+    """Return the record of an effect read off the signal log; its intervals have no width."""
     values = effect.record()
     name = str(values.pop("name"))
     numbers = {key: float(value) for key, value in values.items()}
@@ -306,7 +308,7 @@ def _with_grounds(effect: EffectRecord, grounds: SearchGrounds) -> NamedEffect:
 
 
 def _alternatives(conclusion: Conclusion, selected: Selected) -> tuple[Explanation, ...]:
-    """Write the models beside the one selected; those that fit as well come first."""
+    """Return the models besides the selected one; models that fit equally well come first."""
     chosen = conclusion.best.model
     others = [
         rival
@@ -323,21 +325,21 @@ def _explanation(model: Fitted) -> Explanation:
 
 
 def _known_gap(directory: Path, diagnosis: Diagnosis) -> dict[str, PolicyGap] | None:
-    """Return the policy gap in an earlier record of the same corrected scenario, else None.
+    """Return the policy gap of an earlier record, if that still holds; else None.
 
-    It took the simulations of `ugat-marl policy-gap` to measure, and holds as long as scenario,
-    data, versions and effects are the same.
+    `ugat-marl policy-gap` measured it by simulations. It holds as long as scenario, data, versions
+    and effects are the same.
     """
     try:
         earlier = Diagnosis.read(directory)
     except (OSError, ValueError):
-        return None  # none, or none that `diagnose` wrote
+        return None  # no file, or no diagnosis of this version
     same = (earlier.hashes, earlier.versions) == (diagnosis.hashes, diagnosis.versions)
     return earlier.policy_gap if same and _values(earlier) == _values(diagnosis) else None
 
 
 def _values(diagnosis: Diagnosis) -> list[object]:
-    """Return the effects without intervals and grounds, which change no simulation."""
+    """Return the effects without intervals and grounds, since these change no simulation."""
     return [
         (
             effect.name,
