@@ -1,8 +1,8 @@
-"""Effects proposed at places and in windows, from what a model leaves there; nothing is simulated.
+"""Effects proposed at places and in windows, from the differences of data and model there.
 
-Counts tell where demand and turning differ: see `volume`. Time tells windows: the stretch of
-minutes in which a place departs most from the model, found by a scan over all stretches. Detectors
-tell their own faults.
+Nothing is simulated here. Counts show places where demand and turning differ (`Volume`). A scan
+over all stretches of time finds the window in which a place differs most from the model. Faults of
+detectors show in their own data.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Proposer:
 
     Args:
         site: Lanes and detectors.
-        routes: Of the scenario.
+        routes: Routes of the scenario.
         allowed: Names of effects to examine.
     """
 
@@ -54,9 +54,9 @@ class Proposer:
         """Propose effects at places, strongest first within each kind.
 
         Args:
-            reference: The model so far.
-            distance: Of the data from it.
-            periods: The data.
+            reference: Statistics of the model so far.
+            distance: Distance of the data from the model.
+            periods: The fitted periods.
         """
         found: list[Hypothesis] = []
         found += self._volume.hypotheses(distance)
@@ -67,10 +67,10 @@ class Proposer:
         return [item for item in found if item.name in self.allowed]
 
     def everywhere(self) -> list[Hypothesis]:
-        """Propose what may be at any of the places, if there are few: parking on each lane.
+        """Propose parking on every lane, if there are few lanes.
 
-        A lane on which vehicles stand is avoided; its neighbour takes what it loses, so that
-        neither pools nor single statistics show it, and no other effect leads there.
+        Drivers avoid a lane with parked vehicles and use its neighbour. The sum over both lanes
+        hardly changes, so differences of the data do not show parking reliably.
         """
         lanes = self._site.lanes
         if len(lanes) > THRESHOLDS.most_lanes or "parking" not in self.allowed:
@@ -78,13 +78,13 @@ class Proposer:
         return [_parking(lane.id) for lane in lanes]
 
     def directed(self, distance: Distance) -> dict[str, float]:
-        """Return the sizes of the best origin, turn and stretch: few counts, but the right ones."""
+        """Return the squared standardised sizes of the best origin, turn and stretch of time."""
         return self._volume.directed(distance) | largest_stretches(self._edges, distance)
 
     # --- time ---------------------------------------------------------------------------------
 
     def _timing(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
-        """Find origins whose profile over time would fit if it came sooner or later."""
+        """Find origins whose demand would fit if it came sooner or later."""
         z, difference = distance.z["time"], distance.difference["time"]
         block = reference.blocks["time"]
         found: list[tuple[float, str, float]] = []
@@ -120,7 +120,7 @@ class Proposer:
     def _windows(
         self, reference: Reference, distance: Distance, periods: Sequence[Period]
     ) -> list[Hypothesis]:
-        """Propose surges and closures in the stretches that depart most."""
+        """Propose surges and closures in the stretches of time that differ most."""
         if len({(p.begin_s, p.end_s) for p in periods}) > 1:
             return []
         found: list[tuple[float, Hypothesis]] = []
@@ -136,7 +136,8 @@ class Proposer:
                 surge = Hypothesis("demand_surge", fixed, ("factor",), ((level,),), (1.0,), 0.1)
                 found.append((z, surge))
         for index, lane in enumerate(self._site.lanes):
-            # What comes after a closure, the queue that is let go, is more unusual than itself.
+            # The queue that leaves after a closure differs more than the closure itself, so each
+            # kind of count is scanned to the side that a closure changes.
             for kind, side in (("occupied", 1), ("count_stop", -1), ("count_advance", -1)):
                 option = self._scan(reference, distance, periods, [index], kind, kind, side)
                 if option is not None:
@@ -159,10 +160,21 @@ class Proposer:
         other: str,
         side: int = 0,
     ) -> tuple[float, float, float, float] | None:
-        """The stretch in which counts depart most from their ratio over the rest of the period.
+        """Find the stretch of time whose counts differ most from the ratio over the rest.
+
+        The ratio is that of measured to expected counts.
+
+        Args:
+            reference: Statistics of the model.
+            distance: Distance of the data from the model.
+            periods: The fitted periods.
+            members: Indices of the places whose counts are added.
+            kind: Bin feature for incoming lanes.
+            other: Bin feature for outgoing lanes.
+            side: -1 or 1 to find only fewer or only more counts; 0 for both.
 
         Returns:
-            Standardised size, begin, end, ratio to the expected; or None if all is chance.
+            Standardised size, begin and end in s, ratio to the expected; None if all is chance.
         """
         block = reference.blocks["time"]
         places = len(self._edges)
@@ -183,7 +195,7 @@ class Proposer:
         variance = (block.variance[rows].sum(axis=0) / np.maximum(per_bin, 1))[which] / len(periods)
         if any(period.passages for period in periods):
             measured = self._minutes(periods, members, kind, other, minutes)
-        else:  # counts alone say no more than how many came in each bin
+        else:  # without passages only the counts of whole bins are known
             more = distance.difference["time"][rows].sum(axis=0) / np.maximum(per_bin, 1)
             measured = expected + more[which]
         return most_unusual(measured, expected, variance, begin, side)
@@ -191,7 +203,7 @@ class Proposer:
     def _minutes(
         self, periods: Sequence[Period], members: Sequence[int], kind: str, other: str, minutes: int
     ) -> Array:
-        """Return counts, or occupied seconds, per minute: the mean over the periods."""
+        """Return counts, or occupied seconds, per minute, ``(minutes,)``: mean of the periods."""
         total = np.zeros(minutes)
         for period in periods:
             edges = np.linspace(period.begin_s, period.end_s, minutes + 1)
@@ -220,7 +232,7 @@ class Proposer:
     # --- places -------------------------------------------------------------------------------
 
     def _places(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
-        """Lanes for parking, edges for slow roads, traffic lights for lost time and clocks."""
+        """Propose parking on lanes, speeds on edges, lost time and clocks at traffic lights."""
         found: list[Hypothesis] = []
         lanes = self._site.lanes
         found += [_parking(lane) for lane in self._disturbed(distance)]
@@ -248,7 +260,7 @@ class Proposer:
         return found
 
     def _disturbed(self, distance: Distance) -> list[str]:
-        """Lanes on which something may stand: traffic does not flow there, or avoids the lane."""
+        """Return lanes on which a vehicle may stand: lanes with odd flow, and avoided lanes."""
         lanes = self._site.lanes
         z = np.clip(distance.z["lane"][: len(lanes)], -15, 15)
         unusual = np.abs(z[:, [INDEX[name] for name in _FLOW]]).sum(axis=1)
@@ -276,7 +288,7 @@ class Proposer:
         return float(np.clip(ratio, 0.2, 2.0)) if abs(ratio - 1.0) > 0.03 else 0.8
 
     def _traffic_lights(self, distance: Distance) -> list[Hypothesis]:
-        """Find the two traffic lights whose starts of green differ most from the others'."""
+        """Find the traffic lights whose lost time, or its trend, differs most from the rest."""
         lost = distance.z["intersection"][:, INDEX["lost"]]
         lost = lost - np.median(lost)
         drift = distance.z["intersection"][:, INDEX["lost_trend"]]
@@ -308,7 +320,7 @@ def _parking(lane: str) -> Hypothesis:
 
 
 def _later(counts: Array, bins: float) -> Array:
-    """Return counts ``(rows, bins)`` so many bins later; nobody comes from before the first bin."""
+    """Return counts ``(rows, bins)`` moved later by `bins`; 0 where nothing is known."""
     moved = np.zeros_like(counts)
     whole = int(np.floor(bins))
     for part, step in ((1.0 - (bins - whole), whole), (bins - whole, whole + 1)):
@@ -324,13 +336,13 @@ def _later(counts: Array, bins: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Routes:
-    """Edges that vehicles use: per pair of edges, vehicles per hour of the scenario.
+    """Flows of the scenario's vehicles over edges and pairs of edges, vehicles per hour.
 
     Attributes:
-        origins: Vehicles per hour by first edge.
-        passing: ``passing[origin][edge]``, vehicles per hour that start there and pass here.
-        turns: ``turns[edge][next edge]``, vehicles per hour.
-        joint: ``joint[edge][other]``, vehicles per hour that pass both.
+        origins: Flow that starts on an edge.
+        passing: ``passing[origin][edge]``, flow that starts on `origin` and passes `edge`.
+        turns: ``turns[edge][next edge]``, flow from an edge to the next one.
+        joint: ``joint[edge][other]``, flow that passes both edges.
     """
 
     origins: dict[str, float]
@@ -339,7 +351,7 @@ class Routes:
     joint: dict[str, dict[str, float]]
 
     def share(self, origin: str, edge: str) -> float:
-        """Return the share of the vehicles that pass an edge which start at an origin."""
+        """Return the share of an edge's vehicles that start at an origin, in [0, 1]."""
         own = self.passing[origin].get(edge, 0.0)
         return own / self.joint[edge][edge] if own else 0.0
 
@@ -373,9 +385,9 @@ class _Counts:
     """Measured minus expected vehicles per hour, by edge.
 
     Attributes:
-        place: Edge to its index.
-        whiten: Turns differences into independent ones of unit noise, ``(edges, edges)``.
-        measured: The differences, whitened.
+        place: Index by edge.
+        whiten: Matrix that makes differences independent with unit noise, ``(edges, edges)``.
+        measured: The whitened differences, ``(edges,)``.
     """
 
     place: dict[str, int]
@@ -383,7 +395,16 @@ class _Counts:
     measured: Array
 
     def weighed(self, change: dict[str, float]) -> tuple[float, float, float]:
-        """Return strength, squared z, and squared z of strength 1 of a change of flows by edge."""
+        """Fit a change of flows to the measured differences.
+
+        With r the whitened change and m the measured differences: strength s = r·m / r·r.
+
+        Args:
+            change: Vehicles per hour by edge, for strength 1.
+
+        Returns:
+            Strength s, squared z of the fit ``s^2 r·r``, squared z of strength 1 ``r·r``.
+        """
         ray = np.zeros(len(self.place))
         for edge, value in change.items():
             if edge in self.place:
@@ -399,7 +420,7 @@ class Volume:
 
     Args:
         site: Lanes and detectors.
-        routes: Of the scenario.
+        routes: Routes of the scenario.
     """
 
     def __init__(self, site: Site, routes: Routes) -> None:
@@ -416,7 +437,7 @@ class Volume:
         }
 
     def hypotheses(self, distance: Distance) -> list[Hypothesis]:
-        """Propose the most suspicious origins and turns, with the strength the counts suggest."""
+        """Propose the most suspicious origins and turns, with strengths estimated from counts."""
         counts = self._counts(distance)
         found: list[Hypothesis] = []
         if len(self._routes.passing) > 1:
@@ -464,7 +485,11 @@ class Volume:
         return _Counts(place, whiten, whiten @ np.array(differences))
 
     def _correlation(self, edges: tuple[str, ...]) -> Array:
-        """Return the correlation of the counts of edges if vehicles come by chance."""
+        """Return the correlation of the counts of edges, ``(edges, edges)``.
+
+        With independent vehicles, flows a and b that share the flow j correlate by j / sqrt(a b). A
+        share `alone` of the variance of each count is its own.
+        """
         joint = self._routes.joint
         shared = np.array([[joint.get(a, {}).get(b, 0.0) for b in edges] for a in edges])
         shared = shared.reshape(len(edges), len(edges))
@@ -473,7 +498,7 @@ class Volume:
         return (1 - THRESHOLDS.alone) * shared / np.outer(size, size) + np.diag(alone)
 
     def _origins(self, counts: _Counts) -> list[tuple[float, str, float]]:
-        """Return squared z, origin and factor of every origin that can be told."""
+        """Return squared z, origin and factor of every origin that the counts can show."""
         found: list[tuple[float, str, float]] = []
         for origin, reached in self._routes.passing.items():
             strength, gain, size = counts.weighed(reached)
@@ -482,9 +507,10 @@ class Volume:
         return found
 
     def _turns(self, counts: _Counts, distance: Distance) -> list[tuple[float, str, str, float]]:
-        """Return squared z, edges and share of every pair of edges between which vehicles may move.
+        """Return squared z, edge, next edge and share for every turn that may take more vehicles.
 
-        What arrives says where to, and hardly where from; that is told by the lanes vehicles left.
+        Counts behind the intersection show the next edge, but hardly the edge before. The counts of
+        the lanes that vehicles left show that one.
         """
         found: list[tuple[float, str, str, float]] = []
         approaches = {lane.edge for lane in self._site.lanes}
@@ -501,7 +527,7 @@ class Volume:
         return found
 
     def _lanes_left(self, origin: str, target: str, distance: Distance) -> float:
-        """Squared z of vehicles that moved to those lanes of an edge that lead to another."""
+        """Return squared z of more vehicles on those lanes of an edge that lead to the target."""
         rates = self._routes.turns[origin]
         row = INDEX["count_stop"]
         ray: list[float] = []
@@ -524,7 +550,7 @@ class Volume:
         if len(ray) < 2:
             return 0.0
         scaled = np.array(ray) / np.array(errors)
-        scaled -= scaled.mean()  # how many came in all is counted already
+        scaled -= scaled.mean()  # the total over the lanes is tested by `weighed` already
         found = float(scaled @ np.array(z))
         return max(found, 0.0) ** 2 / max(float(scaled @ scaled), 1e-9)
 
@@ -532,15 +558,18 @@ class Volume:
 # --- stretches of time ----------------------------------------------------------------------------
 
 _COUNTS = 3
-"""Kinds of counts in time that are counts of vehicles; they come first."""
+"""Number of `BIN_FEATURES` that count vehicles; these come first."""
 
 
 def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, float]:
-    """Return the largest squared departure over any stretch of bins: of an edge, of a lane.
+    """Return the largest squared standardised difference over any stretch of bins.
 
     Args:
         edges: Edge of every place.
-        distance: Of the data from a model.
+        distance: Distance of the data from a model.
+
+    Returns:
+        "window" for edges, "lane window" for single lanes.
     """
     z, difference = distance.z["time"], distance.difference["time"]
     variance = np.where(z != 0, (difference / np.where(z != 0, z, 1.0)) ** 2, 0.0)
@@ -556,7 +585,12 @@ def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, flo
 
 
 def _largest(difference: Array, variance: Array) -> float:
-    """Return the largest over all rows and all stretches of bins; both ``(rows, bins)``."""
+    """Return the largest squared standardised sum over all rows and all stretches of bins.
+
+    Args:
+        difference: Data minus model, ``(rows, bins)``.
+        variance: Variance of the differences, ``(rows, bins)``.
+    """
     sums, noise = (
         np.concatenate((np.zeros((len(item), 1)), np.cumsum(item, axis=1)), axis=1)
         for item in (difference, variance)
@@ -572,14 +606,19 @@ def _largest(difference: Array, variance: Array) -> float:
 def most_unusual(
     measured: Array, expected: Array, variance: Array, begin_s: float, side: int = 0
 ) -> tuple[float, float, float, float] | None:
-    """Scan all stretches for the largest standardised departure from a constant ratio.
+    """Scan all stretches of time for the largest standardised difference from a constant ratio.
+
+    The ratio is that of measured to expected outside the stretch.
 
     Args:
-        measured: Per minute.
-        expected: Per minute.
-        variance: Of what is expected, per minute.
-        begin_s: Of the first minute.
-        side: -1 or 1 for departures to that side only.
+        measured: Measured values per minute, ``(minutes,)``.
+        expected: Expected values per minute.
+        variance: Variances of the expected values per minute.
+        begin_s: Begin of the first minute, s.
+        side: -1 or 1 to find only smaller or only larger values; 0 for both.
+
+    Returns:
+        Standardised size, begin and end in s, ratio to the rest; None if all is chance.
     """
     minutes = len(measured)
     if expected.sum() <= 0 or minutes * THRESHOLDS.scan_s <= THRESHOLDS.shortest_stretch_s:
@@ -606,7 +645,13 @@ def most_unusual(
 
 
 def occupied_between(on: Array, off: Array, edges: Array) -> Array:
-    """Return occupied seconds between edges of time."""
+    """Return occupied seconds in each interval of time, ``(edges - 1,)``.
+
+    Args:
+        on: Begins of occupation, s.
+        off: Ends of occupation, s.
+        edges: Bounds of the intervals, s.
+    """
     filled = np.zeros(len(edges))
     for index, edge in enumerate(edges):
         filled[index] = np.clip(np.minimum(off, edge) - on, 0.0, None).sum()
@@ -619,7 +664,7 @@ def occupied_between(on: Array, off: Array, edges: Array) -> Array:
 def fault_hypotheses(
     site: Site, reference: Reference, distance: Distance, periods: Sequence[Period]
 ) -> list[Hypothesis]:
-    """Propose detectors that count too few, stick, fall silent, or have each other's place."""
+    """Propose detectors that count too few, stay on, fall silent, or are exchanged."""
     found: list[Hypothesis] = []
     places = {name: (place, INDEX[kind]) for name, (kind, place) in site.counted.items()}
     z = {name: float(distance.z["lane"][row]) for name, row in places.items()}
@@ -666,7 +711,7 @@ def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:
 
 
 def _silent(periods: Sequence[Period], rate: Mapping[str, float]) -> list[Hypothesis]:
-    """Find detectors that saw nothing at the same time of every period, though vehicles came."""
+    """Find detectors that were silent at the same time of every period, against expectation."""
     found: list[tuple[float, Hypothesis]] = []
     for name, expected in rate.items():
         begin, end = -np.inf, np.inf
@@ -691,7 +736,7 @@ def _swapped(
     difference: Mapping[str, float],
     z: Mapping[str, float],
 ) -> list[Hypothesis]:
-    """Find pairs of detectors of one kind whose counts fit once they are exchanged."""
+    """Find pairs of detectors of one kind whose counts fit if they are exchanged."""
     found: list[tuple[float, Hypothesis]] = []
     suspects = [name for name in mean if abs(z[name]) > 4.0]
     for first in suspects:
@@ -709,10 +754,13 @@ def _swapped(
 
 
 def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None:
-    """Find two detectors of one stream that are both said to miss vehicles, in its direction.
+    """Find two consecutive detectors of one stream that both count too few.
 
-    One detector of a stream that counts too few stands against the others. Where those behind it
-    count too few as well, the vehicles may have left the road.
+    A single detector with too few vehicles contradicts its neighbours, so it is at fault. If the
+    next detector counts too few as well, the vehicles may have left the road.
+
+    Returns:
+        Ids of the upstream and the downstream detector, or None.
     """
     short = [dict(item.fixed)["place"] for item, _ in members if item.name == "undercount"]
     known = {item.id: item for item in site.detectors}
@@ -733,5 +781,5 @@ def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None
 
 
 def _towards(sign: float, strengths: Examined) -> tuple[tuple[float, ...], ...]:
-    """Return the levels of one sign, the weakest first."""
+    """Return the positive levels with the given sign, in their order."""
     return tuple((sign * level,) for level in strengths.levels if level > 0)

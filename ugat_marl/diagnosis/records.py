@@ -530,8 +530,8 @@ class PolicyGap:
         sim: Travel time in the scenario as it is.
         corrected: Travel time in the corrected scenario.
         real: Travel time in the real domain.
-        before: Difference between `sim` and `real`, s.
-        after: Difference between `corrected` and `real`, s.
+        before: Absolute difference of the means of `sim` and `real`, s.
+        after: Absolute difference of the means of `corrected` and `real`, s.
         shrink: Share of the gap that is gone; None if there is no visible gap before.
     """
 

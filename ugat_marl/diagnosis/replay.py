@@ -1,14 +1,15 @@
 """Simulated days under the measured signals, in plain SUMO.
 
-The measured states drive the simulation, so that the controller is not mistaken for physics. One
-process runs per day; the same day has the same vehicles under every model (common random numbers).
+The signals replay the measured states, so differences of the controller do not look like an effect.
+Each day is simulated in its own process. The same day has the same vehicles under every model
+(common random numbers).
 
-Signals that follow the traffic gave green where that day's vehicles stood. With other vehicles a
-queue finds a red that was never shown to it, and everything differs though nothing is missing. So a
-simulated day under such signals is given the arrivals that the advance detectors saw: as many
-vehicles, at these times, on lanes from where they can go on as they did. Their routes, types and
-speeds are those of the model. The number of vehicles to be expected is then no longer in what is
-simulated: it is read from the demand and put in the place of the counts.
+Signals that follow the traffic gave green to the queues of the measured day. Other vehicles meet
+these signals at wrong times, and all statistics differ although no effect is missing. So a
+simulated day under such signals gets the arrivals that the advance detectors saw: the same number
+of vehicles, at the same times, on lanes that allow the same next edges. Routes, types and speeds
+are those of the model. The simulated counts then no longer show the model's demand. They are
+replaced by counts that are read from the demand itself (`corrected`).
 """
 
 from __future__ import annotations
@@ -74,9 +75,9 @@ class Day:
     """One simulated period.
 
     Attributes:
-        period: What the detectors saw.
-        travel_time_s: Mean time in the network of the vehicles due, waiting to enter included.
-        due: What the demand asked for, if the day had measured arrivals instead.
+        period: The period with the passages that the detectors saw.
+        travel_time_s: Mean time in the network of the vehicles due, with the wait to enter, s.
+        due: Vehicles that the demand asked for; None if the day did not get measured arrivals.
     """
 
     period: Period
@@ -89,10 +90,10 @@ class Replay:
 
     Args:
         scenario: The scenario as it is, with the effects of its own file.
-        network: Its network.
-        detectors: What is measured.
-        owner: Detector to its traffic light.
-        answering: Whether the signals answered the traffic, so that days need its arrivals.
+        network: The network of the scenario.
+        detectors: Detectors that are compared.
+        owner: Traffic light by detector.
+        answering: True if the signals followed the traffic; days then get the measured arrivals.
     """
 
     answering = False
@@ -125,12 +126,14 @@ class Replay:
         """Simulate one day.
 
         Args:
-            effects: Applied to the day one after the other; those of detectors to what they see.
-            period: Begin, end and signals; what was detected, if the signals answered it.
-            seed: Which day, and SUMO's own seed.
+            effects: Effects, applied to the day in this order; faults of detectors are applied to
+                the passages.
+            period: Measured period: its begin, end and signals, and its passages if the days get
+                measured arrivals.
+            seed: Number that selects the day; also SUMO's seed.
 
         Raises:
-            SimulatorError: SUMO refused, or its process died again and again.
+            SimulatorError: SUMO refused, or its process crashed repeatedly.
         """
         day = self._day(seed)
         scenario, due = _with(day, effects), None
@@ -148,16 +151,16 @@ class Replay:
         return Day(_logged(seen), done.travel_time_s, due)
 
     def observed(self, effects: Sequence[Effect], period: Period) -> Period:
-        """Return a simulated period as other detectors would have seen it; costs no simulation."""
+        """Return a simulated period as detectors with faults see it, without a new simulation."""
         for effect in effects:
             period = effect.observe(period, self._detectors, self._owner)
         return _logged(period)
 
     def asked(self, effects: Sequence[Effect], period: Period, seed: int) -> Mapping[str, Array]:
-        """Return what a day of a model asks for, see `Due`; this costs no simulation.
+        """Return the vehicles that a day of a model asks for, without a simulation; see `Due`.
 
         Raises:
-            ValueError: The signals answered nobody.
+            ValueError: The days get no measured arrivals.
         """
         if self._arrivals is None:
             raise ValueError("no arrivals are given in the place of those asked for")
@@ -191,7 +194,8 @@ class Replay:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             said = one_line(done.stderr) or f"exit code {done.returncode}"
-            kind = SimulatorCrashed if done.returncode < 0 else SimulatorError  # by a signal
+            # a negative exit code means that a signal of the system ended SUMO
+            kind = SimulatorCrashed if done.returncode < 0 else SimulatorError
             raise kind(f"SUMO failed in a replay of period {period.id!r}: {said}")
         trips = read_trips(directory / "trips.xml")
         seen = read_loops(loops, self._detectors, period.begin_s, period.end_s)
@@ -206,7 +210,7 @@ def _with(scenario: Scenario, effects: Sequence[Effect]) -> Scenario:
 
 
 def _logged(period: Period) -> Period:
-    """Return what the electronics of a street would have kept of a period."""
+    """Return a period with passages as a signal controller would have logged them."""
     passages = {
         name: as_logged(item, period.begin_s, period.end_s)
         for name, item in period.passages.items()
@@ -215,10 +219,10 @@ def _logged(period: Period) -> Period:
 
 
 def replay_document(scenario: Scenario, period: Period, begin_s: float) -> Document:
-    """Write a programme for every measured traffic light that shows what was measured.
+    """Write a signal programme with the measured states of every measured traffic light.
 
-    Before the period the light shows the beginning of its own log once more. A lost time of the
-    scenario's settings is put behind every start of green.
+    The warm-up before the period shows the beginning of the measured log. If the scenario's
+    settings have a lost time, it follows every start of green.
 
     Raises:
         MeasuredDataError: A traffic light has no signals.
@@ -243,7 +247,7 @@ def replay_document(scenario: Scenario, period: Period, begin_s: float) -> Docum
 
 
 def _from(log: SignalLog, period: Period, begin_s: float) -> SignalLog:
-    """Return the log from `begin_s` on, with its own beginning repeated before the period."""
+    """Return the log from `begin_s` on; the time before the period repeats the log's beginning."""
     early = period.begin_s - begin_s
     if early <= 0:
         return log
@@ -254,7 +258,10 @@ def _from(log: SignalLog, period: Period, begin_s: float) -> SignalLog:
 def _durations(
     log: SignalLog, end_s: float, begin_s: float, step_s: float
 ) -> list[tuple[float, str]]:
-    """Return phases in whole steps, at least to the end; times are rounded, not durations."""
+    """Return durations in s and states of phases, in whole steps, beyond the end of the period.
+
+    Times are rounded instead of durations, so that errors do not add up.
+    """
     shown: list[tuple[int, str]] = []
     for time, state in log:
         tick = max(round((time - begin_s) / step_s), 0)
@@ -276,7 +283,17 @@ def _durations(
 
 @dataclass(frozen=True)
 class _Lane:
-    """A lane on which vehicles are seen to come."""
+    """A lane with an advance detector in front of a traffic light.
+
+    Attributes:
+        advance: Id of the advance detector.
+        stop: Id of the stop detector; None if there is none.
+        position_m: Begin of the advance detector's zone on the lane, m.
+        zone_m: Length of this zone, m.
+        speed_mps: Speed limit, m/s.
+        travel_s: Least time from the advance detector to the stop detector, s.
+        following: Edges that the lane leads to.
+    """
 
     advance: str
     stop: str | None
@@ -289,11 +306,12 @@ class _Lane:
 
 @dataclass(frozen=True, eq=False)
 class Due:
-    """Vehicles a day of the model asks for, and those it was given; by edge and bin of time.
+    """Vehicles that the model's demand asks for, and vehicles that the simulated day got.
 
     Attributes:
-        asked: Edge to vehicles that would come by its end if nobody stood anywhere, ``(bins,)``.
-        given: The same of the vehicles that were simulated.
+        asked: Vehicles of the demand that would reach the end of an edge in free flow, by edge,
+            ``(bins,)``.
+        given: The same numbers for the vehicles that were simulated.
     """
 
     asked: Mapping[str, Array]
@@ -301,7 +319,7 @@ class Due:
 
 
 class Arrivals:
-    """Times at which vehicles came, for the vehicles of a simulated day.
+    """Measured arrivals for the vehicles of a simulated day.
 
     Args:
         site: Lanes and detectors.
@@ -319,15 +337,15 @@ class Arrivals:
         """Give a day the measured arrivals.
 
         Args:
-            asked: The day as the model has it, with all its effects.
-            drivers: The same without effects on how many vehicles depart, and when: vehicles are
-                taken from here, so that such effects leave what is simulated alone.
-            period: The measured one.
+            asked: The day of the model, with all its effects.
+            drivers: The same day without effects on departures. Its vehicles are simulated, so
+                effects on departures do not change the simulation.
+            period: The measured period.
 
         Returns:
-            What is to be simulated, and what was asked for beside it. Vehicles that come by no
-            approach with advance detectors, or stop on their way, or come before the period, stay
-            as they are.
+            The day to simulate, and the vehicles that were asked for and given. Some vehicles stay
+            as they are: those without an approach with advance detectors, those with a stop on
+            their way, and those that arrive before the period.
         """
         document = drivers.routes[0]
         root = document.parse()
@@ -352,11 +370,11 @@ class Arrivals:
         )
 
     def asked(self, day: Scenario, period: Period) -> dict[str, Array]:
-        """Vehicles of a day that would come by the end of each counted edge, by bin of time."""
+        """Return vehicles of a day that would reach the end of each counted edge, ``(bins,)``."""
         return self._by_edge(day.routes[0].parse(), period)
 
     def _coming(self, item: ET.Element, period: Period) -> _Coming | None:
-        """Place and time at which a vehicle is first seen; None if it has to be left alone."""
+        """Return where and when a vehicle is first detected; None if it must stay as it is."""
         way = self._way(_route(item))
         if way.approach is None or item.find("stop") is not None:
             return None
@@ -367,7 +385,7 @@ class Arrivals:
         return _Coming(way.approach, time, way_s, way.following, item)
 
     def _way(self, route: str) -> _Way:
-        """Return a route at the speed limit; remembered, since thousands drive the same few."""
+        """Return a route at the speed limit; kept, since many vehicles share few routes."""
         found = self._ways.get(route)
         if found is not None:
             return found
@@ -387,7 +405,7 @@ class Arrivals:
         return found
 
     def _came(self, edge: str, period: Period) -> list[tuple[float, frozenset[str]]]:
-        """Times at which vehicles came by an approach's advance detectors, and their next edges."""
+        """Return the arrival times at an approach, s, each with its possible next edges."""
         lanes = self._approaches[edge]
         seen = [period.passages.get(lane.advance, Passages.none()) for lane in lanes]
         times = [
@@ -414,7 +432,7 @@ class Arrivals:
         return sorted(found, key=lambda row: row[0])
 
     def _by_edge(self, vehicles: Iterable[ET.Element], period: Period) -> dict[str, Array]:
-        """Count vehicles that would come by the end of each counted edge, by bin of time."""
+        """Count vehicles that would reach the end of each counted edge, ``(bins,)``."""
         bins = bins_of(period)
         times: dict[str, list[float]] = {edge: [] for edge in self._counted}
         for item in vehicles:
@@ -434,10 +452,10 @@ class _Way:
     """A route at the speed limit.
 
     Attributes:
-        counted: Edges with detectors, and when their ends are reached, s.
-        approach: The first one on which vehicles are seen to come.
-        approach_s: When its advance detector is reached, s.
-        following: The edge behind it.
+        counted: Edges with detectors, each with the time from departure to its end, s.
+        approach: First edge of the route with advance detectors; None if there is none.
+        approach_s: Time from departure to its advance detector, s.
+        following: Next edge after `approach`; None at the end of the route.
     """
 
     counted: tuple[tuple[str, float], ...]
@@ -448,7 +466,15 @@ class _Way:
 
 @dataclass(frozen=True, eq=False)
 class _Coming:
-    """A vehicle on its way to the first approach where it is seen."""
+    """A vehicle on its way to the first approach with advance detectors.
+
+    Attributes:
+        approach: Edge of this approach.
+        time_s: Time at which the vehicle reaches the advance detector in free flow, s.
+        way_s: Time from departure to there, s.
+        following: Next edge after the approach; None at the end of the route.
+        item: XML element of the vehicle.
+    """
 
     approach: str
     time_s: float
@@ -463,9 +489,16 @@ def _filled(
     earliest_s: float,
     period: Period,
 ) -> list[ET.Element]:
-    """Return vehicles of the pool at the times of those that came; again from the first if too few.
+    """Return vehicles of the pool that arrive at the measured times.
 
-    In their own order, each where it can go on as it means to.
+    Vehicles are taken in their order in time, each on a lane that leads to its next edge. If the
+    pool is too small, it starts again from its first vehicle.
+
+    Args:
+        pool: Vehicles of the model on their way to one approach.
+        came: Measured arrival times, s, with the possible next edges.
+        earliest_s: Earliest departure, s.
+        period: The measured period.
     """
     queues: dict[str | None, deque[_Coming]] = {}
     for item in sorted(pool, key=lambda item: item.time_s):
@@ -476,7 +509,7 @@ def _filled(
     for time, following in came:
         fitting = [name for name in queues if name is None or name in following] or list(queues)
         if not fitting:
-            break  # the model has nobody who comes this way
+            break  # the model has no vehicle on this approach
 
         def waiting(name: str | None) -> float:
             rounds = turns[name] // sizes[name]
@@ -497,15 +530,18 @@ def _filled(
 
 
 def corrected(counted: Tally, site: Site, due: Due) -> Tally:
-    """Return the tally with the counts the demand asks for, in the place of those that were given.
+    """Return the tally of a day, with counts corrected to the model's demand.
+
+    Corrected count = count + share * (asked - given), where the share of a lane is its part of the
+    vehicles given to its edge.
 
     Args:
-        counted: Of a day with measured arrivals.
+        counted: Tally of a day with measured arrivals.
         site: Lanes and detectors.
-        due: What was asked for beside what was given.
+        due: Vehicles asked for and given.
 
     Returns:
-        Its gaps in moving platoons are left out: they are what was put in.
+        The tally without platoon features, since these repeat the measured arrivals.
     """
     sums, bins = counted.sums.copy(), counted.bins.copy()
     lanes = Counter(edge for _, edge, _ in site.places)
@@ -524,7 +560,7 @@ def corrected(counted: Tally, site: Site, due: Due) -> Tally:
 
 
 def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
-    """Find edges all of whose lanes in front of the traffic light have an advance detector."""
+    """Find edges with an advance detector on every lane in front of the traffic light."""
     zones = {item.id: item for item in site.detectors}
     lanes: dict[str, list[_Lane] | None] = {}
     for lane in site.lanes:
@@ -562,16 +598,17 @@ def _factor(item: ET.Element) -> float:
 
 
 def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float = 0.0) -> Array:
-    """Return times at which vehicles would have come if nobody had stood in their way, s.
+    """Return the arrival times of vehicles as if no queue had delayed them, s.
 
-    Vehicles that came through a queue arrived at its end before; when, nobody saw. They are spread
-    evenly between the last that came freely and the next, but none comes later than it did.
+    A vehicle that crosses the detector in a queue had joined the queue earlier, at an unknown time.
+    Such vehicles are spread evenly between the free vehicles before and after them. No vehicle is
+    moved later than its measured time.
 
     Args:
-        seen: An advance detector's vehicles.
-        limit_mps: Speed limit there.
-        period: Its begin and end.
-        zone_m: Length of the detection zone.
+        seen: Passages over an advance detector.
+        limit_mps: Speed limit at the detector, m/s.
+        period: The measured period.
+        zone_m: Length of the detection zone, m.
     """
     seen = seen.at(np.isfinite(seen.on_s))
     times = seen.on_s.copy()
@@ -583,7 +620,7 @@ def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float =
     slow = pace < THRESHOLDS.held_up
     close = np.diff(times, prepend=-np.inf) < THRESHOLDS.close_s
     for place in np.flatnonzero(close & ~slow & (pace < THRESHOLDS.free)).tolist():
-        slow[place] = slow[place - 1]  # it stood farther back in the same queue
+        slow[place] = slow[place - 1]  # a close follower stood farther back in the same queue
     edges = np.flatnonzero(np.diff(np.concatenate(([False], slow, [False]))))
     for first, behind in zip(edges[::2], edges[1::2], strict=True):
         before = times[first - 1] if first else period.begin_s
@@ -596,18 +633,19 @@ def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float =
 def by_lane_left(
     came: Sequence[Array], crossed: Sequence[Array], travel_s: Sequence[float]
 ) -> list[Array]:
-    """Return arrival times of the vehicles that left an approach by each of its lanes.
+    """Return the arrival times of vehicles, by the lane on which they leave the approach.
 
-    Between the detectors some change lanes. Every vehicle at a stop detector is taken for the first
-    that came on its lane and has not left yet; if there is none, for the first on any other lane.
+    Some vehicles change lanes between the detectors. A vehicle at a stop detector is matched to the
+    earliest arrival on its lane that has not left yet. If there is none, it is matched to the
+    earliest such arrival on the other lanes.
 
     Args:
-        came: Times at the advance detectors in order, per lane.
-        crossed: Times at the stop detectors in order, per lane.
-        travel_s: Least time from the one to the other, per lane.
+        came: Times at the advance detectors in order, per lane, s.
+        crossed: Times at the stop detectors in order, per lane, s.
+        travel_s: Least time from the advance to the stop detector, per lane, s.
 
     Returns:
-        Times per lane; who never left is counted for the lane on which he came.
+        Times per lane, s. Vehicles that never left stay on the lane of their arrival.
     """
     waiting = [deque(times.tolist()) for times in came]
     found: list[list[float]] = [[] for _ in came]
@@ -623,7 +661,15 @@ def by_lane_left(
 
 
 def missed(times: Array, crossed: Array, period: Period) -> Array:
-    """Vehicles that advance detectors missed if the stop detectors saw many more, by window."""
+    """Return times for vehicles that the advance detectors missed, s, evenly spread by window.
+
+    Vehicles are missed if the stop detectors saw many more.
+
+    Args:
+        times: Times at the advance detectors, s.
+        crossed: Times at the stop detectors, s.
+        period: The measured period.
+    """
     if len(crossed) - len(times) <= THRESHOLDS.missing + THRESHOLDS.missing_share * len(times):
         return np.empty(0)
     count = max(1, round((period.end_s - period.begin_s) / THRESHOLDS.missed_window_s))
@@ -640,16 +686,16 @@ def missed(times: Array, crossed: Array, period: Period) -> Array:
     return np.concatenate(parts)
 
 
-# --- as detectors of the street would have seen it ------------------------------------------------
+# --- data that the detectors of the street do not measure -----------------------------------------
 
 
 @dataclass(frozen=True)
 class Unmeasured:
-    """Detectors that saw vehicles, but never measured something of them.
+    """Detectors that saw vehicles but never measured their speeds or lengths.
 
     Attributes:
-        speeds: Those without speeds, sorted.
-        lengths: Those without lengths of vehicles, sorted.
+        speeds: Ids of detectors without speeds, sorted.
+        lengths: Ids of detectors without lengths, sorted.
     """
 
     speeds: tuple[str, ...]
@@ -657,7 +703,7 @@ class Unmeasured:
 
     @classmethod
     def of(cls, periods: Sequence[Period]) -> Unmeasured:
-        """Find what no measured period tells."""
+        """Find the detectors without speeds or lengths in all measured periods."""
         seen: set[str] = set()
         speeds: set[str] = set()
         lengths: set[str] = set()
@@ -675,7 +721,7 @@ class Unmeasured:
         return bool(self.speeds or self.lengths)
 
     def kept_from(self, period: Period) -> Period:
-        """Return a simulated period as the detectors of the street would have told it."""
+        """Return a simulated period without the speeds and lengths that the street lacks."""
         if not self:
             return period
         passages = {
