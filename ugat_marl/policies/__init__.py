@@ -1,7 +1,8 @@
 """Policies choose green phases; learners improve them.
 
-`rules` holds controllers that follow a rule, `learners` the algorithms that improve a policy, and
-`export` writes trained policies for places where the suite is not installed.
+`rules` holds controllers that follow a rule. `learners` holds the algorithms that improve a policy.
+`networks` holds their neural networks. `export` writes trained policies to files that other
+programs read without this package.
 """
 
 import lazy_loader

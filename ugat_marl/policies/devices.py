@@ -1,8 +1,8 @@
 """Devices for learning: the processor, or a GPU that torch sees.
 
-A GPU does the sums of an update or a fit and nothing else. What is drawn at random is drawn on the
-CPU, so that a GPU learns from the same draws; transitions, policies, roll-outs and checkpoints stay
-on the CPU, so that a run goes on with or without the GPU it was begun with.
+A GPU computes updates and fits, and nothing else. Random numbers are drawn on the CPU, so a GPU
+learns from the same draws. Transitions, policies, roll-outs and checkpoints stay on the CPU, so a
+run that began with a GPU can continue without it.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _NAMES = re.compile(r"cpu|cuda(?::(0|[1-9]\d*))?")
 
 
 def require_device_name(name: str) -> None:
-    """Refuse what is no device's name, whether this machine has the device or not.
+    """Refuse a name that is no device's; this machine need not have the device.
 
     Raises:
-        OptionError: Neither "cpu", "cuda" nor "cuda:N".
+        OptionError: The name is neither "cpu", "cuda" nor "cuda:N".
     """
     if not _NAMES.fullmatch(name):
         raise OptionError(f"device = {name!r}: must be cpu, cuda, or cuda:N for one GPU of several")
@@ -37,7 +37,7 @@ def device_of(name: str) -> torch.device:
         name: "cpu", "cuda" (torch's current GPU) or "cuda:N".
 
     Raises:
-        OptionError: No device's name, or torch sees no such GPU.
+        OptionError: The name is no device's, or torch finds no such GPU.
     """
     require_device_name(name)
     if name == "cpu":
@@ -58,7 +58,7 @@ def device_of(name: str) -> torch.device:
 
 @contextlib.contextmanager
 def placed(device: torch.device, *modules: nn.Module) -> Iterator[None]:
-    """Move modules to a device, and back to the CPU at the end, also after an error."""
+    """Move modules to a device, and back to the CPU at the end (also after an error)."""
     try:
         for module in modules:
             module.to(device)

@@ -1,16 +1,17 @@
-"""Trained policies for places where the suite is not installed: TorchScript, ONNX, plain matrices.
+"""Trained policies as files for other programs: TorchScript, ONNX, plain matrices.
 
-An exported policy is two files: the model, and beside it a JSON file of the same name that says
-what the model's rows and columns are. The model maps ``observations`` float32 ``(agents,
-observation_width)``, padded with zeros, and ``allowed`` bool ``(agents, action_width)``, false
-where padded, to the allowed actions of highest Q, int64 ``(agents,)``. The JSON file holds:
+An exported policy is two files: the model, and a JSON file of the same name that describes the
+rows and columns of the model. The model has two inputs: ``observations``, float32 ``(agents,
+observation_width)``, padded with zeros, and ``allowed``, bool ``(agents, action_width)``, false
+where padded. Its output is the allowed action of highest value, int64 ``(agents,)``. The JSON file
+holds:
 
-- ``agents``, ``observation_sizes``, ``action_counts``: the rows, and each one's own columns.
-- ``observation_width``, ``action_width``: the columns, with their padding.
-- ``env_options``: options of `ugat_marl.parallel_env` that give the observations it was trained on.
+- ``agents``, ``observation_sizes``, ``action_counts``: the rows, and how many columns each uses.
+- ``observation_width``, ``action_width``: numbers of columns, padding included.
+- ``env_options``: options of `ugat_marl.parallel_env` that the policy was trained with.
 - ``decision_interval_s``, ``intersections``: seconds between decisions, and agent to traffic light;
-  null if no environment was at hand when it was exported.
-- ``sha256``: of the model, so that two files that do not belong together are noticed.
+  null for an export without an environment.
+- ``sha256``: hash of the model; it shows whether the two files belong together.
 """
 
 from __future__ import annotations
@@ -39,29 +40,29 @@ _KIND = "ugat_marl.exported_policy"
 _OPSET = 17
 _IR_VERSION = 8
 _UNREADABLE = (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile)
-"""What numpy and JSON raise on files that are not what was written."""
+"""Errors that numpy and JSON raise for a damaged file."""
 
 Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Weights ``(agents or 1, n_in, n_out)`` and biases ``(agents or 1, 1, n_out)``."""
 
 
 def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None = None) -> Path:
-    """Write a policy for use elsewhere, and a JSON file beside it.
+    """Write a policy for other programs, and a JSON file beside it.
 
     Args:
-        policy: What to export.
-        path: The model; its suffix is the format: ``.ts`` TorchScript, ``.onnx`` ONNX (needs the
-            extra ``onnx``), ``.npz`` matrices for `NumpyPolicy`.
-        env: The environment the policy is for; adds decision interval and traffic lights.
+        policy: Policy to export.
+        path: File of the model. Its suffix chooses the format: ``.ts`` TorchScript, ``.onnx`` ONNX
+            (needs the extra ``onnx``), ``.npz`` matrices for `NumpyPolicy`.
+        env: Environment of the policy; adds decision interval and traffic lights to the JSON file.
 
     Returns:
         The path of the JSON file.
 
     Raises:
-        OptionError: Unknown suffix, missing extra, the environment has other agents, or a network
-            with structure for another format than ``.ts``.
+        OptionError: The suffix is unknown, the extra is missing, the environment has other agents,
+            or a network with structure is to be written to another format than ``.ts``.
         CheckpointError: An option of the environment is not plain data.
-        OutputError: Not writable.
+        OutputError: A file cannot be written.
     """
     if path.suffix not in FORMATS:
         known = ", ".join(f"{suffix} ({name})" for suffix, (name, _) in FORMATS.items())
@@ -78,12 +79,13 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
 
 
 def layers_of(policy: NetworkPolicy) -> list[Layer]:
-    """Return the policy's network as affine maps with ReLU between them, shared or not.
+    """Return the policy's network as affine maps with ReLU between them.
 
-    A ceiling c is a layer more: min(x, c) is c - ReLU(c - x).
+    A shared first layer has one matrix of weights for all agents. A ceiling c adds a layer:
+    ``min(x, c) = c - ReLU(c - x)``.
 
     Raises:
-        OptionError: It is a network with structure, which is more than that.
+        OptionError: The network has structure (FRAP, CoLight) and is not made of such layers only.
     """
     if policy.structure is not None:
         raise OptionError(
@@ -104,14 +106,14 @@ def layers_of(policy: NetworkPolicy) -> list[Layer]:
 
 
 class NumpyPolicy:
-    """An exported policy in numpy alone; torch is not loaded.
+    """An exported policy that needs numpy only, not torch.
 
-    It takes the same actions as the original, except where two values differ by rounding only.
+    It takes the same actions as the original, except where two values differ only by rounding.
 
     Args:
         agents: The agents it acts for.
-        layers: As `layers_of` gives them.
-        env_options: Options of the environment the policy relies on.
+        layers: Affine maps, as `layers_of` returns them.
+        env_options: Options of the environment that the policy relies on.
 
     Raises:
         ValueError: The layers do not fit each other or the agents.
@@ -127,10 +129,11 @@ class NumpyPolicy:
 
     @classmethod
     def load(cls, path: Path) -> NumpyPolicy:
-        """Read what `export_policy` wrote to an ``.npz`` and its JSON file.
+        """Read a policy from the ``.npz`` and JSON files that `export_policy` wrote.
 
         Raises:
-            CheckpointError: Missing, damaged, not finite, or the two do not belong together.
+            CheckpointError: A file is missing, damaged or not finite, or the two do not belong
+                together.
         """
         try:
             about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
@@ -154,14 +157,19 @@ class NumpyPolicy:
         """Return the greedy action of every agent.
 
         Raises:
-            OptionError: The observations are not of the agents this policy was trained for.
+            OptionError: The observations belong to other agents than those the policy was trained
+                for.
         """
         values = self.values(self.agents.stack(observations))
         values[~self.agents.masks(infos)] = -np.inf
         return self.agents.actions(values.argmax(axis=1))
 
     def values(self, stacked: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return Q ``(agents, action_width)`` of padded ``(agents, observation_width)``."""
+        """Return the values of actions, ``(agents, action_width)``.
+
+        Args:
+            stacked: Observations padded with zeros, ``(agents, observation_width)``.
+        """
         hidden = stacked[:, None, :]
         for place, (weight, bias) in enumerate(self.layers):
             hidden = (np.maximum(hidden, 0) if place else hidden) @ weight + bias
@@ -191,7 +199,7 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
 
 
 def _brief(agents: AgentSet) -> str:
-    """Describe agents and sizes in a few words."""
+    """Describe the first three agents and their sizes."""
     columns = (agents.names, agents.observation_sizes, agents.action_counts)
     rows = [f"{name} ({n} numbers, {m} actions)" for name, n, m in zip(*columns, strict=True)]
     return ", ".join(rows[:3]) + f" and {len(rows) - 3} more" * (len(rows) > 3)
@@ -228,7 +236,7 @@ def _torchscript(policy: NetworkPolicy) -> bytes:
     from torch import Tensor, nn
 
     class Greedy(nn.Module):
-        """Observations and masks to actions."""
+        """Map observations and masks to actions."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -260,10 +268,10 @@ def _without_debug_files(archive: io.BytesIO) -> bytes:
 
 
 def _onnx(policy: NetworkPolicy) -> bytes:
-    """Build the graph by hand: torch's exporter leaves paths of this machine in the file.
+    """Build the graph by hand, because torch's exporter leaves paths of this machine in the file.
 
     Raises:
-        OptionError: The extra is not installed.
+        OptionError: The package onnx is not installed.
     """
     try:
         onnx: Any = importlib.import_module("onnx")
@@ -308,4 +316,4 @@ FORMATS: dict[str, tuple[str, Callable[[Any], bytes]]] = {
     ".onnx": ("ONNX", _onnx),
     ".npz": ("matrices", _matrices),
 }
-"""Suffix to the name of a format and what writes it."""
+"""Suffix to the name of the format and the function that writes it."""

@@ -1,4 +1,4 @@
-"""Greedy policies of trained networks, by whichever learner: saved, loaded, sent to processes."""
+"""Greedy policies of trained networks, for every learner: act, save, load, send to processes."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ _KIND = "ugat_marl.network_policy"
 
 
 class NetworkPolicy:
-    """Take every agent's allowed action of highest value: Q of DQN, the logit of an actor.
+    """Take every agent's allowed action of highest value: Q for DQN, the logit for an actor.
 
     Args:
         agents: The agents it acts for.
         hidden: Sizes of the hidden layers of each network.
-        parameters: All parameters as one vector, as `flatten_parameters` orders them; copied, to
-            the CPU.
-        env_options: Options of the environment the policy relies on.
-        shared: Whether all agents share one network.
-        structure: What a network other than "mlp" knows of the intersections.
-        ceiling: What the numbers of an observation are held below, ``(agents,
-            widest_observation)``; None takes them as they are. See `DQNConfig.ceiling`.
+        parameters: All parameters as one vector, in the order of `flatten_parameters`; they are
+            copied to the CPU.
+        env_options: Options of the environment that the policy relies on.
+        shared: True if all agents share one network.
+        structure: Facts about the intersections for a network other than "mlp".
+        ceiling: Largest value of each number of an observation, ``(agents, widest_observation)``;
+            larger numbers are cut to it. None cuts nothing. See `DQNConfig.ceiling`.
 
     Raises:
-        ValueError: `parameters` or `ceiling` are those of other networks.
+        ValueError: `parameters` or `ceiling` belong to other networks.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class NetworkPolicy:
         """Do nothing: the policy is deterministic and has no memory."""
 
     def q_values(self, observations: Observations) -> dict[str, NDArray[np.float32]]:
-        """Return every agent's values of its actions, ``(actions,)`` (Q in scaled reward)."""
+        """Return the values of every agent's actions, ``(actions,)``; Q is in scaled reward."""
         values = self._network(torch.from_numpy(self.agents.stack(observations)).unsqueeze(1))
         rows = zip(self.agents.names, self.agents.action_counts, values.squeeze(1), strict=True)
         return {name: row[:count].numpy() for name, count, row in rows}
@@ -93,8 +93,8 @@ class NetworkPolicy:
         """Return the greedy action of every agent.
 
         Raises:
-            OptionError: The observations are not of the agents this policy was trained for, or not
-                finite.
+            OptionError: The observations belong to other agents than those the policy was trained
+                for, or are not finite.
         """
         stacked = torch.from_numpy(self.agents.stack(observations))
         allowed = torch.from_numpy(self.agents.masks(infos))
@@ -113,7 +113,7 @@ class NetworkPolicy:
         """Read a saved policy.
 
         Raises:
-            CheckpointError: Missing, cut short, not finite, or not a policy.
+            CheckpointError: The file is missing, cut short, not finite, or not a policy.
         """
         content = read_checkpoint(path, _KIND)
         try:
@@ -140,7 +140,7 @@ def header(
     """Return the description of agents and network that every checkpoint holds.
 
     Raises:
-        CheckpointError: An option of the environment is not plain data (a callable, say).
+        CheckpointError: An option of the environment is not plain data (for example a callable).
     """
     try:
         options = json.dumps(dict(env_options), sort_keys=True)

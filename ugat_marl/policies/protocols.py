@@ -1,6 +1,6 @@
 """Protocols of a policy, which acts, and of a learner, which improves a policy.
 
-The driver of UGAT, the evaluation and the conformance kit know nothing else about policies.
+The training of UGAT, the evaluation and the conformance kit use policies only through them.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ class Policy(Protocol):
     """Choose a green phase for every intersection.
 
     Attributes:
-        env_options: Options of `ugat_marl.parallel_env` the policy relies on, such as
-            ``{"observation": "movements"}``; whoever builds an environment for it passes them on.
+        env_options: Options of `ugat_marl.parallel_env` that the policy relies on, such as
+            ``{"observation": "movements"}``. Make its environment with these options.
     """
 
     env_options: Mapping[str, Any]
 
     def reset(self, seed: int) -> None:
-        """Forget the past; called once before every episode."""
+        """Forget the past; call this once before every episode."""
         ...
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
@@ -47,10 +47,10 @@ EpisodeCallback = Callable[[int, Mapping[str, float]], None]
 
 @runtime_checkable
 class Learner(Protocol):
-    """Improve a policy by acting in an environment; keeps its state between calls.
+    """Improve a policy by acting in an environment; keep the state between calls.
 
     Attributes:
-        episodes: Episodes it has been trained for in its life; saved with its state.
+        episodes: Number of training episodes in all calls so far; saved with the state.
     """
 
     episodes: int
@@ -62,9 +62,9 @@ class Learner(Protocol):
         seed: int,
         on_episode: EpisodeCallback | None = None,
     ) -> Policy:
-        """Train for a number of episodes and returns the current greedy policy.
+        """Train for a number of episodes and return the current greedy policy.
 
-        Called again, it goes on from where it was. `seed` fixes every random choice of this call.
+        A further call continues the training. `seed` fixes every random choice of this call.
         """
         ...
 
@@ -77,7 +77,7 @@ class Learner(Protocol):
         ...
 
     def load(self, path: Path) -> None:
-        """Restore the state of a file that `save` wrote.
+        """Restore the state from a file that `save` wrote.
 
         Raises:
             CheckpointError: Unreadable, not finite, or of another set of agents.

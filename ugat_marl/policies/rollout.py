@@ -1,4 +1,4 @@
-"""The loop of acting, stepping and observing, and the recording of its transitions."""
+"""Roll-outs: the loop of acting and stepping, and the recording of its transitions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ugat_marl.seeding import numpy_generator
 from ugat_marl.simulation import Snapshot
 
 SIMULATING = ("libsumo", "numpy", "ugat-marl")
-"""Packages whose version can change a trajectory; written into every log."""
+"""Packages whose version can change a roll-out; every log holds these versions."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Episode:
     """Result of one roll-out.
 
     Attributes:
-        steps: Decisions made.
-        mean_reward: Mean over decisions and agents.
-        log: All transitions, if asked for.
+        steps: Number of decisions.
+        mean_reward: Mean reward over decisions and agents.
+        log: All transitions; None without an observer to record them.
     """
 
     steps: int
@@ -40,11 +40,11 @@ StepCallback = Callable[[int], None]
 
 
 class Stopped(Exception):
-    """A roll-out was ended: another thread failed, or the user interrupted."""
+    """A roll-out ended early: another thread failed, or the user interrupted."""
 
 
 def until(stop: threading.Event) -> StepCallback:
-    """Return a callback that ends a roll-out, with `Stopped`, once `stop` is set."""
+    """Return a callback that raises `Stopped` after `stop` is set."""
 
     def check(_step: int) -> None:
         if stop.is_set():
@@ -65,11 +65,11 @@ def roll_out(
 
     Args:
         env: An environment made with the policy's `env_options`.
-        policy: Who acts.
-        seed: Fixes the simulation and the policy's own choices.
-        record: Keeps the transitions, with the observations this observer makes, which may be
-            others than the policy reads; needs an environment of the suite.
-        on_step: Called after every decision.
+        policy: Policy that acts.
+        seed: Seed of the simulation and of the policy's own choices.
+        record: Observer whose observations are recorded; None records nothing. They may differ from
+            those that the policy reads. It needs an environment of the suite.
+        on_step: Function called after every decision.
     """
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
@@ -89,7 +89,13 @@ def roll_out(
 
 
 def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 0) -> Observer:
-    """Make an observer of the environment's network; by default one like the environment's own."""
+    """Make an observer of the environment's network.
+
+    Args:
+        env: An environment of the suite, wrapped or not.
+        name: Name of the observation; None for that of the environment, with its `neighbours`.
+        neighbours: Number of neighbours that the observation includes.
+    """
     base: Any = env.unwrapped
     if name is None:
         name, neighbours = base.options.observation, base.options.neighbours
@@ -98,7 +104,7 @@ def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 
 
 
 class _Recording:
-    """Transitions of one episode through an observer; agents have the observer's names."""
+    """Transitions of one episode, seen by an observer; agents have the observer's names."""
 
     def __init__(self, env: AnyParallelEnv, observer: Observer, seed: int) -> None:
         self._base: Any = env.unwrapped
@@ -123,10 +129,13 @@ class _Recording:
         return self._recorder.log()
 
     def _served(self) -> dict[str, NDArray[np.float32]] | None:
-        """Return the last decision's features less the vehicles that left since, on average."""
+        """Return the last decision's features minus the mean number of vehicles that left since.
+
+        Return None if the simulation does not count them, or if the features are waiting times.
+        """
         before, self._before = self._before, self._base.seen
         left = self._before.mean_left
-        if not len(left) or self._observer.needs_waiting:  # who has left says nothing of waiting
+        if not len(left) or self._observer.needs_waiting:  # vehicles that left tell no waiting time
             return None
         vectors = self._observer.observe(before.less(left), self._base.phases)
         own = zip(self._observer.agents, vectors, self._observer.layouts, strict=True)
@@ -157,13 +166,13 @@ def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Prove
 
 
 class Exploring:
-    """Policy that takes, agent by agent, a random permitted phase with chance ε.
+    """Policy that replaces each agent's action by a random permitted phase with chance ε.
 
-    Roll-outs for D_sim and D_real need actions the policy would not take: without them h never sees
-    what they do.
+    Roll-outs for D_sim and D_real need actions that the policy would not take; otherwise f and h
+    never see their results.
 
     Args:
-        policy: The policy to follow otherwise.
+        policy: The policy that chooses the other actions.
         epsilon: Chance of a random phase, in [0, 1].
     """
 
@@ -174,7 +183,7 @@ class Exploring:
         self._generator = numpy_generator(0)
 
     def reset(self, seed: int) -> None:
-        """Begin an episode; `seed` decides where exploration happens."""
+        """Begin an episode; `seed` decides which actions are replaced."""
         self._policy.reset(seed)
         self._generator = numpy_generator(seed, "exploring")
 

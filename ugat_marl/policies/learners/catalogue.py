@@ -1,8 +1,9 @@
 """Every learner by name: the suite's own DQN, and those in the files of baselines/.
 
-A new learner is a file in baselines/ with a class that keeps the protocol `Learner` and is called
-as ``Learner(env, config, seed)``, a dataclass of its settings, and a row in `BASELINES`. Its
-policies are `NetworkPolicy`, which all of ``ugat-marl`` reads. A file is loaded when it is used.
+A new learner needs a file in baselines/ and a row in `BASELINES`. The file holds a class that
+follows the protocol `Learner` and is made as ``Learner(env, config, seed)``, and a dataclass of its
+settings. Its policies are of class `NetworkPolicy`, which all commands read. A file of baselines/
+is loaded at its first use.
 """
 
 from __future__ import annotations
@@ -24,22 +25,22 @@ from ugat_marl.policies.learners.dqn_config import DQNConfig
 from ugat_marl.policies.protocols import Learner
 
 LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
-"""Make a fresh learner for the agents of an environment, its initial weights drawn from a seed."""
+"""Make a new learner for the agents of an environment; a seed fixes its initial weights."""
 
 DQN_NAME = "dqn"
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """Home of a learner: its file, its classes, and the library it needs.
+    """Source of a learner: its file, its classes, and the library it needs.
 
     Attributes:
-        file: File of baselines/, without its suffix.
-        learner: Class in it.
-        config: Dataclass of its settings.
-        extra: Extra of the package that brings what it imports; "" for none.
-        library: Distribution that does the work; "" for none.
-        settings: What its name says, in place of the defaults.
+        file: Name of the file in baselines/, without suffix.
+        learner: Name of the learner's class in the file.
+        config: Name of the settings' dataclass in the file.
+        extra: Extra of the package that installs its libraries; "" for none.
+        library: Name of the library on PyPI that does the learning; "" for none.
+        settings: Settings that the learner's name fixes.
     """
 
     file: str
@@ -98,17 +99,17 @@ def learner_factory(
     dqn: DQNConfig | None = None,
     device: str = "cpu",
 ) -> LearnerFactory:
-    """Return the maker of the learner a user names; its library is imported here.
+    """Return the maker of the named learner; its library is imported now.
 
     Args:
         name: "dqn", or one of `BASELINES`.
-        settings: Of a baseline, as ``NAME=VALUE``; the parts of a tuple are divided by commas.
-        dqn: Settings of "dqn".
-        device: Where "dqn" computes its updates (`devices.device_of`); baselines stay on the CPU.
+        settings: Settings of a baseline, as ``NAME=VALUE``; commas separate the parts of a tuple.
+        dqn: Settings of "dqn"; None for the defaults.
+        device: Device of the updates of "dqn" (`devices.device_of`); baselines stay on the CPU.
 
     Raises:
-        UnknownNameError: No such learner, or no such setting.
-        OptionError: A value is impossible, or the library is not installed, or there is no such
+        UnknownNameError: There is no such learner, or no such setting.
+        OptionError: A value is impossible, the library is not installed, or there is no such
             device.
     """
     from ugat_marl.policies.devices import device_of
@@ -131,10 +132,10 @@ def settings_of(name: str, given: Sequence[str] = ()) -> dict[str, Any]:
 
     Args:
         name: One of `BASELINES`.
-        given: Those that are not as usual, as for `learner_factory`.
+        given: Settings that differ from the defaults, as for `learner_factory`.
 
     Raises:
-        UnknownNameError: No such setting.
+        UnknownNameError: There is no such setting.
         OptionError: A value is impossible, or the library is not installed.
     """
     return asdict(_baseline_config(name, given))
@@ -163,7 +164,7 @@ def library_of(name: str) -> str:
 
 
 def is_installed(name: str) -> bool:
-    """Return whether all that a learner imports is installed; it is imported to find out."""
+    """Return true if the libraries of a learner are installed; the check imports them."""
     if name in BASELINES:
         try:
             load_baseline(name)
@@ -177,7 +178,7 @@ def _library(name: str) -> str:
 
 
 def load_baseline(name: str) -> ModuleType:
-    """Return the module of a baseline; the same object at each call.
+    """Return the module of a baseline; all calls return the same object.
 
     Raises:
         OptionError: Its library is not installed.
@@ -191,7 +192,7 @@ def load_baseline(name: str) -> ModuleType:
     if spec is None or spec.loader is None or not path.is_file():
         raise OptionError(f"learner {name!r}: {path} is missing; install the package again")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module  # dataclasses look their module up
+    sys.modules[module_name] = module  # dataclasses look their module up here
     try:
         spec.loader.exec_module(module)
     except BaseException as error:
@@ -215,7 +216,7 @@ def baselines_folder() -> Path:
 
 
 def _configured(kind: Any, preset: Mapping[str, Any], given: Sequence[str], name: str) -> Any:
-    """Make the settings of a learner: those of its name, then those of the user."""
+    """Make the settings of a learner from those that its name fixes and those of the user."""
     hints = get_type_hints(kind)
     names = [item.name for item in fields(kind) if item.name not in preset]
     values = dict(preset)

@@ -1,8 +1,8 @@
 """Deep Q-learning for all intersections at once: a network for each, or one that they share.
 
-Mnih et al. 2015 with double Q-learning (van Hasselt et al. 2016), a softly updated target network
-and exploration in bouts. It is the learner of the UGAT paper, made stronger: with a weak learner,
-under-training looks like a gap between domains.
+The learner follows Mnih et al. 2015, with double Q-learning (van Hasselt et al. 2016), a softly
+updated target network and exploration in bouts. It is stronger than the DQN of the UGAT paper,
+because a policy of a weak learner loses travel time that looks like a gap between domains.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ _KIND = "ugat_marl.dqn"
 _COUNTERS = ("episodes", "decisions", "updates")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 _SCALED = ("mlp", "colight")
-"""Networks whose first layer reads observations and can take the factors of a scale over."""
+"""Networks whose first weights multiply the observation, so that they can absorb its scale."""
 
 
 @dataclass
 class _Tally:
-    """Sums over one episode."""
+    """Sums over the decisions and updates of one episode."""
 
     reward: float = 0.0
     loss: float = 0.0
@@ -58,16 +58,17 @@ class _Tally:
 class StickyExploration:
     """Mix bouts of one exploratory action into greedy actions, independently for every agent.
 
-    A green of 10 s tells little about a phase: most of it is yellow, all-red and starting up. The
-    worth of a phase shows when it is held, so an agent repeats its exploratory action.
+    A phase of 10 s tells little: most of it is yellow, all-red and starting up. The worth of a
+    phase shows in a longer green, so an agent repeats its exploratory action.
 
-    A bout lasts 1 to `longest` decisions (uniform). Bouts begin at a rate that makes `epsilon` the
-    long-run share of *decisions* that are exploratory, for every length of the bouts.
+    A bout lasts 1 to `longest` decisions (uniform), on average m = (1 + longest) / 2. An agent
+    without a bout begins one with chance ``epsilon / (epsilon + m (1 - epsilon))``. So `epsilon` is
+    the share of exploratory *decisions* for every `longest`.
 
     Args:
         agents: Number of agents.
         longest: Longest bout, in decisions; 1 is plain epsilon-greedy.
-        generator: Source of every random choice.
+        generator: Source of all random choices.
     """
 
     def __init__(self, agents: int, longest: int, generator: np.random.Generator) -> None:
@@ -85,7 +86,7 @@ class StickyExploration:
             epsilon: Share of exploratory decisions, 0 to 1.
 
         Returns:
-            The action of every agent; always an allowed one.
+            Action of every agent, ``(agents,)``.
         """
         agents, actions = allowed.shape
         mean_length = (1 + self._longest) / 2
@@ -105,12 +106,12 @@ class StickyExploration:
 class Acting:
     """Networks that choose the actions of a training, always on the CPU.
 
-    Where the learning networks are on the CPU, they choose as well. Where they are on a GPU, a copy
-    chooses, which takes over the weights once they have changed.
+    If the learning networks are on the CPU, they also choose. If they are on a GPU, a copy on the
+    CPU chooses, and takes over their weights after updates.
 
     Args:
         online: The learning networks.
-        weights: Their parameters, as `flatten_parameters` returned them.
+        weights: Parameters of these networks, as `flatten_parameters` returned them.
     """
 
     def __init__(self, online: nn.Module, weights: nn.Parameter) -> None:
@@ -121,7 +122,7 @@ class Acting:
             self._weights = flatten_parameters(self._network)
 
     def network(self, updates: int) -> nn.Module:
-        """Return the networks after `updates` updates."""
+        """Return networks with the weights after `updates` updates."""
         if self._weights is not self._online_weights and self._updates != updates:
             self._weights.data.copy_(self._online_weights.data)
             self._updates = updates
@@ -135,20 +136,20 @@ class Acting:
 class DQN:
     """Learn one Q-network per agent of a parallel environment, or one for all of them.
 
-    It works for any `ParallelEnv` with Box vectors and Discrete actions in which all agents stay to
-    the end; spaces may differ between agents. Episodes that end by truncation are bootstrapped
-    through. The future of a terminated agent counts as zero reward.
+    It works for every `ParallelEnv` with Box vectors and Discrete actions if all agents stay to the
+    end. Spaces may differ between agents. The value after the last decision counts if an episode
+    ends by truncation. A terminated agent has rewards of zero from then on.
 
     Args:
         agents: Names and sizes of the agents; `DQN.of(env)` reads them from an environment.
-        config: Settings.
+        config: Settings; None for the defaults.
         seed: Seed of the initial weights.
-        env_options: Options of the environment the learned policy relies on.
+        env_options: Options of the environment that the learned policy relies on.
         structure: Movements or neighbours for a network other than "mlp"; `DQN.of` reads them.
-        device: Device of the updates; actions are chosen, and transitions kept, on the CPU.
+        device: Device of the updates. Choice of actions and replay memory stay on the CPU.
 
     Raises:
-        OptionError: The network of `config` is not that of `structure`.
+        OptionError: `config` and `structure` name different networks.
     """
 
     def __init__(
@@ -198,11 +199,11 @@ class DQN:
         env_options: Mapping[str, Any] | None = None,
         device: torch.device = CPU,
     ) -> DQN:
-        """Make a learner for the agents of `env`; take its options over if it declares them.
+        """Make a learner for the agents of `env`; without `env_options`, take those of `env`.
 
         Raises:
-            OptionError: `env` has a space this learner cannot use, or no road network where the
-                network needs one.
+            OptionError: `env` has a space that this learner cannot use, or lacks the road network
+                that "frap" or "colight" needs.
         """
         if env_options is None:
             env_options = getattr(env.unwrapped, "env_options", {})
@@ -217,17 +218,17 @@ class DQN:
         seed: int,
         on_episode: EpisodeCallback | None = None,
     ) -> NetworkPolicy:
-        """Train for `episodes` more episodes; continue where the last call ended.
+        """Train for `episodes` more episodes; continue after the last call.
 
-        Every random choice depends on `seed` and the number of episodes so far only, so that one
-        call for four episodes equals two calls for two.
+        Random choices depend only on `seed` and the number of episodes so far. So one call for four
+        episodes equals two calls for two.
 
         Args:
-            env: An environment with the agents of this learner; its state is reset.
-            episodes: Episodes to train.
+            env: An environment with the agents of this learner; it is reset.
+            episodes: Number of episodes.
             seed: Root of the seeds of environment, exploration and replay.
-            on_episode: Called after each episode with its number (from 0, over the learner's life)
-                and ``return`` (sum of the reward, mean over agents), ``loss``, ``q``, ``epsilon``.
+            on_episode: Called after each episode with its number (from 0, over all calls) and
+                ``return`` (sum of the reward, mean over agents), ``loss``, ``q``, ``epsilon``.
 
         Returns:
             The greedy policy at the end.
@@ -251,9 +252,9 @@ class DQN:
     def policy(self) -> NetworkPolicy:
         """Return the current greedy policy; later learning does not change it.
 
-        The policy acts by the target networks, the running mean of the learned ones. Greedy actions
-        of the learned networks swing from episode to episode: on Hangzhou, after 20 to 60 episodes
-        with one seed, their mean travel time was 6 to 26 s worse.
+        The policy uses the target networks, a running mean of the learned ones, because policies of
+        the learned networks vary more from episode to episode. On Hangzhou, after 20 to 60 episodes
+        with one seed, the travel time of the learned networks was 6 to 26 s worse.
         """
         hidden, shared = self.config.hidden, self.config.shared
         weights, options = self._target_weights, self.env_options
@@ -319,7 +320,7 @@ class DQN:
         return self.config.shared or self.config.network != "mlp"
 
     def _measure(self) -> None:
-        """Set the scales of rewards and observations by those of the decisions so far."""
+        """Set the scales of rewards and observations from the decisions so far."""
         config = self.config
         if config.scale_inputs and config.network in _SCALED:
             seen = self._replay.observations()
@@ -332,7 +333,11 @@ class DQN:
         self._centre, self._scale = mean.to(self.device), scale.to(self.device)
 
     def _update(self, generator: torch.Generator) -> tuple[float, float]:
-        """Make one gradient step of all agents; return mean loss and mean Q before it."""
+        """Make one gradient step for all agents; return mean loss and mean Q before it.
+
+        The loss is Huber's of Q(s, a) - y with ``y = r + discount * Q'(s', argmax_a' Q(s', a'))``,
+        where Q' is the target network and r the scaled reward.
+        """
         batch = self._replay.sample(self.config.batch_size, generator)
         batch = batch.scaled(self._inputs).to(self.device)
         with torch.no_grad():
@@ -340,7 +345,7 @@ class DQN:
             best = self._online(batch.next_observation)
             best = best.masked_fill_(~batch.next_allowed, -torch.inf).argmax(-1, keepdim=True)
             future = self._target(batch.next_observation).gather(-1, best).squeeze(-1)
-            # no reward for ever, in the centred and scaled unit
+            # sum of discount^t (0 - centre) scale: rewards of zero for ever, centred and scaled
             nothing = -self._centre * self._scale / (1 - self.config.discount)
             future = torch.where(batch.terminal, nothing, future)
             reward = (batch.reward - self._centre) * self._scale
@@ -349,7 +354,7 @@ class DQN:
         losses = nn.functional.huber_loss(
             chosen, wanted, reduction="none", delta=self.config.huber_delta
         )
-        # the sum over agents keeps networks of their own independent of how many there are
+        # a mean over agents would make the step of each network depend on the number of agents
         losses.mean(dim=1).sum().backward()
         self._adam.step()
         assert self._weights.grad is not None
@@ -376,10 +381,10 @@ class DQN:
         return reward
 
     def save(self, path: Path) -> None:
-        """Write the whole state; a learner that loads it goes on to the same numbers.
+        """Write the whole state; a learner that loads it continues exactly as this one.
 
         Raises:
-            CheckpointError: The networks have diverged (NaN); a file at `path` stays as it was.
+            CheckpointError: The networks have diverged (NaN). An old file at `path` is kept.
         """
         config = self.config
         content = {
@@ -395,11 +400,11 @@ class DQN:
         write_checkpoint(path, _KIND, content)
 
     def load(self, path: Path) -> None:
-        """Restore a saved state; all settings but those of the network remain this learner's own.
+        """Restore a saved state; this learner keeps its own settings.
 
         Raises:
-            CheckpointError: Missing, cut short, not finite, or of other agents or sizes. The
-                learner is left as it was.
+            CheckpointError: The file is missing, cut short, not finite, or belongs to another
+                network or other agents. The learner does not change then.
         """
         content = read_checkpoint(path, _KIND)
         try:

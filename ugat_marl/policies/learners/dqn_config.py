@@ -1,4 +1,4 @@
-"""Settings of the DQN learner, checked when made."""
+"""Settings of the DQN learner; impossible values are refused."""
 
 from __future__ import annotations
 
@@ -9,34 +9,37 @@ from ugat_marl.errors import OptionError
 from ugat_marl.policies.networks.structure import NetworkName
 
 CEILING_DECISIONS = 1_000
-"""How far back a ceiling looks: long enough for a quantile, too short for early exploration."""
+"""Last decisions that a ceiling is measured on.
+
+They are enough for a quantile, and too few to reach back to the exploration at the beginning.
+"""
 
 
 @dataclass(frozen=True)
 class DQNConfig:
     """Settings of DQN.
 
-    Rewards are centred and scaled per agent before learning: the mean and the standard deviation
-    of each agent's rewards over the first `warmup_decisions` are measured once and then frozen, so
-    that targets are of order one whatever the traffic. In episodes without a natural end a constant
-    shift of the reward moves all Q-values alike and changes no decision; where an agent does
-    terminate, the bootstrap value is shifted along. `reward_scale` replaces the measured scale (and
-    the centre, by 0) for all agents.
+    Rewards are centred and scaled for each agent: ``(reward - mean) / deviation``. Mean and
+    standard deviation are measured once, over the first `warmup_decisions`, and then kept. So
+    targets are of order one for any traffic. A constant shift of the reward moves all Q-values
+    alike in episodes without a natural end, and changes no decision. If an agent terminates, its
+    bootstrap value is shifted as well. `reward_scale` replaces the measured scale for all agents,
+    with mean 0.
 
-    Observations are divided, number by number, by the root mean square of what stood there in those
-    decisions: a lane with five vehicles is 0.125 in the observation "count", beside a phase that is
-    1, and its weights would need long to grow.
+    Each number of an observation is divided by its root mean square over the same decisions. The
+    reason is their size: a lane with five vehicles is 0.125 in the observation "count", the current
+    phase is 1, and the weights of the lane would grow slowly.
 
     The defaults were chosen on one network only (Hangzhou, one intersection, 60 episodes of 360
-    decisions, one or two seeds each): longer bouts of exploration, one-step targets and a short
-    decay learned faster; hidden layers of 64 were no better than of 48.
+    decisions, one or two seeds each). Longer bouts of exploration, one-step targets and a short
+    decay learned faster. Hidden layers of 64 were no better than layers of 48.
 
     Attributes:
         hidden: Sizes of the hidden layers of every network.
         learning_rate: Step size of Adam.
         discount: Weight of the next decision's value (gamma), 0.95-0.98 in the literature.
         batch_size: Transitions per update and agent.
-        replay_capacity: Decisions remembered.
+        replay_capacity: Decisions that the replay memory holds.
         warmup_decisions: Decisions before the first update.
         update_every: Decisions from one update to the next.
         target_rate: Share of the online network mixed into the target network at every update.
@@ -45,20 +48,19 @@ class DQNConfig:
         epsilon_decay_decisions: Decisions over which epsilon falls, linearly.
         sticky_decisions: Longest bout of one exploratory action, in decisions; 1 is plain
             epsilon-greedy.
-        huber_delta: Errors beyond this (in scaled reward) count linearly.
-        reward_scale: Factor on all rewards; None measures it per agent.
-        scale_inputs: Whether observations are scaled; not those of "frap".
-        shared: One network for all agents, told for which of them it computes, instead of one for
-            each; it learns from the transitions of all.
-        network: What computes Q. "mlp": layers over an agent's observation. "frap": phases that
-            compete with the demand of their movements (Zheng et al. 2019), one network for all
+        huber_delta: Errors larger than this (in scaled reward) count linearly.
+        reward_scale: Factor on all rewards; None measures it for each agent.
+        scale_inputs: Scale observations (those of "frap" never).
+        shared: One network for all agents instead of one for each. It learns from the transitions
+            of all agents and has a bias for each.
+        network: Network that computes Q. "mlp": layers over an agent's observation. "frap": phases
+            that compete with the demand of their movements (Zheng et al. 2019), one network for all
             intersections; `hidden` is the size of a demand and that of a pair of phases. "colight":
             attention to the neighbours (Wei et al. 2019), one network for all intersections;
             `hidden` is the size of an embedding and that of the layer after the attention.
-        ceiling: Quantile of each number of an observation, over the last `CEILING_DECISIONS`
-            decisions in training, below which policies hold it: they act in a fuller street than
-            they know as in the fullest they know, and not by what a network makes of numbers it
-            has never had. None gives policies observations as they are.
+        ceiling: Quantile at which policies cut each number of an observation. It is measured over
+            the last 1000 decisions of training. In a fuller street than in training, a policy then
+            acts as in the fullest street it knows. None cuts nothing.
     """
 
     hidden: tuple[int, ...] = (48, 48)
@@ -81,7 +83,7 @@ class DQNConfig:
     ceiling: float | None = None
 
     def __post_init__(self) -> None:
-        # a list, as JSON has it, would differ from the tuple of a checkpoint
+        # JSON gives a list, which would differ from the tuple of a checkpoint
         object.__setattr__(self, "hidden", tuple(self.hidden))
         for name in (
             "batch_size",
@@ -124,6 +126,6 @@ class DQNConfig:
             raise OptionError(f"DQNConfig.{name} = {getattr(self, name)!r}: must be {allowed}")
 
     def epsilon(self, decisions: int) -> float:
-        """Share of exploratory decisions after `decisions` decisions."""
+        """Return the share of exploratory decisions after `decisions` decisions."""
         progress = min(1.0, decisions / self.epsilon_decay_decisions)
         return self.epsilon_start + progress * (self.epsilon_end - self.epsilon_start)

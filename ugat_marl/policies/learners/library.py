@@ -1,10 +1,8 @@
-"""Base of the learners of other libraries: environment, policies, checkpoints.
+"""Base of the learners that use other libraries: environment, policies, checkpoints.
 
-That is the environment they are given, the policies they are read out as, and their checkpoints.
-
-A library knows nothing of this suite's episodes, seeds and files. `TrainingEnv` stands between: it
-seeds each episode by its number, scales what is seen and paid, refuses forbidden actions and
-reports returns.
+The libraries do not know the episodes, seeds and files of this package. `LibraryLearner` saves and
+loads their state. `TrainingEnv` seeds each episode by its number, scales observations and rewards,
+refuses forbidden actions and reports returns. `policy_of` makes a policy from their networks.
 """
 
 from __future__ import annotations
@@ -35,11 +33,11 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 
 
 class LibraryLearner(abc.ABC):
-    """A learner whose work a library does; a subclass adds the library's objects and states.
+    """A learner that uses a library; a subclass adds the library's objects and states.
 
     Args:
-        env: Its agents are learned for; nothing is played.
-        kind: Says what a checkpoint is of.
+        env: Environment with the agents of the learner; it is not reset.
+        kind: Kind that is written into a checkpoint and compared at loading.
     """
 
     def __init__(self, env: AnyParallelEnv, kind: str) -> None:
@@ -58,12 +56,14 @@ class LibraryLearner(abc.ABC):
         seed: int,
         on_episode: EpisodeCallback | None = None,
     ) -> NetworkPolicy:
-        """Train for `episodes` more episodes; what it draws depends on `seed` and their number.
+        """Train for `episodes` more episodes.
+
+        Random choices depend only on `seed` and the number of episodes so far.
 
         Raises:
             OptionError: `env` has other agents or spaces than this learner.
             EpisodeError: An agent left before the others, or a reward is not finite.
-            ActionError: The library chose what an agent may not do.
+            ActionError: The library chose an action that the mask forbids.
         """
         if AgentSet.of(env) != self.agents:
             raise OptionError(
@@ -80,7 +80,7 @@ class LibraryLearner(abc.ABC):
         return policy_of(self.agents, self._actors(), self.env_options, self.inputs.factors)
 
     def save(self, path: Path) -> None:
-        """Write the whole state, from which `load` goes on to the same numbers."""
+        """Write the whole state; a learner that loads it continues exactly as this one."""
         policy = self.policy()
         content = {
             **header(self.agents, policy.hidden, self.env_options, policy.shared),
@@ -92,7 +92,11 @@ class LibraryLearner(abc.ABC):
         write_checkpoint(path, self._kind, content)
 
     def load(self, path: Path) -> None:
-        """Restore what `save` wrote; a `CheckpointError` if that is of another learner."""
+        """Restore the state from a file that `save` wrote.
+
+        Raises:
+            CheckpointError: The file is broken, or belongs to another learner.
+        """
         content = read_checkpoint(path, self._kind)
         try:
             agents, *_ = parse_header(content)
@@ -115,7 +119,7 @@ class LibraryLearner(abc.ABC):
 
     @abc.abstractmethod
     def _train(self, env: TrainingEnv, episodes: int, seed: int) -> None:
-        """Play exactly `episodes` episodes of `env`, and learns from them."""
+        """Play exactly `episodes` episodes of `env` and learn from them."""
 
     @abc.abstractmethod
     def _actors(self) -> Sequence[Sequence[nn.Linear]]:
@@ -131,20 +135,21 @@ class LibraryLearner(abc.ABC):
 
     @abc.abstractmethod
     def _restore(self, networks: Mapping[str, Tensor], rest: Mapping[str, Any]) -> None:
-        """Take up what `_networks` and `_rest` gave; the weights have the right shapes."""
+        """Restore a state that `_networks` and `_rest` returned; the shapes are checked before."""
 
 
 class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
-    """Environment for a library, whose calls of `reset` have no seed.
+    """Environment for a library that calls `reset` without a seed.
 
-    What is seen and paid comes back scaled, so that observations may leave their bounds.
+    Observations and rewards are scaled, so observations may leave the bounds of their space.
 
     Args:
         env: The environment.
-        learner: Its `episodes` go up with each one that ends, and so does what it knows of rewards,
-            observations and states.
+        learner: Learner whose count of episodes, and whose scales of rewards, observations and
+            states, are updated.
         seed: Root of the seeds of all episodes.
-        on_episode: Called after each episode with its number and ``return``.
+        on_episode: Called after each episode with its number and ``return`` (sum of the unscaled
+            reward, mean over agents).
     """
 
     def __init__(
@@ -163,7 +168,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         self._allowed: NDArray[np.bool_] | None = None
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
-        """Start the next episode; its number decides the seed, whatever is given."""
+        """Start the next episode; its number decides the seed, and the argument is ignored."""
         seed = derive_seed(self._seed, "learner", "episode", self._learner.episodes)
         observations, infos = self.env.reset(seed=seed, options=options)
         self._allowed = self._agents.masks(infos)
@@ -171,8 +176,8 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         return self._seen(observations), infos
 
     def step(self, actions: dict[str, Any]) -> StepResult:
-        """Execute actions; rewards come back centred and scaled."""
-        if not self.env.agents or self._allowed is None:  # the environment itself says so
+        """Execute actions; return scaled observations, and rewards centred and scaled."""
+        if not self.env.agents or self._allowed is None:  # it raises its own error
             return self.env.step(actions)
         for agent, allowed in zip(self._agents.names, self._allowed, strict=True):
             action = int(actions[agent])
@@ -203,14 +208,17 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         return self.env.state() * self._learner.states.factors
 
     def _note(self, observations: dict[str, Any]) -> None:
-        """Count observations in; not those of `reset`, which libraries call as they like."""
+        """Add observations to the scales.
+
+        Those of `reset` are left out, because libraries differ in how often they call it.
+        """
         learner = self._learner
         learner.inputs.note(self._agents.stack(observations), self._places)
         if learner.states.sums.size:
             learner.states.note(self.env.state()[None])
 
     def _seen(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Return the observations, scaled."""
+        """Return the observations scaled."""
         rows = self._agents.stack(observations) * self._learner.inputs.factors
         sizes = zip(self._agents.names, self._agents.observation_sizes, strict=True)
         return {name: rows[row, :size] for row, (name, size) in enumerate(sizes)}
@@ -226,29 +234,29 @@ def policy_of(
 
     Args:
         agents: The agents it acts for.
-        actors: The layers of perceptrons with ReLU: of one for each agent, which reads its own
-            observation, zeros behind it or not; or of one for all, which reads an observation
+        actors: Layers of perceptrons with ReLU. Either one perceptron for each agent, which reads
+            its observation, padded with zeros or not; or one for all, which reads an observation
             padded to the widest, then a one-hot of the agent.
-        env_options: Options of the environment the policy relies on.
-        factors: What the perceptrons' observations were multiplied with, ``(widest_observation,)``;
-            the policy's are not.
+        env_options: Options of the environment that the policy relies on.
+        factors: Scale of the observations that the perceptrons read, ``(widest_observation,)``.
+            The policy reads unscaled observations.
 
     Raises:
-        ValueError: The layers are of other sizes.
+        ValueError: The layers have other sizes.
     """
     width = agents.widest_observation
     shared = len(actors) == 1 and actors[0][0].in_features == width + len(agents)
     hidden = tuple(layer.out_features for layer in actors[0][:-1])
     with torch.no_grad():
         parts = _shared_parts(agents, actors[0]) if shared else _own_parts(agents, actors)
-        if factors is not None:  # (..., observation, hidden)
+        if factors is not None:  # W (x * factors) = (W * factors) x; W is (..., n_in, n_out)
             parts[0] = parts[0] * torch.from_numpy(factors)[:, None]
         parameters = torch.cat([part.reshape(-1) for part in parts])
     return NetworkPolicy(agents, hidden, parameters, env_options, shared)
 
 
 def _shared_parts(agents: AgentSet, layers: Sequence[nn.Linear]) -> list[Tensor]:
-    """Order parameters as `SharedMLP` does: the weights of the one-hot are a bias of each agent."""
+    """Order parameters as `SharedMLP`: the weights of the one-hot become biases of the agents."""
     width = agents.widest_observation
     first, *rest = layers
     parts = [first.weight[:, :width].T, first.weight[:, width:].T + first.bias]
@@ -258,7 +266,7 @@ def _shared_parts(agents: AgentSet, layers: Sequence[nn.Linear]) -> list[Tensor]
 
 
 def _own_parts(agents: AgentSet, actors: Sequence[Sequence[nn.Linear]]) -> list[Tensor]:
-    """Order parameters as `BatchedMLP` does: all agents' weights of a layer, then their biases."""
+    """Order parameters as `BatchedMLP`: all agents' weights of a layer, then their biases."""
     if len(actors) != len(agents):
         raise ValueError(f"{len(actors)} networks for {len(agents)} agents")
     parts: list[Tensor] = []
@@ -285,7 +293,7 @@ def perceptron(n_in: int, hidden: Sequence[int], n_out: int) -> nn.Sequential:
 
 
 def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
-    """Make a layer with copies of weights ``(n_out, n_in)``; no random number is drawn."""
+    """Make a layer with copies of weights ``(n_out, n_in)`` and bias; draw no random number."""
     layer: Any = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
     layer.weight.data.copy_(weight.detach())
     layer.bias.data.copy_(bias.detach())
@@ -298,14 +306,17 @@ def linear_layers(network: nn.Module) -> list[nn.Linear]:
 
 
 def check_settings(config: Any, *shares: str) -> None:
-    """Refuse impossible settings: whole numbers begin at 1, others at 0, and shares end at 1.
+    """Refuse impossible settings.
+
+    Whole numbers and tuples begin at 1, other numbers at 0. Shares are at most 1, and ``discount``
+    is below 1.
 
     Args:
-        config: A dataclass; what is neither a number nor a tuple of numbers is left alone.
-        shares: Names of settings that are at most 1, beside ``discount`` and ``gae_lambda``.
+        config: A dataclass; settings that are true, false or text are not checked.
+        shares: Names of settings that are at most 1, besides ``discount`` and ``gae_lambda``.
 
     Raises:
-        OptionError: Names the first setting that is out of its range.
+        OptionError: A setting is out of its range; the message names the first.
     """
     for name, value in vars(config).items():
         if isinstance(value, bool | str):
@@ -320,9 +331,10 @@ def check_settings(config: Any, *shares: str) -> None:
 
 
 def decisions_of(env: AnyParallelEnv) -> int:
-    """Return the decisions of an episode: by its scenario, or counted with random actions.
+    """Return the number of decisions of an episode.
 
-    Libraries that learn from roll-outs of one length need it before the first.
+    The scenario gives it; without a scenario, one episode of random actions is counted. Libraries
+    that learn from roll-outs of fixed length need it before training.
     """
     scenario = getattr(env, "scenario", None)
     if scenario is not None:
@@ -344,7 +356,7 @@ def roll_out_length(decisions: int, least: int) -> int:
 
 @contextlib.contextmanager
 def kept_generators() -> Iterator[None]:
-    """Leave the global random generators, which libraries draw from, as they were."""
+    """Restore the global random generators at the end, because libraries draw from them."""
     before = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     try:
         yield
@@ -363,13 +375,13 @@ def seed_generators(seed: int, *path: int | str) -> None:
 
 
 def _state_size(env: AnyParallelEnv) -> int:
-    """Return the length of `state()`; 0 without one."""
+    """Return the length of `state()`; 0 for an environment without it."""
     space: Any = getattr(env, "state_space", None)
     return 0 if space is None else int(space.shape[0])
 
 
 def _require_like(path: Path, found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    """Compare names and shapes before anything is overwritten."""
+    """Refuse weights of other names or shapes, before anything is overwritten."""
     shapes = [{name: tuple(tensor.shape) for name, tensor in one.items()} for one in (found, own)]
     if shapes[0] != shapes[1]:
         differing = sorted(

@@ -15,15 +15,15 @@ from ugat_marl.envs import AgentSet, Mask
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions of the same time indices for all agents.
+    """Transitions of all agents at the same decisions.
 
     Attributes:
-        observation: ``(agents, batch, widest_observation)``.
-        action: The agents' own actions, ``(agents, batch)``.
-        reward: Unscaled, ``(agents, batch)``.
-        terminal: True where no future follows, ``(agents, batch)``; truncation is not terminal.
-        next_observation: Like `observation`.
-        next_allowed: Actions allowed afterwards, ``(agents, batch, most_actions)``.
+        observation: Observations ``(agents, batch, widest_observation)``.
+        action: Actions of the agents, ``(agents, batch)``.
+        reward: Unscaled rewards, ``(agents, batch)``.
+        terminal: True where an agent terminated, ``(agents, batch)``; truncation is not terminal.
+        next_observation: Observations after the action, in the shape of `observation`.
+        next_allowed: Actions allowed after the action, ``(agents, batch, most_actions)``.
     """
 
     observation: Tensor
@@ -34,21 +34,21 @@ class Batch:
     next_allowed: Tensor
 
     def scaled(self, factors: Tensor) -> Batch:
-        """Return a batch with observations times factors ``(agents, 1, widest_observation)``."""
+        """Return the batch with observations times factors ``(agents, 1, widest_observation)``."""
         seen, then = self.observation * factors, self.next_observation * factors
         return replace(self, observation=seen, next_observation=then)
 
     def to(self, device: torch.device) -> Batch:
-        """Return the batch on a device; the batch itself if it is there."""
+        """Return the batch on a device; the batch itself if it is there already."""
         if self.reward.device == device:
             return self
         return Batch(**{name: column.to(device) for name, column in vars(self).items()})
 
 
 class Replay:
-    """A ring of the last `capacity` decisions of all agents, layout ``(agents, capacity, ...)``.
+    """A ring of the last `capacity` decisions of all agents, as ``(agents, capacity, ...)``.
 
-    It stays on the CPU wherever is learnt: it is large, and an update needs little of it.
+    It stays on the CPU also for updates on a GPU: it is large, and an update needs little of it.
     """
 
     def __init__(self, agents: AgentSet, capacity: int) -> None:
@@ -76,7 +76,7 @@ class Replay:
         next_observation: NDArray[np.float32],
         next_allowed: Mask,
     ) -> None:
-        """Store one decision of all agents; the oldest one goes when the ring is full."""
+        """Store one decision of all agents; a full ring loses its oldest decision."""
         at, columns = self.added % self.capacity, self._columns
         columns.observation[:, at] = torch.from_numpy(observation)
         columns.action[:, at] = torch.from_numpy(action)
@@ -100,7 +100,10 @@ class Replay:
         return self._columns.observation[:, : len(self)]
 
     def recent(self, decisions: int) -> Tensor:
-        """Return observations of the last decisions, ``(agents, decisions, ...)``, or of all."""
+        """Return the last observations, ``(agents, n, widest_observation)``.
+
+        n is `decisions`, or the number of stored decisions if that is smaller.
+        """
         first = max(0, self.added - min(decisions, self.capacity))
         at = torch.arange(first, self.added) % self.capacity
         return self._columns.observation.index_select(1, at)
@@ -115,7 +118,7 @@ class Replay:
         return {name: rows.clone() for name, rows in self.rows(self.added).items()}
 
     def restore(self, state: Mapping[str, Tensor], added: int) -> None:
-        """Put back what `state` gave, with the number of decisions added until then."""
+        """Restore rows that `state` returned, and the number of decisions added until then."""
         self.added = added
         for name, rows in self.rows(added).items():
             rows.copy_(state[name])

@@ -1,8 +1,8 @@
-"""Rewards and observations of order one, whatever the traffic and the units.
+"""Scaling of rewards and observations to order one, for any traffic and unit.
 
-Learners of baselines/ see both scaled by what they have had so far. That is not a nicety: a lane
-with five vehicles is 0.125 in the observation `count`, beside a phase that is 1, and a network
-needs long to find out that the small numbers are what matters.
+Learners need it: a lane with five vehicles is 0.125 in the observation `count`, the current phase
+is 1, and a network learns slowly from the small numbers. The learners of baselines/ scale by all
+rewards and observations so far; DQN measures its scale once.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from torch import Tensor
 from ugat_marl.envs import AgentSet
 
 LEAST = 0.01
-"""A number that was always smaller than this is scaled as if it had been this."""
+"""Smallest root mean square by which a number is divided."""
 
 
 class RewardScale:
-    """Centre and scale each agent's rewards by mean and deviation of all it had so far.
+    """Centre and scale each agent's rewards by mean and deviation of its rewards so far.
 
     Args:
-        agents: Their number.
+        agents: Number of agents.
 
     Attributes:
-        sums: Number, sum and sum of squares of the rewards of each agent, ``(3, agents)``.
+        sums: Count, sum and sum of squares of the rewards of each agent, ``(3, agents)``.
     """
 
     def __init__(self, agents: int) -> None:
         self.sums = np.zeros((3, agents))
 
     def __call__(self, rewards: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Scale the rewards of one decision, ``(agents,)``, after counting them in."""
+        """Add the rewards of one decision to the sums and return them scaled, ``(agents,)``."""
         paid = rewards.astype(np.float64)
         self.sums += paid ** np.arange(3)[:, None]
         _, mean, square = self.sums / self.sums[0]
@@ -41,16 +41,16 @@ class RewardScale:
 
 
 class InputScale:
-    """Divide each number of a vector by the root mean square of its place so far.
+    """Divide each number of a vector by its root mean square so far.
 
-    Zero stays zero, so that padding does; and a factor can be moved into the first layer of a
-    network, which then reads vectors as they are.
+    Zero stays zero, so padding does not change. The factors can be moved into the first layer of a
+    network, which then reads unscaled vectors.
 
     Args:
-        size: Of the vectors.
+        size: Length of the vectors.
 
     Attributes:
-        sums: How many numbers stood in each place, and the sum of their squares, ``(2, size)``.
+        sums: For each place, the count of numbers and the sum of their squares, ``(2, size)``.
     """
 
     def __init__(self, size: int) -> None:
@@ -64,22 +64,27 @@ class InputScale:
         return np.where(count > 0, 1 / np.maximum(size, LEAST), 1.0).astype(np.float32)
 
     def note(self, rows: NDArray[np.float32], there: NDArray[np.bool_] | None = None) -> None:
-        """Count vectors ``(n, size)`` in, all of them or the numbers that are `there`."""
+        """Add vectors to the sums.
+
+        Args:
+            rows: Vectors ``(n, size)``.
+            there: Mask ``(n, size)`` of the numbers to add; None adds all.
+        """
         squares = rows.astype(np.float64) ** 2
         exist = np.ones(rows.shape, dtype=np.bool_) if there is None else there
         self.sums += exist.sum(0), (squares * exist).sum(0)
 
 
 def input_factors(observations: Tensor, agents: AgentSet, pooled: bool) -> Tensor:
-    """Return one over the root mean square of each number of the agents' observations.
+    """Return 1 / root mean square of each number of the agents' observations.
 
     Args:
-        observations: ``(agents, n, widest_observation)``.
-        agents: Whose they are.
-        pooled: Whether all agents with a number at a place have one factor there.
+        observations: Observations padded with zeros, ``(agents, n, widest_observation)``.
+        agents: Agents of the observations.
+        pooled: True for one factor per place, from the observations of all agents.
 
     Returns:
-        ``(agents, widest_observation)``; 1 where an agent has no number.
+        Factors ``(agents, widest_observation)``; 1 where an agent has no number.
     """
     own = torch.from_numpy(places(agents))
     square = observations.square().mean(1) * own
@@ -89,23 +94,23 @@ def input_factors(observations: Tensor, agents: AgentSet, pooled: bool) -> Tenso
 
 
 def places(agents: AgentSet) -> NDArray[np.bool_]:
-    """Return a mask of each agent's own numbers in padded observations."""
+    """Return a mask of each agent's own numbers, ``(agents, widest_observation)``."""
     return np.arange(agents.widest_observation) < np.array(agents.observation_sizes)[:, None]
 
 
 def ceilings(seen: Tensor, quantile: float) -> Tensor:
     """Return a quantile over time of each number of an observation.
 
-    A number that is so rarely more than its least (a phase hardly ever chosen) is held by its
-    greatest instead, since held by the quantile it would say nothing any more.
+    If the quantile equals the minimum (as for a phase that is hardly ever chosen), return the
+    maximum instead: cut to the minimum, the number would be constant.
 
     Args:
         seen: Observations ``(agents, time, widest_observation)``.
-        quantile: The share.
+        quantile: Level of the quantile, in (0, 1].
 
     Returns:
-        ``(agents, widest_observation)``.
+        Ceilings ``(agents, widest_observation)``.
     """
-    # not torch's: it refuses more than 16 million numbers
+    # numpy's quantile, because torch's refuses more than 16 million numbers
     level = torch.from_numpy(np.quantile(seen.numpy(), quantile, axis=1).astype(np.float32))
     return torch.where(level > seen.amin(dim=1), level, seen.amax(dim=1))

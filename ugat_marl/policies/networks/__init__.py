@@ -1,5 +1,5 @@
 """Networks that map observations to values of actions, for all intersections at once.
 
-`batched` holds perceptrons, `frap` and `colight` networks from the literature, `structure` the
-plain numbers about intersections that these two need, and `q_network` builds one by its name.
+`batched` holds perceptrons. `frap` and `colight` hold networks from the literature. `structure`
+holds the facts about intersections that these two need. `q_network` builds a network by its name.
 """

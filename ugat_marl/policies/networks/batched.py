@@ -1,8 +1,8 @@
 """Perceptrons for many intersections at once: one for each, or one that all share.
 
-Intersections differ in size. Their tensors are padded to a common size, so that one batched product
-serves all of them. A padded input is zero, and the reader masks padded outputs: no intersection
-sees another one's numbers.
+Intersections differ in size. Their tensors are padded to a common size, so one batched product
+serves all of them. Padded inputs are zero, and the caller masks padded outputs. No intersection
+sees the numbers of another.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from torch import Tensor, nn
 class BatchedLinear(nn.Module):
     """One affine map per intersection, computed together.
 
-    Weights have shape ``(agents, n_in, n_out)``, biases ``(agents, 1, n_out)``. Initialised like
-    `torch.nn.Linear`, with the fan-in of each agent's own (unpadded) input.
+    Weights have shape ``(agents, n_in, n_out)``, biases ``(agents, 1, n_out)``. The initial weights
+    are drawn as in `torch.nn.Linear`, with the fan-in of each agent's own (unpadded) input.
 
     Args:
-        fan_in: Input size of each agent, length ``agents``; the padded size is its maximum.
-        n_out: Output size, shared.
+        fan_in: Input size of each agent; the padded size is the maximum.
+        n_out: Output size, the same for all agents.
         generator: Source of the initial weights.
     """
 
@@ -47,7 +47,7 @@ class BatchedMLP(nn.Module):
     Args:
         fan_in: Input size of each agent.
         hidden: Sizes of the hidden layers.
-        n_out: Output size (of the largest agent; the caller masks the rest).
+        n_out: Output size of the agent with the most actions; the caller masks the rest.
         generator: Source of the initial weights.
     """
 
@@ -69,18 +69,18 @@ class BatchedMLP(nn.Module):
 
 
 class SharedMLP(nn.Module):
-    """One multi-layer perceptron with ReLU for all agents, told for which of them it computes.
+    """One multi-layer perceptron with ReLU for all agents; its first layer has a bias per agent.
 
-    A one-hot of the agent appended to its observation (Gupta, Egorov, Kochenderfer 2017; Terry et
-    al. 2020) adds one row of the first layer's weights to its output. That row is kept as the
-    agent's own bias of that layer, which saves the product. The rows begin alike: agents that
-    observe the same begin with the same Q, and differ once their rewards do.
+    The bias tells the network which agent it computes for. It replaces a one-hot of the agent
+    behind the observation (Gupta, Egorov, Kochenderfer 2017; Terry et al. 2020): such a one-hot
+    adds one row of weights to the output of the first layer, and the bias is that row. All biases
+    begin equal, so agents with equal observations begin with equal Q.
 
     Args:
         agents: Number of agents.
-        n_in: Input size, of the widest observation.
+        n_in: Size of the widest observation.
         hidden: Sizes of the hidden layers.
-        n_out: Output size, of the largest agent.
+        n_out: Output size of the agent with the most actions.
         generator: Source of the initial weights.
     """
 
@@ -110,13 +110,16 @@ class SharedMLP(nn.Module):
 
 
 def mask_of(sizes: Sequence[int]) -> Tensor:
-    """Boolean ``(agents, max(sizes))``, true where an agent's own entries are."""
+    """Return a mask ``(agents, max(sizes))``, true for an agent's own entries."""
     return torch.arange(max(sizes))[None, :] < torch.tensor(list(sizes))[:, None]
 
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Run torch on one thread: products this small lose by being split, sums keep their order."""
+    """Run torch on one thread.
+
+    Products this small are slower on several threads, and sums keep their order on one.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""CoLight: an intersection attends to those around it."""
+"""CoLight: an intersection attends to its neighbours."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ugat_marl.envs import AgentSet
 from ugat_marl.policies.networks.batched import BatchedLinear, SharedMLP, mask_of
 
 HEADS = 5
-"""Heads of attention, the number Wei et al. found best."""
+"""Number of attention heads; Wei et al. found it best."""
 
 HEAD_SIZE = 16
 """Length of a query, a key and a value of one head."""
@@ -21,18 +21,19 @@ class CoLight(nn.Module):
     """One network of attention to the neighbours for all intersections.
 
     Wei et al. 2019 ("CoLight: Learning Network-level Cooperation for Traffic Signal Control",
-    CIKM). Every observation is embedded. In each head the query of an intersection is compared
-    with the keys of itself and of its neighbours; their values are averaged with the softmax of
-    these scores, the heads with equal weights, and two layers make Q of the average. So Q depends
-    on what the neighbours observe at the same decision, and not on their order.
+    CIKM). Every observation x_i is embedded as e_i. In each head, an intersection i attends to the
+    set N(i) of itself and its neighbours: ``s_i = sum_j softmax_j(q_i . k_j) v_j`` for j in N(i),
+    with queries q, keys k and values v linear in e. The mean of s_i over the heads passes through
+    two layers to Q. So Q depends on what the neighbours observe at the same decision, but not on
+    their order.
 
-    It differs from the paper in the embedding, whose bias is each agent's own, as in `SharedMLP`:
-    intersections whose lanes are numbered otherwise can then be told apart. An intersection has
-    the neighbours it has, not always four, and their number is not filled up with distant ones.
+    Two things differ from the paper. The embedding has a bias for each agent, as in `SharedMLP`, so
+    that intersections with differently numbered lanes can be told apart. The number of neighbours
+    is not fixed at four: no distant intersections are added.
 
     Args:
         agents: Sizes of the agents.
-        neighbours: For each agent the positions of those it attends to beside itself.
+        neighbours: For each agent, the positions of its neighbours among the agents.
         hidden: Size of an embedding, and of the layer after the attention.
         generator: Source of the initial weights.
     """
@@ -55,7 +56,7 @@ class CoLight(nn.Module):
         self.register_buffer("around", around, persistent=False)
         self.register_buffer("absent", ~present[:, :, None, None], persistent=False)
         self.embedding = SharedMLP(len(agents), agents.widest_observation, (), embedding, generator)
-        # queries, keys and values of all heads in one product
+        # one product for queries, keys and values of all heads is faster than three
         self.heads = BatchedLinear([embedding], 3 * HEADS * HEAD_SIZE, generator)
         self.joint = BatchedLinear([HEAD_SIZE], joint, generator)
         self.readout = BatchedLinear([joint], agents.most_actions, generator)
@@ -74,6 +75,6 @@ class CoLight(nn.Module):
     def _around(self, own: Tensor) -> Tensor:
         """Gather rows of each agent and its neighbours, ``(agents, 1 + most neighbours, ...)``.
 
-        Rows without a neighbour hold somebody's numbers; their share is zero.
+        Rows without a neighbour hold the numbers of agent 0; their share is zero.
         """
         return own.index_select(0, self.around.flatten()).unflatten(0, self.around.shape)

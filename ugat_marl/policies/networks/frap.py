@@ -1,4 +1,4 @@
-"""FRAP: phases compete, pair by pair, with the demand of the movements they serve."""
+"""FRAP: phases compete in pairs; each enters with the demand of the movements it serves."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from ugat_marl.policies.networks.structure import Junction
 
 
 class FRAP(nn.Module):
-    """One network of phase competition for all intersections, whatever their shape.
+    """One network of phase competition for all intersections.
 
-    Zheng et al. 2019 ("Learning Phase Competition for Traffic Signal Control", CIKM), shared by a
-    whole network as in MPLight (Chen et al. 2020, AAAI). The demand of a movement is computed from
-    its traffic and whether it has green; that of a phase is the sum over its movements. A pair of
-    phases (p, q) is described by both demands and by whether they share a movement; from that
-    comes a score of p against q, and Q of p is the mean score against all others. So Q follows when
-    phases or movements are numbered otherwise, and nothing is kept of single intersections.
+    Zheng et al. 2019 ("Learning Phase Competition for Traffic Signal Control", CIKM). One network
+    serves all intersections, as in MPLight (Chen et al. 2020, AAAI). The demand of a movement is
+    computed from its traffic and its share of green. The demand d_p of a phase p is the sum over
+    its movements. With ``z_pq = ReLU(W [d_p, d_q] + b)``, Q of p is the mean over the other phases
+    q of ``w_pq . z_pq``, plus one constant. The weights w_pq are one of two learned rows: one for
+    pairs of phases that share a movement, one for the others. So Q does not depend on the numbering
+    of phases or movements, and no weight belongs to a single intersection.
 
-    It differs from the paper where intersections differ: scores are averaged, not summed, so that
-    two and eight phases have values of one size, and a movement counts by the share of its links
-    with green. What relations are embedded into, and the layer that joins it with the demands, are
-    here the weights a pair's score is read out with, a row for each of the two relations.
+    Three things differ from the paper. Scores are averaged, not summed, so that intersections with
+    two and with eight phases have values of one size. A movement counts by the share of its links
+    with green. The row w_pq replaces the embedding of the relation of two phases, and the layer
+    that joins this embedding with the demands.
 
     Args:
         agents: Sizes of the agents.
-        junctions: Their intersections.
+        junctions: Movements and phases of the intersections, in the order of the agents.
         hidden: Size of the demand of a movement, and of the layer for pairs.
         generator: Source of the initial weights.
     """
@@ -71,15 +72,15 @@ class FRAP(nn.Module):
         return values.view(agents, phases, batch).transpose(1, 2) + self.level
 
     def pairs(self, inputs: Tensor) -> Tensor:
-        """Each phase beside each other, ``(agents, phases, batch, phases, size)``."""
+        """Return z_pq of all pairs of phases, ``(agents, phases, batch, phases, size)``."""
         demands = self.demands(inputs)
-        # the layer of pairs on (p, q) is that of its halves on p and on q, added
+        # W [d_p, d_q] = W_1 d_p + W_2 d_q: each half is computed once per phase, not per pair
         own, other = self.pair.weight[0].chunk(2)
         first = (demands @ own + self.pair.bias).transpose(1, 2).contiguous().unsqueeze(3)
         return (first + (demands @ other).unsqueeze(1)).relu()
 
     def demands(self, inputs: Tensor) -> Tensor:
-        """Demand of each phase, ``(agents, batch, phases, size)``; zeros where padded."""
+        """Return the demand of each phase, ``(agents, batch, phases, size)``; 0 where padded."""
         agents, batch, _ = inputs.shape
         movements = self.greens.shape[2]
         seen = torch.bmm(inputs, self.inputs).view(1, agents * batch * movements, -1)
@@ -88,9 +89,10 @@ class FRAP(nn.Module):
 
 
 def _inputs(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
-    """Observation to (traffic of each kind, share of green) of each movement, as matrices.
+    """Return matrices from observations to the numbers of each movement.
 
-    ``(agents, widest_observation, movements * numbers)``, zeros where padded.
+    These numbers are the traffic of each kind and the share of green. The shape is ``(agents,
+    widest_observation, movements * numbers)``, 0 where padded.
     """
     most = max(len(junction.movements) for junction in junctions)
     kinds = len(junctions[0].movements[0])
@@ -105,7 +107,10 @@ def _inputs(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
 
 
 def _greens(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
-    """Share of each movement's links that each phase gives green, zeros where padded."""
+    """Return the share of each movement's links that each phase gives green.
+
+    The shape is ``(agents, phases, movements)``, 0 where padded.
+    """
     most = max(len(junction.movements) for junction in junctions)
     found = torch.zeros(len(agents), agents.most_actions, most)
     for row, junction in enumerate(junctions):
@@ -115,7 +120,10 @@ def _greens(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
 
 
 def _rivals(agents: AgentSet) -> Tensor:
-    """Weight of each other phase in the mean over them, ``(agents, phases, phases)``."""
+    """Return the weight of each other phase in the mean, ``(agents, phases, phases)``.
+
+    The weight is ``1 / (phases - 1)``, and 0 for the phase itself and where padded.
+    """
     own = mask_of(agents.action_counts).float()
     pairs = own.unsqueeze(2) * own.unsqueeze(1) * (1 - torch.eye(agents.most_actions))
     return pairs / (own.sum(dim=1) - 1).clamp_min(1)[:, None, None]

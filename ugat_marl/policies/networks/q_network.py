@@ -1,4 +1,4 @@
-"""Networks by their names: a network for every agent, or one that all agents share."""
+"""Networks by name: one for each agent, or one that all agents share."""
 
 from __future__ import annotations
 
@@ -35,7 +35,12 @@ def q_network(
 
 
 class Held(nn.Module):
-    """Networks that read every number capped at its ceiling, ``(agents, width)``."""
+    """A network whose inputs are cut to a ceiling: it reads ``min(observation, ceiling)``.
+
+    Args:
+        network: The network behind.
+        ceiling: Largest value of each number, ``(agents, width)``.
+    """
 
     ceiling: Tensor
 
@@ -50,7 +55,13 @@ class Held(nn.Module):
 
 
 def greedy_actions(network: nn.Module, stacked: Tensor, allowed: Tensor) -> NDArray[np.int64]:
-    """Return the allowed action of highest value for one observation of every agent."""
+    """Return the allowed action of highest value for every agent, ``(agents,)``.
+
+    Args:
+        network: Network from observations to values of actions.
+        stacked: One observation of every agent, ``(agents, widest_observation)``.
+        allowed: Mask of allowed actions, ``(agents, most_actions)``.
+    """
     with torch.no_grad():
         values = network(stacked.unsqueeze(1)).squeeze(1)
         return values.masked_fill(~allowed, -torch.inf).argmax(dim=1).numpy()
@@ -59,8 +70,8 @@ def greedy_actions(network: nn.Module, stacked: Tensor, allowed: Tensor) -> NDAr
 def flatten_parameters(module: nn.Module) -> nn.Parameter:
     """Move all parameters of `module`, and their gradients, into one vector each.
 
-    The module computes on views of the vector, so that the optimiser and the target network's
-    update are single operations over all agents and layers.
+    The module then computes on views of the vector. So the step of the optimiser and the update of
+    the target network are single operations over all agents and layers.
     """
     parameters = list(module.parameters())
     flat = nn.Parameter(nn.utils.parameters_to_vector(parameters).detach().clone())
@@ -75,17 +86,19 @@ def flatten_parameters(module: nn.Module) -> nn.Parameter:
 
 
 def reading_unscaled(network: nn.Module, factors: Tensor) -> Tensor:
-    """Return parameters for unscaled inputs: the output for x is that for ``x * factors`` now.
+    """Return parameters with which the network reads unscaled observations.
+
+    The new network computes for x what `network` computes for ``x * factors``.
 
     Args:
-        network: Its first weights, ``(..., n_in, n_out)``, are those that observations meet.
-        factors: ``(widest_observation,)`` or ``(agents, widest_observation)``; one for all agents
-            where they share a network.
+        network: A network whose first weights, ``(..., n_in, n_out)``, multiply the observation.
+        factors: Scale of the observations: ``(widest_observation,)`` for a network that all agents
+            share, otherwise ``(agents, widest_observation)``.
 
     Returns:
-        All of them as one vector, as `flatten_parameters` orders them.
+        All parameters as one vector, in the order of `flatten_parameters`.
     """
     named = list(network.named_parameters())
-    first = next(name for name, _ in named if name.endswith("weight"))  # (..., n_in, n_out)
+    first = next(name for name, _ in named if name.endswith("weight"))
     factor = factors.unsqueeze(-1)
     return nn.utils.parameters_to_vector(p * factor if name == first else p for name, p in named)

@@ -1,6 +1,6 @@
 """Facts about intersections for FRAP and CoLight: movements and phases, or neighbours.
 
-Plain numbers, so that a saved policy needs neither network file nor environment.
+The facts are plain numbers, so a saved policy needs neither network file nor environment.
 """
 
 from __future__ import annotations
@@ -19,24 +19,25 @@ from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Intersection, Link, Network, turn_of
 
 NetworkName = Literal["mlp", "frap", "colight"]
-"""Networks a policy may have; `q_network` builds them."""
+"""Names of the networks that `q_network` builds."""
 
 MOST_NEIGHBOURS = 5
-"""Intersections that one attends to beside itself, where more are a road away."""
+"""Largest number of neighbours of an intersection in CoLight."""
 
 Places = tuple[int, ...]
-"""Places in an observation whose numbers are added up, or positions of agents."""
+"""Places in an observation whose numbers are summed, or positions of agents."""
 
 
 @dataclass(frozen=True)
 class Junction:
-    """One agent's intersection.
+    """Movements and phases of one agent's intersection.
 
     Attributes:
-        movements: For each movement and each kind of number (vehicles, or halting, vehicles and
-            vehicles beyond), its places in the observation.
+        movements: For each movement and each kind of number, the places in the observation. The
+            kinds are halting vehicles, vehicles, and vehicles on the outgoing lanes for the
+            observation `movements`, and one kind for the others.
         greens: For each phase, the share of each movement's links that it gives green.
-        first_phase: Place in the observation where the one-hot of the current phase begins.
+        first_phase: Place in the observation at which the one-hot of the current phase begins.
     """
 
     movements: tuple[tuple[Places, ...], ...]
@@ -46,11 +47,11 @@ class Junction:
 
 @dataclass(frozen=True)
 class Structure:
-    """A network by its name, and the intersections it computes for.
+    """Name of a network, and the facts about intersections that it needs.
 
     Attributes:
-        network: As in `DQNConfig`; "mlp" needs none.
-        junctions: For "frap", one for each agent, in their order.
+        network: "frap" or "colight"; "mlp" needs no structure.
+        junctions: For "frap", the intersection of each agent, in the order of the agents.
         neighbours: For "colight", the positions of each agent's neighbours among the agents.
     """
 
@@ -63,8 +64,8 @@ class Structure:
         """Read the intersections of an environment of the suite; return None for "mlp".
 
         Raises:
-            OptionError: Another environment, or observations put together by a wrapper where
-                movements are looked for in them.
+            OptionError: The environment is not of the suite, or a wrapper has changed the
+                observations in which "frap" looks for movements.
         """
         if network == "mlp":
             return None
@@ -96,7 +97,7 @@ class Structure:
         """Return the structure itself if it fits the agents.
 
         Raises:
-            ValueError: It is not one of these agents.
+            ValueError: It belongs to other agents.
         """
         if self.network == "mlp" or (self.junctions and self.neighbours):
             raise ValueError(f"network {self.network!r} with movements or neighbours it has not")
@@ -134,7 +135,7 @@ class Structure:
                 raise ValueError(f"{junction} is none of {size} numbers and {actions} phases")
 
     def written(self) -> dict[str, Any]:
-        """Return plain lists, for a checkpoint."""
+        """Return the structure as a dictionary of plain values, for a checkpoint."""
         return asdict(self)
 
 
@@ -146,7 +147,7 @@ def structure_in(content: Mapping[str, Any], agents: AgentSet) -> Structure | No
     """Read the structure in a checkpoint; return None if it holds none.
 
     Raises:
-        ValueError: Broken, or of other agents.
+        ValueError: The structure is broken, or belongs to other agents.
     """
     if "structure" not in content:
         return None
@@ -156,7 +157,7 @@ def structure_in(content: Mapping[str, Any], agents: AgentSet) -> Structure | No
 def _neighbours(
     agents: AgentSet, light_of: Mapping[str, str], roads: Network
 ) -> tuple[Places, ...]:
-    """Return the nearest intersections one road away from each agent's, as positions of agents."""
+    """Return each agent's neighbours, one road away, as positions of agents, nearest first."""
     if {*light_of} != {*agents.names}:
         raise OptionError(
             f"network 'colight' does not know the intersections of {', '.join(agents.names[:4])}; "
@@ -175,7 +176,13 @@ def _neighbours(
 
 
 def _junction(item: Intersection, layout: AgentLayout, halves: bool) -> Junction:
-    """The movements of an intersection; `halves`: halting and moving, and what is beyond, apart."""
+    """Return movements and phases of an intersection.
+
+    Args:
+        item: The intersection.
+        layout: Order of the numbers in its observation.
+        halves: True if the observation holds halting vehicles, vehicles and outgoing lanes apart.
+    """
     movements: dict[tuple[str, str], list[Link]] = {}
     for link in item.links:
         movements.setdefault((link.from_edge, turn_of(link)), []).append(link)
@@ -185,7 +192,7 @@ def _junction(item: Intersection, layout: AgentLayout, halves: bool) -> Junction
         )
         for name, links in movements.items()
     }
-    # what every phase treats alike, a right turn with green throughout, competes with nothing
+    # a movement that every phase treats alike (a right turn that is always green) cannot compete
     told = [name for name, shares in greens.items() if len(set(shares)) > 1] or list(greens)
     return Junction(
         movements=tuple(_places(item, movements[name], halves) for name in told),
@@ -195,7 +202,7 @@ def _junction(item: Intersection, layout: AgentLayout, halves: bool) -> Junction
 
 
 def _places(item: Intersection, links: Sequence[Link], halves: bool) -> tuple[Places, ...]:
-    """Return the places of the lanes of a movement in the features."""
+    """Return the places of a movement's lanes in the observation, one tuple for each kind."""
     incoming = tuple(sorted({item.incoming_lanes.index(link.from_lane) for link in links}))
     if not halves:
         return (incoming,)

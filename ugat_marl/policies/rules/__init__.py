@@ -1,7 +1,7 @@
 """Controllers that follow a rule; a learned policy has to beat them.
 
-The rules read queues and vehicles from the observation `movements` (two of them waiting times from
-`waiting`), as a detector would give them; a rule never looks into the simulator.
+Most rules read queues and vehicles from the observation `movements`. Two rules read waiting times
+from the observation `waiting`. No rule reads the state of the simulator.
 """
 
 from ugat_marl.policies.rules.actuated import Actuated, DelayActuated

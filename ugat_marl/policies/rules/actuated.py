@@ -13,11 +13,11 @@ from ugat_marl.policies.rules.approaches import Approach, ControlledNetwork, all
 
 
 class _Extended:
-    """Phases of a smallest cover in turn, each extended up to a longest green.
+    """Show the phases of a smallest cover in turn; extend each up to a longest green.
 
-    A phase lasts at least one decision. It goes on while its lanes still need it, and ends at the
-    longest green if another phase is called. Phases nobody calls are skipped, and where none is
-    called, the light rests.
+    A phase lasts at least one decision. It goes on while its lanes still use it, and ends at the
+    longest green if another phase is called. A phase without a call is skipped. Without any call,
+    the light keeps its phase.
     """
 
     env_options: Mapping[str, Any] = {"observation": "movements"}
@@ -33,7 +33,7 @@ class _Extended:
         self._place, self._age = {}, {}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Return the phase that is due in each cycle; where it is masked, an allowed one."""
+        """Return the phase that is due in each cycle; if it is masked, the first allowed one."""
         return {
             agent: self._choose(
                 agent,
@@ -47,7 +47,7 @@ class _Extended:
     def _demand(
         self, agent: str, approach: Approach, observation: NDArray[np.float32]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return masks of the lanes that use a green, and of those that call one, ``(lanes,)``."""
+        """Return two masks ``(lanes,)``: lanes that use their green, lanes that call for one."""
         raise NotImplementedError
 
     def _choose(
@@ -84,16 +84,16 @@ class _Extended:
 class Actuated(_Extended):
     """Gap-out control: extend a green until a gap opens in the stream on every lane it serves.
 
-    With one count per lane in place of a loop at the stop line, the gap is the mean one: a stream
-    at the speed limit with a headway of `gap_s` puts ``free-flow time / gap_s`` vehicles on a lane.
-    A lane with as many vehicles, or with a standing one, still uses its green. A vehicle anywhere
-    on the lanes of a phase calls it.
+    A controller in the field measures gaps at the stop line. Here the observation gives one count
+    per lane, so the rule uses the mean gap: a stream at the speed limit with a headway of `gap_s`
+    puts ``free-flow time / gap_s`` vehicles on a lane. A lane with as many vehicles, or with a
+    standing vehicle, still uses its green. A vehicle anywhere on the lanes of a phase calls it.
 
     Args:
         network: The controlled network.
         longest_s: Longest time from one phase to the next while another one is called (clearance
             included), rounded up to whole decisions.
-        gap_s: Headway at which a green ends.
+        gap_s: Headway in seconds at which a green ends.
     """
 
     def __init__(
@@ -113,10 +113,11 @@ class Actuated(_Extended):
 class DelayActuated(_Extended):
     """Delay-based control: extend a green until the vehicles that waited for it are moving.
 
-    A lane uses its green while its vehicles have more than `most_waiting_s` vehicle-seconds of
-    standing behind them; with more than that it also calls for one. (After Oertel and Wagner 2011,
-    where each vehicle's own delay is known; here one that moves counts no more, and greens end
-    earlier.)
+    A lane uses its green, and calls for one, while its vehicles have waited more than
+    `most_waiting_s` vehicle-seconds in all.
+
+    The rule follows Oertel and Wagner 2011. Their controller knows the delay of each vehicle. Here
+    a vehicle that moves again no longer counts, so greens end earlier.
 
     Args:
         network: The controlled network.

@@ -17,7 +17,10 @@ from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Intersection, Network
 
 MOST_SEARCHED_PHASES = 12
-"""Largest number of phases for an exhaustive search of the smallest cover; above, it is greedy."""
+"""Largest number of phases for an exhaustive search of the smallest cover.
+
+With more phases the search is greedy.
+"""
 
 
 @dataclass(frozen=True)
@@ -26,8 +29,9 @@ class ControlledNetwork:
 
     Attributes:
         intersections: Agent to intersection.
-        capacity: Lane to the number of vehicles that fit on it, the unit of `movements`.
-        free_flow_s: Lane to the seconds a vehicle needs along it at the speed limit.
+        capacity: Lane to the number of vehicles that fit on it. The observation `movements` holds
+            vehicles divided by this number.
+        free_flow_s: Lane to the seconds that a vehicle needs along it at the speed limit.
         decision_interval_s: Seconds from one decision to the next.
         clearance_s: Seconds of yellow and all-red between two greens.
     """
@@ -54,7 +58,7 @@ class ControlledNetwork:
 
     @cached_property
     def approaches(self) -> dict[str, Approach]:
-        """Agent to the approach its rule reads."""
+        """Agent to the lanes and phases of its intersection."""
         return {agent: Approach.of(item, self) for agent, item in self.intersections.items()}
 
     def decisions(self, seconds: float) -> int:
@@ -70,7 +74,7 @@ class Traffic(NamedTuple):
     Attributes:
         halting: Standing vehicles.
         vehicles: All vehicles, standing or moving.
-        shown: Phase that is green, or that follows the clearance under way.
+        shown: Phase that is green; during a clearance, the phase that follows it.
     """
 
     halting: NDArray[np.float64]
@@ -87,7 +91,7 @@ class Approach:
         outgoing: Number of outgoing lanes.
         capacity: Vehicles that fit on each lane, ``(lanes,)``.
         free_flow_s: Seconds along each lane at the speed limit, ``(lanes,)``.
-        served: Whether a phase shows green to one of a lane's links, ``(phases, lanes)``.
+        served: True where a phase shows green to a link of a lane, ``(phases, lanes)``.
         cycle: A smallest set of phases that serves every link.
     """
 
@@ -100,7 +104,7 @@ class Approach:
 
     @classmethod
     def of(cls, item: Intersection, network: ControlledNetwork) -> Approach:
-        """Collect the approaches of one intersection."""
+        """Collect the lanes and phases of one intersection."""
         lanes = list(item.incoming_lanes)
         served = np.zeros((len(item.phases), len(lanes)), np.bool_)
         for row, phase in enumerate(item.phases):
@@ -146,7 +150,7 @@ def check_length(agent: str, observation: NDArray[np.float32], least: int, name:
 
 
 def allowed_phases(infos: Infos, agent: str, phases: int) -> NDArray[np.bool_]:
-    """Return a mask of the phases an agent may choose, ``(phases,)``; by default all of them."""
+    """Return a mask of the phases that an agent may choose, ``(phases,)``; all without a mask."""
     mask = infos.get(agent, {}).get("action_mask")
     return np.ones(phases, np.bool_) if mask is None else np.asarray(mask, dtype=np.bool_)
 
@@ -159,8 +163,8 @@ def green_indices(item: Intersection, phase: str) -> frozenset[int]:
 def covering_phases(item: Intersection) -> tuple[int, ...]:
     """Return the smallest set of phases that gives every servable link green, ascending.
 
-    Among sets of equal size, take the one with the fewest green letters in all (least overlap),
-    then the first.
+    Among sets of equal size, take the one with the fewest green links in all (least overlap). If
+    several remain, take the first.
     """
     served = [green_indices(item, phase) for phase in item.phases]
     wanted = frozenset[int]().union(*served)

@@ -28,12 +28,12 @@ from ugat_marl.policies.rules.webster import Webster
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a rule's spelling.
+    """A number in the spelling of a rule.
 
     Attributes:
-        name: Meaning, for messages.
-        unit: Its unit.
-        default: Value where the spelling leaves it out.
+        name: Meaning of the number, for messages.
+        unit: Unit of the number.
+        default: Value if the spelling leaves it out.
         choices: Values that tuning tries.
     """
 
@@ -48,8 +48,8 @@ class Rule:
     """A rule that can be named.
 
     Attributes:
-        make: Maker of the rule from the network and its parameters.
-        parameters: In the order of the spelling.
+        make: Function that makes the rule from a `ControlledNetwork` and the parameters.
+        parameters: Parameters of the rule, in the order of the spelling.
     """
 
     make: Callable[..., Policy]
@@ -129,27 +129,27 @@ STANDARD_RULES = (
 
 
 def controller_for(spec: str, env: AnyParallelEnv) -> Policy:
-    """Make the rule of a spelling such as ``"largest-queue:30"``.
+    """Make a rule from its spelling, such as ``"largest-queue:30"``.
 
     Args:
         spec: A name of `RULES`, and optionally its parameters, each after a colon.
-        env: Any environment of the scenario; only its network is read. The controller's
-            `env_options` say how the environment it acts in must be made.
+        env: Any environment of the scenario; only its network is read. Make the environment in
+            which the rule acts with the rule's `env_options`.
 
     Raises:
-        UnknownNameError: No controller of this name.
-        OptionError: A parameter that is not a number above 0, or one too many.
+        UnknownNameError: No rule has this name.
+        OptionError: A parameter is not a number above 0, or there are too many.
     """
     name, values = parse_spec(spec)
     return RULES[name].make(ControlledNetwork.of(env), *values)
 
 
 def parse_spec(spec: str) -> tuple[str, tuple[float, ...]]:
-    """Return the name and the parameters of a spelling, defaults filled in.
+    """Return the name and the parameters of a spelling, with defaults filled in.
 
     Raises:
-        UnknownNameError: No controller of this name.
-        OptionError: Impossible parameters.
+        UnknownNameError: No rule has this name.
+        OptionError: A parameter is not a number above 0, or there are too many.
     """
     name, *texts = spec.split(":")
     if name not in RULES:

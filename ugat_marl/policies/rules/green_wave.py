@@ -16,10 +16,10 @@ class Road:
     """A chain of intersections, each reached from the one before by driving straight on.
 
     Attributes:
-        agents: The intersections' agents, in the direction of travel.
-        edges: Edge by which each is entered.
-        arrival_s: Seconds at the speed limit from the first stop line to each of them.
-        lanes: Lanes that lead straight on, over all intersections.
+        agents: Agents of the intersections, in the direction of travel.
+        edges: For each intersection, the edge on which the road enters it.
+        arrival_s: Seconds at the speed limit from the first stop line to each stop line.
+        lanes: Number of lanes that lead straight on, summed over the intersections.
     """
 
     agents: tuple[str, ...]
@@ -29,17 +29,19 @@ class Road:
 
 
 def main_roads(network: ControlledNetwork) -> list[Road]:
-    """Find roads that share no intersection and together pass all of them.
+    """Find roads that share no intersection and together pass all intersections.
 
-    The longest road is taken first, by number of intersections and then of lanes that lead straight
-    on; between equals, and between the two directions of one road, the one that starts at the
-    first agent. The intersections of a road taken end the others.
+    The longest road is taken first: the one with the most intersections, then with the most lanes
+    that lead straight on. Of equal roads, or of the two directions of one road, the one that starts
+    at the earlier agent is taken. A later road ends where it meets a road already taken.
     """
     free = dict(network.intersections)
     roads: list[Road] = []
     while free:
         found = [road for agent in free for road in _roads_from(agent, free, network)]
-        best = max(found, key=lambda road: (len(road.agents), road.lanes))  # the first of equals
+        best = max(
+            found, key=lambda road: (len(road.agents), road.lanes)
+        )  # max returns the first of equals
         roads.append(best)
         for agent in best.agents:
             del free[agent]
@@ -66,14 +68,16 @@ def _roads_from(
 
 
 class GreenWave:
-    """Fixed time on a common cycle, each signal of a road delayed by the travel time to it.
+    """Fixed time on a common cycle; each signal of a road is delayed by the travel time to it.
 
-    The roads are `main_roads`. On a road every light has the same cycle: the phase that serves
-    straight traffic in the direction of travel for `main_s`, the others of a smallest cover for
-    `green_s` each; a light with fewer phases gives the rest to the main one. Its clock is behind
-    that of the first light by the travel time at the speed limit, rounded to whole decisions. With
-    ``main_s = green_s`` it differs from fixed time by nothing but the offsets (and the order of
-    the phases).
+    The roads come from `main_roads`. All lights of a road have the same cycle. The main phase
+    serves straight traffic in the direction of travel and lasts `main_s`. The other phases of a
+    smallest cover last `green_s` each. A light with fewer phases gives the remaining time to its
+    main phase.
+
+    The cycle of each light starts later than that of the first light, by the travel time at the
+    speed limit rounded to whole decisions. With ``main_s = green_s`` and lights of equally many
+    phases, the rule differs from fixed time only in the offsets and the order of the phases.
 
     Args:
         network: The controlled network.
@@ -102,7 +106,7 @@ class GreenWave:
         self._time = 0
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Return the phase whose turn it is; where it is masked, the first allowed one."""
+        """Return the phase whose turn it is; if it is masked, the first allowed one."""
         actions: Actions = {}
         for agent, phases in self._phases.items():
             turns = self._turns[agent]

@@ -13,11 +13,11 @@ from ugat_marl.seeding import numpy_generator
 
 
 class FixedTime:
-    """Equal splits: each phase of a smallest set that serves every link, in turn.
+    """Show each phase of a smallest cover in turn, all for the same time.
 
     Args:
         network: The controlled network.
-        green_s: Time from one phase to the next (its clearance included), rounded up to whole
+        green_s: Time from one phase to the next (clearance included), rounded up to whole
             decisions.
     """
 
@@ -34,7 +34,7 @@ class FixedTime:
         self._time = 0
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Return the phase whose turn it is; where it is masked, the first allowed one."""
+        """Return the phase whose turn it is; if it is masked, the first allowed one."""
         turn = self._time // self._decisions
         self._time += 1
         actions: Actions = {}
@@ -46,7 +46,7 @@ class FixedTime:
 
 
 class ProgrammeControl:
-    """Leave the signals to the programme of the network; its actions are ignored."""
+    """Leave the signals to the programme of the network file; actions are ignored."""
 
     def __init__(self, network: ControlledNetwork) -> None:
         self.env_options: Mapping[str, Any] = {"signals": "programme"}

@@ -21,8 +21,8 @@ from ugat_marl.scenarios import Intersection
 class _Scored:
     """Take the phase of highest score and hold it for at least `hold_s`.
 
-    The held phase is reconsidered at every decision after that. Between equal scores the phase
-    already shown wins, then the one of lower index.
+    After that time the rule chooses again at every decision. Of equal scores the phase already
+    shown wins, then the phase of lower index.
     """
 
     env_options: Mapping[str, Any] = {"observation": "movements"}
@@ -40,7 +40,7 @@ class _Scored:
         self._shown, self._age = {}, {}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Return the phase of each intersection by the rule, among those its mask allows."""
+        """Return the phase that the rule chooses for each agent among the allowed ones."""
         return {
             agent: self._choose(
                 agent, observations[agent], allowed_phases(infos, agent, weights.shape[0])
@@ -49,7 +49,10 @@ class _Scored:
         }
 
     def scores(self, agent: str, observation: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Return the score of every phase of an agent, ``(phases,)``, in vehicles."""
+        """Return the score of every phase of an agent, ``(phases,)``.
+
+        The unit is vehicles, or vehicle-seconds for waiting times.
+        """
         weights = self._weights[agent]
         phases, features = weights.shape
         check_length(agent, observation, features + phases, self.env_options["observation"])
@@ -71,7 +74,7 @@ class _Scored:
         return best
 
     def _stays(self, shown: float, best: float) -> bool:
-        """Return true if the phase shown goes on, given its score and the highest one."""
+        """Return true if the shown phase goes on, given its score and the highest score."""
         return shown >= best
 
 
@@ -97,10 +100,10 @@ class LargestQueue(_Scored):
 class MaxPressure(_Scored):
     """Serve the phase of highest pressure (Varaiya 2013).
 
-    The pressure of a phase is the sum over the incoming lanes it serves of the vehicles on the lane
-    minus the mean number of vehicles on the lanes its green links lead to. (The mean stands for the
-    turning shares, which a controller does not know; where every lane has one link, it is the sum
-    over links of upstream minus downstream.)
+    The pressure of a phase is a sum over the incoming lanes that it serves. Each lane adds its
+    vehicles minus the mean number of vehicles on the lanes that its green links lead to. The mean
+    replaces the turning shares, which a controller does not know. If every lane has one link, the
+    pressure is the sum over links of upstream minus downstream vehicles.
 
     Args:
         network: The controlled network.
@@ -117,16 +120,16 @@ class MaxPressure(_Scored):
 
 
 class MaxPressureLoss(MaxPressure):
-    """Max pressure that counts what a switch loses (after Wang et al. 2022).
+    """Max pressure that counts the time lost by a switch (after Wang et al. 2022).
 
-    In the next `hold_s` seconds the phase shown serves all the time, another one only after the
-    clearance. The rule switches if ``best * (1 - clearance / hold) > shown``, pressures below 0
-    counted as 0: a phase is worth a switch only if something can be served by it.
+    In the next `hold_s` seconds the shown phase serves all the time, another phase only after the
+    clearance. The rule switches if ``best * (1 - clearance / hold) > shown``. Pressures below 0
+    count as 0, because a phase without traffic is not worth a switch.
 
     Args:
         network: The controlled network.
-        hold_s: Shortest time a phase is kept, rounded up to whole decisions; the gain and loss of a
-            switch are counted over it.
+        hold_s: Shortest time a phase is kept, rounded up to whole decisions. Gain and loss of a
+            switch are counted over this time.
     """
 
     def __init__(self, network: ControlledNetwork, hold_s: float = 10.0) -> None:
@@ -141,8 +144,9 @@ class MaxPressureLoss(MaxPressure):
 class LongestWaiting(_Scored):
     """Serve the phase whose incoming lanes have waited longest.
 
-    The score of a lane is the sum, over its vehicles, of the seconds since each last moved: many
-    short waits weigh as much as one long wait. No approach starves.
+    The score of a lane is a sum over its vehicles: the seconds since each vehicle last moved. Many
+    short waits weigh as much as one long wait. The score of a waiting lane keeps growing, so every
+    lane gets green at last.
 
     Args:
         network: The controlled network.
@@ -161,7 +165,10 @@ class LongestWaiting(_Scored):
 
 
 def _queue_weights(item: Intersection, capacity: Mapping[str, float]) -> NDArray[np.float64]:
-    """``(phases, 2 * incoming + outgoing)``: halting vehicles that a phase serves, per feature."""
+    """Return weights that add up the halting vehicles a phase serves.
+
+    The shape is ``(phases, 2 * incoming + outgoing)``, as the features of `movements`.
+    """
     incoming = list(item.incoming_lanes)
     weights = np.zeros((len(item.phases), 2 * len(incoming) + len(item.outgoing_lanes)))
     for row, phase in enumerate(item.phases):
@@ -172,7 +179,10 @@ def _queue_weights(item: Intersection, capacity: Mapping[str, float]) -> NDArray
 
 
 def _pressure_weights(item: Intersection, capacity: Mapping[str, float]) -> NDArray[np.float64]:
-    """``(phases, 2 * incoming + outgoing)``: vehicles upstream minus mean vehicles downstream."""
+    """Return weights for vehicles upstream minus mean vehicles downstream.
+
+    The shape is ``(phases, 2 * incoming + outgoing)``, as the features of `movements`.
+    """
     incoming, outgoing = list(item.incoming_lanes), list(item.outgoing_lanes)
     weights = np.zeros((len(item.phases), 2 * len(incoming) + len(outgoing)))
     for row, phase in enumerate(item.phases):

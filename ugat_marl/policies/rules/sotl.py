@@ -15,15 +15,16 @@ from ugat_marl.policies.rules.approaches import Approach, ControlledNetwork, all
 class SelfOrganising:
     """SOTL (Gershenson 2005; Cools, Gershenson and D'Hooghe 2007), for any number of phases.
 
-    At every decision each lane adds, while it has red, its vehicles times the decision interval to
-    a sum that its green empties. Once a green has lasted `hold_s` and the lanes of another phase
-    together reach `threshold`, the phase with the largest total is next. (The original's last rule,
-    that a short platoon close to the stop line is not cut, needs positions, which counts per lane
-    do not give.)
+    Each lane keeps a sum. At every decision with red the lane adds its vehicles times the decision
+    interval; green sets the sum to 0. When a green has lasted `hold_s` and the sums of another
+    phase's lanes reach `threshold` together, the phase with the largest total is next.
+
+    One rule of the original is left out: not to cut a short platoon close to the stop line. It
+    needs positions of vehicles, and the observation only gives counts per lane.
 
     Args:
         network: The controlled network.
-        threshold: Vehicle-seconds on the red lanes of a phase at which it gets green.
+        threshold: Vehicle-seconds on the red lanes of a phase that give it green.
         hold_s: Shortest time a phase is kept, rounded up to whole decisions.
     """
 
@@ -44,7 +45,7 @@ class SelfOrganising:
         self._sums = {agent: np.zeros(len(a.lanes)) for agent, a in self._approaches.items()}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Return the phase of each intersection by the rule, among those its mask allows."""
+        """Return the phase that the rule chooses for each agent among the allowed ones."""
         return {
             agent: self._choose(
                 agent,

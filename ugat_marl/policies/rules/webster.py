@@ -13,13 +13,13 @@ from ugat_marl.envs import Actions, Infos, Observations
 from ugat_marl.policies.rules.approaches import Approach, ControlledNetwork, allowed_phases
 
 LONGEST_CYCLE_S = 180.0
-"""Longest cycle: near saturation the formula has no bound."""
+"""Longest cycle in seconds; near saturation the formula has no bound."""
 
 MEMORY_S = 900.0
-"""Age at which a count has lost a factor of e in weight."""
+"""Age in seconds at which the weight of a count has fallen to 1/e."""
 
 FIRST_PHASE_S = 20.0
-"""Time of each phase before the first count."""
+"""Time of each phase in seconds before the first count."""
 
 
 def webster_plan(
@@ -27,13 +27,14 @@ def webster_plan(
 ) -> list[int]:
     """Return the decisions of each phase: Webster's cycle, split by the critical flow ratios.
 
-    The cycle is ``(1.5 L + 5) / (1 - Y)`` with L the clearances of all phases (start-up loss and
-    the use of yellow taken to cancel) and Y the sum of the ratios, at most `LONGEST_CYCLE_S`.
+    The cycle is ``(1.5 L + 5) / (1 - Y)`` seconds, at most `LONGEST_CYCLE_S`. L is the sum of the
+    clearances of all phases; the start-up loss and the use of yellow are assumed to cancel. Y is
+    the sum of the ratios.
 
     Args:
-        ratios: Of each phase, the largest ratio of flow to saturation flow among its lanes.
-        clearance_s: Yellow and all-red.
-        decision_interval_s: Phases last whole decisions, at least one.
+        ratios: For each phase, the largest ratio of flow to saturation flow among its lanes.
+        clearance_s: Seconds of yellow and all-red.
+        decision_interval_s: Seconds of one decision. Each phase lasts at least one decision.
 
     Source:
         Webster, Traffic Signal Settings, Road Research Technical Paper 39, 1958.
@@ -54,17 +55,16 @@ def webster_plan(
 
 
 class Webster:
-    """Cycle and splits by Webster (1958), counted anew before each cycle.
+    """Cycle and splits by Webster (1958), computed anew before each cycle.
 
-    Counts come from the running episode, not from an earlier one: the rule follows the demand and
-    works in any domain. The arrivals on a lane are the growth of its number of vehicles between two
-    decisions with red in between, when no vehicle leaves. Lanes that never have red are not
-    counted, and need no green of their own. If several phases of the cycle serve a lane, its flow
-    is spread over them.
+    Counts come from the running episode, so the rule follows the demand and works in any domain.
+    The arrivals on a lane are the growth of its number of vehicles between two decisions with red,
+    because no vehicle leaves then. A lane that never has red is not counted and needs no green of
+    its own. If several phases of the cycle serve a lane, its flow is divided equally among them.
 
     Args:
         network: The controlled network.
-        saturation_vph: Vehicles an hour that a lane discharges in green.
+        saturation_vph: Saturation flow of a lane, in vehicles per hour of green.
     """
 
     def __init__(self, network: ControlledNetwork, saturation_vph: float = 1800.0) -> None:
@@ -80,7 +80,7 @@ class Webster:
         self._left: dict[str, list[int]] = {}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Return the phase whose turn it is; where it is masked, the first allowed one."""
+        """Return the phase whose turn it is; if it is masked, the first allowed one."""
         actions: Actions = {}
         for agent, approach in self._network.approaches.items():
             self._counts[agent].add(agent, observations[agent], self._network.decision_interval_s)
@@ -95,7 +95,7 @@ class Webster:
         return actions
 
     def plan(self, agent: str) -> list[int]:
-        """Return the decisions of each phase of an agent's cycle, by the counts so far."""
+        """Return the decisions of each phase of an agent's cycle, from the counts so far."""
         network, approach = self._network, self._network.approaches[agent]
         flows = self._counts[agent].flows_per_s()
         if flows is None:
@@ -109,7 +109,7 @@ class Webster:
 
 
 class _RedCounts:
-    """Arrivals on each lane while it has red, the recent ones weighing more."""
+    """Arrivals on each lane while it has red; recent arrivals weigh more."""
 
     def __init__(self, approach: Approach) -> None:
         self._approach = approach
@@ -119,7 +119,7 @@ class _RedCounts:
         self._shown = 0
 
     def add(self, agent: str, observation: NDArray[np.float32], interval_s: float) -> None:
-        """Count the vehicles after another decision interval."""
+        """Count the vehicles that arrived during one more decision interval."""
         seen = self._approach.traffic(agent, observation)
         if self._before is not None:
             served = self._approach.served
@@ -130,7 +130,7 @@ class _RedCounts:
         self._before, self._shown = seen.vehicles, seen.shown
 
     def flows_per_s(self) -> NDArray[np.float64] | None:
-        """Return vehicles per second and lane, ``(lanes,)``; None before the first red."""
+        """Return arrivals per second on each lane, ``(lanes,)``; None before the first red."""
         if not self._red_s.any():
             return None
         return np.maximum(self._arrived, 0.0) / np.maximum(self._red_s, 1e-9)
