@@ -1,16 +1,20 @@
 """Experiments: settings x domains x seeds, trained, judged and compared with intervals.
 
-A `Setting` says how a policy is made and what its row is called. A `Job` is a setting with a
-scenario, a domain and a training seed, in a folder of its own. The driver performs jobs in
-processes or on Ray and takes interrupted ones up again. `train`, the tables of the UGAT paper,
-the learning curves of the learners and ``studies.bench strength`` are lists of settings.
+A `Setting` says how a policy is made and names its row in a table. A `Job` adds a scenario, a
+domain, a training seed and a folder. The driver performs jobs in processes or on Ray, and resumes
+interrupted ones. `train`, the tables of the UGAT paper, the learning curves of the learners and
+``studies.bench strength`` are lists of settings.
 
 - `settings`, `jobs`, `driver`, `training`: a setting, a job, many jobs, one training.
-- `transfers`, `paper`, `learning_curves`, `baseline`: what is trained for each command.
-- `evaluation`, `scores`, `comparison`, `statistics`, `gaps`: policies played, and what follows.
-- `tuning`, `headroom`, `trial`: rules tuned, and scenarios tried out with them.
-- `recording`, `queues`, `policy_gaps`, `randomised`, `machine`: measured data, halting vehicles,
-  the worth of a diagnosis, worlds drawn at random, facts of the machine.
+- `transfers`, `paper`, `learning_curves`, `baseline`: the trainings of each command.
+- `evaluation`, `scores`, `comparison`, `statistics`, `gaps`: episodes of policies, their scores
+  and intervals.
+- `tuning`, `headroom`, `trial`: the tuning of rules, and the trial of scenarios with them.
+- `recording`: measured data of a domain.
+- `queues`: halting vehicles per intersection and minute.
+- `policy_gaps`: travel times before and after a diagnosis.
+- `randomised`: worlds drawn at random.
+- `machine`: facts of the machine.
 """
 
 import lazy_loader

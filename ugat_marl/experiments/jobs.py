@@ -1,8 +1,8 @@
 """Jobs: one setting, trained with one seed and judged in its domains, in a folder of its own.
 
-``python -m ugat_marl.experiments.jobs FOLDER`` performs what ``FOLDER/job.json`` says. It ends when
-its standard input does, so that no training outlives the command that wanted it. An interrupted job
-goes on where it was.
+``python -m ugat_marl.experiments.jobs FOLDER`` performs the job of ``FOLDER/job.json``. It ends
+when its standard input is closed, so no training outlives the command that started it. An
+interrupted job resumes at its last checkpoint.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ JOB, SCORES, POLICY, LEARNER, RULE_FILE = (
 )  # fmt: skip
 
 EVALUATION_SEED = 1000
-"""First seed of the reported episodes; apart from those of training and of the search for rules."""
+"""First seed of the reported episodes; training and the search for rules use other seeds."""
 
 
 def evaluation_seeds(count: int) -> tuple[int, ...]:
@@ -58,26 +58,27 @@ def evaluation_seeds(count: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Job:
-    """A setting with a scenario, a training seed, and what it is judged by.
+    """A setting with a scenario, a training seed and evaluation episodes.
 
     Attributes:
-        setting: How the policy is made, and what it is called.
+        setting: Recipe of the policy, and its name.
         scenario: Scenario as a user names it.
         sim: The simulation.
         target: The real domain, if the policy depends on it.
-        seed: Seed of the training; None for a rule, which has none.
+        seed: Seed of the training; None for a rule, which is not trained.
         episodes: Training episodes in all, those of `start` included; 0 for a rule.
-        start: File of the learner it goes on from, seen from the folder that holds the jobs'
-            folders; None for a fresh one.
-        every: Episodes from one evaluation to the next; 0 to judge at the end alone.
-        last: So many of the last episodes are followed by an evaluation each.
+        start: File of the learner to continue from, relative to the folder that holds the jobs'
+            folders; None for a fresh learner.
+        every: Episodes from one evaluation to the next; 0 for evaluations at the end only.
+        last: Number of episodes at the end that are each followed by an evaluation.
         options: Options of the environments.
-        rule_budget: Most episodes in which each rule is tuned, for "rule"; None to take the rules
-            with their usual numbers.
-        tuning_seeds: Episodes behind the choice among the rules.
-        domains: Domains it is judged in; no part of its identity.
-        evaluation_seeds: Seeds of the episodes of each evaluation; no part of it either.
-        device: Where it is trained; no part of it, as results agree within tolerance.
+        rule_budget: Most episodes to tune one rule, for recipe "rule"; None to use default
+            parameters.
+        tuning_seeds: Number of seeds on which the best rule is chosen.
+        domains: Domains of the evaluation; not part of `identity`.
+        evaluation_seeds: Seeds of each evaluation's episodes; not part of `identity`.
+        device: Device of the training; not part of `identity`, because results of all devices
+            agree within tolerance.
     """
 
     setting: Setting
@@ -98,16 +99,16 @@ class Job:
 
     @property
     def marks(self) -> tuple[int, ...]:
-        """Numbers of training episodes after which it is judged, ascending."""
+        """Numbers of training episodes after which the policy is judged, ascending."""
         late = range(max(1, self.episodes - self.last + 1), self.episodes)
         often = range(self.every, self.episodes, self.every) if self.every else ()
         return tuple(sorted({*often, *late, self.episodes}))
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Everything that decides the policy: jobs with the same are the same job.
+        """Everything that decides the policy. Jobs of equal identity are the same job.
 
-        A job that is judged every few episodes stays the same when more episodes are wanted.
+        With `every`, the number of episodes is left out: a longer job continues a shorter one.
 
         Raises:
             OptionError: The learner's library is not installed.
@@ -131,13 +132,13 @@ class Job:
 
     @functools.cached_property
     def digest(self) -> str:
-        """Ten letters for `identity`."""
+        """First ten hexadecimal digits of the hash of `identity`."""
         text = json.dumps(self.identity, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:10]
 
     @functools.cached_property
     def name(self) -> str:
-        """Name of its folder: what people look for, then the digest."""
+        """Name of the job's folder: scenario, learner, kind, domains, seed and digest."""
         setting = self.setting
         learner = "" if setting.recipe == "rule" else setting.learner.name
         place = (
@@ -158,7 +159,7 @@ class Job:
 
     @property
     def after(self) -> str | None:
-        """Name of the job that must be done before; None if there is none."""
+        """Name of the job that must be done before this one; None if there is none."""
         return None if self.start is None else Path(self.start).parts[0]
 
     @property
@@ -177,17 +178,17 @@ class Job:
 
 
 def file_stem(scenario: str) -> str:
-    """Return a scenario as a part of the name of a file."""
+    """Return the name of a scenario in the form of a file's name."""
     return re.sub(r"[^\w.+-]+", "-", Path(scenario).name.removesuffix(".sumocfg")).strip("-")
 
 
 def file_name(name: str) -> str:
-    """Return the name of a policy as the name of a file."""
+    """Return the name of a policy in the form of a file's name."""
     return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
 
 
 def file_names(names: Iterable[str]) -> list[str]:
-    """Return names of files for policies, all different: a second one of a kind ends in -2."""
+    """Return names of files for policies, all different: repeated names end in -2, -3, ...."""
     found: list[str] = []
     for name in names:
         own = [file_name(name), *(f"{file_name(name)}-{k}" for k in range(2, len(found) + 2))]
@@ -202,13 +203,13 @@ def _hash(scenario: str, domain: str) -> str:
 
 @dataclass
 class Record:
-    """Result of a job: every episode it was judged by, and what its training took.
+    """Result of a job: the scores of its evaluation episodes, and the cost of its training.
 
     Attributes:
-        scores: Scores by episodes trained, domain and seed.
-        episodes: Training episodes that `seconds` and `own_seconds` are the sum of.
-        seconds: Time of training in s, evaluations left out.
-        own_seconds: Processor time of the learner's process in it, in s.
+        scores: Scores by number of training episodes, domain and seed.
+        episodes: Number of training episodes that `seconds` and `own_seconds` cover.
+        seconds: Time of training without evaluations, in s.
+        own_seconds: Processor time of the learner's process during training, in s.
     """
 
     scores: dict[tuple[int, str, int], Scores] = field(default_factory=dict)
@@ -218,7 +219,7 @@ class Record:
 
     @classmethod
     def read(cls, folder: Path) -> Record:
-        """Read what `write` wrote; an empty record if there is none, or a broken one."""
+        """Read a record that `write` wrote; an empty record if the file is missing or broken."""
         try:
             content = json.loads((folder / SCORES).read_text(encoding="utf-8"))
             scores: dict[tuple[int, str, int], Scores] = {}
@@ -230,7 +231,7 @@ class Record:
             return cls()
 
     def write(self, folder: Path) -> None:
-        """Write it, whole or not at all."""
+        """Write the record, whole or not at all."""
         rows = [
             {"trained": trained, "domain": domain, "seed": seed, **asdict(scores)}
             for (trained, domain, seed), scores in self.scores.items()
@@ -240,13 +241,13 @@ class Record:
         write_whole(folder / SCORES, content + "\n")
 
     def add(self, effort: Effort) -> None:
-        """Count some episodes of training."""
+        """Add the cost of some training episodes."""
         self.episodes += effort.episodes
         self.seconds += effort.seconds
         self.own_seconds += effort.own_seconds
 
     def missing(self, job: Job, mark: int) -> dict[str, list[int]]:
-        """Return the seeds that were not played after so many episodes, by domain."""
+        """Return the seeds not yet played after `mark` training episodes, by domain."""
         seeds = {
             domain: [s for s in job.evaluation_seeds if (mark, domain, s) not in self.scores]
             for domain in job.domains
@@ -263,15 +264,15 @@ class Record:
 
 
 def perform(job: Job, folder: Path, reporter: Reporter) -> Record:
-    """Train what is not trained yet, judge what was not judged yet, keep it.
+    """Do the missing training and evaluations of a job, and write them to its folder.
 
     Args:
-        job: What to do.
+        job: The job.
         folder: Folder of the job.
         reporter: Shows progress.
 
     Raises:
-        OptionError: The training has gone beyond an evaluation that is missing.
+        OptionError: An evaluation is missing, and the training has already passed it.
     """
     record = Record.read(folder)
     if record.is_whole(job):
@@ -290,7 +291,7 @@ def train_job(job: Job, folder: Path, reporter: Reporter) -> Policy:
     """Train a job without judging it, and return its policy.
 
     Args:
-        job: What to train.
+        job: The job.
         folder: Folder of the job.
         reporter: Shows progress.
     """
@@ -301,7 +302,7 @@ def train_job(job: Job, folder: Path, reporter: Reporter) -> Policy:
 def _judge(
     job: Job, mark: int, factory: PolicyFactory, record: Record, folder: Path, reporter: Reporter
 ) -> None:
-    """Play what is missing after so many episodes; keep it domain by domain."""
+    """Play the missing episodes after `mark` training episodes; write them domain by domain."""
     scenario = load_scenario(job.scenario)
     for domain, seeds in record.missing(job, mark).items():
         queues = QueueRecord()
@@ -318,12 +319,13 @@ def _judge(
         )
         record.scores |= {(mark, domain, r.seed): r.scores for r in found.results}
         if mark == job.episodes:
-            queues.write(folder / QUEUES, keep=True)  # before what says that these were played
+            # Before the record: it marks these episodes as played, so they are not played again.
+            queues.write(folder / QUEUES, keep=True)
         record.write(folder)
 
 
 def _rule(job: Job, folder: Path, reporter: Reporter) -> str:
-    """Return the rule that is best in the real domain, searched on seeds of its own."""
+    """Return the rule that is best in the real domain, chosen on separate tuning seeds."""
     saved, rules, target = folder / RULE_FILE, job.setting.rules, job.target or job.sim
     if not saved.exists():
         scenario = load_scenario(job.scenario)
@@ -351,7 +353,7 @@ def _rule(job: Job, folder: Path, reporter: Reporter) -> str:
 def _plain(
     job: Job, folder: Path, record: Record, reporter: Reporter
 ) -> Generator[tuple[int, Policy], None, None]:
-    """Train without grounding and yield the policy at every mark where something is missing."""
+    """Train without grounding; yield the policy at each mark with missing episodes and the end."""
     assert job.seed is not None
     make = job.setting.learner.factory(job.device)
     with contextlib.closing(_world(job)) as env:
@@ -410,7 +412,7 @@ def _start(job: Job, folder: Path) -> Path | None:
 
 
 def _save(policy: Any, path: Path) -> None:
-    """Save a policy, if it is one that can be."""
+    """Save a policy if it has a method `save`."""
     if hasattr(policy, "save"):
         policy.save(path)
 

@@ -1,7 +1,8 @@
-"""Tables of the UGAT paper, and those it lacks: their rows as lists of settings, and their jobs.
+"""Tables of the UGAT paper and further tables: their settings and their jobs.
 
-A table is a list of settings (`settings_of`), each trained for every seed and, if it depends on the
-real domain, for every domain (`Planner`), and put together as a `Comparison` (`compare`).
+`settings_of` lists the settings of a table. `Planner` makes a job of each setting and seed; a
+setting that depends on the real domain gets a job per domain. `compare` performs the jobs and
+returns a `Comparison`.
 """
 
 from __future__ import annotations
@@ -62,10 +63,10 @@ def settings_of(
         sim: The simulation.
         groundings: Kinds of grounding to try: "phase", "timed".
         constants: Constant delays in s that "main" sweeps.
-        learner: The algorithm that learns in all of them; None for DQN with its usual settings.
+        learner: The learner of all rows; None for DQN with its default settings.
 
     Raises:
-        OptionError: A grounding, delay or table that does not exist.
+        OptionError: A grounding, delay or table does not exist.
     """
     for grounding in groundings:
         if grounding not in GROUNDED_NAME:
@@ -74,7 +75,7 @@ def settings_of(
         raise OptionError("groundings is empty; name phase, timed, or both")
     if wrong := [seconds for seconds in constants if seconds < 1]:
         raise OptionError(f"constants holds {wrong[0]}: delays are whole seconds, at least 1")
-    # The paper's grounding obeys its models from the start.
+    # Phase grounding is the paper's: it uses f and h from the start, however accurate they are.
     least = {"phase": None, "timed": ugat.least_accuracy}
     alone = replace(ugat, timed=replace(ugat.timed, match=False))  # matching is a row of its own
     bases = {g: replace(alone, grounding=g, least_accuracy=least[g]) for g in groundings}
@@ -106,10 +107,10 @@ def matched_name(grounding: str) -> str:
 
 
 def late_in(sim: str, seconds: int) -> str:
-    """Return the simulation with every green late by so many seconds.
+    """Return the simulation with every green late by a constant delay in s.
 
     Raises:
-        OptionError: It is a scenario of its own, to which no effect can be added by name.
+        OptionError: The simulation is a separate scenario; no effect can be added to it by name.
     """
     if scenario_of(sim) is not None:
         raise OptionError(
@@ -130,7 +131,7 @@ def _grounded(bases: Mapping[str, UgatConfig]) -> list[Setting]:
 
 
 def _matching(name: str, base: UgatConfig) -> list[Setting]:
-    """Timed grounding that matches rewards; nothing for the phase's, which cannot."""
+    """Return timed grounding that matches rewards; nothing for phase grounding, which cannot."""
     ugat = replace(base, timed=replace(base.timed, match=True))
     return [_ugat(matched_name(name), ugat)] * ugat.matches
 
@@ -148,7 +149,7 @@ def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Sett
 
 
 def _ablated(name: str, base: UgatConfig) -> list[Setting]:
-    """Table 3 of the paper: static threshold, no uncertainty; and every other part alone."""
+    """Return Table 3 of the paper (static α, no uncertainty) and rows that change another part."""
     full = GROUNDED_NAME[name]
     ungated = replace(base, gate=replace(base.gate, mode="infinite"))
     variants = {
@@ -168,7 +169,7 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
 
 
 def _other_answers(name: str, base: UgatConfig) -> Setting:
-    """Another h: of the phase's one that is trained on means, of the timed one none at all."""
+    """Return phase grounding with h fitted to smoothed pairs, or timed grounding without h."""
     full = GROUNDED_NAME[name]
     if name == "phase":
         smoothed = replace(base, fit=replace(base.fit, pairs="smoothed"))
@@ -208,40 +209,40 @@ def _methods(name: str, base: UgatConfig) -> list[Setting]:
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """Options of a table: what is trained, how often, and how it is judged.
+    """Options of a table: its trainings and their evaluation.
 
     Attributes:
         scenario: Scenarios, one table each.
-        domains: The real domains; default: V1 to V4, for "ablation" and "alpha" only V1, as in
+        domains: The real domains; default: V1 to V4; for "ablation" and "alpha" only V1, as in
             the paper.
         sim: The simulation to train in.
-        seeds: Number of trainings of every setting, with the seeds 0, 1, ...
-        first_seed: First of these seeds.
-        episodes: Plain training before the first iteration.
-        iterations: Rounds of rolling out, fitting and grounded training.
-        grounded_episodes: Episodes of training per iteration.
+        seeds: Number of trainings of every setting, each with its own seed.
+        first_seed: First training seed; the others follow it.
+        episodes: Episodes of plain training before the first iteration.
+        iterations: Rounds of roll-outs, fits and grounded training.
+        grounded_episodes: Episodes of grounded training per iteration.
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
         groundings: Kinds of grounding: phase, timed, or both.
         constants: Constant delays in s that "main" sweeps.
-        rows: Names of the rows to train, and direct transfer with them; default: all of the table.
-        evaluation_seeds: Episodes every policy is played for in each domain.
-        rule_budget: Most episodes in which each rule is tuned in each domain.
-        observation: What agents see.
-        reward: What agents want.
-        neighbours: How many roads away intersections are seen too.
+        rows: Names of the rows to train; direct transfer is always trained. Default: all rows.
+        evaluation_seeds: Number of evaluation episodes of each policy in each domain.
+        rule_budget: Most episodes to tune one rule in one domain.
+        observation: Kind of observation.
+        reward: Kind of reward.
+        neighbours: Agents also see the intersections up to so many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
-        learner: The algorithm that learns in all rows: dqn, the suite's own, or a baseline
+        learner: Learner of all rows: dqn, the suite's own, or a baseline
             (docs/how-to/learners.md).
-        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; the
-            parts of a tuple are divided by commas.
-        device: Where dqn's updates and the fits are computed: cpu, cuda, or cuda:N; all trainings
-            share it.
+        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; commas
+            separate the parts of a tuple.
+        device: Device for dqn's updates and the fits: cpu, cuda, or cuda:N; all trainings share
+            it.
         dqn: Settings of dqn.
-        inputs: What f and h see beside the intersection's own state and action.
-        fit: How f and h are fitted, but for what a row says itself.
-        gate: How alpha is found, but for what a row says itself.
-        timed: How greens are delayed, but for what a row says itself.
+        inputs: Inputs of f and h beside the intersection's own state and action.
+        fit: Settings of the fit of f and h; a row may replace some.
+        gate: Settings of the gate and its threshold; a row may replace some.
+        timed: Settings of timed grounding; a row may replace some.
     """
 
     scenario: tuple[str, ...] = ("single-v1",)
@@ -288,7 +289,7 @@ class PaperConfig:
             raise OptionError(f"domain {self.sim!r} is the simulation itself; name real ones")
         if self.timed.match:
             raise OptionError("rewards are matched in a row of its own; leave timed.match out")
-        _ = self.ugat, self.spec  # refuse what is impossible
+        _ = self.ugat, self.spec  # both check their options when they are made
 
     @property
     def ugat(self) -> UgatConfig:
@@ -312,7 +313,7 @@ class PaperConfig:
 
     @property
     def all_episodes(self) -> int:
-        """Episodes every policy but direct transfer is trained for in all."""
+        """All training episodes of a policy that goes beyond direct transfer."""
         return self.episodes + self.iterations * self.grounded_episodes
 
     def targets(self, table: str) -> list[str]:
@@ -326,7 +327,7 @@ class PaperConfig:
         )
 
     def settings(self, table: str) -> list[Setting]:
-        """Return the rows of a table, without those that match rewards which cannot be matched.
+        """Return the rows of a table; rows that match rewards only if the reward allows it.
 
         Raises:
             UnknownNameError: The table has no row of that name.
@@ -349,19 +350,19 @@ def compare(
     workers: Workers,
     reporter: Reporter,
 ) -> Comparison:
-    """Train and play whatever a table still lacks, and put it together.
+    """Perform the unfinished jobs of a table and return the whole table.
 
     Args:
         table: One of `TABLES`.
         scenario: One of the scenarios.
-        config: What is trained.
-        folder: Where the folders of the jobs lie; finished ones are used again.
+        config: Options of the table.
+        folder: Folder that holds the jobs' folders; finished jobs are reused.
         workers: Jobs at a time, or an executor.
         reporter: Shows progress.
     """
     loaded = load_scenario(scenario)
     rows = config.settings(table)
-    config.spec.factory(config.device)  # what is not there is an error now, not in a job's log
+    config.spec.factory(config.device)  # a missing library is an error now, not in a job's log
     timed = any(row.ugat is not None and row.ugat.grounding == "timed" for row in rows)
     for target in config.targets(table):
         check_worlds(loaded, config.sim, target, timed)  # an error now, not in an hour
@@ -400,7 +401,7 @@ class Planner:
 
     @property
     def bases(self) -> list[Job]:
-        """Plain training, one per seed: what other jobs start from."""
+        """Jobs of plain training, one per seed; other jobs start from them."""
         return list(self._bases.values())
 
     def jobs(self, row: Setting) -> list[Job]:

@@ -1,4 +1,4 @@
-"""Settings: ways to come to a policy, each with the name its row has in every table."""
+"""Settings: ways to come to a policy, and the names of their rows in tables."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ORACLE = "trained in real"
 RULE = "best rule, tuned there"
 
 GROUNDED_NAME = {"phase": UGAT, "timed": TIMED}
-"""Kind of grounding to the name of its row."""
+"""Name of the row of each kind of grounding."""
 
 MOST_DELAY_S = 5
 """Longest of the random delays of the recipe "delays", in s."""
@@ -56,10 +56,10 @@ class LearnerSpec:
         require_known(self.name)
 
     def factory(self, device: str = "cpu") -> LearnerFactory:
-        """Return what makes fresh learners.
+        """Return a factory of fresh learners.
 
         Args:
-            device: Where "dqn" computes its updates; baselines stay on the CPU.
+            device: Device for the updates of "dqn"; baselines stay on the CPU.
 
         Raises:
             UnknownNameError: No such setting.
@@ -69,7 +69,7 @@ class LearnerSpec:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Everything that decides what is learned.
+        """Name and settings of the learner, and the library of a baseline.
 
         Raises:
             OptionError: The learner's library is not installed.
@@ -85,18 +85,18 @@ class Setting:
     """One way to come to a policy; it can be written as JSON.
 
     Attributes:
-        name: Name of its row in a table. It decides nothing about the policy.
+        name: Name of its row in a table. It has no influence on the policy.
         recipe: "direct" (plain training in the simulation), "grounded" (UGAT), "further" (direct
-            transfer trained on in `world`), "scratch" (all episodes in `world`), "randomised" (all
-            episodes in worlds drawn at random), "delays" (direct transfer trained on in `world`
-            while greens begin late by random times), "rule" (the best rule, no training).
-        world: Domain to train in; None for the real domain of the column, or for the simulation if
-            there is none.
+            transfer trained further in `world`), "scratch" (all episodes in `world`), "randomised"
+            (all episodes in worlds drawn at random), "delays" (direct transfer trained further in
+            `world` while greens begin late by random times), "rule" (the best rule, no training).
+        world: Domain to train in; None for the job's real domain, or for the simulation if the job
+            has no real domain.
         learner: The algorithm that learns.
-        ugat: Settings of UGAT, for "grounded" alone.
-        episodes: Training episodes beyond those of direct transfer; None for as many as UGAT has.
+        ugat: Settings of UGAT; only for "grounded".
+        episodes: Training episodes after those of direct transfer; None for as many as UGAT has.
         most_delay_s: Longest delay of "delays", in s.
-        rules: Rules among which "rule" chooses; none for all.
+        rules: Rules among which "rule" chooses; empty for all.
     """
 
     name: str
@@ -119,28 +119,28 @@ class Setting:
 
     @property
     def knows_target(self) -> bool:
-        """True if the policy depends on the real domain it is judged in."""
+        """True if the policy depends on the real domain in which it is judged."""
         by_world = self.recipe in ("further", "scratch") and self.world is None
         return by_world or self.recipe in ("grounded", "rule")
 
     @property
     def begins_with_direct(self) -> bool:
-        """True if training goes on from direct transfer."""
+        """True if training starts from direct transfer."""
         return self.recipe in ("grounded", "further", "delays")
 
     @property
     def matches(self) -> bool:
-        """True if the rewards of both worlds are matched."""
+        """True if timed grounding matches the rewards of simulation and real domain."""
         return self.ugat is not None and self.ugat.matches
 
     @property
     def kind(self) -> str:
-        """Recipe, or the kind of grounding, as a word for names of folders."""
+        """Kind of grounding, or else the recipe: a word for names of folders."""
         return self.ugat.grounding if self.ugat is not None else self.recipe
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Everything that decides the policy, beside where and for how long it is trained."""
+        """Part of a job's identity that the setting decides."""
         if self.recipe == "rule":
             return {"recipe": self.recipe, "rules": self.rules}
         found: dict[str, Any] = {"recipe": self.recipe, "world": self.world}

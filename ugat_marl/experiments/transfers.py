@@ -1,4 +1,4 @@
-"""``train``: UGAT in one folder, and the settings it is compared with, judged in both worlds."""
+"""Command ``train``: UGAT and the settings compared with it, judged in both domains."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
 TRAININGS = "trainings"
-"""Folder, in that of the run, of the policies trained beside UGAT's: a job each."""
+"""Folder in a run's folder; it holds the jobs of the settings compared with UGAT."""
 
 ADDED = ("control", "further", "randomised", "random_delay_s", "fine_tuned", "oracle")
-"""Options that add policies to the table and change none of the others."""
+"""Options that add policies to the table and change no other policy."""
 
 
 @dataclass(frozen=True)
@@ -79,38 +79,38 @@ class TransferConfig:
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         real: The real domain: V1..V4 or an alias, effect=value+..., or a scenario directory. "none"
-            with `real_log`: nothing but the log is known of the real world.
+            needs `real_log`: only the log is known of the real domain.
         sim: The simulation to train in; "sim", or a domain like `real`.
-        real_log: Recorded transitions that take the place of roll-outs in the real domain.
+        real_log: Transition log that replaces the roll-outs in the real domain.
         seed: Root of every random choice in training.
-        observation: What agents see: count, queue, pressure, waiting, density, movements.
-        reward: What agents want: queue, pressure, waiting.
-        neighbours: How many roads away intersections are seen too.
+        observation: Kind of observation: count, queue, pressure, waiting, density, movements.
+        reward: Kind of reward: queue, pressure, waiting.
+        neighbours: Agents also see the intersections up to so many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
-        evaluation_seeds: Episodes behind every number of the table.
-        tuning_seeds: Episodes behind the choice of the best rule.
-        rule_budget: Tune every rule in every domain with up to so many episodes before the best is
-            chosen; without it the rules are taken with their usual settings.
-        control: Also train as many further episodes in plain sim, for comparison.
-        further: Domains in which direct transfer is trained on as long as the control is, for one
-            policy each: "late_green=*,3" is a constant delay of all greens, "V4" is fine-tuning in
-            the real domain itself.
-        corrected: A corrected simulation, as `ugat-marl diagnose` writes it, or any other domain: a
-            further policy is trained there from scratch, for as many episodes as UGAT in all.
-        randomised: Also train from scratch, for as many episodes as UGAT in all, each of them in a
-            world drawn from the ranges of the effects.
-        random_delay_s: Also train direct transfer on, as long as the control, while greens begin
-            late by random whole seconds up to this.
-        fine_tuned: Also train direct transfer on in the real domain, for as many episodes as UGAT
-            sees of it.
+        evaluation_seeds: Number of evaluation episodes of each policy in each domain.
+        tuning_seeds: Number of episodes on which the best rule is chosen.
+        rule_budget: Most episodes to tune each rule in each domain before the best is chosen;
+            default: no tuning, rules with default parameters.
+        control: Also train direct transfer for as many further episodes in plain sim.
+        further: Domains in which direct transfer is trained further, as long as the control, with
+            one policy each. "late_green=*,3" delays all greens by 3 s; "V4" fine-tunes in the real
+            domain itself.
+        corrected: A corrected scenario of `ugat-marl diagnose`, or any other domain: also train
+            there from scratch, for as many episodes as UGAT in all.
+        randomised: Also train from scratch, for as many episodes as UGAT in all. Each episode is in
+            another world, drawn from the ranges of the effects.
+        random_delay_s: Also train direct transfer further, as long as the control, while greens
+            begin late by random whole seconds up to this value.
+        fine_tuned: Also train direct transfer further in the real domain, for as many episodes as
+            UGAT records there.
         oracle: Also train from scratch in the real domain, for as many episodes as UGAT in all.
-        placebo: A negative control, with which grounding must do nothing: "same-world" takes D_real
-            from the simulation, "shuffled" deals out anew what followed in D_real, "noise" puts
-            noise in the place of f.
-        learner: What learns: dqn, the suite's own; or a baseline (docs/how-to/learners.md).
-        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; the
-            parts of a tuple are divided by commas.
-        device: Where dqn's updates and the fits of f and h are computed: cpu, cuda, or cuda:N.
+        placebo: A negative control; grounding must win nothing with it. "same-world" records D_real
+            in the simulation, "shuffled" permutes the outcomes in D_real, "noise" replaces f by
+            noise.
+        learner: The learner: dqn, the suite's own, or a baseline (docs/how-to/learners.md).
+        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; commas
+            separate the parts of a tuple.
+        device: Device for dqn's updates and the fits of f and h: cpu, cuda, or cuda:N.
         ugat: Settings of the algorithm.
         dqn: Settings of dqn.
     """
@@ -186,7 +186,7 @@ class TransferConfig:
 
     @property
     def settings(self) -> list[Setting]:
-        """The settings trained beside direct transfer and UGAT."""
+        """Settings trained in addition to direct transfer and UGAT."""
         seen, spec = self.ugat.iterations * self.ugat.real_rollouts, self.spec
         found: list[Setting] = []
         if self.control:
@@ -217,13 +217,13 @@ class TransferConfig:
 
     @property
     def domains(self) -> list[str]:
-        """The domains the policies are judged in."""
+        """Domains in which the policies are judged."""
         only = self.real == "none" or describe(self.real) == describe(self.sim)
         return [self.sim] if only else [self.sim, self.real]
 
     @property
     def episodes(self) -> int:
-        """Episodes that UGAT trains for in all, and so do the control and corrected sim."""
+        """All training episodes of UGAT; the control and corrected sim get the same number."""
         return self.ugat.pretrain_episodes + self.ugat.iterations * self.ugat.grounded_episodes
 
 
@@ -235,18 +235,19 @@ def transfer(
     reporter: Reporter | None = None,
     workers: Workers = None,
 ) -> Evaluation:
-    """Train by UGAT, evaluate, and leave everything in `directory`.
+    """Train by UGAT, evaluate, and write all results to `directory`.
 
     Args:
-        config: What to do.
-        directory: Folder of the run; ``table.json``, ``metrics.parquet``, ``policies``,
-            TensorBoard files, checkpoints and what `ugat-marl report` shows go there.
-        resume: Go on with the run in the folder.
+        config: Options of the run.
+        directory: Folder of the run. It receives ``table.json``, ``metrics.parquet``,
+            ``policies``, TensorBoard files, checkpoints and the data of `ugat-marl report`.
+        resume: Continue the run in the folder.
         reporter: Shows progress.
-        workers: An executor for roll-outs and the search for rules; the rest is played here.
+        workers: Simulations at a time, or an executor, for roll-outs and the search for rules; the
+            policies are evaluated on this machine.
     """
     reporter = reporter or Silent()
-    make = config.spec.factory(config.device)  # refuses what is impossible now
+    make = config.spec.factory(config.device)  # impossible options are an error now, not later
     scenario = load_scenario(config.scenario)
     with contextlib.closing(parallel_env(scenario, config.sim, **config.env_options)) as env:
         worlds = _worlds(config, scenario, env, reporter, workers)
@@ -296,7 +297,7 @@ def judge(
     watch: Watch | None = None,
     workers: Workers = None,
 ) -> Evaluation:
-    """Evaluate policies beside the rules that are best in each domain, which `workers` find."""
+    """Evaluate policies and the best rule of each domain; `workers` search for the rules."""
     seeds = [TUNING_SEED + k for k in range(config.tuning_seeds)]
     options: Any = {"duration_s": config.duration_s, "reporter": reporter, "workers": workers}
     if config.rule_budget is None:
@@ -335,7 +336,7 @@ def _worlds(
     reporter: Reporter,
     workers: Workers,
 ) -> tuple[SimulatedWorld, World]:
-    """Return the sources of D_sim and D_real; a log that does not fit is refused here."""
+    """Return the sources of D_sim and D_real; raise an error if the log does not fit."""
     recorded: RecordedWorld | None = None
     if config.real_log is not None:
         log = TransitionLog.read(config.real_log)
@@ -357,7 +358,7 @@ def _train(
     run: Run,
 ) -> State:
     def probe(policy: Policy) -> dict[str, float]:
-        """Return the ATT after an iteration, on a seed that is not reported."""
+        """Return the ATT in s after an iteration, on a seed that no result is reported on."""
         found = evaluate(
             scenario,
             {"policy": fixed_policy(policy)},
@@ -381,7 +382,7 @@ def _train(
 
 
 def _jobs(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> list[Job]:
-    """Return the jobs of the settings beside UGAT; worlds with other agents are refused."""
+    """Return the jobs of `config.settings`; raise an error if a domain has other agents."""
     for option in ("corrected", *(["real"] if config.fine_tuned or config.oracle else [])):
         if (domain := getattr(config, option)) is not None:
             _require_same_agents(config, scenario, env, option, domain)
@@ -408,7 +409,7 @@ def _jobs(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> list[J
 def _require_same_agents(
     config: TransferConfig, scenario: Scenario, sim: TrafficEnv, option: str, domain: str
 ) -> None:
-    """Refuse another domain to train in whose policies would not fit the others' worlds."""
+    """Raise an error if policies trained in a domain would not fit the simulation's agents."""
     with contextlib.closing(parallel_env(scenario, domain, **config.env_options)) as env:
         if AgentSet.of(env) != AgentSet.of(sim):
             raise ScenarioError(
@@ -419,15 +420,15 @@ def _require_same_agents(
 
 
 def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> dict[str, Any]:
-    """Return everything that must be the same for a run to be taken up again."""
+    """Return everything that must be the same when a run is resumed."""
     settings = asdict(config)
     for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", "device", "corrected", *ADDED):
         settings.pop(other)
-    log = config.real_log  # the same if its content is, wherever it lies
+    log = config.real_log  # identified by its content, so the file may be moved
     settings["real_log"] = hashlib.sha256(log.read_bytes()).hexdigest() if log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":
         hashes["real"] = in_domain(scenario, config.real).hash
-    if config.corrected is not None:  # the same, wherever it lies
+    if config.corrected is not None:  # identified by its content, so the folder may be moved
         hashes["corrected"] = in_domain(scenario, config.corrected).hash
     return {**settings, "scenario_hash": hashes, "domains": [describe(d) for d in config.domains]}
