@@ -1,8 +1,8 @@
 """Settings x training seeds x domains, compared with intervals over training seeds.
 
-One training is one sample. Episodes of its evaluation are averaged first; intervals are Student's
-over training seeds, and two settings are compared seed by seed: the same seed means the same
-initial weights, the same episodes of plain training and the same traffic in the evaluation.
+One training is one sample: the mean over its evaluation episodes. Intervals are Student's over
+training seeds. Two settings are compared seed by seed: the same seed means the same initial
+weights, the same episodes of plain training and the same traffic in the evaluation.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ugat_marl.data import MEASURES, MORE_IS_BETTER, Scores
 from ugat_marl.experiments.statistics import Floats, Interval, PairedTest
 
 LEAST_SHARE_ARRIVED = 0.9
-"""Share of the vehicles due that arrive in an episode that did not break down."""
+"""An episode broke down if a smaller share of the vehicles due arrives."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class Trial:
     """One episode of one trained policy.
 
     Attributes:
-        setting: How the policy was made.
-        target: The real domain it was made for; results of a policy that knows none stand there
-            once per domain.
-        domain: Where the episode was played: the simulation or the target.
-        training_seed: Seed of the training; None for a rule, which has none.
+        setting: Name of the setting.
+        target: The real domain of the policy. Episodes of a policy that depends on no real domain
+            are listed once per target.
+        domain: Domain of the episode: the simulation or the target.
+        training_seed: Seed of the training; None for a rule, which is not trained.
         seed: Seed of the episode.
-        scores: How it went.
+        scores: Scores of the episode.
     """
 
     setting: str
@@ -50,10 +50,10 @@ class Comparison:
 
     Attributes:
         scenario: Id of the scenario.
-        scenario_hash: Its hash.
-        sim: The simulation, as the trials spell it.
+        scenario_hash: Hash of the scenario.
+        sim: Name of the simulation, as in the trials.
         trials: One per setting, target, domain, training seed and episode.
-        notes: Whatever else a reader must know.
+        notes: Further facts for the reader, by name.
         constants: Settings that sweep a constant delay.
         grounded: Settings trained by UGAT.
     """
@@ -87,7 +87,7 @@ class Comparison:
 
     @functools.cached_property
     def _scores(self) -> Mapping[tuple[str, str, str], Mapping[int | None, Sequence[Scores]]]:
-        """The episodes by setting, target and domain, and then by training seed."""
+        """Scores of the episodes by setting, target and domain, then by training seed."""
         found: dict[tuple[str, str, str], dict[int | None, list[Scores]]] = {}
         for t in self.trials:
             seeds = found.setdefault((t.setting, t.target, t.domain), {})
@@ -97,13 +97,13 @@ class Comparison:
     def values(self, setting: str, target: str, measure: str, domain: str | None = None) -> Floats:
         """Return means over the episodes, one per training seed, ``(n,)``.
 
-        A rule stands beside every training with the same value.
+        A rule has the same value for every training seed.
 
         Args:
             setting: Name of the setting.
-            target: The real domain it was made for.
+            target: The real domain of the policy.
             measure: A field of `Scores`.
-            domain: Where it was played; default: the target.
+            domain: Domain of the episodes; default: the target.
         """
         played = self._scores.get((setting, target, target if domain is None else domain), {})
         means = {
@@ -119,11 +119,11 @@ class Comparison:
         return [t.scores for t in self.trials if (t.setting, t.target, t.domain) == wanted]
 
     def median_s(self, setting: str, target: str) -> float:
-        """Return the ATT that half of the episodes in the target stay below, in s."""
+        """Return the median ATT of the episodes in the target, in s."""
         return float(np.median([own.att_s for own in self.episodes(setting, target)]))
 
     def unserved(self, setting: str, target: str) -> float:
-        """Return the share of episodes in which less than `LEAST_SHARE_ARRIVED` arrived."""
+        """Return the share of episodes in the target that broke down."""
         found = self.episodes(setting, target)
         return sum(own.throughput < LEAST_SHARE_ARRIVED * own.due for own in found) / len(found)
 
@@ -153,18 +153,20 @@ class Comparison:
         return self.values(setting, target, "att_s") - best
 
     def won_back(self, setting: str, target: str, direct: str) -> float:
-        """Return the share of the regret of `direct` that is gone: 1 is the best setting.
+        """Return the share of the regret of `direct` that a setting removes.
 
-        A ratio of means over training seeds; nan where direct transfer leaves nothing to win.
+        1 - regret(setting) / regret(direct), both means over training seeds. The best setting has
+        1. The share is nan where direct transfer has no regret.
         """
         start = float(self.regret_s(direct, target).mean())
         mine = float(self.regret_s(setting, target).mean())
         return 1.0 - mine / start if start > 0 else math.nan
 
     def reduction(self, setting: str, target: str, direct: str, measure: str = "att_s") -> float:
-        """Return the reduction of the gap against that of `direct`, as a share (paper, Table 2).
+        """Return the share by which a setting reduces the gap of `direct` (paper, Table 2).
 
-        nan where direct transfer loses nothing on the way: there is no gap to make smaller.
+        1 - gap(setting) / gap(direct), both means over training seeds. The share is nan where
+        direct transfer has no gap.
         """
         sign = -1.0 if measure in MORE_IS_BETTER else 1.0
         start = sign * float(self.gaps(direct, target, measure).mean())
@@ -172,7 +174,7 @@ class Comparison:
         return 1.0 - mine / start if start > 0 else math.nan
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a flat row per setting and target: means and gaps of all measures, regret."""
+        """Return one flat row per setting and target: all measures, their gaps, the regret."""
         found: list[dict[str, Any]] = []
         for setting in self.settings:
             for target in self.targets:

@@ -1,4 +1,4 @@
-"""Policies x domains x seeds -> scores with intervals, gaps and regret; races between rules."""
+"""Evaluation of policies x domains x seeds, and races between rules."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
 Watch = Callable[[str, str, TrafficEnv], StepCallback]
-"""Called with the names of policy and domain and the environment; what it returns is called after
-each decision, in several threads at a time."""
+"""Maker of a callback from the name of the policy, the name of the domain and the environment. The
+callback is called after each decision. Several threads call callbacks at the same time."""
 
 TUNING_SEED = 9001
-"""First of the seeds the best rule is searched on; never those a result is reported on."""
+"""First seed of the search for the best rule. No result is reported on these seeds."""
 
 
 @dataclass(frozen=True)
@@ -68,24 +68,24 @@ def evaluate(
     """Play every policy in every domain with every seed, spread over the cores.
 
     Args:
-        scenario: Where.
-        policies: Name to factory.
-        domains: Domains; gaps are taken against the first, usually ``"sim"``.
-        seeds: Seeds of the episodes, the same for all.
-        duration_s: Length of an episode; None for the scenario's own.
+        scenario: The scenario.
+        policies: Factories by name of the policy.
+        domains: Domains; gaps are differences to the first, usually ``"sim"``.
+        seeds: Seeds of the episodes, the same for all policies and domains.
+        duration_s: Length of an episode in s; None for the scenario's own.
         workers: Simulations at a time; None for the number of cores; or an executor.
         reporter: Shows progress.
-        title: What to call the work there.
-        notes: Kept with the result.
-        watch: Looks at the environments while they are played.
+        title: Title of the progress bar.
+        notes: Further facts, kept with the result.
+        watch: Makes callbacks that observe the environments; needs workers in this process.
     """
     names = [describe(domain) for domain in domains]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
-    # Made once, and a wrong name is an error now, not in an hour.
+    # Made once for all policies. A wrong name is an error now, not in an hour.
     worlds = [parallel_env(scenario, domain, duration_s=duration_s) for domain in domains]
     for make in policies.values():
-        make(worlds[0])  # so is a wrong policy
+        make(worlds[0])  # a wrong policy is an error now, too
     if watch is not None and not in_this_process(workers):
         raise OptionError("what is watched must be played here; give a number of workers")
     episodes = len(seeds) * len(policies) * len(domains)
@@ -121,10 +121,10 @@ def best_rules(
 ) -> dict[str, str]:
     """Find the rule with the smallest mean ATT on the tuning seeds, for each domain.
 
-    The rules are raced: after each seed the worse half is left behind.
+    The rules are raced: after each seed the worse half drops out.
 
     Returns:
-        Name of the domain to the spelling of the rule.
+        Spelling of the best rule, by name of the domain.
     """
     found: dict[str, str] = {}
     for domain in domains:
@@ -153,20 +153,21 @@ def race(
     reporter: Reporter | None = None,
     title: str = "racing",
 ) -> tuple[Trial, ...]:
-    """Play all rules with the first seeds, the better half with the next ones too, and so on.
+    """Race rules by successive halving: after each rung, the better half plays the next rung.
 
     Args:
-        scenario: Where.
-        domain: In which domain.
+        scenario: The scenario.
+        domain: The domain.
         specs: Spellings of the rules.
-        seeds: The seeds of each rung.
-        duration_s: Length of an episode; None for the scenario's own.
+        seeds: Seeds of each rung.
+        duration_s: Length of an episode in s; None for the scenario's own.
         workers: Simulations at a time; None for the number of cores; or an executor.
         reporter: Shows progress.
-        title: What to call the work there.
+        title: Title of the progress bar.
 
     Returns:
-        All rules: those of the last rung by their ATT, then those left behind before it, ....
+        All rules, first those of the last rung, then those that dropped out, the latest first. In
+        each rung the order is by mean ATT.
     """
     played: dict[str, list[float]] = {spec: [] for spec in specs}
     running, left = list(played), list[str]()
@@ -183,7 +184,8 @@ def race(
         )
         for spec in running:
             played[spec] += found.values(spec, found.domains[0], "att_s").tolist()
-        running.sort(key=lambda spec: float(np.mean(played[spec])))  # stable: the first of equals
+        # The sort is stable: of equal rules, the one named first stays first.
+        running.sort(key=lambda spec: float(np.mean(played[spec])))
         if rung + 1 < len(seeds):
             kept = max(2, math.ceil(len(running) / 2))
             running, left = running[:kept], running[kept:] + left
@@ -216,18 +218,18 @@ class FixedPolicy:
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Maker that returns a policy trained for the agents of an environment.
+    """Maker that returns a trained policy if its agents are those of the environment.
 
     Attributes:
-        policy: It.
-        path: Where it was read, for the error.
+        policy: The trained policy.
+        path: File of the policy, named in the error message.
     """
 
     policy: NetworkPolicy
     path: str
 
     def __call__(self, env: TrafficEnv) -> Policy:
-        """Return the policy, if it fits."""
+        """Return the policy; raise `CheckpointError` if it has other agents."""
         fitting = parallel_env(env.scenario, **self.policy.env_options)
         if AgentSet.of(fitting) != self.policy.agents:
             raise CheckpointError(
@@ -253,8 +255,9 @@ def policy_factory(spec: str) -> PolicyFactory:
     """Return a factory for a rule, or for the file of a trained policy, as a user names it.
 
     Raises:
-        UnknownNameError: Neither a file nor a rule.
-        CheckpointError: The file is not a policy, or (when used) one of another scenario.
+        UnknownNameError: The name is neither a file nor a rule.
+        CheckpointError: The file is not a policy. The factory raises it for a policy of another
+            scenario.
     """
     path = Path(spec)
     if path.is_dir():
@@ -272,7 +275,8 @@ def _pairs(
 
 def _play(task: _Task, stop: Stop) -> list[Result]:
     policy = task.make(task.world)
-    env = parallel_env(task.world.scenario, **policy.env_options)  # its domain is in its files
+    # The scenario's files hold the effects of the domain already.
+    env = parallel_env(task.world.scenario, **policy.env_options)
     results: list[Result] = []
     check = until(stop)
     look = task.watch(task.name, task.world.domain, env) if task.watch is not None else check

@@ -1,7 +1,7 @@
-"""Learning curves: learners trained and judged in one domain, beside rules that are tuned there.
+"""Learning curves: learners trained and judged in one domain, beside rules tuned there.
 
-Each learner is a setting, each of its trainings a job that is judged every few episodes. The rules
-are jobs, too.
+Each learner is a setting. Each of its trainings is a job that is judged every few episodes. Each
+rule is a job, too.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ class Curve:
 
     Attributes:
         learner: Name of the setting.
-        library: Library that does the learner's work, with its version; "" for none.
+        library: Library that implements the learner, with its version; "" for none.
         seed: Seed of the training.
-        att_s: Episodes trained to mean travel time over the evaluation seeds, in s.
-        speed: Decisions of all agents a second in training, learning included.
-        own_ms: Processor time of a decision outside the simulation, in ms.
+        att_s: Mean travel time over the evaluation seeds in s, by number of training episodes.
+        speed: Decisions per second in training, learning included; a decision is one of all agents
+            together.
+        own_ms: Processor time per decision outside the simulation, in ms.
     """
 
     learner: str
@@ -50,8 +51,8 @@ class Curve:
 
         Args:
             job: A training.
-            record: Its record.
-            scenario: Its scenario, which says how many decisions an episode has.
+            record: Record of the job.
+            scenario: Scenario of the job; it gives the number of decisions per episode.
         """
         (domain,) = job.domains
         assert job.seed is not None
@@ -67,34 +68,36 @@ class Curve:
 
     @property
     def final_s(self) -> float:
-        """Travel time of the policy at the end, in s."""
+        """Travel time in the last evaluation, in s."""
         return list(self.att_s.values())[-1]
 
     @property
     def best_s(self) -> float:
-        """The smallest of all evaluations, in s."""
+        """Smallest travel time of all evaluations, in s."""
         return min(self.att_s.values())
 
     def mean_of_last_s(self, count: int) -> float:
-        """Return the mean of so many evaluations at the end, in s."""
+        """Return the mean travel time of the last `count` evaluations, in s."""
         return fmean(list(self.att_s.values())[-count:])
 
     def unsteadiness(self, count: int) -> float:
-        """Return the mean of so many evaluations at the end over the best one, at least 1."""
+        """Return `mean_of_last_s` divided by `best_s`, at least 1."""
         return self.mean_of_last_s(count) / self.best_s
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Everything the learners reach on a scenario.
+    """Learning curves of all learners on a scenario, and the rules beside them.
 
     Attributes:
         scenario: Id of the scenario.
-        domain: Domain in which they are trained and judged.
-        curves: The trainings that have all their evaluations.
-        rules: Spelling of each rule to its mean travel time, in s; fixed time first.
-        best: The best rule, chosen on other episodes.
-        failures: Name of each job that failed, or learner that cannot be made, to its reason.
+        domain: Domain in which the learners are trained and judged.
+        curves: Trainings that have all their evaluations.
+        rules: Mean travel time in s by spelling of the rule; the network's programme first, then
+            fixed time.
+        best: Spelling of the best rule, chosen on separate tuning episodes.
+        failures: Reason of failure, by name of the job that failed or of the learner whose library
+            is missing.
     """
 
     scenario: str
@@ -110,13 +113,14 @@ class CurvesConfig:
     """Options of learning curves.
 
     Attributes:
-        learners: Names; default: all.
+        learners: Names of learners; default: all.
         seeds: Number of trainings of each learner, with the seeds 0, 1, ...
         episodes: Episodes of each training.
         evaluate_every: Episodes from one evaluation to the next.
-        evaluation_seeds: Episodes of an evaluation, always the same; rules are played for them too.
-        rule_budget: Most episodes in which each rule is tuned.
-        domain: Where learners are trained and judged.
+        evaluation_seeds: Number of episodes of each evaluation; all learners and rules play the
+            same ones.
+        rule_budget: Most episodes to tune one rule.
+        domain: Domain in which learners are trained and judged.
         duration_s: Length of an episode in s; default: the scenario's own.
     """
 
@@ -135,19 +139,19 @@ class CurvesConfig:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
         if self.rule_budget < LEAST_BUDGET:
             raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
-        _ = self.settings  # refuses learners that do not exist
+        _ = self.settings  # raises an error for an unknown learner
 
     @property
     def settings(self) -> list[Setting]:
-        """One setting per learner, called as it is."""
+        """One setting per learner, with the learner's name."""
         return [Setting(n, "direct", learner=LearnerSpec(n)) for n in self.learners]
 
     def job(self, scenario: str, setting: Setting, seed: int | None) -> Job:
         """Return the job of a learner, or of a rule.
 
         Args:
-            scenario: As a user names it.
-            setting: One of `settings`, or a rule's.
+            scenario: Scenario as a user names it.
+            setting: One of `settings`, or the setting of a rule.
             seed: Seed of the training; None for a rule.
         """
         is_rule = setting.recipe == "rule"
@@ -166,7 +170,7 @@ class CurvesConfig:
         )
 
     def trainings(self, scenario: str) -> list[Job]:
-        """Return all trainings on a scenario, one of every learner before the next seed."""
+        """Return the jobs of all trainings on a scenario, ordered by seed, then by learner."""
         pairs = [(seed, setting) for seed in range(self.seeds) for setting in self.settings]
         return [self.job(scenario, setting, seed) for seed, setting in pairs]
 
@@ -188,15 +192,15 @@ def learn_curves(
     workers: Workers,
     reporter: Reporter,
 ) -> Curves:
-    """Train and judge whatever is missing, and put it together.
+    """Perform the unfinished jobs and return all curves.
 
-    A learner whose library is missing and a job that fails leave the others alone.
+    A missing library or a failed job does not stop the other jobs.
 
     Args:
         scenario: The network and its traffic.
         spelling: The scenario as a user names it.
         config: Options.
-        folder: Folder that holds the jobs' folders; finished ones are used again.
+        folder: Folder that holds the jobs' folders; finished jobs are reused.
         workers: Jobs at a time, or an executor.
         reporter: Shows progress.
     """
@@ -220,7 +224,7 @@ def learn_curves(
 
 
 def _can_be_made(job: Job, failures: dict[str, str]) -> bool:
-    """Return False, and keep the reason, where a learner's library is not installed."""
+    """Return False, and add the reason to `failures`, if the learner cannot be made."""
     try:
         job.setting.learner.factory()
     except UgatMarlError as error:

@@ -1,9 +1,9 @@
-"""Scores of policies in domains, seed by seed, and what follows from them.
+"""Scores of policies in domains, seed by seed, with gaps and regrets.
 
-The gap of a policy is its score in a domain minus its score in the first one, usually ``sim``, seed
-by seed. It mixes physics with policy: slow vehicles are slow under any policy. The regret is how
-far the policy is, in that domain, from the best policy known there; that part transfer can win
-back.
+The gap of a policy is its score in a domain minus its score in the first domain, usually ``sim``,
+seed by seed. A part of the gap is physics: slow vehicles are slow under any policy. The regret is
+the ATT of the policy minus that of the best policy known in the domain: the part of a loss that
+transfer can win back.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from ugat_marl.files import write_whole
 
 @dataclass(frozen=True)
 class Result:
-    """One episode.
+    """One episode of a policy in a domain.
 
     Attributes:
         policy: Name of the policy.
         domain: Name of the domain.
         seed: Seed of the episode.
-        scores: How it went.
+        scores: Scores of the episode.
     """
 
     policy: str
@@ -60,9 +60,9 @@ class Evaluation:
 
     Attributes:
         scenario: Id of the scenario.
-        scenario_hash: Its hash.
+        scenario_hash: Hash of the scenario.
         results: One per policy, domain and seed.
-        notes: What else a reader must know, such as which rule was the best one.
+        notes: Further facts for the reader by name, such as the best rule of a domain.
     """
 
     scenario: str
@@ -96,13 +96,13 @@ class Evaluation:
         return Estimate.of(real - self.values(policy, self.domains[0], measure))
 
     def regret(self, policy: str, domain: str) -> Estimate:
-        """Return the ATT above that of the best policy there, in s, paired by seed."""
+        """Return the ATT of a policy minus that of the best policy there, in s, paired by seed."""
         best = min(self.policies, key=lambda name: self.estimate(name, domain, "att_s").mean)
         mine = self.values(policy, domain, "att_s")
         return Estimate.of(mine - self.values(best, domain, "att_s"))
 
     def _hidden(self, domain: str) -> list[str]:
-        """Return the measures that only a domain with an objective has."""
+        """Return the names of the hidden measures, which only domains with an objective have."""
         played = (result.scores for result in self.results if result.domain == domain)
         return list(dict.fromkeys(name for scores in played for name in scores.hidden))
 
@@ -138,7 +138,7 @@ class Evaluation:
 
     @classmethod
     def read(cls, path: Path) -> Evaluation:
-        """Read what `write` wrote; null and missing values become nan.
+        """Read an evaluation that `write` wrote; null and missing values become nan.
 
         Raises:
             CheckpointError: The file is missing, cut short or of another form.
@@ -162,12 +162,12 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Trial:
-    """One setting of a rule.
+    """Result of one rule with its parameters in a race.
 
     Attributes:
-        spec: Its spelling.
-        att_s: Mean ATT over its episodes.
-        episodes: How many it was given; those that fell behind have fewer.
+        spec: Spelling of the rule.
+        att_s: Mean ATT over its episodes, in s.
+        episodes: Number of its episodes; rules that dropped out early have fewer.
     """
 
     spec: str
@@ -177,12 +177,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class Tuned:
-    """A rule with the best of its settings.
+    """Result of the tuning of a rule.
 
     Attributes:
         rule: Name of the rule.
         domain: Name of the domain.
-        trials: Everything tried, the best one first.
+        trials: All parameters tried, the best first.
     """
 
     rule: str
@@ -191,12 +191,12 @@ class Tuned:
 
     @property
     def best(self) -> Trial:
-        """The setting that won."""
+        """The trial with the best parameters."""
         return self.trials[0]
 
     @property
     def episodes(self) -> int:
-        """Episodes played for it."""
+        """Number of episodes of all trials."""
         return sum(trial.episodes for trial in self.trials)
 
 
@@ -211,7 +211,7 @@ def result_of(row: Mapping[str, Any]) -> Result:
 
 
 def _whole(results: tuple[Result, ...]) -> tuple[Result, ...]:
-    """Refuse episodes of which some are missing: every policy plays every seed in every domain."""
+    """Raise an error if an episode is missing: every policy plays every seed in every domain."""
     played = {(result.policy, result.domain, result.seed) for result in results}
     policies, domains, seeds = (len(set(part)) for part in zip(*played, strict=True))
     if len(played) < policies * domains * seeds:
@@ -224,7 +224,7 @@ def _number(value: Any) -> float:
 
 
 def _measured(scores: Scores, measure: str) -> float:
-    """Return a measure, also a hidden one; nan where it was not measured."""
+    """Return a measure, which may be hidden; nan if it was not measured."""
     if hasattr(scores, measure):
         return getattr(scores, measure)
     return scores.hidden.get(measure, math.nan)

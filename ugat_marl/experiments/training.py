@@ -1,7 +1,8 @@
 """Training of one policy: episode by episode in an environment, or grounded by UGAT.
 
-`train_through` is every training without grounding: it goes on from where the learner is and stops
-wherever the policy is to be judged. `train_grounded` is Algorithm 1 between two worlds.
+`train_through` trains without grounding. It continues from the learner's current episode and stops
+at each mark for an evaluation. `train_grounded` is Algorithm 1 of the UGAT paper between two
+domains.
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ class Effort(NamedTuple):
     """Cost of some episodes of training.
 
     Attributes:
-        episodes: How many.
-        seconds: Time they took, in s.
-        own_seconds: Processor time of this process in them, in s; the simulation has another.
+        episodes: Number of episodes.
+        seconds: Time of these episodes, in s.
+        own_seconds: Processor time of this process, in s; the simulation runs in another process.
     """
 
     episodes: int
@@ -62,15 +63,15 @@ def train_through(
     """Train a learner and yield its policy at every mark.
 
     Args:
-        learner: Fresh, or as it was saved.
-        env: Where it is trained.
-        marks: Numbers of episodes in its life, ascending; those it has had already count.
+        learner: A fresh learner, or one read from a file.
+        env: Environment of the training.
+        marks: Numbers of training episodes, ascending; earlier episodes of the learner count.
         seed: Root of every random choice.
         on_episode: Called after every episode.
-        on_chunk: Called after every few episodes; the learner may be saved then.
+        on_chunk: Called after at most `CHUNK` episodes; the learner may be saved then.
 
     Yields:
-        Mark and greedy policy.
+        The mark and the greedy policy.
     """
     for mark in marks:
         while learner.episodes < mark:
@@ -96,7 +97,7 @@ def train_grounded(
     probe: Probe | None = None,
     device: str = "cpu",
 ) -> State:
-    """Train by UGAT, or go on with the run, and return where it stands at the end.
+    """Train by UGAT, or resume the run, and return the final state.
 
     Args:
         ugat: Settings of the algorithm.
@@ -105,10 +106,10 @@ def train_grounded(
         worlds: Sources of D_sim and D_real.
         seed: Root of every random choice.
         run: Folder of metrics and checkpoints.
-        start: File of a learner that has had its plain training; None to train it here, too.
+        start: File of a learner after plain training; None to do plain training here.
         placebo: A negative control.
         probe: Measures the policy after every iteration.
-        device: Where f and h are fitted.
+        device: Device for the fits of f and h.
     """
     learner = make(env, seed)
     transform = ugat.transform(env.layouts, seed, neighbours_of(env))
@@ -134,12 +135,12 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
         scenario: The network and its traffic.
         sim: The simulation.
         real: The real domain.
-        timed: Whether greens are to be delayed: one that begins a decision later than it was asked
-            for has no delay that could be told, or executed.
+        timed: True for timed grounding: every green must begin in the decision that asks for it,
+            or its delay can be neither measured nor set.
 
     Raises:
-        UnknownNameError: No such domain.
-        OptionError: Agents look farther in one of them, or greens begin too late to be delayed.
+        UnknownNameError: A domain does not exist.
+        OptionError: The reaches differ, or greens begin too late for timed grounding.
     """
     here, there = (in_domain(scenario, world) for world in (sim, real))
     for world in (here, there) if timed else ():
@@ -169,18 +170,18 @@ def simulated_worlds(
     options: Mapping[str, Any],
     workers: Workers = None,
 ) -> tuple[SimulatedWorld, SimulatedWorld]:
-    """Return the sources of D_sim and D_real if both worlds can be played.
+    """Return the sources of D_sim and D_real if both domains can be simulated.
 
     Args:
         scenario: The network and its traffic.
         sim: The simulation.
         real: The real domain.
-        ugat: How often is rolled out, and whether greens are delayed by chance.
-        options: Of both environments.
-        workers: As for `SimulatedWorld`.
+        ugat: Settings of the algorithm: numbers of roll-outs and random delays.
+        options: Options of both environments.
+        workers: Simulations at a time, or an executor, see `SimulatedWorld`.
 
     Raises:
-        OptionError: As `check_worlds`, or rewards that cannot be matched.
+        OptionError: `check_worlds` fails, or the rewards cannot be matched.
     """
     check_worlds(scenario, sim, real, ugat.grounding == "timed")
     reward = options.get("reward", MATCHED_REWARD)
@@ -191,7 +192,7 @@ def simulated_worlds(
         )
 
     def world(domain: Domain, name: str, episodes: int, most_delay_s: int = 0) -> SimulatedWorld:
-        crossings = ugat.most_delay_s > 0  # they tell best when a green began
+        crossings = ugat.most_delay_s > 0  # crossing vehicles show best when a green began
         make = partial(parallel_env, scenario, domain, crossings=crossings, **options)
         return SimulatedWorld(make, name, episodes, ugat.rollout_epsilon, most_delay_s, workers)
 

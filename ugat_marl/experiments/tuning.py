@@ -1,9 +1,9 @@
-"""The best settings of the rules in a domain, found by racing them, and remembered.
+"""Tuning of rules: a race finds the best parameters of a rule in a domain, and a file keeps them.
 
-A rule has one or two parameters that act in whole decisions, so that a handful of values each is
-all there is to try; what costs is that one episode says little. So the settings are raced:
-successive halving (Jamieson and Talwalkar 2016) plays all of them a little and the better half
-on, with the same seeds for all.
+A rule has one or two parameters. They act in whole decisions, so a few values of each are enough.
+One episode says little about a value, so the values are raced by successive halving (Jamieson and
+Talwalkar 2016): all of them play a few episodes, then the better half plays more. All play the
+same seeds.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario
 
 VERSION = 1
-"""Rises whenever the rules or the race change, so that what was remembered no longer holds."""
+"""Version of rules and race. Increase it with every change of them: stored results expire."""
 
 BUDGET = 24
-"""Episodes in which one rule is tuned."""
+"""Default for the most episodes to tune one rule."""
 
 LEAST_BUDGET = 2
-"""One episode each of two settings."""
+"""Smallest budget: one episode each for two settings."""
 
 TUNED_RULES = tuple(name for name in RULE_NAMES if name != "random")
-"""The rules a search for the best one tunes."""
+"""Rules that are tuned in a search for the best rule."""
 
 UNTUNED_EPISODES = 3
-"""At most so many episodes of a rule that has nothing to tune."""
+"""Most episodes of a rule without parameters to tune."""
 
 
 def tune(
@@ -57,24 +57,24 @@ def tune(
 ) -> Tuned:
     """Find the settings of a rule with the smallest mean ATT in a domain.
 
-    All combinations of the values in the rule's `RULES` entry are raced on seeds from
-    `TUNING_SEED` on, which no result is reported on. If the budget does not pay for all, they are
-    thinned out evenly.
+    The race holds all combinations of the values in the rule's `RULES` entry. If the budget is too
+    small for all, it holds an evenly spread part of them. Seeds begin at `TUNING_SEED`; no result
+    is reported on them. The result is kept in the user's cache folder and reused for the same
+    scenario, domain, rule, values, budget and versions.
 
     Args:
         name: Name of the rule, without parameters.
-        scenario: Where.
-        domain: The domain to tune it in.
+        scenario: The scenario.
+        domain: The domain in which to tune.
         budget: Most episodes to play.
-        duration_s: Length of an episode; None for the scenario's own.
+        duration_s: Length of an episode in s; None for the scenario's own.
         workers: Simulations at a time; None for the number of cores; or an executor.
         reporter: Shows progress.
-        fresh: Play again though the result is remembered. It is kept in the user's cache folder
-            for the same scenario, domain, rule, values, budget and versions.
+        fresh: Ignore a stored result and play again.
 
     Raises:
-        UnknownNameError: No rule of this name.
-        OptionError: A budget below 2.
+        UnknownNameError: No rule has this name.
+        OptionError: The budget is below `LEAST_BUDGET`.
     """
     if name not in RULES:
         raise UnknownNameError("controller", name, RULE_NAMES)
@@ -109,12 +109,12 @@ def tuned_rules(
     workers: Workers = None,
     reporter: Reporter | None = None,
 ) -> dict[str, str]:
-    """Find the best rule of each domain, each rule with the settings that are best there.
+    """Tune the rules in each domain and find the best tuned rule there.
 
-    As `ugat_marl.experiments.evaluation.best_rules`, but the rules are tuned before they are raced.
+    `best_rules` does the same without tuning.
 
     Returns:
-        Name of the domain to the spelling of the rule.
+        Spelling of the best rule, by name of the domain.
     """
     found: dict[str, str] = {}
     for domain in domains:
@@ -143,11 +143,13 @@ def tuned_rules(
 
 
 def rungs(settings: int, budget: int) -> list[list[int]]:
-    """Return the seeds of each rung: new ones, about the same number of episodes in each.
+    """Return the seeds of each rung of a race.
+
+    Every rung has new seeds and about the same number of episodes.
 
     Args:
-        settings: How many take part.
-        budget: Most episodes in all, and enough for one each in every rung.
+        settings: Number of settings at the start.
+        budget: Most episodes in all; enough for one episode of each setting in every rung.
     """
     if settings < 2:
         return [[TUNING_SEED + k for k in range(min(budget, UNTUNED_EPISODES))]]
@@ -165,7 +167,7 @@ def rungs(settings: int, budget: int) -> list[list[int]]:
 
 
 def settings_of(name: str, budget: int) -> list[str]:
-    """Return the spellings that a budget pays to race: the usual one, others spread evenly."""
+    """Return the spellings to race within a budget: the default, and others spread evenly."""
     rule = RULES[name]
     values = itertools.product(*(parameter.choices for parameter in rule.parameters))
     specs = [format_spec(name, list(each)) for each in values]
@@ -194,7 +196,7 @@ def _place(
     duration_s: float | None,
     specs: Sequence[str],
 ) -> Path:
-    """Return the file that remembers a result; whatever could change that changes its name."""
+    """Return the file that keeps a result; its name is a hash of all that decides the result."""
     world = in_domain(scenario, domain)
     if duration_s is not None:
         world = world.with_duration(duration_s)
@@ -204,7 +206,7 @@ def _place(
 
 
 def _recall(place: Path, specs: Sequence[str]) -> tuple[Trial, ...] | None:
-    """Return the result in a file; None if there is none, or the file holds something else."""
+    """Return the result in a file; None if the file is missing or holds other settings."""
     try:
         rows: Any = json.loads(place.read_text(encoding="utf-8"))
         trials = tuple(Trial(str(r["spec"]), float(r["att_s"]), int(r["episodes"])) for r in rows)
