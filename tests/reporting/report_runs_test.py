@@ -43,6 +43,7 @@ from ugat_marl.reporting import RunRecord, read_records, runs_page, style, write
 from ugat_marl.reporting import formats as words
 from ugat_marl.reporting.charts import radar_picture
 from ugat_marl.reporting.figures import NamedFigure
+from ugat_marl.reporting.formats import command_block, commands_in
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Page as MadePage
 from ugat_marl.scenarios import Network
@@ -456,6 +457,14 @@ def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
     _, page = page_of(tmp_path / "direct-0")
     assert "The worst intersections and minutes" in page.text
     assert "direct transfer in V4" in page.text
+
+
+def test_a_command_is_read_as_it_was_written() -> None:
+    command = "ugat-marl paper main --rows 'direct transfer' 'UGAT, timed' " + "--seeds 5 " * 20
+    lines = command_block(command.strip())
+    assert max(map(len, lines)) <= 102
+    assert commands_in("\n".join(["# A page", "", *lines, ""])) == [command.strip()]
+    assert commands_in("no command") == []
 
 
 def test_a_finished_table_is_shown_with_its_command() -> None:

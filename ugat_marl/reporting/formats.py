@@ -69,6 +69,13 @@ def command_block(command: str) -> list[str]:
     return ["```sh", *lines, "```"]
 
 
+def commands_in(page: str) -> list[str]:
+    """Return the commands in the blocks of a page in Markdown, each in one line."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
+    lines = (re.sub(r" \\\n\s*", " ", block).splitlines() for block in blocks)
+    return [line for block in lines for line in block]
+
+
 def made_with(rows: Mapping[str, Any]) -> list[str]:
     """Return the table of what figures were made with."""
     return [

@@ -22,6 +22,7 @@ import polars as pl
 from ugat_marl.data import CHECKPOINT, METRICS, SETTINGS, Metrics
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.experiments import QUEUES, Evaluation, read_queues, result_of
+from ugat_marl.reporting.formats import commands_in
 
 RUN, JOB, TABLE, SCORES = "run.json", "job.json", "table.json", "scores.json"
 TABLE_CSV, TABLE_MD = "table.csv", "table.md"
@@ -335,8 +336,8 @@ def _table(directory: Path, name: str) -> TableRecord:
     reader = _Reader(directory)
     rows = reader.read(TABLE_CSV, _csv, "there is nothing to show") or []
     page = reader.read(TABLE_MD, lambda p: p.read_text(errors="replace"), "its command is unknown")
-    lines = [line.strip() for line in (page or "").splitlines() if line.startswith("    ugat-marl")]
-    return TableRecord(name, directory, tuple(rows), (lines or [""])[0], tuple(reader.missing))
+    command = next(iter(commands_in(page or "")), "")
+    return TableRecord(name, directory, tuple(rows), command, tuple(reader.missing))
 
 
 def _csv(path: Path) -> list[dict[str, Any]]:
