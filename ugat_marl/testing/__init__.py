@@ -1,7 +1,8 @@
 """Conformance kit: checks of environments, policies and scenarios against the suite's rules.
 
-``check_...`` run all checks and return their results; ``..._CHECKS`` are the checks one by one. A
-check is a function of a case that raises `ConformanceError`; `report` shows results.
+A function ``check_...`` runs all checks of a subject and returns their results; `report` shows
+them. A tuple ``..._CHECKS`` holds the single checks. A check is a function of a case. It raises
+`ConformanceError` if the subject breaks the rule.
 """
 
 import lazy_loader

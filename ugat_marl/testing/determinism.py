@@ -1,4 +1,4 @@
-"""Checks that a seed decides an episode to the bit, whatever else runs or ran."""
+"""Checks that a seed decides an episode to the bit, independent of all other episodes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SEED_ALL = "draw every random number, SUMO's too, from the seed given to reset(
 
 
 def a_seed_repeats_its_episode(case: EnvironmentCase) -> None:
-    """The same seed twice in one environment gives the same episode."""
+    """The same seed, used twice in one environment, gives the same episode."""
     case.need_episode()
     env = case.make()
     first, second = case.play(env, case.seed), case.play(env, case.seed)
@@ -34,7 +34,7 @@ def a_seed_repeats_its_episode(case: EnvironmentCase) -> None:
 
 
 def other_episodes_leave_no_trace(case: EnvironmentCase) -> None:
-    """An episode does not depend on which others ran before, to their end or not."""
+    """An episode does not depend on earlier episodes, whether these were finished or not."""
     case.need_episode()
     env = case.make()
     case.play(env, case.seed + 1)
@@ -49,7 +49,7 @@ def other_episodes_leave_no_trace(case: EnvironmentCase) -> None:
 
 
 def replayed_actions_repeat_the_episode(case: EnvironmentCase) -> None:
-    """Recorded actions, played back from dicts of another order, give the same again."""
+    """Recorded actions give the same episode again, even from dicts in another order."""
     env = case.make()
     again = case.play(env, case.seed, replaying(case.episode, reverse=True))
     cure = "let nothing depend on the order of the actions, and " + _SEED_ALL
@@ -59,7 +59,7 @@ def replayed_actions_repeat_the_episode(case: EnvironmentCase) -> None:
 
 
 def live_environments_are_independent(case: EnvironmentCase) -> None:
-    """Two environments stepped in turn give what each gives alone."""
+    """Two environments that are stepped in turn give the same episodes as each one alone."""
     case.need_episode()
     solo = case.make()
     alone = [case.episode, case.play(solo, case.seed + 1)]
@@ -106,7 +106,7 @@ def other_seeds_give_other_episodes(case: EnvironmentCase) -> None:
 
 
 def resets_without_seed_follow_from_the_last(case: EnvironmentCase) -> None:
-    """After `reset(seed)`, further episodes without a seed are decided by it too, and differ."""
+    """After `reset(seed)`, that seed also decides all later episodes without a seed."""
     case.need_episode()
     runs: list[list[Episode]] = []
     for _ in range(2):
@@ -137,10 +137,10 @@ DETERMINISM_CHECKS = (
 def check_determinism(make_env: MakeEnv, seed: int = 1) -> list[Result]:
     """Check that episodes are reproducible to the bit.
 
-    Plays about a dozen whole episodes; give it short ones.
+    The checks play about a dozen whole episodes, so use an environment with short episodes.
 
     Args:
-        make_env: Makes a fresh environment.
+        make_env: Function that returns a new environment.
         seed: Seed of the first episode.
     """
     case = EnvironmentCase(make_env, seed)

@@ -1,4 +1,4 @@
-"""Checks of an environment: its declarations, its life, and the episodes it gives."""
+"""Checks of an environment: its declarations, its start and end, and its episodes."""
 
 from __future__ import annotations
 
@@ -32,10 +32,11 @@ COMMON = "__common__"
 _AGENT = re.compile(r"[A-Za-z][A-Za-z0-9-]*(_[A-Za-z0-9-]+)*_[0-9]+")
 
 _PATIENCE_S = 5.0
+"""Time that processes have to end after `close`, s."""
 
 
 def an_episode_runs(case: EnvironmentCase) -> None:
-    """`reset` and `step` work to the end of an episode under random allowed actions."""
+    """`reset` and `step` work to the end of an episode with random allowed actions."""
     require(len(case.episode.moments) > 1, "the episode has no step")
 
 
@@ -54,7 +55,7 @@ def agents_stay_the_same(case: EnvironmentCase) -> None:
 
 
 def observations_lie_in_their_spaces(case: EnvironmentCase) -> None:
-    """Every observation, also the last, is contained in its agent's space."""
+    """Every observation lies in its agent's space, and so does the last one."""
     for moment, when in _moments(case):
         for agent, seen in moment.observations.items():
             where = _outside(seen, case.fresh.observation_space(agent))
@@ -65,7 +66,7 @@ def observations_lie_in_their_spaces(case: EnvironmentCase) -> None:
 
 
 def _outside(value: Any, space: Any) -> str:
-    """Say in words why a vector is outside its space; empty if it is inside."""
+    """Return the reason why a vector is outside its space; "" if it is inside."""
     if not isinstance(value, np.ndarray):
         return f"is {type(value).__name__}, not a numpy array"
     if value.dtype != space.dtype or value.shape != space.shape:
@@ -79,7 +80,7 @@ def _outside(value: Any, space: Any) -> str:
 
 
 def state_lies_in_its_space(case: EnvironmentCase) -> None:
-    """`state()` is in `state_space` at every moment, after the last step too."""
+    """`state()` lies in `state_space` at every moment, also after the last step."""
     case.need_episode()
     env: Any = case.make()
     count = 0
@@ -110,14 +111,14 @@ def infos_keep_their_keys(case: EnvironmentCase) -> None:
 
 
 def _shapes(info: Any) -> dict[str, tuple[int, ...]]:
-    """Keys of an info and the shape of what is there."""
+    """Return each key of an info with the shape of its value."""
     if not isinstance(info, Mapping):
         return {}
     return {str(key): np.shape(value) for key, value in sorted(info.items())}
 
 
 def infos_hold_numbers(case: EnvironmentCase) -> None:
-    """Infos are dicts of numbers and numeric arrays, by agent (and ``__common__``)."""
+    """Infos map each agent (and ``__common__``) to a dict of numbers and numeric arrays."""
     agents = {*case.fresh.possible_agents, COMMON}
     for moment, when in _moments(case):
         strange = sorted(map(str, set(moment.infos) - agents))
@@ -139,7 +140,7 @@ def infos_hold_numbers(case: EnvironmentCase) -> None:
 
 
 def masks_allow_something(case: EnvironmentCase) -> None:
-    """Every info has an int8 `action_mask` of zeros and ones with a one in it, at reset too."""
+    """Every info, also after `reset`, has an int8 `action_mask` of 0 and 1 with at least one 1."""
     for moment, when in _moments(case):
         for agent in _told(case, moment):
             count = int(getattr(case.fresh.action_space(agent), "n", 0))
@@ -157,7 +158,7 @@ def masks_allow_something(case: EnvironmentCase) -> None:
 
 
 def executed_actions_are_told(case: EnvironmentCase) -> None:
-    """Every info has `executed_action`, the phase that was really served."""
+    """Every info has `executed_action`: the phase that the lights really served."""
     for moment, when in _moments(case):
         for agent in _told(case, moment):
             executed = _entry(moment, agent, "executed_action")
@@ -172,7 +173,7 @@ def executed_actions_are_told(case: EnvironmentCase) -> None:
 
 
 def _told(case: EnvironmentCase, moment: Moment) -> list[str]:
-    """Agents that have an info; who has none is for another check."""
+    """Return the agents that have an info; another check finds agents without one."""
     return [agent for agent in case.fresh.possible_agents if agent in moment.infos]
 
 
@@ -182,7 +183,7 @@ def _entry(moment: Moment, agent: str, key: str) -> Any:
 
 
 def everybody_acts_to_the_end(case: EnvironmentCase) -> None:
-    """All agents live to the end, are truncated together, and then `agents` is empty."""
+    """All agents act to the end and are truncated together; after that `agents` is empty."""
     everybody = tuple(case.fresh.possible_agents)
     last = len(case.episode.moments) - 1
     for step, (moment, when) in enumerate(_moments(case)):
@@ -214,7 +215,7 @@ def everybody_acts_to_the_end(case: EnvironmentCase) -> None:
 
 
 def values_are_plain(case: EnvironmentCase) -> None:
-    """Rewards are finite Python floats, terminations and truncations Python bools."""
+    """Rewards are finite Python floats; terminations and truncations are Python bools."""
     for moment, when in _moments(case):
         for agent, reward in moment.parts.get("rewards", {}).items():
             require(
@@ -231,7 +232,7 @@ def values_are_plain(case: EnvironmentCase) -> None:
 
 
 def results_are_fresh(case: EnvironmentCase) -> None:
-    """Returned values are neither returned again nor changed later."""
+    """The environment neither returns an object twice nor changes it later."""
     previous: Moment | None = None
     for moment, when in _moments(case):
         for name, part in moment.given.items():
@@ -250,7 +251,7 @@ def results_are_fresh(case: EnvironmentCase) -> None:
 
 
 def what_was_given_may_be_changed(case: EnvironmentCase) -> None:
-    """Overwriting observations, infos and results does not reach into the environment."""
+    """Changes to returned observations, infos and results do not change the environment."""
     env = case.make()
     moment = begin(env, case.seed)
     choose = random_actions(case.seed)
@@ -296,7 +297,7 @@ def _when(index: int) -> str:
 
 
 def pictures_are_pictures(case: EnvironmentCase) -> None:
-    """With render mode "rgb_array", `render` gives uint8 pixels."""
+    """With render mode "rgb_array", `render` returns uint8 pixels, ``(height, width, 3)``."""
     case.need_episode()
     env = case.make()
     if getattr(env, "render_mode", None) != "rgb_array":
@@ -314,7 +315,7 @@ def pictures_are_pictures(case: EnvironmentCase) -> None:
 
 
 def wrong_actions_are_refused(case: EnvironmentCase) -> None:
-    """An action out of range, or missing, is an error, after which the episode goes on."""
+    """An action out of range, or a missing one, is an error; after it the episode goes on."""
     case.need_episode()
     env = case.make()
     _, infos = env.reset(seed=case.seed)
@@ -361,7 +362,7 @@ BEHAVIOUR = (
 
 
 def agents_are_named(case: EnvironmentCase) -> None:
-    """Agents are known before `reset` and called ``<group>_<n>``."""
+    """Agents are known before `reset` and named ``<group>_<n>``."""
     agents: Any = getattr(case.fresh, "possible_agents", None)
     require(
         isinstance(agents, list) and agents,
@@ -420,7 +421,7 @@ def agents_have_traffic_lights(case: EnvironmentCase) -> None:
 
 
 def spaces_are_the_same_objects(case: EnvironmentCase) -> None:
-    """Asking twice for a space gives one object, or seeding it would have no effect."""
+    """A space is the same object at each call; otherwise seeding it would have no effect."""
     env = case.fresh
     for agent in env.possible_agents:
         for kind in ("observation_space", "action_space"):
@@ -474,7 +475,7 @@ def _require_bounded(space: Any, what: str) -> None:
 
 
 def action_spaces_count_from_zero(case: EnvironmentCase) -> None:
-    """Actions are the whole numbers 0 to n - 1 with n > 1."""
+    """Actions are the whole numbers from 0 to n - 1, with n > 1."""
     for agent in case.fresh.possible_agents:
         space: Any = case.fresh.action_space(agent)
         require(
@@ -485,14 +486,14 @@ def action_spaces_count_from_zero(case: EnvironmentCase) -> None:
 
 
 def state_space_is_bounded(case: EnvironmentCase) -> None:
-    """`state_space` exists before `reset`; float32, finite."""
+    """`state_space` exists before `reset`, is float32 and has finite bounds."""
     space = getattr(case.fresh, "state_space", None)
     require(space is not None, "state_space is missing; skrl and QMIX read it before reset()")
     _require_bounded(space, "state_space")
 
 
 def metadata_is_complete(case: EnvironmentCase) -> None:
-    """`metadata` and `render_mode` are as PettingZoo wants them."""
+    """`metadata` and `render_mode` follow PettingZoo's rules."""
     env: Any = case.fresh
     metadata: Any = getattr(env, "metadata", None)
     require(isinstance(metadata, Mapping), f"metadata is {metadata!r}; make it a dict")
@@ -522,7 +523,7 @@ def metadata_is_complete(case: EnvironmentCase) -> None:
 
 
 def attributes_do_not_mislead(case: EnvironmentCase) -> None:
-    """There is no `num_envs` and no `device`."""
+    """There is no attribute `num_envs` or `device`, which other libraries would misread."""
     for env in (case.fresh, case.fresh.unwrapped):
         for name in ("num_envs", "device"):
             require(
@@ -548,7 +549,7 @@ DECLARED = (
 
 
 def nothing_starts_before_reset(case: EnvironmentCase) -> None:
-    """Making an environment starts neither SUMO nor a process."""
+    """The constructor of an environment starts neither SUMO nor a process."""
     before, simulated = descendants(), simulates_here()
     case.make()
     require(
@@ -562,7 +563,7 @@ def environments_can_be_sent(case: EnvironmentCase) -> None:
     """Before `reset` an environment can be pickled, and its copy works."""
     case.need_episode()
     env = case.make()
-    # A worker process does this. The bytes were made one line before: nothing foreign is unpickled.
+    # A worker process does the same. The bytes are our own: nothing foreign is unpickled.
     copy: AnyParallelEnv | None = None
     with Listening() as heard:
         copy = ForkingPickler.loads(ForkingPickler.dumps(env))  # pyright: ignore[reportAttributeAccessIssue]
@@ -611,7 +612,7 @@ def _a_step(env: AnyParallelEnv, seed: int | None) -> None:
 
 
 def reset_takes_seed_and_options(case: EnvironmentCase) -> None:
-    """`reset` takes the keywords `seed` and `options`, whatever is in the latter."""
+    """`reset` takes the keywords `seed` and `options`, and accepts unknown options."""
     case.need_episode()
     env = case.make()
     with Listening() as heard:
@@ -624,7 +625,7 @@ def reset_takes_seed_and_options(case: EnvironmentCase) -> None:
 
 
 def close_ends_processes(case: EnvironmentCase) -> None:
-    """After `close` no process is left that `reset` started."""
+    """After `close`, no process that `reset` started still runs."""
     case.need_episode()
     before = descendants()
     env = case.make()
@@ -641,13 +642,13 @@ def close_ends_processes(case: EnvironmentCase) -> None:
 
 
 def descendants() -> set[int]:
-    """Processes below this one that are not zombies; none where the system does not tell."""
+    """Return ids of running descendants of this process; none if the system has no ``/proc``."""
     found: set[int] = set()
     unseen = [os.getpid()]
     while unseen:
         process = unseen.pop()
         tasks: list[Path] = []
-        with Listening():  # the process, or one of its tasks, may have ended meanwhile
+        with Listening():  # the process or one of its tasks may have ended
             tasks += Path(f"/proc/{process}/task").glob("*/children")
         for task in tasks:
             with Listening():
@@ -677,12 +678,12 @@ ENVIRONMENT_CHECKS = (an_episode_runs, *LIFE, *DECLARED, *BEHAVIOUR)
 
 
 def check_environment(make_env: MakeEnv, seed: int = 1) -> list[Result]:
-    """Check an environment, the suite's own, a wrapped or a third-party one.
+    """Check an environment: one of the suite, a wrapped one, or a third-party one.
 
-    Plays about three whole episodes; give it short ones.
+    The checks play about three whole episodes, so use an environment with short episodes.
 
     Args:
-        make_env: Makes a fresh environment.
+        make_env: Function that returns a new environment.
         seed: Seed of the episodes.
     """
     case = EnvironmentCase(make_env, seed)

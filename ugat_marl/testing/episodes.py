@@ -1,4 +1,4 @@
-"""Whole episodes as values, to be looked at and compared to the bit."""
+"""Whole episodes as values that checks inspect and compare to the bit."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from ugat_marl.seeding import numpy_generator
 from ugat_marl.testing.results import ConformanceError, Listening, NotChecked
 
 MakeEnv = Callable[[], AnyParallelEnv]
-"""Makes a fresh environment of the kind to be checked, not reset yet."""
+"""Function that returns a new environment of the kind to check, not yet reset."""
 
 Choose = Callable[[int, AnyParallelEnv, Mapping[str, Any]], Actions]
-"""Maps step, environment and infos to actions."""
+"""Function of step, environment and infos that returns the actions of all agents."""
 
 PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
+"""Names of the values that `step` returns, in their order."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +29,10 @@ class Moment:
     """Values that `reset` or one `step` returned.
 
     Attributes:
-        parts: Name of each of `PARTS` that was given, to a copy of it as it was at the time.
-        given: The same objects themselves, which the environment may have changed since.
-        agents: `env.agents` afterwards.
-        actions: The actions that led here; None for `reset`.
+        parts: Name of each returned value (of `PARTS`) to a copy made at that time.
+        given: Name to the returned object itself. The environment may have changed it since.
+        agents: `env.agents` after the call.
+        actions: Actions of the step; None for `reset`.
     """
 
     parts: Mapping[str, Any]
@@ -52,7 +53,12 @@ class Moment:
 
 @dataclass(frozen=True)
 class Episode:
-    """All moments of an episode, `reset` first, and the scores the environment gave at its end."""
+    """All moments of an episode, `reset` first, and the scores at its end.
+
+    Attributes:
+        moments: Moment of `reset`, then one per step.
+        scores: Scores that the environment gave; None if it has none.
+    """
 
     moments: tuple[Moment, ...]
     scores: Any = None
@@ -64,12 +70,12 @@ class Episode:
 
 
 class EnvironmentCase:
-    """Environment under examination; work that several checks need is done once.
+    """Environment that is checked. Work that several checks need is done once.
 
     Args:
-        make_env: Makes the environment.
+        make_env: Function that returns a new environment.
         seed: Seed of the episodes.
-        max_steps: An episode longer than this is taken to have no end.
+        max_steps: Number of steps after which an episode counts as endless.
     """
 
     def __init__(self, make_env: MakeEnv, seed: int = 1, max_steps: int = 10_000) -> None:
@@ -83,7 +89,7 @@ class EnvironmentCase:
         self._failed = False
 
     def make(self) -> AnyParallelEnv:
-        """Return a new environment, which `tidy` closes."""
+        """Return a new environment; `tidy` closes it."""
         env = self._make_env()
         self._made.append(env)
         return env
@@ -102,16 +108,17 @@ class EnvironmentCase:
             raise NotChecked("not checked, because no whole episode could be run")
         if self._episode is None:
             self._failed = True
-            # After its episode it holds no simulation, but the process that forks new ones.
+            # After its episode this environment keeps no simulation, only the process that forks
+            # new ones, so it need not be closed before the next check.
             self._episode = self.play(self._keep(), self.seed)
             self._failed = False
         return self._episode
 
     def need_episode(self) -> None:
-        """Skip a check where no episode can be run.
+        """Skip a check if no whole episode can be run.
 
         Raises:
-            NotChecked: It cannot.
+            NotChecked: No whole episode can be run.
         """
         _ = self.episode
 
@@ -126,7 +133,7 @@ class EnvironmentCase:
         return play(env, seed, choose or random_actions(self.seed), self.max_steps, watch)
 
     def tidy(self) -> None:
-        """Close what `make` has made; what is wrong with `close` is for a check to say."""
+        """Close the environments of `make`. Errors are ignored, since a check covers `close`."""
         while self._made:
             with Listening():
                 self._made.pop().close()
@@ -154,13 +161,13 @@ def play(
 
     Args:
         env: The environment.
-        seed: Given to `reset`, unless it is None.
-        choose: Chooses the actions.
-        max_steps: When to give up.
-        watch: Called after `reset` and after every step.
+        seed: Seed for `reset`; None to call `reset` without a seed.
+        choose: Function that chooses the actions.
+        max_steps: Number of steps after which the episode counts as endless.
+        watch: Function called after `reset` and after every step.
 
     Raises:
-        ConformanceError: The episode does not end.
+        ConformanceError: The episode does not end, or has no agents after `reset`.
     """
     moments = [begin(env, seed)]
     if not env.agents:
@@ -183,13 +190,13 @@ def play(
 
 
 def begin(env: AnyParallelEnv, seed: int | None) -> Moment:
-    """Reset the environment."""
+    """Reset the environment and return the moment."""
     given = env.reset() if seed is None else env.reset(seed=seed)
     return _moment(env, ("observations", "infos"), given, None)
 
 
 def proceed(env: AnyParallelEnv, actions: Actions) -> Moment:
-    """Step the environment."""
+    """Step the environment and return the moment."""
     return _moment(env, PARTS, env.step(dict(actions)), dict(actions))
 
 
@@ -209,13 +216,13 @@ def _moment(
 
 
 def _all_over(moment: Moment) -> bool:
-    """Return True if all agents are done, even if the environment left them in `agents`."""
+    """Return True if all agents are done, even if the environment still lists them."""
     ended, cut = moment.parts["terminations"], moment.parts["truncations"]
     return all(ended.get(agent) or cut.get(agent) for agent in moment.agents)
 
 
 def random_actions(seed: int) -> Choose:
-    """Chooses among the actions each agent's mask allows; the stream begins anew at step 0."""
+    """Return a function that draws allowed actions; its random stream restarts at step 0."""
     generator = numpy_generator(seed, "conformance", "actions")
 
     def choose(step: int, env: AnyParallelEnv, infos: Mapping[str, Any]) -> Actions:
@@ -241,7 +248,7 @@ def _random_action(
 
 
 def allowed_actions(info: Any, count: int) -> NDArray[np.int64]:
-    """Return the actions a mask allows; all where there is no mask, or no mask that makes sense."""
+    """Return the actions that a mask allows; all actions if there is no valid mask."""
     mask = np.asarray(info.get("action_mask")) if isinstance(info, Mapping) else np.empty(0)
     if mask.shape == (count,) and mask.dtype.kind in "biu" and mask.any():
         return np.flatnonzero(mask)
@@ -249,7 +256,10 @@ def allowed_actions(info: Any, count: int) -> NDArray[np.int64]:
 
 
 def replaying(episode: Episode, *, reverse: bool = False) -> Choose:
-    """Chooses what was chosen in `episode`; with `reverse` in dicts of the opposite order."""
+    """Return a function that repeats the actions of `episode`.
+
+    With `reverse`, the dicts list the agents in the opposite order.
+    """
 
     def choose(step: int, env: AnyParallelEnv, infos: Mapping[str, Any]) -> Actions:
         if step >= len(episode.actions):
@@ -265,7 +275,7 @@ def replaying(episode: Episode, *, reverse: bool = False) -> Choose:
 def require_same(expected: Episode, found: Episode, what: str, cure: str) -> None:
     """Raise a `ConformanceError` that names the first difference of two episodes.
 
-    Scores are not compared; see `different`.
+    Scores are not compared; use `different` for them.
     """
     for step, (a, b) in enumerate(zip(expected.moments, found.moments, strict=False)):
         if where := different(a.parts, b.parts):
@@ -276,7 +286,7 @@ def require_same(expected: Episode, found: Episode, what: str, cure: str) -> Non
 
 
 def different(a: Any, b: Any, path: str = "") -> str:
-    """Say in words where two nested values first differ; empty if they are equal to the bit."""
+    """Return in words where two nested values first differ; "" if they are equal to the bit."""
     if is_dataclass(a) and is_dataclass(b):
         a, b = asdict(a), asdict(b)  # pyright: ignore[reportArgumentType]
     if isinstance(a, Mapping) and isinstance(b, Mapping):

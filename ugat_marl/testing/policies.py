@@ -1,4 +1,4 @@
-"""Checks of a policy: what `ugat_marl.policies.protocols.Policy` promises."""
+"""Checks of a policy against the promises of `ugat_marl.policies.protocols.Policy`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Answers = list[Mapping[str, Any]]
 
 
 class PolicyCase(EnvironmentCase):
-    """Policy under examination, and an episode (of other actions) for it to answer to.
+    """Policy that is checked, with an episode of random actions as its questions.
 
     Args:
         policy: The policy.
-        make_env: Makes an environment with the policy's `env_options`.
+        make_env: Function that returns a new environment with the policy's `env_options`.
         seed: Seed of the episode and of `policy.reset`.
-        max_steps: An episode longer than this is taken to have no end.
+        max_steps: Number of steps after which an episode counts as endless.
     """
 
     def __init__(
@@ -39,16 +39,16 @@ class PolicyCase(EnvironmentCase):
 
     @property
     def questions(self) -> Sequence[Moment]:
-        """Every moment of the episode at which a policy acts."""
+        """Moments of the episode at which a policy acts: all but the last."""
         return self.episode.moments[:-1]
 
     @property
     def answers(self) -> Answers:
-        """Return the policy's answers from `reset(seed)` on."""
+        """The policy's answers to all questions after `reset(seed)`."""
         if self._speechless:
             raise NotChecked("not checked, because act() failed")
         if self._first is None:
-            self.need_episode()  # where that fails, it is not the policy's fault
+            self.need_episode()  # a failure here is not the policy's fault
             self._speechless = True
             self._first = self.ask(self.policy)
             self._speechless = False
@@ -56,23 +56,23 @@ class PolicyCase(EnvironmentCase):
 
     @property
     def second_answers(self) -> Answers:
-        """Return its answers to the same questions after another `reset(seed)`."""
+        """The policy's answers to the same questions after a second `reset(seed)`."""
         if self._again is None:
             _ = self.answers
             self._again = self.ask(self.policy)
         return self._again
 
     def need_repeatable(self) -> None:
-        """Skip a check where the policy does not repeat its answers.
+        """Skip a check if the policy does not repeat its answers.
 
         Raises:
-            NotChecked: It does not.
+            NotChecked: The policy does not repeat its answers.
         """
         if self.answers != self.second_answers:
             raise NotChecked("not checked, because the policy does not repeat its answers")
 
     def ask(self, policy: Policy, order: Callable[[Any], Any] = dict) -> Answers:
-        """Return a policy's answer; `order` arranges the dicts it is given."""
+        """Return a policy's answers to all questions; `order` sorts the dicts that it gets."""
         policy.reset(self.seed)
         found: Answers = []
         for moment in self.questions:
@@ -91,7 +91,7 @@ class PolicyCase(EnvironmentCase):
 
 
 def it_is_a_policy(case: PolicyCase) -> None:
-    """It has `env_options`, `reset(seed)` and `act(observations, infos)`."""
+    """The policy has `env_options`, `reset(seed)` and `act(observations, infos)`."""
     for name in ("reset", "act"):
         require(
             callable(getattr(case.policy, name, None)),
@@ -110,7 +110,7 @@ def it_answers(case: PolicyCase) -> None:
 
 
 def it_acts_for_every_agent(case: PolicyCase) -> None:
-    """`act` returns an action for each agent, and no other."""
+    """`act` returns an action for each agent, and for no other name."""
     agents = set(case.fresh.possible_agents)
     for step, answer in enumerate(case.answers):
         missing, unknown = sorted(agents - set(answer)), sorted(set(answer) - agents)
@@ -122,7 +122,7 @@ def it_acts_for_every_agent(case: PolicyCase) -> None:
 
 
 def its_actions_are_phases(case: PolicyCase) -> None:
-    """Every action is a whole number from 0 to the agent's number of actions - 1."""
+    """Every action is a whole number from 0 to n - 1 for an agent with n actions."""
     for step, answer in enumerate(case.answers):
         for agent, action in answer.items():
             count = case.actions(agent) if agent in case.fresh.possible_agents else 0
@@ -139,7 +139,7 @@ def _is_phase(action: Any, count: int) -> bool:
 
 
 def it_respects_masks(case: PolicyCase) -> None:
-    """An action the mask forbids is never chosen, whatever the observation."""
+    """The policy never chooses an action that the mask forbids, for any observation."""
     _ = case.answers
     options: Any = getattr(case.policy, "env_options", None) or {}
     if options.get("signals") == "programme":
@@ -190,7 +190,7 @@ def order_does_not_matter(case: PolicyCase) -> None:
 
 
 def what_it_is_given_stays_as_it_is(case: PolicyCase) -> None:
-    """`act` changes neither observations nor infos: they may be stored by a learner."""
+    """`act` changes neither observations nor infos, since a learner may store them."""
     _ = case.answers
     case.policy.reset(case.seed)
     for step, moment in enumerate(case.questions):
@@ -204,7 +204,7 @@ def what_it_is_given_stays_as_it_is(case: PolicyCase) -> None:
 
 
 def saving_keeps_its_answers(case: PolicyCase) -> None:
-    """A loaded policy answers like the saved one, where it has `save` and `load`."""
+    """A loaded policy answers like the saved one, if the policy has `save` and `load`."""
     policy: Any = case.policy
     if not (callable(getattr(policy, "save", None)) and callable(getattr(policy, "load", None))):
         return
@@ -212,7 +212,7 @@ def saving_keeps_its_answers(case: PolicyCase) -> None:
     with TemporaryDirectory(prefix="ugat_marl-check-") as folder:
         path = Path(folder) / "policy.pt"
         policy.save(path)
-        # `load` makes a policy (a class method), or fills the one it is called on.
+        # `load` either is a class method that returns a policy, or fills the policy it belongs to.
         loaded = type(policy).load(path) if _makes(policy) else copy.deepcopy(policy)
         if not _makes(policy):
             loaded.load(path)
@@ -247,7 +247,8 @@ def check_policy(policy: Policy, make_env: MakeEnv, seed: int = 1) -> list[Resul
 
     Args:
         policy: The policy.
-        make_env: Makes an environment with the policy's `env_options`; one episode of it is played.
+        make_env: Function that returns a new environment with the policy's `env_options`. The
+            checks play one episode.
         seed: Seed of that episode and of `policy.reset`.
     """
     case = PolicyCase(policy, make_env, seed)

@@ -15,7 +15,7 @@ from ugat_marl.errors import UgatMarlError
 
 
 class ConformanceError(UgatMarlError, AssertionError):
-    """A subject breaks a rule; the message says which, and how to mend it."""
+    """A subject breaks a rule; the message names the rule and the repair."""
 
 
 class NotChecked(ConformanceError):
@@ -29,7 +29,7 @@ class Result:
     Attributes:
         name: Name of the check's function.
         passed: Whether the subject passed; None if the check could not be made.
-        message: What is wrong and how to mend it; empty if passed.
+        message: Fault and its repair; "" if the subject passed.
     """
 
     name: str
@@ -38,10 +38,10 @@ class Result:
 
 
 class Closing(Protocol):
-    """A subject under examination that cleans up after each check."""
+    """A case that cleans up after each check."""
 
     def tidy(self) -> None:
-        """Close what the last check has made."""
+        """Close all that the last check has opened."""
         ...
 
 
@@ -49,10 +49,10 @@ AnyCase = TypeVar("AnyCase", bound=Closing)
 
 
 class Listening:
-    """Context that keeps any exception raised by a foreign subject in its body, but Ctrl-C.
+    """Context that catches and keeps the exceptions of a subject; Ctrl-C still passes.
 
     Attributes:
-        error: The exception, or None.
+        error: The exception; None if there was none.
     """
 
     error: BaseException | None = None
@@ -71,7 +71,7 @@ class Listening:
 
 
 def run_checks(checks: Sequence[Callable[[AnyCase], None]], case: AnyCase) -> list[Result]:
-    """Run every check on one case, whatever the others said."""
+    """Run every check on one case, even if earlier ones failed, and return their results."""
     results: list[Result] = []
     for check in checks:
         with Listening() as heard:
@@ -87,7 +87,7 @@ def run_checks(checks: Sequence[Callable[[AnyCase], None]], case: AnyCase) -> li
 
 
 def said(error: BaseException) -> str:
-    """Return an exception in one line: our own by message, others with type and place."""
+    """Return an exception in one line: the suite's own as message, others with type and place."""
     if isinstance(error, UgatMarlError):
         return str(error)
     frames = traceback.extract_tb(error.__traceback__)

@@ -25,16 +25,16 @@ from ugat_marl.testing.episodes import begin, proceed, random_actions
 from ugat_marl.testing.results import NotChecked, Result, require, run_checks
 
 Change = Callable[[Scenario, str], Scenario]
-"""Puts a scenario into a domain."""
+"""Function that puts a scenario into a domain."""
 
 
 class ScenarioCase:
-    """Scenario under examination.
+    """Scenario that is checked.
 
     Args:
-        name: As for `ugat_marl.load_scenario`.
+        name: Name, directory or scenario, as for `ugat_marl.load_scenario`.
         seed: Seed of the short simulations.
-        change: How a scenario is put into a domain.
+        change: Function that puts a scenario into a domain.
     """
 
     def __init__(
@@ -57,12 +57,12 @@ class ScenarioCase:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario, with the effects of its own file."""
+        """The scenario, with the effects that its own file names."""
         return self._once("_scenario", "it cannot be loaded")
 
     @property
     def network(self) -> Network:
-        """Its network."""
+        """Network of the scenario."""
         return self._once("_network", "its network cannot be used")
 
     @cached_property
@@ -71,7 +71,7 @@ class ScenarioCase:
 
     @property
     def demand(self) -> Demand:
-        """Its demand, all edges of which exist."""
+        """Demand of the scenario, in which all edges exist."""
         return self._once("_demand", "its routes do not exist")
 
     def in_domain(self, domain: str) -> Scenario:
@@ -81,7 +81,7 @@ class ScenarioCase:
         return self._domains[domain]
 
     def need_demand(self) -> None:
-        """Skip a check that simulates where demand or network are broken.
+        """Skip a check that simulates if the demand or the network is broken.
 
         Raises:
             NotChecked: The scenario cannot be simulated.
@@ -97,7 +97,7 @@ class ScenarioCase:
         return found
 
     def environment(self, scenario: Scenario) -> TrafficEnv:
-        """Return an environment of the scenario as it is."""
+        """Return an environment of the scenario; `tidy` closes it."""
         env = parallel_env(scenario)
         self._envs.append(env)
         return env
@@ -109,17 +109,17 @@ class ScenarioCase:
 
 
 def it_loads(case: ScenarioCase) -> None:
-    """Its files are there and its settings valid."""
+    """The files of the scenario exist and its settings are valid."""
     require(case.scenario.decisions > 0, f"scenario {case.scenario.id!r} has no decision in it")
 
 
 def its_network_can_be_controlled(case: ScenarioCase) -> None:
-    """The network has traffic lights, and their phases can be shown and do not conflict."""
+    """The network has traffic lights with phases that can be shown and do not conflict."""
     require(case.network.intersections, "the network has no traffic light")
 
 
 def every_lane_gets_green(case: ScenarioCase) -> None:
-    """Every lane and every link is green in some phase, or vehicles would wait for ever."""
+    """Every lane and every link is green in some phase; otherwise vehicles wait for ever."""
     for item in case.network.intersections:
         served = _served(item)
         links = [link for link in item.links if link.index not in served]
@@ -144,7 +144,7 @@ def _served(item: Intersection) -> set[int]:
 
 
 def no_greens_conflict(case: ScenarioCase) -> None:
-    """Neither a phase nor the network's own programme gives green to streams that cross."""
+    """No phase and no state of the network's own programme gives green to crossing streams."""
     foes = _foes(case.scenario)
     for item in case.network.intersections:
         shown = {"phase": item.phases, "programme": [state for _, state in item.programme]}
@@ -160,7 +160,7 @@ def no_greens_conflict(case: ScenarioCase) -> None:
 
 
 def _foes(scenario: Scenario) -> dict[str, list[int]]:
-    """Junction to a bit mask of foes for each row of its right-of-way matrix."""
+    """Return junction to a bit mask of foes for each row of its right-of-way matrix."""
     found: dict[str, list[int]] = {}
     for junction in scenario.network.parse().iter("junction"):
         rows = sorted(junction.iter("request"), key=lambda row: int(row.get("index", "0")))
@@ -169,7 +169,7 @@ def _foes(scenario: Scenario) -> dict[str, list[int]]:
 
 
 def its_routes_exist(case: ScenarioCase) -> None:
-    """All routes use edges of the network, and some vehicle departs."""
+    """All routes use edges of the network, and at least one vehicle departs."""
     require(case.demand.vehicles or case.demand.flows, "nobody departs within the episode")
 
 
@@ -201,7 +201,7 @@ def _routes(root: ET.Element) -> list[tuple[str, list[str]]]:
 
 
 def vehicles_enter_early(case: ScenarioCase) -> None:
-    """Some vehicle enters within the first tenth of the episode."""
+    """At least one vehicle enters within the first tenth of the episode."""
     case.need_demand()
     decisions = max(1, case.scenario.decisions // 10)
     seconds = decisions * case.scenario.control.decision_interval_s
@@ -220,7 +220,7 @@ def vehicles_enter_early(case: ScenarioCase) -> None:
 
 
 def effects_change_it(case: ScenarioCase) -> None:
-    """V1 to V4 apply, change the hash, each in its own way, and run in SUMO."""
+    """V1 to V4 can be applied, give four new hashes, and run in SUMO."""
     case.need_demand()
     hashes = {case.scenario.hash: "sim"}
     for name in SETTINGS:
@@ -237,7 +237,7 @@ def effects_change_it(case: ScenarioCase) -> None:
 
 
 def writing_keeps_it(case: ScenarioCase) -> None:
-    """Written to a directory and loaded again it has the same hash, in V4 too."""
+    """A scenario that is written and loaded again has the same hash, in `sim` and in V4."""
     for domain in ("sim", "V4"):
         changed = case.in_domain(domain)
         with TemporaryDirectory(prefix="ugat_marl-check-") as folder:
@@ -264,10 +264,12 @@ SCENARIO_CHECKS = (
 
 
 def check_scenario(name: str | Path | Scenario, seed: int = 1) -> list[Result]:
-    """Check a scenario; simulate a tenth of an episode, and a decision in each of V1 to V4.
+    """Check a scenario.
+
+    The checks simulate a tenth of an episode in `sim` and one decision in each of V1 to V4.
 
     Args:
-        name: As for `ugat_marl.load_scenario`.
+        name: Name, directory or scenario, as for `ugat_marl.load_scenario`.
         seed: Seed of the simulations.
     """
     return run_checks(SCENARIO_CHECKS, ScenarioCase(name, seed))

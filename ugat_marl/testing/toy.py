@@ -1,7 +1,7 @@
 """Small environment without SUMO that keeps every rule of `ugat_marl.testing`.
 
-For fast tests of learners and wrappers, and the good subject that the kit's own tests break in one
-place each. Unequal intersections: queues grow by random arrivals, the green phase serves its lanes.
+It serves fast tests of learners and wrappers. The tests of the kit take it as a good subject and
+break one rule each. Queues grow by random arrivals, and the green phase serves its lanes.
 """
 
 from __future__ import annotations
@@ -23,16 +23,18 @@ CAPACITY = 20
 
 
 class ToyTraffic(ParallelEnv[str, Any, Any]):
-    """Queues at three intersections, two of four lanes and one of three.
+    """Queues at three intersections: two have four lanes, one has three.
 
-    Phase k serves lanes k and k + 1. Reward: minus the queued vehicles of the intersection.
+    Phase k serves lanes k and k + 1. The reward is minus the number of queued vehicles at the
+    intersection.
 
     Args:
-        steps: Decisions in an episode.
-        served: Vehicles that leave a green lane per decision; another value is another domain.
-        arrivals: Mean arrivals per lane and decision.
-        equal: Leave the intersection of three lanes out.
-        masked: Forbid phases at random, by the masks; to show one is an `ActionError`.
+        steps: Number of decisions in an episode.
+        served: Largest number of vehicles that leave a green lane per decision. Another value makes
+            another domain.
+        arrivals: Mean number of arrivals per lane and decision.
+        equal: Leave out the intersection with three lanes.
+        masked: Forbid random phases by the masks; a forbidden phase raises an `ActionError`.
     """
 
     observation_spaces: dict[str, Box]
@@ -94,7 +96,7 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
-        """Empty the roads."""
+        """Empty the roads and begin an episode."""
         if seed is not None:
             self._generator = np.random.default_rng(seed)
         self._traffic = np.random.default_rng(int(self._generator.integers(2**31)))
@@ -148,7 +150,7 @@ class ToyTraffic(ParallelEnv[str, Any, Any]):
         return np.concatenate(list(self._vectors().values()))
 
     def scores(self) -> Scores:
-        """Return the measures of the episode that has ended; times are counted in decisions."""
+        """Return the measures of the episode that has ended."""
         if self._scores is None:
             raise EpisodeError("scores() needs a whole episode")
         return self._scores
