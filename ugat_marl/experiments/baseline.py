@@ -1,4 +1,4 @@
-"""Command of a baseline's file: train its learner on one scenario and judge it."""
+"""Command line of a baseline's file: train its learner on one scenario and judge it."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class BaselineArgs:
 
     Attributes:
         scenario: Id or path of the scenario.
-        domain: The world to train and to be judged in.
+        domain: Domain in which to train and to judge.
         duration_s: Length of an episode in s; none: the scenario's own.
-        episodes: Episodes to train.
-        seed: Seed of all that is drawn.
+        episodes: Number of training episodes.
+        seed: Root of every random choice.
         evaluate_every: Episodes from one evaluation to the next; 0: only at the end.
-        evaluation_seeds: Episodes of an evaluation, always the same; 0: none.
+        evaluation_seeds: Number of episodes of an evaluation, always the same; 0: none.
         out: Folder for policy.pt, learner.pt and result.json.
     """
 
@@ -49,7 +49,13 @@ class BaselineArgs:
 
 
 class Result(NamedTuple):
-    """The policy, the return of each episode, and by episodes trained the ATT of each seed, s."""
+    """Result of a training.
+
+    Attributes:
+        policy: The trained policy.
+        returns: Return of each training episode.
+        att_s: ATT of each evaluation seed in s, by number of training episodes.
+    """
 
     policy: NetworkPolicy
     returns: list[float]
@@ -64,7 +70,7 @@ def train_baseline(
     """Train and evaluate; write the results if `args.out` is given.
 
     Args:
-        args: What to do.
+        args: Options of the training.
         make: Makes the learner for an environment.
         on_episode: Called after every episode of training.
     """
@@ -101,7 +107,7 @@ def train_baseline(
 def baseline_command(
     kind: type[BaselineArgs], train: Callable[[Any, EpisodeCallback | None], Result]
 ) -> None:
-    """Read the command line into `kind`, train, print; errors are one line."""
+    """Read the command line into `kind`, train and print the results; an error is one line."""
     name = Path(sys.argv[0]).name
     try:
         result = train(

@@ -1,7 +1,7 @@
-"""The driver: settings x domains x seeds, several at a time, resumable.
+"""Driver: performs many jobs, several at a time, and resumes them.
 
-A job is described in its folder and leaves its results there, so that an executor whose workers are
-elsewhere needs a file system they have in common.
+A job's folder holds its description and its results. Workers on other machines therefore need a
+shared file system.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from ugat_marl.progress import Reporter
 
 LOG = "job.log"
 _TAIL = 400
-"""Letters of a failed job's log that are shown."""
+"""Number of characters shown from the end of a failed job's log."""
 
 
 def record_of(job: Job, folder: Path) -> Record | None:
-    """Return the record of a job; None if something of it is missing.
+    """Return the record of a job; None if an evaluation is missing.
 
     Args:
         job: The job.
@@ -45,22 +45,21 @@ def perform_all(
     *,
     keep_going: bool = False,
 ) -> dict[str, str]:
-    """Perform what is not done yet, each job in a process of its own.
+    """Perform the unfinished jobs, each in its own process.
 
     Args:
-        plan: Jobs; those that are the same are performed once. A job waits for the one it starts
-            from.
+        plan: Jobs; equal jobs are performed once. A job waits for the job it starts from.
         folder: Folder that holds the jobs' folders.
         workers: Jobs at a time, or an executor.
         reporter: Shows progress.
-        title: What to call the work there.
+        title: Title of the progress bar.
         keep_going: Perform the other jobs if one fails.
 
     Returns:
-        Name of each job that failed to its reason; empty unless `keep_going`.
+        Reason of failure by name of the job; empty unless `keep_going`.
 
     Raises:
-        MeasurementError: A job failed; its log says why. The others' results are kept.
+        MeasurementError: A job failed; its log holds the reason. Results of other jobs are kept.
         OptionError: Another process performs jobs in that folder.
     """
     jobs = list({job.name: job for job in plan}.values())
@@ -80,7 +79,7 @@ def perform_all(
                     own = folder.resolve() / job.name
                     job.write(own)
                     running[pool.submit(_perform_apart, str(own), stop)] = job
-                # Wakes up now and then, so that Ctrl-C is heard.
+                # The timeout lets Ctrl-C interrupt the wait.
                 finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
                 for future in finished:
                     job = running.pop(future)
@@ -102,7 +101,7 @@ def perform_here(plan: Sequence[Job], folder: Path, reporter: Reporter) -> list[
     """Perform jobs one after another in this process and return their records.
 
     Args:
-        plan: Jobs; one that another starts from comes before it.
+        plan: Jobs; a job comes after the job it starts from.
         folder: Folder that holds the jobs' folders.
         reporter: Shows progress.
     """
@@ -115,15 +114,15 @@ def perform_here(plan: Sequence[Job], folder: Path, reporter: Reporter) -> list[
 
 
 def _perform_apart(folder: str, stop: Stop) -> None:
-    """Perform the job in a folder in another process, until nobody waits for it any more."""
+    """Perform the job in a folder in another process; end it when `stop` is set."""
     with Path(folder, LOG).open("wb") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "ugat_marl.experiments.jobs", folder],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=subprocess.STDOUT,
-            env={"OMP_NUM_THREADS": "1", **os.environ},  # a job has a core
-            start_new_session=True,  # Ctrl-C is for this process; it ends the others itself
+            env={"OMP_NUM_THREADS": "1", **os.environ},  # each job has one core
+            start_new_session=True,  # Ctrl-C reaches this process only; it ends the jobs itself
         )
     try:
         while process.poll() is None and not stop.wait(0.1):

@@ -1,4 +1,4 @@
-"""Controllers x gaps: the cost of each gap to each controller, over all its domains."""
+"""Cost of each gap to each controller, as a matrix."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Cell:
 
     Attributes:
         cost: Mean over the gap's domains and the seeds, with an interval over seeds. For the
-            reward gap the cost of the domain's objective above that of the best controller there,
-            in %, for the others the travel time above that of the same controller in the first
-            domain, in s.
-        worst: The domain in which it is highest.
-        worst_cost: The mean there.
+            reward gap: the cost of the domain's objective above that of the best controller there,
+            in %. For the other gaps: the travel time above that of the same controller in the
+            first domain, in s.
+        worst: Name of the domain with the highest cost.
+        worst_cost: Mean cost in that domain.
     """
 
     cost: Estimate
@@ -31,7 +31,7 @@ class Cell:
 
 
 def gaps_of(found: Evaluation) -> dict[str, list[str]]:
-    """Return the gaps of an evaluation with those of its domains that open them, none empty."""
+    """Return the names of the evaluation's domains by gap, without gaps that have no domain."""
     others = found.domains[1:]
     listed = {
         gap: [name for name in others if name in NAMED and NAMED[name].gap == gap] for gap in GAPS
@@ -63,7 +63,7 @@ def _cell(found: Evaluation, policy: str, gap: str, domains: Sequence[str]) -> C
 
 
 def _above_first(found: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
-    """Return the travel time above that in the first domain, seed by seed, in s."""
+    """Return the travel time minus that in the first domain, seed by seed, in s."""
     first = found.values(policy, found.domains[0], "att_s")
     return found.values(policy, domain, "att_s") - first
 

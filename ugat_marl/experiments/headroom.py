@@ -1,7 +1,7 @@
-"""Headroom of a scenario between controllers: the largest-queue rule, held long and short.
+"""Headroom of a scenario: the ATT of the largest-queue rule with long and short holds.
 
-Vehicles that start slowly are served better by longer greens. Where the rule that is best in
-simulation loses nothing in another domain, no transfer can win anything there.
+Longer greens serve slow vehicles better, so the best hold depends on the domain. If the rule best
+in `sim` loses nothing in another domain, no transfer can win anything there.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ SEEDS = (0, 1, 2, 3, 4)
 
 @dataclass(frozen=True)
 class Row:
-    """One domain.
+    """Results in one domain, means over the seeds.
 
     Attributes:
         domain: Name of the domain.
-        att_s: Mean ATT over the seeds for each hold, in the order of the holds.
-        programme_att_s: Mean ATT of the network's own signal programme.
-        best_hold_s: The hold with the smallest ATT.
-        lost: ATT of the rule best in the first domain above that of the rule best here, as a
-            fraction of the latter.
+        att_s: ATT for each hold in s, in the order of the holds.
+        programme_att_s: ATT of the network's own signal programme, in s.
+        best_hold_s: Hold with the smallest ATT, in s.
+        lost: ATT of the rule best in the first domain, divided by that of the rule best here,
+            minus 1.
         finished: Share of the vehicles due that arrive under the rule best here.
-        backlog: Vehicles that never got in under the rule best here, mean over the seeds.
+        backlog: Number of vehicles that never enter the network under the rule best here.
     """
 
     domain: str
@@ -57,9 +57,9 @@ def headroom(
     """Return the ATT of the largest-queue rule in every domain for every hold.
 
     Args:
-        scenario: Where.
-        domains: The first one is the domain the others are compared with.
-        holds_s: Shortest times a phase is kept, in s.
+        scenario: The scenario.
+        domains: Domains; the others are compared with the first.
+        holds_s: Shortest durations of a phase, in s.
         seeds: Seeds of the episodes.
         workers: Simulations at a time; None for the number of cores; or an executor.
         reporter: Shows progress.
@@ -68,7 +68,7 @@ def headroom(
         One row per domain.
 
     Raises:
-        OptionError: No domain, hold or seed.
+        OptionError: Domains, holds or seeds are empty.
     """
     if not (domains and holds_s and seeds):
         raise OptionError("headroom needs at least one domain, one hold and one seed")

@@ -1,4 +1,4 @@
-"""The machine and the versions a figure was taken with."""
+"""Facts of the machine and versions of the libraries, to store with measured results."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def machine_facts() -> dict[str, Any]:
 
 
 def _program() -> list[str]:
-    """Return the words to type for the running program; of an absolute path only the name."""
+    """Return the words to type for the running program; an absolute path is cut to its name."""
     path = Path(sys.argv[0])
     if path.name == "__main__.py":
         return ["ugat-marl"]
@@ -44,7 +44,7 @@ def _program() -> list[str]:
 
 
 def cpu_model() -> str:
-    """Return the processor's name, as the system calls it."""
+    """Return the name of the processor as the system reports it."""
     information = Path("/proc/cpuinfo")
     if information.exists():
         for line in information.read_text(errors="replace").splitlines():
@@ -54,7 +54,7 @@ def cpu_model() -> str:
 
 
 def memory_gib() -> float | None:
-    """Return the physical memory in GiB, or None where the system does not say."""
+    """Return the physical memory in GiB; None if the system does not report it."""
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
     except (AttributeError, ValueError, OSError):

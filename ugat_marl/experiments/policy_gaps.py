@@ -1,9 +1,8 @@
-"""Worth of a correction to those who train controllers: policies before and after it.
+"""Policy gaps: travel times of policies before and after the correction of a scenario.
 
-A policy's travel time in the simulation is a promise. The gap is how far the promise is from what
-the policy does in the real world; a corrected scenario is good if its promise is closer, for
-policies it has never seen. That can only be said where the "real" world can be played in, that is,
-where it is a simulation itself.
+The simulation predicts the travel time of a policy. The gap is the travel time in the real domain
+minus this prediction. A corrected scenario is good if it has a smaller gap, for policies that its
+diagnosis did not use. Only a real domain that is itself a simulation allows this test.
 """
 
 from __future__ import annotations
@@ -39,31 +38,34 @@ def policy_gap(
     duration_s: float | None = None,
     workers: Workers = None,
 ) -> dict[str, dict[str, Any]]:
-    """Play policies in the simulation, the corrected one and the real world.
+    """Play policies in the simulation, the corrected scenario and the real domain.
 
-    The demand and the seeds are the same in all three, but for what the correction changed about
-    the demand. Detector faults change no traffic and have no part in this.
+    All three have the same seeds and the same demand, unless the correction changed the demand.
+    Detector faults change no traffic, so they have no influence.
 
     Args:
-        scenario: The simulation as it was.
-        corrected: The same with the effects that were found.
-        real: The world the data came from.
-        policies: Name to factory.
+        scenario: The simulation before the correction.
+        corrected: The simulation with the effects of the diagnosis.
+        real: The domain of the measured data.
+        policies: Factories by name of the policy.
         seeds: Seeds of the episodes.
         reporter: Shows progress.
         duration_s: Length of an episode in s; None for the scenario's own.
-        workers: Simulations at a time, or who plays them (`executors`).
+        workers: Simulations at a time; None for the number of cores; or an executor.
 
     Returns:
-        For each policy ``sim``, ``corrected`` and ``real``: ATT in s as mean with Student's 95 %
-        interval ``low``, ``high`` (None for one seed); ``before`` and ``after``: |ATT(real) -
-        ATT(sim)| and |ATT(real) - ATT(corrected)| of the means, s; ``shrink``: 1 - after / before,
-        None where no gap is to be seen before (the interval of ATT(real) - ATT(sim), paired by
-        seed, holds 0).
+        For each policy, with ATT in s:
+
+        - ``sim``, ``corrected``, ``real``: ``mean`` of the ATT, and ``low`` and ``high`` of
+          Student's 95 % interval (None for one seed);
+        - ``before``: |ATT(real) - ATT(sim)| of the means;
+        - ``after``: |ATT(real) - ATT(corrected)| of the means;
+        - ``shrink``: 1 - after / before; None if the 95 % interval of ATT(real) - ATT(sim), paired
+          by seed, holds 0.
 
     Raises:
-        OptionError: The real world is the simulation, or there are no policies or seeds.
-        UnknownNameError: No such domain.
+        OptionError: The real domain is the simulation, or there are no policies or seeds.
+        UnknownNameError: A domain does not exist.
         ScenarioError: A scenario named as a domain cannot be read or has other roads.
     """
     if not policies or not seeds:
@@ -115,7 +117,7 @@ def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[dict[str, Any],
     """Read a diagnosis and the corrected scenario beside it.
 
     Args:
-        directory: What `ugat_marl.diagnosis.workflow.diagnose` wrote to.
+        directory: Output folder of `ugat_marl.diagnosis.workflow.diagnose`.
         scenario: The scenario that was diagnosed.
 
     Raises:
@@ -153,10 +155,12 @@ def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[dict[str, Any],
 def write_policy_gap(
     directory: Path, record: Mapping[str, Any], gap: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Write a diagnosis with its policy gap, whole or not at all, numbers to nine digits.
+    """Write a diagnosis with its policy gap, whole or not at all.
+
+    Numbers of the policy gap have nine significant digits.
 
     Returns:
-        What was written.
+        The content of the file.
     """
     content = {**record, "policy_gap": _rounded(gap)}
     text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)

@@ -38,7 +38,7 @@ class _Sums:
 
 
 class QueueRecord:
-    """Sum of halting vehicles on incoming lanes, minute by minute, over all episodes it sees."""
+    """Mean number of halting vehicles on incoming lanes, by minute, over all episodes."""
 
     def __init__(self) -> None:
         self._sums: dict[tuple[str, str], _Sums] = {}
@@ -48,12 +48,12 @@ class QueueRecord:
         """Return a callback for `evaluation.evaluate`, one per environment.
 
         Args:
-            policy: Who plays in it.
-            domain: Which world it is in.
+            policy: Name of the policy.
+            domain: Name of the domain.
             env: An environment of the suite, wrapped or not.
 
         Returns:
-            What is to be called after every decision.
+            A callback, to be called after every decision.
         """
         base: Any = env.unwrapped
         lights = base.network.intersections
@@ -80,7 +80,11 @@ class QueueRecord:
         return look
 
     def frame(self) -> pl.DataFrame:
-        """Return policy, domain, minute (from 0), intersection, queue (mean, vehicles), looks."""
+        """Return the record as a table.
+
+        Columns: policy, domain, minute (from 0), intersection, queue (mean number of halting
+        vehicles), looks (number of decisions in the mean).
+        """
         rows: list[tuple[str, str, int, str, float, int]] = []
         with self._lock:
             for (policy, domain), sums in self._sums.items():
@@ -95,7 +99,7 @@ class QueueRecord:
 
         Args:
             path: The file.
-            keep: Whether what is there already counts as well; a file that cannot be read does not.
+            keep: True to include the record in the file, if there is one that can be read.
         """
         frame = self.frame()
         if keep and path.exists():
@@ -108,7 +112,7 @@ class QueueRecord:
 
 
 def read_queues(path: Path) -> pl.DataFrame:
-    """Read what `QueueRecord.write` wrote.
+    """Read a table that `QueueRecord.write` wrote.
 
     Raises:
         CheckpointError: The file is missing, cut short or of another form.

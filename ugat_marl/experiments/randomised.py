@@ -1,8 +1,8 @@
 """Domain randomisation: every episode in another world, drawn from the ranges of the effects.
 
-What a policy has met in training, the street may do as well: the rival of every method that looks
-at the street. The effects are those in which the paper's worlds V1 to V4 differ; the ranges are the
-hull of those worlds, of the simulation, and of what the diagnosis tries.
+It needs no data of the real domain, so methods that use such data must beat it. The effects are
+those of the paper's domains V1 to V4. Each range spans the values of V1 to V4, of the simulation,
+and of the diagnosis.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import numpy_generator
 
 NO_SOFTER = {"emergency_deceleration": "deceleration"}
-"""Who brakes in an emergency brakes at least as hard as usual."""
+"""Effects with their lower bound: an emergency deceleration is at least the usual deceleration."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """The values an effect is drawn from.
+    """Range of the values of an effect.
 
     Attributes:
-        hypothesis: The effect, with its value left open.
+        hypothesis: The effect with an open value.
         low: Smallest value, in the effect's unit.
-        high: Largest value.
+        high: Largest value, in the effect's unit.
     """
 
     hypothesis: Hypothesis
@@ -47,11 +47,11 @@ class Range:
 def effect_ranges(scenario: Scenario) -> tuple[Range, ...]:
     """Return the ranges of the effects of V1 to V4 around a simulation.
 
-    Each holds the simulation's own value, those of V1 to V4, and those at which the diagnosis first
-    tries the effect (`discrepancy.hypotheses`).
+    Each range holds the simulation's own value, those of V1 to V4, and the first values that the
+    diagnosis tries, without the extreme ones.
 
     Args:
-        scenario: The simulation; its vehicle types say where each number is now.
+        scenario: The simulation; its vehicle types hold the present values.
     """
     settings = [effect for effects in SETTINGS.values() for effect in effects]
     found: list[Range] = []
@@ -67,8 +67,8 @@ def drawn(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
     """Draw the world of an episode: each value uniform in its range, independent of the others.
 
     Args:
-        ranges: What to draw.
-        seed: Of the episode.
+        ranges: Ranges of the effects.
+        seed: Seed of the episode.
     """
     generator = numpy_generator(seed, "randomised")
     values = {item.name: float(generator.uniform(item.low, item.high)) for item in ranges}
@@ -79,13 +79,13 @@ def drawn(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
 
 
 class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
-    """Environment with another world in every episode; `reset(seed)` decides which.
+    """Environment with another world in every episode; the seed of `reset` decides the world.
 
-    The simulation of one episode is ended before that of the next begins.
+    The simulation of an episode ends before the next one begins.
 
     Args:
-        make_env: Makes an environment with these effects upon the simulation.
-        ranges: What the worlds are drawn from.
+        make_env: Makes an environment of the simulation with some effects.
+        ranges: Ranges of the effects.
     """
 
     def __init__(
@@ -98,11 +98,11 @@ class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
         self._generator = numpy_generator(0, "worlds")
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
-        """Start an episode in a world of its own.
+        """Start an episode in a newly drawn world.
 
         Args:
-            seed: Decides world and traffic; without it both follow from the seed before.
-            options: Not used.
+            seed: Seed of world and traffic; None to draw it from the generator of the last seed.
+            options: Passed to the environment.
 
         Raises:
             ScenarioError: The world has other agents than the simulation.
@@ -129,7 +129,7 @@ def randomised_env(
 
     Args:
         scenario: The network and its traffic.
-        options: Of the environments, see `EnvOptions`.
+        options: Options of the environments, see `EnvOptions`.
         sim: The simulation, as a domain of the scenario.
     """
     simulation = in_domain(scenario, sim)

@@ -1,4 +1,4 @@
-"""Means with intervals of what trainings log by episode or by iteration."""
+"""Means with intervals of values that trainings log per episode or per iteration."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from ugat_marl.experiments.statistics import Interval
 
 Row = tuple[float, float, float, float]
-"""Episode or iteration, mean, low, high."""
+"""Episode or iteration, mean, lower and upper end of the interval."""
 
 _STRETCHES = 20
-"""Stretches that a training is cut into, at most."""
+"""Largest number of stretches in a training."""
 _LEAST = 4
-"""Episodes of a stretch, at least."""
+"""Smallest number of episodes in a stretch."""
 
 
 def binned(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
-    """Return stretches of episodes: middle, mean, and Student's 95 % interval.
+    """Return the middle, the mean and Student's 95 % interval of each stretch of episodes.
 
-    The interval is over the episodes of a stretch for one series, over the series for several.
+    For one series, the interval is over the episodes of the stretch; for several, over the series.
     """
     if not series:
         return []
@@ -38,7 +38,10 @@ def binned(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
 
 
 def joined(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
-    """Return mean and Student's 95 % interval over the series at each step (nan for one)."""
+    """Return mean and Student's 95 % interval over the series at each step.
+
+    With one series the ends of the interval are nan.
+    """
     steps: dict[int, list[float]] = {}
     for one in series:
         for step, value in one:

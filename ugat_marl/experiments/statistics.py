@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with its 95 % interval (nan for a single value)."""
+    """A mean with Student's 95 % interval; its ends are nan for a single value."""
 
     mean: float
     low: float
@@ -22,11 +22,14 @@ class Interval:
 
     @classmethod
     def of(cls, values: Floats) -> Interval:
-        """Return Student's interval of the mean of ``(n,)`` values."""
+        """Return the mean of ``(n,)`` values with its interval.
+
+        mean ± t(0.975, n - 1) · s / √n, where s is the standard deviation of the sample.
+        """
         mean, count = float(values.mean()), values.size
         if count < 2:
             return cls(mean, math.nan, math.nan)
-        # Equal values have a mean beside them by rounding, and a spread of nearly 0.
+        # The mean of equal values may differ from them by rounding; their spread is set to 0.
         spread = float(values.std(ddof=1)) if values.min() < values.max() else 0.0
         half = float(stdtrit(count - 1, 0.975)) * spread / math.sqrt(count)
         return cls(mean, mean - half, mean + half)
@@ -37,9 +40,9 @@ class PairedTest:
     """A difference between two settings, seed by seed.
 
     Attributes:
-        difference: One minus the other.
-        p: Two-sided, of Student's paired test; nan for a single seed, or where a value is nan.
-        better: Number of seeds in which the difference is below zero.
+        difference: Mean of the first setting minus the second, with an interval.
+        p: Two-sided p-value of Student's paired test; nan for a single seed or if a value is nan.
+        better: Number of seeds with a difference below zero.
         count: Number of seeds.
     """
 
@@ -57,7 +60,7 @@ class PairedTest:
         if count > 1 and np.isfinite(differences).all():
             spread = float(differences.std(ddof=1))
             t = abs(float(differences.mean())) * math.sqrt(count)
-            # Equal differences leave no doubt, or none to settle.
+            # Without a spread, t is infinite (p = 0), or all differences are 0 (p = 1).
             p = student_p(t / spread, count - 1) if spread > 0 else float(t == 0)
         return cls(Interval.of(differences), p, better, count)
 

@@ -1,4 +1,4 @@
-"""Trial of a scenario: traffic that gets in and through, controllers that can be told apart."""
+"""Trial of a scenario: traffic must enter and pass, and controllers must differ."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from ugat_marl.scenarios import Scenario, Survey, departures, run_program, sumo_
 from ugat_marl.simulation import launch_of
 
 TRIPS = "trips.xml"
-"""What the simulator calls SUMO's report on its vehicles."""
+"""Name of the file with SUMO's report on its vehicles."""
 
 RULES = ("programme", "largest-queue:20")
 MUCH_WORSE = 1.5
-"""A rule that takes so many times as long as the programme has phases it cannot work with."""
+"""A rule's ATT divided by the programme's above which the phases do not suit the rule."""
 _NAMED = 5
 MOST_BACKLOG = 0.01
-"""Share of the vehicles due that may be left outside under the better rule."""
+"""Largest share of the vehicles due that may wait outside under the better rule."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Run:
 
     Attributes:
         rule: The rule.
-        att_s: Average travel time of all vehicles due, s.
-        due: Vehicles due.
-        departed: Vehicles that got in.
-        arrived: Vehicles that reached their goal.
-        backlog: Vehicles left outside at the end.
+        att_s: Average travel time of all vehicles due, in s.
+        due: Number of vehicles due.
+        departed: Number of vehicles that entered the network.
+        arrived: Number of vehicles that arrived.
+        backlog: Number of vehicles that wait outside at the end.
     """
 
     rule: str
@@ -74,7 +74,7 @@ def try_out(
 def measured_headroom(
     scenario: Scenario, seeds: int, workers: int | None, reporter: Reporter
 ) -> list[Row]:
-    """Return the ATT of the largest-queue rule, held long and short, in every domain."""
+    """Return the ATT of the largest-queue rule with long and short holds in every domain."""
     return headroom(
         scenario, DOMAINS, HOLDS_S, tuple(range(seeds)), workers=workers, reporter=reporter
     )
@@ -89,7 +89,7 @@ def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
     """Count the vehicles that wait outside at the end, by road, under the network's own programme.
 
     Raises:
-        ScenarioError: SUMO refused; holds its words.
+        ScenarioError: SUMO failed; the message quotes SUMO.
     """
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name) / "run"
@@ -109,12 +109,12 @@ def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
 def problems(
     facts: Survey, runs: Sequence[Run], outside: Mapping[str, int] | None = None
 ) -> list[str]:
-    """Return the faults to mend before training makes sense, each with the way out.
+    """Return the faults to repair before training, each with a remedy.
 
     Args:
-        facts: What was looked at.
-        runs: What was tried.
-        outside: From `left_outside`, if it was asked.
+        facts: Survey of the scenario.
+        runs: Results of `try_out`.
+        outside: Result of `left_outside`; None if it was not called.
     """
     found: list[str] = []
     for item in facts.intersections:
@@ -153,7 +153,7 @@ def problems(
 
 
 def _unsuited(facts: Survey, runs: Sequence[Run]) -> str:
-    """Return a sentence on a rule far behind the programme, where phases serve lanes in part."""
+    """Return a message if phases serve lanes in part and a rule is far behind the programme."""
     lanes = sum(len(item.partly_served) for item in facts.intersections)
     att_s = {run.rule: run.att_s for run in runs}
     if not lanes or any(rule not in att_s for rule in RULES):
@@ -175,7 +175,7 @@ def as_json(
     wrong: Sequence[str],
     outside: Mapping[str, int] | None = None,
 ) -> dict[str, object]:
-    """Return everything as plain values."""
+    """Return survey, runs, headroom and faults as values for JSON."""
     found: dict[str, object] = asdict(facts)
     found["runs"] = [asdict(run) for run in runs]
     found["headroom"] = None if rows is None else [asdict(row) for row in rows]

@@ -1,4 +1,4 @@
-"""Measured data of any domain under any controller: a simulation measured as a street is."""
+"""Recording of measured data: a simulation of any domain, measured like a real street."""
 
 from ugat_marl.experiments.recording.days import record
 

@@ -1,4 +1,4 @@
-"""Commands of a controller, as its cabinet logs them."""
+"""Signal logs of a recording: the commands of a controller, and the signals of other lights."""
 
 from __future__ import annotations
 
@@ -26,8 +26,11 @@ _STATE = re.compile(r'<tlsState time="([\d.]+)" id="([^"]*)" [^>]*?state="([^"]*
 class _LoggingEnv(TrafficEnv):
     """Environment that keeps the commands of its controller.
 
-    The plan is made by the same machine as the environment's own, and before anything on the
-    street may delay a green.
+    `signals.advance` plans the signals as in the environment itself. The log holds the plan before
+    an effect of the domain delays a green.
+
+    Attributes:
+        commanded: Pairs of time in s and signal state, by id of the traffic light.
     """
 
     commanded: dict[str, list[tuple[float, str]]]
@@ -52,7 +55,7 @@ class _LoggingEnv(TrafficEnv):
 def play(
     scenario: Scenario, make: PolicyFactory, seed: int, stop: threading.Event
 ) -> dict[str, SignalLog]:
-    """Play one episode and return the commands."""
+    """Play one episode and return the commands, by id of the traffic light."""
     policy = make(parallel_env(scenario))
     env = _LoggingEnv(scenario, "sim", EnvOptions.of(policy.env_options))
     env.commanded = defaultdict(list)
@@ -66,9 +69,14 @@ def play(
 def own_programmes(
     scenario: Scenario, network: Network, make: PolicyFactory
 ) -> tuple[dict[str, SignalLog], tuple[str, ...]]:
-    """Return fixed programmes of lights that nobody commands, and lights without a fixed one.
+    """Return the signals of the traffic lights that the policy does not command.
 
-    SUMO itself says what a programme shows, without vehicles and without the effects of a domain.
+    SUMO plays fixed programmes without vehicles and without the effects of a domain, and writes
+    their states.
+
+    Returns:
+        The signals of lights with a fixed programme, by id; and the ids of lights whose programme
+        depends on the traffic.
     """
     policy = make(parallel_env(scenario))
     own = set(network.uncontrolled)
@@ -100,7 +108,7 @@ def own_programmes(
 
 
 def switch_document(lights: Sequence[str], file: Path) -> Document:
-    """Return an additional file by which SUMO writes every change of some traffic lights."""
+    """Return an additional file that makes SUMO write every change of some traffic lights."""
     root = ET.Element("additional")
     for tls in lights:
         options = {"type": "SaveTLSSwitchStates", "source": tls, "dest": str(file)}
@@ -109,7 +117,7 @@ def switch_document(lights: Sequence[str], file: Path) -> Document:
 
 
 def switches(file: Path, end_s: float) -> dict[str, SignalLog]:
-    """Read the states of lights from SUMO's own output."""
+    """Read the states of lights until `end_s` from SUMO's output."""
     try:
         text = file.read_text(encoding="utf-8")
     except OSError as error:

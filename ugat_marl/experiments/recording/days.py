@@ -1,9 +1,8 @@
-"""Recording of a domain, day after day, by the detectors that a street would have.
+"""Recording of a domain over several days, with the detectors of a real street.
 
-Every period is another day: the vehicles are drawn again, the effects of the domain are added to
-that day, and the effects on detectors to what was seen of it. The signals that are logged are the
-ones the controller commands, as its cabinet logs them; what the lights on the street make of it
-shows only in the vehicles.
+Every period is a day with newly drawn vehicles. The effects of the domain change the simulation of
+the day; effects on detectors change its data. The signal log holds the commands of the controller.
+The lights on the street may differ from them, as with late greens; only the vehicles show that.
 """
 
 from __future__ import annotations
@@ -65,10 +64,16 @@ class _Street:
 
     Attributes:
         base: The scenario without the effects.
-        effects: What makes the domain out of it.
+        effects: Effects of the domain.
         detectors: Detection zones.
-        programmes: Traffic lights that follow a fixed programme of their own, and what they show.
-        watched: Traffic lights whose own programme depends on the traffic.
+        programmes: Signals of the traffic lights that follow a fixed programme, by id.
+        watched: Ids of the traffic lights whose programme depends on the traffic.
+        policy: Maker of the controller.
+        seed: Root of the seeds of all days.
+        same_demand: True if every day has the scenario's own vehicles.
+        speeds: True if the detectors measure speeds and lengths.
+        lanes: True to keep data per lane and second.
+        trajectories: True to keep the positions of all vehicles.
     """
 
     base: Scenario
@@ -86,7 +91,7 @@ class _Street:
 
 @dataclass(frozen=True)
 class _Day:
-    """One period and, where asked for, its vehicles second by second."""
+    """One period and, on request, data per lane and second and the tracks of its vehicles."""
 
     period: Period
     lanes: pl.DataFrame | None
@@ -109,26 +114,26 @@ def record(
     workers: int | None = None,
     reporter: Reporter | None = None,
 ) -> Measured:
-    """Measure a domain as a street is measured. The same arguments give the same data.
+    """Measure a domain like a real street. The same arguments give the same data.
 
     Args:
         scenario: The simulation.
-        domain: The world to measure.
-        policy: Who controls the signals there.
+        domain: The domain to measure.
+        policy: Maker of the controller of the signals.
         periods: Number of days; the last 40 % are held out.
         seed: Root of the seeds of all days.
         duration_s: Length of a day in s; None for the scenario's own.
-        same_demand: Whether every day has the scenario's own vehicles, not vehicles drawn again.
-        detector_length_m: Length of the detection zones; 0 for points.
-        speeds: Whether the detectors measure speeds and lengths.
-        lanes: Whether to keep vehicles, halting and mean speed per lane and second.
-        trajectories: Whether to keep the position of every vehicle at every second.
+        same_demand: True to use the scenario's own vehicles every day, False to draw new ones.
+        detector_length_m: Length of the detection zones in m; 0 for points.
+        speeds: True if the detectors measure speeds and lengths.
+        lanes: True to keep vehicles, halting vehicles and mean speed per lane and second.
+        trajectories: True to keep the position of every vehicle at every second.
         workers: Simulations at a time; None for the number of cores.
         reporter: Shows progress.
 
     Raises:
-        OptionError: Not a number of periods or workers, or an impossible length.
-        UnknownNameError: No such domain, effect or detector.
+        OptionError: A number of periods or workers, a seed or a length is impossible.
+        UnknownNameError: A domain, effect or detector does not exist.
         ScenarioError: The scenario cannot be simulated.
         SimulatorError: SUMO failed.
     """
@@ -172,9 +177,9 @@ def record(
 
 
 def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, ...]]:
-    """Return the scenario that days are drawn from, and the effects added to each of them.
+    """Return the scenario from which days are drawn, and the effects to add to each day.
 
-    The effects of a scenario's own file are in its documents already, but for those on detectors.
+    A scenario's documents hold the effects of its file already, except those on detectors.
     """
     changed = in_domain(scenario, domain)  # a wrong name is an error now
     if scenario_of(domain) is not None:
@@ -183,7 +188,7 @@ def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, 
 
 
 def _zone(detector: Detector, length_m: float) -> Detector:
-    """Return a zone that ends where the point was, and begins on the lane."""
+    """Return a detection zone that ends at the detector's point; it begins at 0 m or later."""
     begin = max(detector.position_m - length_m, 0.0)
     return replace(
         detector, position_m=round(begin, 2), length_m=round(detector.position_m - begin, 2)
@@ -191,14 +196,14 @@ def _zone(detector: Detector, length_m: float) -> Detector:
 
 
 def _all_days(street: _Street, periods: int, workers: int, advance: Advance) -> list[_Day]:
-    """Record all days. Threads suffice: the simulations run in processes of their own."""
+    """Record all days. Threads suffice: each simulation runs in its own process."""
     stop = threading.Event()
     pool = concurrent.futures.ThreadPoolExecutor(workers)
     splits = split_periods(periods)
     try:
         days = [pool.submit(_day, street, i, split, stop) for i, split in enumerate(splits)]
         left = set(days)
-        while left:  # wakes up now and then, so that Ctrl-C is heard
+        while left:  # the timeout lets Ctrl-C interrupt the wait
             done, left = concurrent.futures.wait(
                 left, timeout=0.2, return_when=concurrent.futures.FIRST_COMPLETED
             )
@@ -252,10 +257,10 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
 
 
 def _renamed(scenario: Scenario, seed: int) -> Scenario:
-    """Rename the vehicles of a day that was drawn again.
+    """Rename the vehicles of a newly drawn day.
 
-    Effects choose vehicles by their names; on a street the trucks of two days are not the same
-    ones, and no model knows which they are.
+    Effects choose vehicles by name. With new names they choose other vehicles every day, as on a
+    street, where the trucks of two days differ.
     """
 
     def renamed(document: Document) -> Document:
@@ -269,13 +274,13 @@ def _renamed(scenario: Scenario, seed: int) -> Scenario:
 
 
 def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scenario:
-    """Return the scenario with detectors, and with whatever else has to be watched."""
+    """Return the scenario with detectors, and with the other outputs that a recording needs."""
     extra = [loops_document(street.detectors, None, directory / "loops.xml")]
     if street.watched:
         extra.append(switch_document(street.watched, directory / "signals.xml"))
     settings = scenario.settings
     if street.lanes or street.trajectories:
-        # A scenario file must not name outputs of SUMO; here one is wanted, in our own folder.
+        # Readers of scenario files refuse outputs of SUMO; this one goes to our own folder.
         output = {
             "fcd-output": str(directory / "vehicles.xml"),
             "fcd-output.attributes": "id,lane,pos,speed",
@@ -285,7 +290,7 @@ def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scena
 
 
 def _logged(period: Period) -> Period:
-    """Return the data that the electronics of a street would have kept, without empty detectors."""
+    """Return a period as the detectors' electronics log it, without empty detectors."""
     found = {
         name: as_logged(passages, period.begin_s, period.end_s)
         for name, passages in period.passages.items()

@@ -1,4 +1,4 @@
-"""Vehicles second by second, one by one and lane by lane."""
+"""Data of every second: the position of each vehicle, and the traffic of each lane."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import polars as pl
 from ugat_marl.scenarios import Detector, Period
 
 HALTING_MPS = 0.1
-"""Below this speed SUMO calls a vehicle halting."""
+"""Speed in m/s below which SUMO calls a vehicle halting."""
 
 _FCD = re.compile(r'<timestep time="([\d.]+)"|<vehicle ([^>]*)/>')
 _ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
 
 
 def tracks(file: Path, period: str, begin_s: float, end_s: float) -> pl.DataFrame:
-    """Return the place of every vehicle at every whole second, junctions included."""
+    """Return the position of every vehicle at every whole second, also on junctions."""
     columns: dict[str, list[Any]] = {
         name: [] for name in ("vehicle_id", "time_s", "lane_id", "position_m", "speed_mps")
     }
@@ -46,7 +46,7 @@ def tracks(file: Path, period: str, begin_s: float, end_s: float) -> pl.DataFram
 
 
 def per_lane(vehicles: pl.DataFrame, detectors: Sequence[Detector], period: Period) -> pl.DataFrame:
-    """Return vehicles, halting and mean speed of every lane with a detector, empty ones too."""
+    """Return vehicles, halting vehicles and mean speed of each lane with a detector, by second."""
     names = sorted({item.lane for item in detectors})
     seconds = pl.DataFrame({"time_s": np.arange(np.ceil(period.begin_s), period.end_s)})
     grid = seconds.join(pl.DataFrame({"lane_id": names}), how="cross")
