@@ -1,9 +1,9 @@
-"""Features of detector data by regime: their sums, per lane, of one period.
+"""Features of detector data: sums by regime and lane for one period.
 
-Every statistic is a mean: a sum and the number of observations behind it. So lanes pool to
-intersections and to the network, and periods pool to data sets, by adding. Queue discharge is
-counted from the start of green; times of crossing are those at which a vehicle's rear leaves the
-stop detector, since a vehicle may wait anywhere on it.
+Every feature is a mean, kept as a sum and a number of observations. So lanes add up to
+intersections and to the network, and periods add up to data sets. Queue discharge is counted from
+the start of green. A vehicle crosses when its rear leaves the stop detector, since a vehicle may
+wait anywhere on the detector.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ EVENT_FEATURES = frozenset(
         "yellow_crossings", "late_crossings", "red_crossings", "long_vehicles", "queue_over",
     }
 )  # fmt: skip
-"""Features that count how often something happens, which may be hardly ever."""
+"""Features that count events, some of which are very rare."""
 COUNT_FEATURES = ("count_advance", "count_stop", "count_exit")
 PLATOON_FEATURES = ("platoon_gap", "platoon_short", "platoon_middle", "platoon_time")
 BIN_FEATURES = (*COUNT_FEATURES, "occupied")
@@ -96,11 +96,11 @@ class Tally:
     """The features of one period.
 
     Attributes:
-        sums: Sums and numbers of observations, ``(features, places, 2)``; a place is an incoming
-            lane, or behind them an outgoing one.
+        sums: Sums and numbers of observations, ``(features, places, 2)``. Places are the incoming
+            lanes, followed by the outgoing lanes.
         bins: Counts and occupied seconds in time, ``(bin features, places, bins)``.
         days: Number of periods that were added up.
-        known: In how many of these every one of the bins was counted; None for all.
+        known: Number of periods in which each bin was counted, shape of `bins`; None if all were.
     """
 
     sums: Array
@@ -114,13 +114,13 @@ class Tally:
         return np.full_like(self.bins, self.days) if self.known is None else self.known
 
     def gathered(self, together: int) -> tuple[Array, Array]:
-        """Put bins together, and count the periods in which all of each were counted.
+        """Join bins to groups, and count the periods in which each group was counted.
 
         Args:
-            together: How many bins make one; what is left at the end is not used.
+            together: Number of bins in a group; leftover bins at the end are not used.
 
         Returns:
-            Both ``(bin features, places, groups of bins)``.
+            Sums of the groups and numbers of periods, both ``(bin features, places, groups)``.
         """
         width = min(together, self.bins.shape[-1])
         groups = self.bins.shape[-1] // width
@@ -151,8 +151,9 @@ def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
 
     Args:
         site: Lanes and detectors.
-        period: What was detected.
-        greens: ``site.greens(period)``; those of the measured period for its replicates.
+        period: Period with passages.
+        greens: Greens of every lane, ``site.greens(period)``; simulated days use those of the
+            measured period.
     """
     places = len(site.lanes) + len(site.exits)
     bins = bins_of(period)
@@ -185,7 +186,14 @@ def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
 
 @dataclass
 class _Counter:
-    """Sums of features, for one lane after the other."""
+    """Sums of features, filled one place after the other.
+
+    Attributes:
+        sums: Sums and numbers of observations, ``(features, places, 2)``.
+        bins: Counts and occupied seconds, ``(bin features, places, bins)``.
+        period: Period that is counted.
+        place: Index of the place that is being filled.
+    """
 
     sums: Array
     bins: Array
@@ -209,19 +217,19 @@ class _Counter:
 
 
 def _passages(period: Period, lane: SiteLane, kind: str) -> Passages | None:
-    """Return what the lane's detectors of a kind saw; None if it has none."""
+    """Return the passages over the lane's detector of a kind; None if it has none."""
     names = lane.detectors.get(kind)  # pyright: ignore[reportArgumentType,reportCallIssue]
     return None if not names else _merged(period, names)
 
 
 def _merged(period: Period, names: Sequence[str]) -> Passages:
-    """The first detector that saw anything: two at one place would count everything twice."""
+    """Return the passages of the first detector with a record, so that no vehicle counts twice."""
     found = [period.passages[name] for name in names if name in period.passages]
     return found[0] if found else Passages.none()
 
 
 def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
-    """Gaps, speeds and times over the detector of vehicles that stood at the start of green."""
+    """Add gaps, speeds and times over the detector of vehicles queued at the start of green."""
     order = np.argsort(stop.off_s, kind="stable")
     stop = stop.at(order[np.isfinite(stop.off_s[order])])
     cycles = float(len(greens.start_s))
@@ -295,7 +303,7 @@ def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
 
 
 def _lengths(counter: _Counter, passages: Passages) -> None:
-    """Count lengths as measured, or else from speed and time over the detector."""
+    """Add lengths of vehicles: measured ones, else speed times time over the detector."""
     quick = (passages.speed_mps > 5.0) & np.isfinite(passages.on_s)
     length = np.where(quick, passages.speed_mps * (passages.off_s - passages.on_s), np.nan)
     length = np.where(np.isfinite(passages.length_m), passages.length_m, length)
@@ -304,7 +312,7 @@ def _lengths(counter: _Counter, passages: Passages) -> None:
 
 
 def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: float) -> None:
-    """Count moving platoons, free vehicles, and those that see red."""
+    """Add gaps and speeds of moving platoons, free vehicles, and vehicles that approach red."""
     known = np.isfinite(advance.on_s)
     advance = advance.at(known)
     if len(advance) < 2:
@@ -341,7 +349,7 @@ def _share(values: Array, limit: float) -> Array:
 
 
 def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
-    """Sum the occupancy of the advance detector by signal, and queues that stand on it."""
+    """Add occupied seconds of the advance detector in green and red, and queues on it."""
     period = counter.period
     on = np.where(np.isfinite(advance.on_s), advance.on_s, period.begin_s)
     off = np.where(np.isfinite(advance.off_s), advance.off_s, period.end_s)
@@ -371,7 +379,7 @@ def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
 
 
 def _conserved(counter: _Counter, site: Site, advances: Array, stops: Array, exits: Array) -> None:
-    """Count vehicles that came and were seen again, by approach and by intersection."""
+    """Add the ratios of counts: stop to advance by approach, exit to stop by intersection."""
     approaches: dict[str, list[int]] = {}
     for index, lane in enumerate(site.lanes):
         if "stop" in lane.detectors and "advance" in lane.detectors:
@@ -391,10 +399,10 @@ def _conserved(counter: _Counter, site: Site, advances: Array, stops: Array, exi
 
 
 def bins_together(counts: pl.DataFrame | None) -> int:
-    """Return the number of bins that one count covers; within it, times are unknown.
+    """Return the number of bins that the longest interval of the counts covers.
 
     Args:
-        counts: ``begin_s, end_s`` and others; None where single vehicles were detected.
+        counts: Table with ``begin_s, end_s``; None if single vehicles were detected.
     """
     if counts is None or counts.is_empty():
         return 1
@@ -415,14 +423,14 @@ def without_gaps(counts: pl.DataFrame, periods: Sequence[Period]) -> frozenset[s
 
 
 def counts_tally(site: Site, period: Period, counts: pl.DataFrame, whole: Collection[str]) -> Tally:
-    """Put counts where the counts of detected vehicles would be; all else stays empty.
+    """Return a tally that holds only counts; all other features stay empty.
 
     Args:
         site: Lanes and detectors.
-        period: Which period.
-        counts: ``period_id, begin_s, end_s, detector_id, count``.
-        whole: Detectors `without_gaps`. Of the others only single bins are used: the mean of some
-            hours is not that of all.
+        period: Period to tally.
+        counts: Table with ``period_id, begin_s, end_s, detector_id, count``.
+        whole: Detectors `without_gaps`. Other detectors fill only their known bins, since the mean
+            of some hours is not the mean of the period.
     """
     places = len(site.lanes) + len(site.exits)
     length = bins_of(period)

@@ -1,10 +1,10 @@
 """Statistics of data sets, their noise, and the distance between data and a model.
 
-A data set is D periods. Its statistics are features pooled three ways: over the network, over each
-intersection, over each lane. Each pool is a block with one correlation between features, estimated
-from simulated days over all members of the block at once and shrunk (Ledoit and Wolf 2004). The
-distance is the sum of the blocks' Mahalanobis distances: a composite of dependent parts, so that
-its distribution is never looked up but always simulated.
+A data set is one or more periods. Its statistics are features pooled three ways: over the network,
+over each intersection, over each lane. A fourth block holds counts in bins of time. A block has one
+correlation between features. It is estimated from simulated days over all members of the block and
+shrunk (Ledoit and Wolf 2004). The distance is the sum of the blocks' Mahalanobis distances. The
+blocks depend on each other, so the distribution of the distance is always simulated.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from ugat_marl.diagnosis.thresholds import THRESHOLDS
 Array = NDArray[np.float64]
 
 SINGLE = ("lane", "time")
-"""Blocks with so many statistics of single lanes and minutes that most of an effect's differences
-there are chance: those are left as they were."""
+"""Blocks of single lanes and bins of time. Most differences there are chance, so differences that
+may be chance are not used when a model changes."""
 SOFT = {
     "network": np.inf,
     "intersection": np.inf,
     "lane": THRESHOLDS.soft_lane,
     "time": THRESHOLDS.soft_time,
 }
-"""Standardised differences beyond this count less: queues reach a place or they do not, and single
-lanes and minutes have heavy tails."""
+"""Standardised differences beyond this count less, by block. Single lanes and bins of time have
+heavy tails, since a queue either reaches a place or does not."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,9 @@ class Pools:
     """Pools of places: the network, intersections, lanes.
 
     Attributes:
-        blocks: Block name to a matrix ``(members, places)`` of zeros and ones.
-        together: How many bins of time make one; what is left at the end is not used.
+        blocks: Matrix ``(members, places)`` of zeros and ones, by name of the block.
+        together: Number of bins of time that are joined to one; leftover bins at the end are not
+            used.
     """
 
     blocks: dict[str, Array]
@@ -66,8 +67,8 @@ class Pools:
     def pool(self, item: Tally) -> dict[str, Array]:
         """Return sums and weights ``(members, features, 2)`` of every block.
 
-        The block "time" has a member for every kind of count at every place, and bins of time for
-        features.
+        In the block "time" the members are pairs of bin feature and place, and the features are the
+        bins of time.
         """
         pooled = {
             name: np.einsum("mp,fpc->mfc", matrix, item.sums)
@@ -84,13 +85,13 @@ class Block:
     """One block of statistics under a model; all arrays ``(members, features)``.
 
     Attributes:
-        mean: Expected statistics.
-        variance: Variance of one period.
+        mean: Expected statistics, in units of the features.
+        variance: Variance of a statistic of one period.
         weight: Observations per period.
-        error: Variance of `mean` itself.
-        used: Which statistics are used.
-        correlation: Between features, ``(features, features)``.
-        doubt: Variance of `mean` that no number of days takes away.
+        error: Variance of `mean`, since it comes from a finite number of days.
+        used: True for statistics that are used.
+        correlation: Correlation between features, ``(features, features)``.
+        doubt: Variance of `mean` that more days do not reduce.
     """
 
     mean: Array
@@ -102,11 +103,14 @@ class Block:
     doubt: Array | float = 0.0
 
     def noise(self, weight: Array, periods: int) -> Array:
-        """Return the variance of measured minus expected; fewer observations than usual say less.
+        """Return the variance of measured minus expected statistics.
+
+        noise = variance * thin / periods + error + doubt, where `thin` is the usual number of
+        observations over the measured one, within 1/4 and 4.
 
         Args:
             weight: Observations per measured period.
-            periods: Measured periods.
+            periods: Number of measured periods.
         """
         thin = np.clip(self.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
         return self.variance * thin / periods + self.error + self.doubt
@@ -117,11 +121,12 @@ class Distance:
     """Distance of data from a model.
 
     Attributes:
-        total: Sum over the blocks.
-        parts: The distance of every block.
-        penalty: Logarithm of the variances relative to a reference, for comparing models.
+        total: Sum of `parts`.
+        parts: Squared Mahalanobis distance of every block.
+        penalty: Sum of the logarithms of the variances relative to those of a reference, for the
+            comparison of models; 0 without a reference.
         z: Standardised differences of every block, 0 where unused, ``(members, features)``.
-        difference: Data minus model, in units of the features.
+        difference: Data minus model in units of the features, 0 where unused, same shape.
     """
 
     total: float
@@ -135,14 +140,14 @@ class Reference:
     """Statistics and noise of a model, from simulated days.
 
     Args:
-        pools: How places pool.
-        tallies: Simulated days.
-        speeds: Whether speeds were measured.
-        prior: A model whose correlations are taken over, and towards whose variances those of few
+        pools: Pools of places.
+        tallies: Tallies of the simulated days.
+        speeds: True if speeds were measured.
+        prior: Model whose correlations are used, and towards whose variances the variances of few
             days are shrunk.
-        paired: Days of `prior` with the same numbers as `tallies`: their difference is what is
-            known of the mean (common random numbers).
-        doubt: Variance of the means that no number of days takes away, by block; None for that of
+        paired: Days of `prior` with the same numbers as `tallies`. They make the means more exact,
+            since both models have common random numbers.
+        doubt: Variance of the means that more days do not reduce, by block; None for that of
             `prior`.
     """
 
@@ -209,10 +214,10 @@ class Reference:
         """Measure the distance of a data set.
 
         Args:
-            data: Its periods.
-            relative_to: Whose variances the penalty is relative to; its choice of statistics is
-                used too.
-            extra: Further variance of the expected statistics.
+            data: Tallies of its periods.
+            relative_to: Model that chooses the statistics and gives the variances for the penalty;
+                None for this model without a penalty.
+            extra: Further variance of the expected statistics, by block.
         """
         sums = self.pools.pool(added(data))
         total = penalty = 0.0
@@ -241,7 +246,7 @@ class Reference:
 
 
 def softened(block: str, z: Array) -> Array:
-    """Standardised differences as they count: those of single places less, the larger they are."""
+    """Return ``s asinh(z / s)`` with s of `SOFT`: large differences of single places count less."""
     soft = SOFT[block]
     return soft * np.arcsinh(z / soft) if soft < np.inf else z
 
@@ -261,13 +266,24 @@ def added(tallies: Sequence[Tally]) -> Tally:
 
 
 def _smoothed(mean: Array, variance: Array) -> Array:
-    """Return variances of counts in short bins: half their own, half in proportion to the mean."""
+    """Return variances of counts in bins: half the estimate, half in proportion to the mean.
+
+    Both arguments and the result are ``(members, bins)``. The estimate of one bin is noisy.
+    """
     scale = variance.sum(axis=1, keepdims=True) / np.maximum(mean.sum(axis=1, keepdims=True), 1e-9)
     return np.maximum(0.5 * variance + 0.5 * scale * mean, 0.05)
 
 
 def _moments(sums: Array) -> tuple[Array, Array, Array, Array]:
-    """Ratio estimates: mean, variance of one day, observations per day, residuals of the days."""
+    """Return ratio estimates from sums ``(days, members, features, 2)``.
+
+    With sums s and numbers of observations n: mean m = Σs / Σn, residual of a day
+    r = (s - m n) / mean(n), variance = Σr² / (days - 1).
+
+    Returns:
+        Mean, variance of one day, observations per day: all ``(members, features)``; residuals
+        ``(days, members, features)``.
+    """
     total = sums.sum(axis=0)
     weight = total[..., 1] / len(sums)
     mean = total[..., 0] / np.maximum(total[..., 1], 1e-9)
@@ -279,7 +295,7 @@ def _moments(sums: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _moved(mean: Array, residual: Array, partner: Array) -> NDArray[np.bool_]:
-    """Statistics that differ from those of the same days under the prior model beyond chance."""
+    """Mark statistics that differ from those of the same days of the prior model beyond chance."""
     before, _, _, other = _moments(partner)
     days = len(partner)
     noise = ((residual - other) ** 2).sum(axis=0) / max(days - 1, 1) / days
@@ -289,7 +305,11 @@ def _moved(mean: Array, residual: Array, partner: Array) -> NDArray[np.bool_]:
 def _controlled(
     mean: Array, variance: Array, residual: Array, partner: Array, prior: Block
 ) -> tuple[Array, Array]:
-    """The mean corrected by what the same days do under the prior model (a control variate)."""
+    """Return the mean and its variance, corrected by the same days of the prior model.
+
+    The days of the prior model are a control variate: m' = m - b (m_same - m_prior), with b the
+    slope of the residuals on those of the prior model.
+    """
     before, _, _, other = _moments(partner)
     spread = (other**2).sum(axis=0)
     slope = np.clip((residual * other).sum(axis=0) / np.maximum(spread, 1e-12), 0.0, 1.5)
@@ -303,7 +323,7 @@ def _controlled(
 
 @functools.cache
 def _grain(width: int) -> Array:
-    """Return the precision of a mean of one observation, for every feature or bin of time."""
+    """Return the least standard deviation of one observation, by feature or bin of time."""
     if width != len(FEATURES):
         return np.full(width, THRESHOLDS.grain)
     return np.array(
@@ -316,19 +336,23 @@ def _grain(width: int) -> Array:
 
 @functools.cache
 def _constant(speeds: bool) -> NDArray[np.bool_]:
-    """Mark features that are never used."""
+    """Mark features that are never used: those that need speeds if no speeds were measured."""
     return np.array([not speeds and name in SPEED_FEATURES for name, _, _ in FEATURES])
 
 
 def _correlation(residual: Array) -> Array:
-    """Return the shrunk correlation of ``(days, members, features)``, all members together."""
+    """Return the shrunk correlation ``(features, features)`` over all days and members.
+
+    Args:
+        residual: Standardised residuals, ``(days, members, features)``.
+    """
     rows = residual.reshape(-1, residual.shape[-1])
     spread = np.sqrt((rows**2).mean(axis=0))
     rows = rows / np.where(spread > 0, spread, 1.0)
     count, width = rows.shape
     sample = rows.T @ rows / count
     np.fill_diagonal(sample, 1.0)
-    # Ledoit and Wolf (2004), with the identity as target.
+    # Ledoit and Wolf (2004): C = (1 - k) S + k I, k = noise of S / distance of S from I.
     distance = ((sample - np.eye(width)) ** 2).sum()
     noise = float((((rows**2).T @ (rows**2)) / count - sample**2).sum()) / count
     shrinkage = min(max(noise / max(distance, 1e-12), 0.02), 1.0)
@@ -350,10 +374,15 @@ def _mahalanobis(z: Array, used: NDArray[np.bool_], correlation: Array) -> float
 def shift(
     pools: Pools, after: Sequence[Tally], before: Sequence[Tally]
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return the change of the statistics under a change of the model, from the same days.
+    """Return the change of the statistics between two models, from the same days.
+
+    Args:
+        pools: Pools of places.
+        after: Days of the changed model.
+        before: The same days of the model before.
 
     Returns:
-        The differences, and the variances of these differences.
+        The differences by block, and their variances; infinite where nothing is known.
     """
     new, old = _stack(pools, after), _stack(pools, before)
     difference: dict[str, Array] = {}
@@ -369,10 +398,9 @@ def shift(
 
 
 def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> dict[str, Array]:
-    """Return differences drawn towards 0 by what may be chance in them.
+    """Return differences d shrunk towards 0: ``d max(0, 1 - certain * variance / d^2)``.
 
-    A derivative that holds chance points everywhere a little, which makes a fit timid and its
-    errors too small.
+    Noise in a derivative makes the steps of a fit too short and its standard errors too small.
     """
     found: dict[str, Array] = {}
     for name, values in difference.items():
@@ -384,7 +412,7 @@ def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> di
 def without_noise(
     difference: Mapping[str, Array], variance: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return differences with those of single lanes and minutes set to 0 that may be chance."""
+    """Return differences; in blocks of `SINGLE`, those that may be chance are set to 0."""
     found: dict[str, Array] = {}
     for name, values in difference.items():
         certain = values**2 > THRESHOLDS.certain * variance[name]
@@ -395,19 +423,24 @@ def without_noise(
 # --- whitening ------------------------------------------------------------------------------------
 
 Group = tuple[NDArray[np.int64], NDArray[np.bool_], Array]
-"""Members of a block, the features they use, and what makes these independent."""
+"""Members of a block with equal features, a mask of these features, and the inverse Cholesky factor
+of their correlation."""
 
 
 class Whitener:
-    """Map from differences of statistics to independent numbers of unit noise, in one vector.
+    """Map from differences of statistics to one vector of independent numbers of unit noise.
 
     Args:
-        reference: Whose noise.
-        data: The data set, which decides what is used and how precise it is.
-        tolerance: Share of a measured difference that counts as noise as well: predictions by
-            interpolation are no better.
-        relative_to: Whose choice of statistics is used, so that vectors of different models fit.
-        blocks: Blocks to use; None for all.
+        reference: Model that gives the noise.
+        data: Data set that decides which statistics are used and how exact they are.
+        tolerance: Share of a measured difference that counts as noise, since predictions by
+            interpolation are not more exact.
+        relative_to: Model that chooses the statistics, so that vectors of different models have the
+            same length; None for `reference`.
+        blocks: Names of the blocks to use; None for all.
+
+    Attributes:
+        measured: The whitened difference of data and model, ``(statistics,)``.
     """
 
     def __init__(
@@ -435,7 +468,7 @@ class Whitener:
         self.measured = self(found.difference)
 
     def __call__(self, differences: Mapping[str, Array]) -> Array:
-        """Return whitened differences, one after the other."""
+        """Return whitened differences of all blocks, ``(statistics,)``."""
         rows: list[Array] = []
         for name, scale, groups in self._parts:
             rows.append(independent(differences[name] / scale, groups))
@@ -443,7 +476,12 @@ class Whitener:
 
 
 def groups_of(used: NDArray[np.bool_], correlation: Array) -> list[Group]:
-    """Group members that use the same features, with what makes these independent."""
+    """Group members that use the same features.
+
+    Args:
+        used: Mask of the features that each member uses, ``(members, features)``.
+        correlation: Correlation of the features, ``(features, features)``.
+    """
     patterns, kind = np.unique(used, axis=0, return_inverse=True)
     groups: list[Group] = []
     for index, pattern in enumerate(patterns):
@@ -455,7 +493,12 @@ def groups_of(used: NDArray[np.bool_], correlation: Array) -> list[Group]:
 
 
 def independent(z: Array, groups: Sequence[Group]) -> Array:
-    """Return standardised differences as independent numbers, one after the other."""
+    """Return ``L^-1 z`` of every member, one after the other, where ``C = L L'``.
+
+    Args:
+        z: Standardised differences, ``(members, features)``.
+        groups: Groups of members, from `groups_of`.
+    """
     z = np.nan_to_num(z)
     rows = [(z[members][:, used] @ inverse.T).ravel() for members, used, inverse in groups]
     return np.concatenate(rows) if rows else np.empty(0)
