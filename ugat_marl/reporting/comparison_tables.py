@@ -20,14 +20,14 @@ from ugat_marl.reporting.formats import PAGE_WIDTH, command_block, listed, made_
 from ugat_marl.reporting.tables import number
 
 CERTAIN = 0.05
-"""Level of the paired tests in the paragraph of meaning."""
+"""Level of the paired tests in the paragraph that says what the table means."""
 
 Cell = Callable[[str, str], str]
 """Setting and domain to the text of a cell."""
 
 
 def terminal_tables(found: Comparison, direct: str) -> RenderableType:
-    """ATT, change of the gap, regret and its share that is won back, in 80 columns."""
+    """Return ATT, change of the gap, regret and the share won back, in 80 columns."""
     blocks: list[RenderableType] = []
     for title, cell in _headlines(found, direct):
         table = Table(
@@ -50,12 +50,12 @@ def terminal_tables(found: Comparison, direct: str) -> RenderableType:
 
 
 def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
-    """The whole comparison as a page.
+    """Return the whole comparison as a page of Markdown.
 
     Args:
-        found: What was trained and played.
-        direct: The setting the others are compared with.
-        facts: Command, versions and processor (`bench.machine`).
+        found: The comparison.
+        direct: Setting with which the others are compared.
+        facts: Command, versions and processor (`experiments.machine_facts`).
     """
     lines = [
         f"# {found.scenario}: {found.notes['table']}",
@@ -98,7 +98,7 @@ def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
 
 
 def as_csv(found: Comparison) -> str:
-    """`Comparison.rows` with a heading; what has no value is empty."""
+    """Return `Comparison.rows` as CSV with a heading; a missing value is an empty cell."""
     rows = found.rows()
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
@@ -109,7 +109,7 @@ def as_csv(found: Comparison) -> str:
 
 
 def seeds_csv(found: Comparison) -> str:
-    """Every training with its mean ATT and throughput: enough for a reader's own tests."""
+    """Return every training with its mean ATT and throughput as CSV, for tests of a reader."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["setting", "domain", "training_seed", "att_s", "att_s_sim", "throughput"])
@@ -193,7 +193,7 @@ def _against_constants(found: Comparison) -> list[str]:
 
 
 def _meaning(found: Comparison, direct: str) -> list[str]:
-    """Return what the table says: who is better than direct transfer, and who is best."""
+    """Return the meaning of the table: settings better than direct transfer, and the best ones."""
     better = [
         setting
         for setting in found.settings
@@ -213,7 +213,7 @@ def _meaning(found: Comparison, direct: str) -> list[str]:
 
 
 def _better_everywhere(found: Comparison, setting: str, direct: str) -> bool:
-    """Return whether a setting is certainly faster than another wherever it was measured."""
+    """Return True if a setting is faster than another in each domain, with p < `CERTAIN`."""
     tests = [found.test(setting, direct, t) for t in found.targets if found.has(setting, t)]
     return all(test.difference.mean < 0 and test.p < CERTAIN for test in tests)
 
@@ -233,7 +233,7 @@ def _provenance(found: Comparison, facts: Mapping[str, Any]) -> list[str]:
 
 
 def with_interval(interval: Interval) -> str:
-    """A mean with its interval, if it has one."""
+    """Return a mean with its interval, if it has one."""
     if math.isnan(interval.low) or interval.low == interval.high:
         return number(interval.mean)
     to = " to " if interval.low < 0 else "–"
@@ -241,12 +241,12 @@ def with_interval(interval: Interval) -> str:
 
 
 def share(value: float) -> str:
-    """A share of the regret; a dash where there is none."""
+    """Return a share of the regret; a dash for nan."""
     return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
 
 
 def percent(value: float) -> str:
-    """A signed share in per cent."""
+    """Return a signed share in per cent; a dash for nan."""
     return "–" if math.isnan(value) else f"{'−' if value < 0 else '+'}{abs(100 * value):.0f} %"
 
 

@@ -1,4 +1,4 @@
-"""A diagnosis as one page of HTML that needs nothing else: no network, no scripts."""
+"""A diagnosis as one page of HTML that loads no other file and runs no script."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ from ugat_marl.reporting.style import DISAGREEMENT
 from ugat_marl.scenarios import Network
 
 _PLACES = 10
+"""Number of places in the table of disagreements that is shown at once."""
 _LOUD, _QUIET = 16, 6
-"""Strips that are shown at once, of statistics outside of their noise and, if none is, inside."""
+"""Most strips that are shown at once: of statistics outside their noise, else of those inside."""
 _STRIPS = 8
-"""Strips in a picture; two pictures stand side by side."""
+"""Most strips in one picture; two pictures stand side by side."""
 _COMMANDS = re.compile(r"<h2>Run it again</h2>\s*<pre><code>(.*?)</code></pre>", re.DOTALL)
 _BADGES = {
     "no_discrepancy": "good", "explained": "good", "not_identifiable": "mixed",
@@ -48,8 +49,8 @@ def write_diagnosis_page(
     Args:
         record: Content of ``diagnosis.json``.
         network: Network of the scenario, for the map.
-        path: Where to write.
-        commands: How to run it again and what to do next, one line each.
+        path: File to write.
+        commands: Commands that repeat the diagnosis and go on from it, one line each.
     """
     write_whole(path, diagnosis_page(record, network, commands))
 
@@ -86,7 +87,10 @@ def diagnosis_page(record: Record, network: Network, commands: Sequence[str] = (
 
 
 def commands_on_page(path: Path) -> list[str]:
-    """Return the commands a page shows, which its record does not hold; none if unreadable."""
+    """Return the commands on a page; none if the page cannot be read.
+
+    The record of a diagnosis does not hold them.
+    """
     try:
         match = _COMMANDS.search(path.read_text(encoding="utf-8", errors="replace"))
     except OSError:
@@ -95,7 +99,7 @@ def commands_on_page(path: Path) -> list[str]:
 
 
 def _effects(record: Record) -> Grid | None:
-    """The named effects, with intervals."""
+    """Return a table of the named effects with intervals; None without effects."""
     rows = [
         (
             words.effect_name(effect),
@@ -119,7 +123,7 @@ def _grounds(evidence: Record) -> str:
 
 
 def _heldout(heldout: Record) -> list[tuple[str, str]]:
-    """The held-out periods in numbers."""
+    """Return the numbers of the held-out periods with their labels."""
     boxes = [(number(heldout["before"]), "distance before")]
     after = heldout["shrink"] is not None
     if after:
@@ -134,12 +138,12 @@ def _heldout(heldout: Record) -> list[tuple[str, str]]:
 
 
 def _changed(record: Record, table: str, before: str, after: str) -> bool:
-    """Return whether there is a model beside the scenario as it is."""
+    """Return True if the values after the correction differ from those before."""
     return any(row[before] != row[after] for row in record.get(table) or ())
 
 
 def _model(record: Record) -> str:
-    """The corrected side of the page."""
+    """Return the words for the corrected model."""
     return "the effects named" if record["effects"] else "the best attempt, which is not named"
 
 
@@ -199,7 +203,7 @@ def _statistics(page: Page, record: Record) -> dict[str, Any] | None:
 
 
 def _strip(row: Record, *, after: bool) -> tuple[str, str, float, float | None]:
-    """The texts and deviations of a statistic."""
+    """Return the texts and deviations of a statistic."""
     text = f"measured {number(row['measured'])}, simulated {number(row['before'])}"
     if after:
         text += f" → {number(row['after'])}"
@@ -210,7 +214,7 @@ def _strip(row: Record, *, after: bool) -> tuple[str, str, float, float | None]:
 
 
 def _where(record: Record) -> dict[str, Grid | None] | None:
-    """Places where data and simulation disagree, before and after."""
+    """Return tables of the places where data and simulation disagree, before and after."""
     where, left = record.get("where") or (), record.get("left") or ()
     if not where:
         return None
@@ -237,7 +241,7 @@ def _disagreements(items: Sequence[Record]) -> Grid:
 
 
 def _ranking(record: Record) -> list[dict[str, Any]]:
-    """The explanations that were simulated, by how well they fit."""
+    """Return the simulated explanations, the chosen one first."""
     items: list[tuple[str, Any, Any, bool]] = []
     if record["effects"]:
         grounds = (effect.get("evidence") or {} for effect in record["effects"])
@@ -263,7 +267,7 @@ def _ranking(record: Record) -> list[dict[str, Any]]:
 
 
 def _logarithm(distance: Any, most: float) -> float:
-    """Length of the bar of a distance, per cent."""
+    """Return the length of a bar in per cent: 100 log(1 + distance) / log(1 + most)."""
     if distance is None:
         return 0.0
     return 100 * math.log1p(max(float(distance), 0.0)) / math.log1p(max(most, 1.0))
@@ -281,7 +285,7 @@ def _in_words(effect: Record) -> str:
 
 
 def _courtesy(record: Record) -> Grid | None:
-    """The criteria that traffic engineers are used to."""
+    """Return the usual criteria of traffic engineering."""
     tables = record.get("courtesy") or {}
     if not tables:
         return None
@@ -299,7 +303,7 @@ def _courtesy(record: Record) -> Grid | None:
 
 
 def _policy_gap(record: Record) -> Grid | None:
-    """Travel times of policies against what was promised, if they were measured."""
+    """Return travel times of policies in both simulations and in the real domain, if measured."""
     gap = record.get("policy_gap")
     if not isinstance(gap, Mapping) or not gap:
         return None
@@ -318,7 +322,7 @@ def _policy_gap(record: Record) -> Grid | None:
 
 
 def _mean(item: Any) -> str:
-    """A mean with its interval."""
+    """Return a mean with its interval."""
     if not isinstance(item, Mapping):
         return "–"
     if item.get("low") is None or item.get("high") is None:
@@ -348,7 +352,7 @@ def _provenance(record: Record) -> list[tuple[str, str]]:
 
 
 def _usual_commands(record: Record) -> list[str]:
-    """The command with capitals for the paths, which no record holds."""
+    """Return the commands with words in capitals for the paths, which no record holds."""
     options = f"--budget-s {record['budget_s']:g} --alpha {record['alpha']:g}"
     options += f" --seed {record['seed']}"
     if record.get("left_out"):

@@ -13,10 +13,14 @@ from ugat_marl.reporting.diagnosis_words import Record
 from ugat_marl.reporting.formats import chance, number, share, signed
 
 _SHOWN = 3
+"""Number of disagreements in the table."""
 
 
 def diagnosis_summary(record: Record) -> RenderableType:
-    """Verdict, effects, strongest disagreements and the held-out periods."""
+    """Return verdict, effects, strongest disagreements and the numbers of the held-out periods.
+
+    `record` is the content of ``diagnosis.json``.
+    """
     blocks: list[RenderableType] = []
     if (text := words.partial(record)) is not None:
         blocks.append(Text(text, style="bold yellow"))

@@ -13,7 +13,7 @@ Record = Mapping[str, Any]
 """The content of ``diagnosis.json``, or a part of it."""
 
 UNTRIED = 8
-"""Effects named that were not examined; of more, their number is told."""
+"""Most effects that are named as not examined; of more, the text gives their number."""
 
 VERDICTS = {
     "no_discrepancy": "no discrepancy",
@@ -38,7 +38,7 @@ MEANINGS = {
 
 
 def meaning(record: Record) -> str:
-    """Return the meaning of the verdict; nothing if the search was cut short."""
+    """Return the meaning of the verdict; "" if the search is not complete."""
     if not record.get("complete", True):
         return ""
     text = MEANINGS.get(str(record["verdict"]), "")
@@ -59,7 +59,7 @@ def place(item: Record) -> str:
 
 
 def window(span: Sequence[float] | None) -> str:
-    """Return a stretch of time on the scenario's clock, as h:mm:ss."""
+    """Return begin and end of a window on the scenario's clock; "" for None."""
     return "" if span is None else f"{clock(span[0])} – {clock(span[1])}"
 
 
@@ -81,13 +81,13 @@ def _parameter(name: str, given: Record, intervals: bool) -> str:
 
 
 def _rounded(value: float, width: float) -> str:
-    """A number with as many decimals as an interval of this width deserves."""
+    """Return a number rounded to two digits of its interval's width."""
     decimals = min(max(1 - math.floor(math.log10(max(width, 1e-9))), 0), 4)
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
 def disagreement_place(item: Record) -> str:
-    """Return the narrowest place that is known of a disagreement."""
+    """Return the narrowest known place of a disagreement: lane, approach or traffic light."""
     for key in ("lane", "approach", "tls"):
         if item.get(key) is not None:
             return str(item[key])
@@ -95,7 +95,7 @@ def disagreement_place(item: Record) -> str:
 
 
 def strongest(record: Record, count: int) -> list[Record]:
-    """Return the first disagreements by size, one per statistic and the broadest place first."""
+    """Return the strongest disagreements, one per statistic: the first one in the record."""
     found: list[Record] = []
     seen: set[str] = set()
     for item in record.get("where") or ():
@@ -120,7 +120,7 @@ def partial(record: Record) -> str | None:
 
 
 def geh_line(record: Record) -> str | None:
-    """Return the judgement of the usual criterion on counts; None without counts."""
+    """Return a sentence on GEH, the usual criterion for counts; None without counts."""
     tables = record.get("courtesy") or {}
     before = (tables.get("before") or {}).get("geh_below_5")
     after = (tables.get("after") or {}).get("geh_below_5")

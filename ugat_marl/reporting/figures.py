@@ -1,7 +1,7 @@
 """Pictures: matplotlib figures that are written as SVG for a page, as an SVG file and as PNG.
 
-On a page every colour is a custom property of CSS, so that a picture is dark on a dark page. Text
-stays text. Names of other people are escaped and never read as formulas.
+On a page every colour is a custom property of CSS. A dark page therefore shows a dark picture. Text
+stays text. Names from foreign files are escaped and never read as formulas.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ugat_marl.reporting.style import LIGHT, curve_style, styled
 WIDTH = 480.0
 """Width of a picture in points, which are also the units of its SVG."""
 TOP = 34.0
-"""Height of a picture's title."""
+"""Height of a picture's title, in points."""
 LEGEND = 19.0
-"""Height of a line of a legend."""
+"""Height of a line of a legend, in points."""
 _DPI = 144
 _TIP = "tip: "
 _FONTS = 'system-ui, "Segoe UI", Roboto, Arial, sans-serif'
@@ -38,8 +38,8 @@ class NamedFigure:
 
     Attributes:
         name: Name of its files, without an ending.
-        title: Text for those who cannot see it.
-        figure: A `matplotlib.figure.Figure` that is not known to pyplot.
+        title: Title, which is also the text for readers who cannot see the picture.
+        figure: A `matplotlib.figure.Figure` that pyplot does not know, so that it needs no closing.
     """
 
     name: str
@@ -92,14 +92,14 @@ class NamedFigure:
         return list(files)
 
     def _parsed(self) -> ET.Element:
-        """The SVG of matplotlib with words, without what a page must not have twice."""
+        """Return matplotlib's SVG with a title, without parts that may occur once per page."""
         content = io.BytesIO()
         with styled(self.name):
             self.figure.savefig(content, format="svg", metadata={"Date": None})
         root = ET.fromstring(content.getvalue())
         for parent in (root, *root.findall(f"{_SVG}defs")):
             for child in [*parent.findall(f"{_SVG}metadata"), *parent.findall(f"{_SVG}style")]:
-                parent.remove(child)  # the style would hold for all of a page
+                parent.remove(child)  # the style would apply to the whole page
         root.set("style", "stroke-linejoin: round; stroke-linecap: butt")
         root.set("role", "img")
         root.set("aria-label", printable(self.title))
@@ -111,7 +111,10 @@ class NamedFigure:
 
 
 def _clean(root: ET.Element) -> None:
-    """Turn ids into tool tips where they are meant so, and drop those that nothing refers to."""
+    """Turn the ids of `add_tip` into tool tips, and drop all that no page needs.
+
+    These are ids without a reference, fonts, blanks and surplus decimals.
+    """
     used = {element.attrib[_HREF][1:] for element in root.iter() if _HREF in element.attrib}
     used |= {m for element in root.iter() for m in _USED.findall(element.get("clip-path", ""))}
     for element in root.iter():
@@ -134,7 +137,7 @@ def _clean(root: ET.Element) -> None:
 
 
 def _shortened_path(path: str) -> str:
-    """A path with two decimals, which is a hundredth of a point."""
+    """Return a path with two decimals: a hundredth of a point is exact enough."""
     text = re.sub(r"-?\d+\.\d+", lambda m: f"{float(m[0]):.2f}".rstrip("0").rstrip("."), path)
     return re.sub(r"\s*\n\s*", "", text)
 
@@ -145,7 +148,7 @@ def _variable(match: re.Match[str]) -> str:
 
 
 def write_png(picture: NamedFigure, path: Path) -> None:
-    """Write a picture as PNG under a path of its own."""
+    """Write a picture as PNG to a given path."""
     write_whole(path, picture.png())
 
 
@@ -163,14 +166,14 @@ def new_picture(name: str, title: str, height: float, width: float = WIDTH) -> N
 def add_axes(
     picture: NamedFigure, left: float, top: float, right: float, bottom: float, **more: Any
 ) -> Any:
-    """Return axes whose sides keep these distances, in points, from those of the picture."""
+    """Return axes whose sides have these distances, in points, from the sides of the picture."""
     width, height = picture.figure.get_size_inches() * 72
     box = left / width, bottom / height, 1 - (left + right) / width, 1 - (top + bottom) / height
     return picture.figure.add_axes(box, **more)
 
 
 def legend_columns(labels: Sequence[str], width: float = WIDTH) -> int:
-    """Return how many labels stand side by side."""
+    """Return the number of labels that fit side by side."""
     longest = max(map(len, labels), default=1)
     return max(1, min(len(labels), int((width - 16) / (46 + 6.9 * longest))))
 
@@ -199,23 +202,23 @@ def add_legend(picture: NamedFigure, labels: Sequence[str], *, lines: bool = Tru
 
 
 def add_tip(artist: Any, text: str) -> None:
-    """Give a shape a text that is shown when one points at it."""
+    """Give a shape a text that a page shows when the reader points at the shape."""
     artist.set_gid(f"{_TIP}{printable(text)}")
 
 
 def printable(text: str) -> str:
-    """Return a text without what no XML or font can hold: control characters, half characters."""
+    """Return a text without control characters and half characters, which XML cannot hold."""
     whole = text.encode("utf-8", "replace").decode()
     return "".join(c if c.isprintable() else " " for c in whole)
 
 
 def shortened(text: str, most: int) -> str:
-    """Return a text with an ellipsis in place of what is too much."""
+    """Return a text of `most` characters at most, cut with an ellipsis."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def tick_text(value: float, _: Any = None) -> str:
-    """Return a number for a scale; takes a place as well, as matplotlib's formatters do."""
+    """Return the text of a number on a scale; the second argument is matplotlib's and unused."""
     if abs(value) >= 10_000:
         return f"{value:,.0f}".replace(",", "\u2009").replace("-", "−")
     return f"{round(value, 6):.4g}".replace("-", "−")

@@ -9,7 +9,10 @@ from typing import Any
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """Return a number with three digits, in groups of thousands; a dash where there is none."""
+    """Return a number with `digits` significant digits, or a whole number with grouped thousands.
+
+    A missing, infinite or undefined number is a dash.
+    """
     if value is None or isinstance(value, bool) or not isinstance(value, int | float):
         return "–" if value is None else str(value)
     if not math.isfinite(value):
@@ -26,7 +29,7 @@ def signed(value: Any) -> str:
 
 
 def share(value: Any) -> str:
-    """Return a share in per cent; never 100 % where something is missing."""
+    """Return a share in per cent; a share below 1 is never rounded to 100 %."""
     if value is None:
         return "–"
     percent = 100 * float(value)
@@ -40,16 +43,16 @@ def share(value: Any) -> str:
 
 
 def chance(value: Any) -> str:
-    """Return a probability."""
+    """Return a probability, such as 0.05 or < 0.001."""
     if value is None:
         return "–"
     return "< 0.001" if value < 0.001 else f"{value:.2g}"
 
 
 PAGE_WIDTH = 140
-"""Characters of a line of prose in Markdown."""
+"""Longest line of prose in Markdown, in characters."""
 COMMAND_WIDTH = 100
-"""Characters of a line of a command in Markdown."""
+"""Longest line of a command in Markdown, in characters."""
 
 
 def listed(names: Sequence[str]) -> str:
@@ -77,7 +80,7 @@ def commands_in(page: str) -> list[str]:
 
 
 def made_with(rows: Mapping[str, Any]) -> list[str]:
-    """Return the table of what figures were made with."""
+    """Return a table of Markdown on how figures were made: command, versions, machine."""
     return [
         "| Made with | |",
         "|---|---|",

@@ -1,4 +1,4 @@
-"""Tables of 80 columns: controllers by gaps, and measures of a domain's objective."""
+"""Tables of 80 columns: cost of each gap per controller, and measures of hidden objectives."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def matrix_table(found: Evaluation) -> RenderableType:
 
 
 def hidden_tables(found: Evaluation) -> list[RenderableType]:
-    """Return the measures of domains with an objective; nothing where none has one."""
+    """Return the measures of domains with an objective; an empty list without such domains."""
     told = {result.domain for result in found.results if result.scores.hidden}
     domains = [domain for domain in found.domains if domain in told]
     if not domains:
@@ -76,7 +76,7 @@ _SHORT = {
 
 
 def _measured(found: Evaluation, domains: Sequence[str]) -> list[Table]:
-    """Parts of the costs, once for domains with the same traffic."""
+    """Return tables of the parts of the costs, one table for all domains with equal values."""
     alike: dict[tuple[float, ...], list[str]] = {}
     for domain in domains:
         values = [

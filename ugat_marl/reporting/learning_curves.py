@@ -16,11 +16,11 @@ from ugat_marl.reporting.tables import number
 
 
 def curves_page(found: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -> str:
-    """Return everything the learners reach on a scenario, as Markdown.
+    """Return a page of Markdown with the travel times of the learners and rules on a scenario.
 
     Args:
-        found: Trainings and rules; both the programme and fixed time among the latter.
-        config: How they were trained and judged.
+        found: Trainings and rules; the rules include the programme and fixed time.
+        config: Settings of training and evaluation.
         facts: Command, versions and processor (`experiments.machine_facts`).
     """
     fixed = min(

@@ -34,11 +34,15 @@ from ugat_marl.scenarios import Network
 Point = tuple[float, float]
 
 _NAMED = 30
-"""With more intersections than this their names would cover the roads."""
+"""Largest number of intersections whose names are shown; more names would cover the roads."""
 _LANE_M = 2.6
+"""Width of a lane on a map, m."""
 _HIGH, _LOW = 340.0, 150.0
+"""Largest and least height of a map, in points."""
 _ROWS, _COLUMNS = 16, 60
+"""Most intersections and most columns of minutes in a picture of queues."""
 _CELL = 17.0
+"""Height of a row of a picture of queues, in points."""
 
 
 @styled()
@@ -50,10 +54,10 @@ def node_map(
 
     Args:
         name: Name of the picture.
-        title: What the number is.
-        network: Where the intersections are.
-        values: Intersection to its number and to the text in its circle; nan is shown empty.
-        ends: Ends of the scale of colours.
+        title: Title of the picture.
+        network: Network with the intersections.
+        values: Intersection to its number and to the text in its circle; nan gets no colour.
+        ends: Lower and upper end of the scale of colours.
         unit: Unit of the number.
     """
     centres = {item.id: item.position for item in network.intersections if item.id in values}
@@ -88,13 +92,13 @@ def disagreement_map(
 
     Args:
         name: Name of the picture.
-        title: What it shows.
-        network: Where the lanes are.
-        lanes: Lane to its root mean square of the standardised differences.
-        tls: Traffic lights in the frame.
+        title: Title of the picture.
+        network: Network with the lanes.
+        lanes: Lane to its disagreement: root mean square of the standardised differences.
+        tls: Traffic lights that the map must show.
 
     Returns:
-        None if no lane of the record is in the network.
+        The picture; None if the network has none of the lanes.
     """
     known = {lane: z for lane, z in lanes.items() if lane in network.lanes}
     if not known:
@@ -124,9 +128,9 @@ def minutes_picture(
 
     Args:
         name: Name of the picture.
-        title: Whose queues they are.
+        title: Title of the picture.
         queues: Intersection to its mean queue in every minute, vehicles.
-        most: End of the scale of colours; default: the longest queue.
+        most: Upper end of the scale of colours, vehicles; None for the longest queue.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -160,7 +164,10 @@ def minutes_picture(
 def _map(
     name: str, title: str, network: Network, points: Sequence[Point], below: float
 ) -> tuple[NamedFigure, Any, float]:
-    """A picture with the roads around some points, its axes, and points of type per metre."""
+    """Return a picture of the roads around some points, its axes, and its scale.
+
+    The scale is in points of the picture per metre.
+    """
     from matplotlib.collections import LineCollection
 
     low, high = _frame(points)
@@ -182,7 +189,7 @@ def _map(
 
 
 def _frame(points: Sequence[Point]) -> tuple[Any, Any]:
-    """The corners around some points with some road around them, m."""
+    """Return two opposite corners of a frame with some road around the points, m."""
     places = np.array(points)
     low, high = places.min(axis=0), places.max(axis=0)
     margin = min(max(90.0, 0.3 * float(max(high - low))), 220.0)
@@ -190,7 +197,7 @@ def _frame(points: Sequence[Point]) -> tuple[Any, Any]:
 
 
 def _radius(points: Sequence[Point]) -> float:
-    """A radius at which discs and the names below them keep apart."""
+    """Return a radius, in points, at which discs and the names below them do not overlap."""
     distances = [math.dist(a, b) for a, b in itertools.combinations(points[:400], 2)]
     return min(max(0.36 * min(distances, default=60.0), 3.0), 17.0)
 

@@ -1,7 +1,7 @@
-"""Pages from templates: one file of HTML that loads nothing and runs nothing.
+"""Pages from templates: one file of HTML that loads no other file and runs no script.
 
-Names come from files of other people. Every text is escaped by the templates, and the page forbids
-itself scripts.
+Names may come from foreign files. The templates therefore escape every text, and the page forbids
+scripts.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from ugat_marl.reporting.figures import NamedFigure
 from ugat_marl.reporting.style import DARK, LIGHT, css_variables
 
 _MANY = 7
-"""Columns beyond which a table is set narrower."""
+"""Number of columns above which a table is set narrower."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A table that becomes a list of cards where it does not fit.
+    """A table; a narrow screen shows it as a list of cards.
 
     Attributes:
         headings: Headings of the columns.
-        rows: As many texts as there are headings.
-        numbers: Headings of columns that are set flush right.
+        rows: Rows, each with one text per heading.
+        numbers: Headings of the columns that are aligned to the right.
     """
 
     headings: Sequence[str]
@@ -58,15 +58,15 @@ class Page:
     """A page under construction.
 
     Attributes:
-        text: The page, once it is made.
-        pictures: All pictures on it, each with a name of its own.
+        text: HTML of the page; "" until it is made.
+        pictures: All pictures on the page; each has another name.
     """
 
     text: str = ""
     pictures: list[NamedFigure] = field(default_factory=list)
 
     def figures(self, *pairs: tuple[NamedFigure | None, str]) -> list[Figure]:
-        """Return pictures with their captions, without those that are not there."""
+        """Return pictures with their captions; leave out each picture that is None."""
         made: list[Figure] = []
         for picture, caption in pairs:
             if picture is None:
@@ -84,7 +84,7 @@ class Page:
 def render(template: str, **context: Any) -> str:
     """Return a page made from one of the ``templates/``."""
     text = _environment().get_template(template).render(context)
-    return text.encode("utf-8", "replace").decode()  # names of files may hold half characters
+    return text.encode("utf-8", "replace").decode()  # file names may hold half characters
 
 
 @functools.cache

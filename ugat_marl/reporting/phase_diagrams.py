@@ -23,11 +23,12 @@ STYLES: dict[str, tuple[str, Literal["solid", "dashed", "dotted"], str]] = {
     "s": (LIGHT["c3"], "dotted", "on red after a stop"),
     "r": (LIGHT["stop"], "solid", "red"),
 }
-"""Colour, line and meaning of each signal; lines say the same again in black and white."""
+"""Colour, line and meaning of each signal. The lines alone suffice in black and white."""
 _ROAD, _INK, _WALK = LIGHT["line"], LIGHT["ink"], LIGHT["c2"]
 _COLUMNS, _PER_PAGE = 4, 15
 _PANEL_IN = 2.45
 _ARM_M = 16.0
+"""Least length of road that is drawn around an intersection, in metres."""
 _UNDER_TEXT = {
     "boxstyle": "round,pad=0.1",
     "facecolor": LIGHT["paper"],
@@ -35,7 +36,7 @@ _UNDER_TEXT = {
     "alpha": 0.8,
 }
 _NAMED = 80
-"""With more intersections than this the overview leaves out their names."""
+"""Largest number of intersections whose names the overview shows."""
 
 
 @styled()
@@ -44,16 +45,16 @@ def draw_network(scenario: Scenario, out: Path, reporter: Reporter) -> list[Path
 
     Args:
         scenario: The scenario.
-        out: Folder to write to: ``network`` and a picture for every intersection (several if it has
-            more than 15 phases), each as ``.svg`` and ``.png``.
-        reporter: Shows progress.
+        out: Folder to write to. It gets ``network`` and a picture for every intersection (several
+            if it has more than 15 phases), each as ``.svg`` and ``.png``.
+        reporter: Reporter of the progress.
 
     Returns:
-        The files.
+        The files written.
 
     Raises:
         OutputError: The folder cannot be written.
-        ScenarioError: The network cannot be controlled.
+        ScenarioError: The lights of the network cannot be controlled.
     """
     network = Network.read(scenario)
     walks = _crossing_shapes(scenario)
@@ -75,12 +76,19 @@ def draw_network(scenario: Scenario, out: Path, reporter: Reporter) -> list[Path
 
 
 Frame = tuple[float, float, float, float]
-"""Left, bottom, width and height, m."""
+"""Left, bottom, width and height of a part of the network, m."""
 
 
 @dataclass(frozen=True)
 class _Place:
-    """An intersection with all that each panel of a sheet shows."""
+    """An intersection with all data for the panels of its sheet.
+
+    Attributes:
+        item: The intersection.
+        network: The network.
+        walks: Lane of a crossing to its centre line, ``(points, 2)``, m.
+        frame: Part of the network that is drawn.
+    """
 
     item: Intersection
     network: Network
@@ -89,7 +97,7 @@ class _Place:
 
 
 def _crossing_shapes(scenario: Scenario) -> dict[str, NDArray[np.float64]]:
-    """Centre lines of the crossings, by their lanes."""
+    """Return lane of each crossing to its centre line, ``(points, 2)``, m."""
     found: dict[str, NDArray[np.float64]] = {}
     for edge in scenario.network.parse().iter("edge"):
         if edge.get("function") == "crossing":
@@ -100,7 +108,7 @@ def _crossing_shapes(scenario: Scenario) -> dict[str, NDArray[np.float64]]:
 
 
 def _file_name(tls: str, taken: set[str]) -> str:
-    """A name that any file system takes, not given twice whatever the case of its letters."""
+    """Return a new name that is valid in any file system, even if that ignores case."""
     name = re.sub(r"[^\w-]+", "_", tls).strip("_")[:80] or "intersection"
     while name.lower() in taken:
         name += "_"
@@ -119,7 +127,7 @@ def _picture(name: str, title: str, width_in: float, height_in: float) -> NamedF
 
 
 def _sheet(name: str, place: _Place, scenario: str, phases: range) -> NamedFigure:
-    """The plan of an intersection and its phases, four panels in a row."""
+    """Return a picture of an intersection: its plan and its phases, four panels in a row."""
     item = place.item
     rows = math.ceil((len(phases) + 1) / _COLUMNS)
     columns = min(_COLUMNS, len(phases) + 1)
@@ -177,7 +185,7 @@ def _legend(figure: Any, item: Intersection, height: float) -> None:
 
 
 def _frame(item: Intersection, network: Network) -> Frame:
-    """Left, bottom, width and height of what is drawn: the ways across and some road, square."""
+    """Return the square to draw: all ways across the intersection and some road around them."""
     ends = np.array(
         [network.lanes[link.from_lane].shape[-1] for link in item.links]
         + [network.lanes[link.to_lane].shape[0] for link in item.links]
@@ -209,7 +217,7 @@ def _roads(axes: Any, place: _Place) -> None:
 
 
 def _points(metres: float, frame: Frame) -> float:
-    """A width in points on a panel."""
+    """Return a width in points on a panel, 1 at least."""
     return max(1.0, metres / frame[2] * _PANEL_IN * 0.92 * 72)
 
 
@@ -224,7 +232,7 @@ def _direction(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[
 
 
 def _ways(axes: Any, place: _Place, state: str) -> None:
-    """The links, red ones first, and the crossings that have green."""
+    """Draw the links, red ones first so that green covers them, and the crossings."""
     order = "rsgG"
     for link in sorted(place.item.links, key=lambda one: order.find(state[one.index])):
         letter = state[link.index] if state[link.index] in STYLES else "r"
@@ -233,7 +241,7 @@ def _ways(axes: Any, place: _Place, state: str) -> None:
 
 
 def _crossings(axes: Any, place: _Place, state: str = "") -> None:
-    """Crossings as stripes across the road: green ones in colour, others pale."""
+    """Draw crossings as stripes across the road: green ones in colour, others pale."""
     for crossing in place.item.crossings:
         if crossing.to_lane not in place.walks:
             continue
@@ -262,7 +270,11 @@ def _arrow(axes: Any, curve: NDArray[np.float64], letter: str) -> None:
 
 
 def _curve(link: Link, network: Network) -> NDArray[np.float64]:
-    """A Bezier curve from the stop line to the first metres of the lane behind."""
+    """Return a cubic Bezier curve from the stop line to the first metres of the next lane.
+
+    With the ends ``p0``, ``p3`` and the control points ``p1``, ``p2`` along the lanes, the curve is
+    (1-t)³ p0 + 3(1-t)²t p1 + 3(1-t)t² p2 + t³ p3.
+    """
     before = np.array(network.lanes[link.from_lane].shape)
     behind = np.array(network.lanes[link.to_lane].shape)
     start, end = before[-1], behind[0]
@@ -279,7 +291,7 @@ def _curve(link: Link, network: Network) -> NDArray[np.float64]:
 
 
 def _names(axes: Any, place: _Place) -> None:
-    """All links, and beside every incoming road its name and the numbers of its links."""
+    """Draw all links, and beside every incoming road its name and the numbers of its links."""
     item, network = place.item, place.network
     left, bottom, width, height = place.frame
     by_edge: dict[str, list[str]] = {}
@@ -301,7 +313,7 @@ def _names(axes: Any, place: _Place) -> None:
 
 
 def _ranges(numbers: Sequence[int]) -> str:
-    """``0-2, 5`` of 0, 1, 2, 5."""
+    """Return numbers as ranges: 0, 1, 2, 5 as ``0-2, 5``."""
     parts: list[list[int]] = []
     for number in numbers:
         if parts and number == parts[-1][-1] + 1:
@@ -312,7 +324,7 @@ def _ranges(numbers: Sequence[int]) -> str:
 
 
 def _overview(network: Network, scenario: str) -> NamedFigure:
-    """The whole network with the names of its agents."""
+    """Return a picture of the whole network with the names of its agents."""
     from matplotlib.collections import LineCollection
 
     shapes = [np.array(lane.shape) for lane in network.lanes.values()]

@@ -16,8 +16,9 @@ _APART = (
     "further", "corrected", "randomised", "random_delay_s", "fine_tuned", "oracle",
     "scenario_hash", "domains",
 )  # fmt: skip
-"""Settings in which trainings of one group may differ: they make no other policy of UGAT."""
+"""Settings in which trainings of one group may differ, since they do not change UGAT itself."""
 RULE = "best rule there"
+"""Name of the best rule of the real domain, as a setting."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +26,10 @@ class Group:
     """Trainings that are compared with intervals over their seeds.
 
     Attributes:
-        title: What they have in common.
-        rows: As `Comparison.rows` makes them.
-        note: What a reader must know.
-        left_out: Names of what could not take part.
+        title: Scenario and settings that all of them share.
+        rows: Rows as returned by `Comparison.rows`.
+        note: Number of seeds and kind of intervals, in a sentence.
+        left_out: Names of trainings that were not judged in both domains.
     """
 
     title: str
@@ -57,7 +58,7 @@ def groups(records: Sequence[RunRecord]) -> list[Group]:
 
 
 def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
-    """Return trainings that differ in nothing but their seed, whose curves are drawn as one."""
+    """Return lists of trainings that differ in their seed alone; one curve shows each list."""
     return list(_parted(records, lambda r: (*_common(r), r.real, _ugat(r), r.setting)).values())
 
 
@@ -80,7 +81,7 @@ def _parted(records: Iterable[RunRecord], key: Any) -> dict[Any, list[RunRecord]
 
 
 def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], tuple[str, ...]]:
-    """Trials that were scored in both domains, and names of records that were not."""
+    """Return trials that were scored in both domains, and names of the other records."""
     names = job_labels(records)
     trials: list[Trial] = []
     left_out: list[str] = []
@@ -116,14 +117,14 @@ def _of_job(record: RunRecord, name: str) -> Iterable[Trial]:
         if target == record.sim or (only is not None and target != only):
             continue
         if seeds[target] != seeds.get(record.sim):
-            continue  # half played
+            continue  # the evaluation is not complete
         for r in found.results:
             if r.domain in (record.sim, target):
                 yield Trial(name, target, r.domain, _seed(record), r.seed, r.scores)
 
 
 def _rank(setting: str) -> int:
-    """Direct transfer first, then UGAT, controls, and rules last; stable."""
+    """Return the place of a setting: direct transfer, UGAT, other settings, rules."""
     order = (DIRECT, UGAT, "", "best rule")
     return next(n for n in (0, 1, 3, 2) if setting.startswith(order[n]))
 
@@ -133,7 +134,7 @@ def _seed(record: RunRecord) -> int | None:
 
 
 def job_labels(records: Sequence[RunRecord]) -> list[str]:
-    """Names of jobs, with the settings of UGAT by which those of the same name differ."""
+    """Return names of jobs; equal names get the settings of UGAT in which the jobs differ."""
     flat = [dict(_flat(record.ugat)) for record in records]
     names = [record.setting for record in records]
     found: list[str] = []

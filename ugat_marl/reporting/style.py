@@ -1,9 +1,8 @@
 """The look of every page and picture: one palette in light and dark, markers, dashes, one style.
 
-Curves have the colours of Okabe and Ito (Color Universal Design, 2008), which stay apart for every
-kind of colour blindness. Each also has a marker and dashes of its own, so that colour is never the
-only difference. Scales of areas go from light to dark (on a dark page from dark to light) all the
-way.
+Curves have the colours of Okabe and Ito (Color Universal Design, 2008), which differ for every kind
+of colour blindness. Each curve also has its own marker and dashes, so that colour is never the only
+difference. Scales of areas go from light to dark, on a dark page from dark to light.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ LIGHT = {
     "d0": "#bccdd8", "d1": "#dba53f", "d2": "#d5752a", "d3": "#b5361f", "d4": "#5e0f22",
     "band": "#dce6f0", "good": "#1f7a4d", "mixed": "#9a5b00", "bad": "#a3283c",
 }  # fmt: skip
-"""Colours of light pages and of files, each used by one name alone."""
+"""Name to colour on light pages and in files. No two names have the same colour."""
 DARK = {
     "paper": "#12161b", "ink": "#e5eaf0", "soft": "#9ba8b6", "line": "#2d3640",
     "card": "#1a2027", "road": "#333d48", "stop": "#5a6672",
@@ -34,13 +33,13 @@ DARK = {
     "band": "#26364a", "good": "#63c796", "mixed": "#e6b25c", "bad": "#f08496",
 }  # fmt: skip
 CURVES = ("c0", "c1", "c2", "c3", "c4", "c5")
-"""Colours of curves and dots, in the order in which they are used."""
+"""Colours of curves and dots, in the order of use."""
 MARKERS = ("o", "s", "^", "D", "X", "v")
 DASHES: tuple[Any, ...] = (
     "solid", (0, (4, 2)), (0, (1, 1.3)), (0, (5, 2, 1, 2)), (0, (3, 1)), (0, (1, 2)),
 )  # fmt: skip
 STEPS = tuple(f"q{number}" for number in range(7))
-"""Colours of areas, from little to much; the first is nearly the colour of the page."""
+"""Colours of areas, from small to large values; the first is nearly the colour of the page."""
 DISAGREEMENT = (
     (1.5, "as chance would"), (3.0, "1.5 to 3"), (6.0, "3 to 6"), (15.0, "6 to 15"),
     (float("inf"), "above 15"),
@@ -90,16 +89,16 @@ _RC: dict[Any, Any] = {
 
 @contextmanager
 def styled(salt: str = "ugat") -> Iterator[None]:
-    """Apply the style to what is drawn or written within, also as a decorator.
+    """Apply the style within a ``with`` block, or to a function as a decorator.
 
     Args:
-        salt: Seed of the ids in SVG, so that a picture has the same bytes every time, and ids of
-            its own among the pictures of a page.
+        salt: Seed of the ids in SVG. With it a picture has the same bytes every time, and its ids
+            differ from those of other pictures on a page.
     """
     import matplotlib as mpl
 
     with mpl.rc_context():
-        mpl.rcdefaults()  # a user's own settings change no picture
+        mpl.rcdefaults()  # a user's own settings must not change the pictures
         mpl.rcParams.update({**_RC, "svg.hashsalt": salt})
         yield
 
@@ -114,7 +113,7 @@ def curve_style(number: int) -> dict[str, Any]:
 
 
 def step(value: float, low: float, high: float) -> str:
-    """Return the name of the colour of a value on a scale that is cut into equal steps."""
+    """Return the name of a value's colour on a scale of equal steps from `low` to `high`."""
     if high <= low:
         return STEPS[0]
     place = int((value - low) / (high - low) * len(STEPS))
@@ -122,12 +121,12 @@ def step(value: float, low: float, high: float) -> str:
 
 
 def text_on(colour: str) -> str:
-    """Return the name of the colour of text that is read on one of `STEPS`."""
+    """Return the name of a text colour that is readable on one of `STEPS`."""
     return "paper" if colour in STEPS[4:] else "ink"
 
 
 def disagreement_level(z: float) -> int:
-    """Return the class of a disagreement in `DISAGREEMENT`, from 0."""
+    """Return the index in `DISAGREEMENT` of a disagreement `z`, in standard deviations."""
     return sum(z >= end for end, _ in DISAGREEMENT[:-1])
 
 

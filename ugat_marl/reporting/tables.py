@@ -106,11 +106,11 @@ def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
 def policy_gap_table(
     title: str, gap: Mapping[str, Mapping[str, Any]], seeds: int
 ) -> RenderableType:
-    """Return distances of both simulations from the real world, policy by policy.
+    """Return distances of both simulations from the real domain, policy by policy.
 
     Args:
-        title: What the table is of.
-        gap: As `ugat_marl.experiments.policy_gaps.policy_gap` returns it.
+        title: Title of the table.
+        gap: Gaps as returned by `ugat_marl.experiments.policy_gaps.policy_gap`.
         seeds: Number of episodes behind every number.
     """
     table = Table(
@@ -148,7 +148,7 @@ def _limits(att: Mapping[str, float | None]) -> str:
 
 
 def _backlog(found: Evaluation, domain: str) -> list[str]:
-    """Vehicles kept out of the network, which throughput and queue do not show."""
+    """Return a line on vehicles that never entered; throughput and queue do not show them."""
     waiting = {name: found.estimate(name, domain, "backlog").mean for name in found.policies}
     kept_out = [f"{name} {number(mean)}" for name, mean in waiting.items() if mean >= 0.5]
     return [f"vehicles due that never entered: {', '.join(kept_out)}"] if kept_out else []
@@ -170,7 +170,7 @@ def _caption(found: Evaluation) -> str:
 
 
 def _medians(found: Evaluation) -> list[str]:
-    """Medians where a few locked-up episodes carry the mean away."""
+    """Return medians for domains in which a few locked-up episodes dominate the mean."""
     lines: list[str] = []
     for domain in found.domains:
         both = {name: found.estimate(name, domain, "att_s") for name in found.policies}
