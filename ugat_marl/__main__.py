@@ -65,7 +65,7 @@ SHORT: dict[str, tuple[str, ...]] = {
     "scenarios": ("scenario", "list"),
     "check": ("scenario", "check", "--conformance"),
 }
-"""Short names of commands, and the words they stand for."""
+"""Short names of commands, and the words that replace them."""
 
 
 LINE = CommandLine(
@@ -85,8 +85,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command of ``ugat-marl``.
 
     Returns:
-        The exit code: 0, 1 (a check or target failed), 2 (a wrong call or input; one line says
-        which), 130 (interrupted).
+        The exit code: 0, 1 (a check or target failed), 2 (wrong call or input; one line names the
+        fault), 130 (interrupted).
     """
     return run(LINE, sys.argv[1:] if arguments is None else arguments)
 

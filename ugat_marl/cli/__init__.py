@@ -1,4 +1,4 @@
-"""Command line: one file per verb, each a dataclass whose fields are its options."""
+"""Command line: one file per command, with a dataclass whose fields are the options."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Options that several commands share; their help says what the default means."""
+"""Options that several commands share; their help explains the default."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Workers = Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default:
 RayAddress = Annotated[
     str | None, arg(metavar="[ADDRESS]", help_behavior_hint="(default: not used)")
 ]
-"""Address of Ray: local (meant by a bare --ray), auto, host:port, ray://host:port."""
+"""Address of Ray: local (--ray without an address), auto, host:port, ray://host:port."""
 
 LengthS = Annotated[
     float | None, arg(metavar="FLOAT", help_behavior_hint="(default: the scenario's own)")
@@ -32,12 +32,12 @@ def workers_of(
     """Yield the workers for the parts of a command: processes of this machine, or Ray.
 
     Args:
-        workers: How many at a time on this machine.
-        ray: Address of Ray, or None.
-        option: What `workers` is called on the command line.
+        workers: Number of processes on this machine; None for one per core.
+        ray: Address of Ray; None for processes of this machine.
+        option: Name of the option `workers` on the command line.
 
     Raises:
-        OptionError: Both are given, or there is no Ray.
+        OptionError: `workers` and `ray` are both given, or Ray is not available.
     """
     if ray is None:
         yield workers

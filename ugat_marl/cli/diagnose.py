@@ -1,4 +1,4 @@
-"""``ugat-marl diagnose``: compare a scenario with measured data and name what it lacks."""
+"""``ugat-marl diagnose``: compare a scenario with measured data and name the missing effects."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REPORT = "report.html"
 
 @dataclass(frozen=True)
 class Diagnose:
-    """Compares measured data with a scenario, names what is missing, and adds it.
+    """Compare measured data with a scenario; name the missing effects and add them.
 
     Examples:
         ugat-marl diagnose single-v1 measured --out found
@@ -41,16 +41,16 @@ class Diagnose:
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
-        measured: Directory of measured data, as record or import-atspm writes it
-            (docs/reference/measured-data.md); it is never written to.
-        out: Directory for diagnosis.json, report.html and the corrected scenario; an earlier
+        measured: Directory of measured data from record or import-atspm
+            (docs/reference/measured-data.md). Nothing is written to it.
+        out: Directory for diagnosis.json, report.html and the corrected scenario. An earlier
             diagnosis in it is replaced.
         budget_s: Time in s after which no further simulation begins. The result is then marked as
             partial; the same command continues from there.
-        alpha: Chance of naming an effect where there is none.
+        alpha: Chance of naming an effect if there is none.
         seed: Root of the simulated days; the same data and seed give the same diagnosis.
         leave_out: Names of effects (docs/reference/effects.md) that are not examined.
-        cache: Folder of remembered simulations.
+        cache: Folder of stored simulations.
         workers: Simulations at a time.
         ray: Simulate on Ray instead.
         report: Write the page report.html.
@@ -73,7 +73,7 @@ class Diagnose:
     report: bool = True
 
     def run(self, console: Console) -> int:
-        """Diagnoses; the exit code is 0 whatever is found."""
+        """Diagnose, write and print; the exit code is 0 for every finding."""
         config = self._config()
         self._check_out()
         scenario = load_scenario(self.scenario)
@@ -107,7 +107,7 @@ class Diagnose:
         )
 
     def _check_out(self) -> None:
-        """Refuse an output among the measured data, which are never written to."""
+        """Refuse an output directory inside the measured data, which must not change."""
         out, measured = self.out.resolve(), self.measured.resolve()
         if out == measured or measured in out.parents:
             raise OptionError(
@@ -127,7 +127,7 @@ class Diagnose:
             ) from None
 
     def _commands(self, diagnosis: Diagnosis) -> list[str]:
-        """Return the command itself and the next one."""
+        """Return the command line of this diagnosis and the next one."""
         given = ["ugat-marl", "diagnose", self.scenario, str(self.measured), "--out", str(self.out)]
         given += ["--budget-s", f"{self.budget_s:g}", "--alpha", f"{self.alpha:g}"]
         given += ["--seed", str(self.seed)]
@@ -136,7 +136,7 @@ class Diagnose:
         return [shlex.join(given), *self._next(diagnosis)]
 
     def _next(self, diagnosis: Diagnosis) -> list[str]:
-        """Return the command that uses the corrected scenario, if anything in it is corrected."""
+        """Return the command that uses the corrected scenario; nothing if traffic is as before."""
         if diagnosis.corrected is None or not any(map(_in_the_model, diagnosis.effects)):
             return []
         corrected = str(self.out / CORRECTED)
@@ -158,7 +158,7 @@ class Diagnose:
 
 
 def _say_what_cannot_be_seen(measured: Measured, console: Console) -> None:
-    """Print the effects that the data rule out, before anything runs."""
+    """Print the effects that the data cannot show, before the first simulation."""
     ruled_out = {name for finding in measured.findings for name in finding.rules_out}
     if not ruled_out:
         return
@@ -172,5 +172,5 @@ def _say_what_cannot_be_seen(measured: Measured, console: Console) -> None:
 
 
 def _in_the_model(effect: NamedEffect) -> bool:
-    """Return true if an effect changes the simulation, not only the detections."""
+    """Return true if an effect changes the traffic, not only the detections."""
     return not known_effects()[effect.name].on_detectors

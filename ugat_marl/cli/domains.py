@@ -1,4 +1,4 @@
-"""``ugat-marl domains``: the named domains, by the gap they open."""
+"""``ugat-marl domains``: list the named domains, grouped by their gap."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TITLES = {
 
 @dataclass(frozen=True)
 class Domains:
-    """List the domains that have a name: their gap, effects, and counterpart in Sim2Signal.
+    """List the named domains: their gap, effects, and counterpart in Sim2Signal.
 
     Domains and effects can be combined: V4+zone-50+counting_noise=0.1.
 
@@ -85,7 +85,7 @@ def _table(title: str, domains: list[NamedDomain]) -> Table:
 
 
 def _notes(domains: list[NamedDomain]) -> list[str]:
-    """Return the notes on the listed domains, each one once."""
+    """Return the notes on the listed domains, each note once."""
     said: dict[str, list[str]] = {}
     for item in domains:
         if item.note:

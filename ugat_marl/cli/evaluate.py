@@ -1,4 +1,4 @@
-"""``ugat-marl evaluate``: any policies and rules in any domains."""
+"""``ugat-marl evaluate``: play policies and rules in domains and compare them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from ugat_marl.reporting import hidden_tables, matrix_table, measures_table
 from ugat_marl.scenarios import Scenario
 
 MOST_IN_DETAIL = 8
-"""More domains than these, named ones among them, are shown as a matrix of controllers and gaps."""
+"""Most domains in the detailed table; more are shown as a matrix of controllers and gaps."""
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Plays policies in domains with several seeds; prints measures, gaps and regret.
+    """Play policies in domains with several seeds; print measures, gaps and regret.
 
     Examples:
         ugat-marl evaluate single-v1 --policies largest-queue:20 max-pressure programme
@@ -37,10 +37,11 @@ class Evaluate:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         policies: Rules (such as fixed-time:30, actuated:40, largest-queue:20, max-pressure:10,
             programme; docs/reference/rules.md has them all) and files of trained policies.
-        domains: Domains; gaps are taken against the first. "all" is sim and every named domain,
-            observation, action, transition or reward all of that gap: see ugat-marl domains.
+        domains: Domains; gaps are differences from the first. "all" is sim and every named domain.
+            "observation", "action", "transition" or "reward" is every domain of this gap; see
+            ugat-marl domains.
         seeds: Number of episodes of each policy in each domain.
-        first_seed: Seed of the first of them.
+        first_seed: Seed of the first episode.
         duration_s: Length of an episode in s; default: the scenario's own.
         workers: Simulations at a time; default: one per core.
         ray: Play on Ray instead.
@@ -94,7 +95,7 @@ class Evaluate:
         return 0
 
     def _domains(self, scenario: Scenario, console: Console) -> list[str]:
-        """Return the domains spelled out, without those that the network does not allow."""
+        """Return the names of all domains, without those that do not fit the network."""
         found: list[str] = []
         for name in spelled_out(self.domains):
             if name in NAMED and name not in self.domains and _may_not_fit(name):
@@ -108,16 +109,17 @@ class Evaluate:
 
 
 def _may_not_fit(name: str) -> bool:
-    """Return True if a domain asks for what not every network has: a barrier, a long lane.
+    """Return true if a domain may not fit the network or the episode.
 
-    Or not every episode: vehicles that come later may all come too late for a short one.
+    Not every network has a barrier order of phases or a lane long enough for an incident. With late
+    demand, all vehicles may come after the end of a short episode.
     """
     words = ("phase_order=barrier", "incident=", "demand_timing=")
     return any(word in NAMED[name].effects for word in words)
 
 
 def names_of(policies: Sequence[str]) -> list[str]:
-    """Return names of policies in the table: files by the shortest path endings that differ."""
+    """Return names for the table: rules as given, files by the shortest endings that differ."""
     paths = [Path(spec.removesuffix(".pt")).parts for spec in policies]
     for length in range(1, max(map(len, paths)) + 1):
         names = ["/".join(parts[-length:]) for parts in paths]

@@ -1,4 +1,4 @@
-"""``ugat-marl export``: a trained policy as a file that runs without the suite."""
+"""``ugat-marl export``: write a trained policy to a file that runs without this package."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ class Export:
 
     Attributes:
         policy: File of a trained policy.
-        out: The model; its suffix is the format: .ts, .onnx or .npz. A .json is written beside it.
-        scenario: The scenario it was trained in; adds the decision interval and the traffic lights.
+        out: File of the model; its suffix chooses the format: .ts, .onnx or .npz. A .json is
+            written beside it.
+        scenario: Scenario of the training; adds decision interval and traffic lights to the .json.
     """
 
     policy: Annotated[Positional[Path], arg(metavar="POLICY")]
@@ -33,7 +34,7 @@ class Export:
     scenario: str | None = None
 
     def run(self, console: Console) -> int:
-        """Export and say where."""
+        """Export and print the paths."""
         policy, env = NetworkPolicy.load(self.policy), None
         if self.scenario is not None:
             env = parallel_env(load_scenario(self.scenario), **policy.env_options)

@@ -1,4 +1,4 @@
-"""``ugat-marl field``: a policy at a street that speaks TraCI, behind what keeps it safe."""
+"""``ugat-marl field``: drive the lights of a running SUMO by a policy, within safe limits."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ Log = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: n
 class Field:
     """Drive the lights of a SUMO that runs elsewhere, as if it were the street.
 
-    Counts are read once per decision. Minimum green and clearance are kept
-    whatever the policy asks for; where counts are stale, missing or absurd, or
-    the policy fails, lights follow a fixed-time plan (docs/how-to/field.md).
+    Counts are read once per decision. Minimum green and clearance are always
+    kept. If counts are stale, missing or absurd, or the policy fails, the lights
+    follow a fixed-time plan (docs/how-to/field.md).
 
     Examples:
         ugat-marl field single-v1 --policy largest-queue:20 --start --domain V4
@@ -47,13 +47,13 @@ class Field:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         policy: A rule or the file of a trained policy.
         port: Port of SUMO (its --remote-port).
-        host: The machine SUMO runs on.
+        host: The machine on which SUMO runs.
         start: Start a SUMO with the scenario, for a demonstration.
-        domain: Domain of the SUMO that is started.
-        seed: Seed of the SUMO that is started.
+        domain: Domain of the SUMO that --start runs.
+        seed: Seed of the SUMO that --start runs.
         seconds: Time to drive, s.
         detectors: Count on whole lanes, or on SUMO's lane-area detectors.
-        log: File of JSON lines, one for each decision; lines are added.
+        log: File of JSON lines, one for each decision; new lines are appended.
         limits: Limits beyond which counts and policy are not trusted.
     """
 
@@ -70,7 +70,7 @@ class Field:
     limits: Limits = field(default_factory=Limits)
 
     def run(self, console: Console) -> int:
-        """Drive and sum up."""
+        """Drive the lights and print a summary."""
         if self.port is None and not self.start:
             raise OptionError("--port is missing: where SUMO listens; or let --start run one")
         if self.start and self.host != "localhost":

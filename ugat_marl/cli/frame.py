@@ -34,11 +34,11 @@ class CommandLine:
 
     Attributes:
         program: Name of the program, as a user types it.
-        purpose: The first line of its help.
-        commands: Name of each command to where it is, ``"module:Dataclass"``, and one line of help.
-        short: Short names of commands, and what they stand for.
+        purpose: First line of the program's help.
+        commands: Name of each command to its place, ``"module:Dataclass"``, and one line of help.
+        short: Short names of commands, and the words that replace them.
         examples: Command lines for a first try.
-        perform: Runs a command's dataclass and returns the exit code.
+        perform: Function that runs a command's dataclass and returns the exit code.
     """
 
     program: str
@@ -53,12 +53,12 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
     """Run the command that the arguments name.
 
     Args:
-        line: The commands there are.
-        arguments: Words behind the program's name.
+        line: Commands of the program.
+        arguments: Words after the program's name.
 
     Returns:
-        The exit code: 0, 1 (a check or target failed), 2 (a wrong call or input; one line says
-        which), 130 (interrupted).
+        The exit code: 0, 1 (a check or target failed), 2 (wrong call or input; one line names the
+        fault), 130 (interrupted).
     """
     console = Console(highlight=False)
     progress = console if console.is_terminal else Console(stderr=True, highlight=False)
@@ -72,7 +72,7 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         parts = [f"{line.program}: interrupted", *map(str, interrupt.args)]
         print("; ".join(parts), file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # the reader has gone; the interpreter must not write to it at its end
+    except BrokenPipeError:  # else the interpreter writes to the closed pipe at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return USAGE_ERROR
 
@@ -103,7 +103,7 @@ def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
 
 
 def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
-    """Parse the options of a command into its dataclass; turn a message of tyro into one line."""
+    """Parse the options of a command into its dataclass; turn errors of tyro into one line."""
     import tyro
 
     module, _, attribute = line.commands[name][0].partition(":")
@@ -136,7 +136,7 @@ def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
 
 
 def _with_address(words: list[str]) -> list[str]:
-    """Complete a bare ``--ray``, which means the Ray of this machine."""
+    """Complete a ``--ray`` without an address to ``--ray local``, the Ray of this machine."""
     complete: list[str] = []
     for word, following in zip(words, [*words[1:], "--"], strict=False):
         complete.append(word)
@@ -146,7 +146,7 @@ def _with_address(words: list[str]) -> list[str]:
 
 
 def _description(command_type: Any) -> str:
-    """Return the docstring up to its list of attributes, examples included."""
+    """Return the docstring with its examples, without its list of attributes."""
     return (inspect.getdoc(command_type) or "").partition("\nAttributes:")[0].strip()
 
 
@@ -168,7 +168,7 @@ def _options(command_type: Any, prefix: str = "") -> set[str]:
 
 
 def _one_line(box: str) -> str:
-    """Return the message inside the box that tyro draws."""
+    """Return the message in the box that tyro draws, as one line."""
     lines = [re.sub(r"[│╭╮╰╯]", " ", line).strip() for line in box.splitlines()]
     until = next((i for i, line in enumerate(lines) if line.startswith("──")), len(lines))
     words = " ".join(re.sub(r"─+", " ", line) for line in lines[:until])

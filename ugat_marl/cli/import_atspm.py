@@ -1,4 +1,4 @@
-"""``ugat-marl import-atspm``: a signal controllers' log becomes measured data."""
+"""``ugat-marl import-atspm``: convert a log of signal controllers to measured data."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ImportAtspm:
 
     The log has the columns TimeStamp, DeviceId, EventId and Parameter.
 
-    The mapping names lights and lanes (docs/reference/measured-data.md).
+    The mapping gives its lights and lanes (docs/reference/measured-data.md).
 
     Examples:
         ugat-marl import-atspm my-scenario events.parquet mapping.toml --out street
@@ -29,8 +29,8 @@ class ImportAtspm:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         events: The log, .csv or .parquet.
         mapping: TOML file that maps devices, phases and channels to the network.
-        out: Directory to write; measured data in it are replaced.
-        csv: Write CSV, not Parquet.
+        out: Directory to write; old measured data in it are replaced.
+        csv: Write CSV instead of Parquet.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]

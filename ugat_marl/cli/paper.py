@@ -1,4 +1,4 @@
-"""``ugat-marl paper``: the tables of the UGAT paper, and those it lacks."""
+"""``ugat-marl paper``: make the tables of the UGAT paper, and further ones."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from ugat_marl.reporting import (
 
 @dataclass(frozen=True)
 class _Paper:
-    """Options that all tables have.
+    """Options that all tables share.
 
     Attributes:
-        config: What is trained, how often, and how it is judged.
+        config: Settings of the trainings and of the evaluation.
         out: Folder of the tables.
         runs: Folder of the trainings.
         jobs: Trainings at a time; default: one per core.
@@ -55,7 +55,7 @@ class _Paper:
     table: ClassVar[str]
 
     def run(self, console: Console) -> int:
-        """Train, play, print the table, write it as Markdown, CSV and PNG."""
+        """Train and evaluate; print the table and write it as Markdown, CSV and PNG."""
         if self.jobs is not None and self.jobs < 1:
             raise OptionError(f"jobs = {self.jobs}: must be at least 1")
         if self.ray is not None and self.config.device != "cpu":
@@ -63,7 +63,7 @@ class _Paper:
                 f"device = {self.config.device!r}: trainings on Ray have a core each and no GPU; "
                 "leave --ray or --device out"
             )
-        device_of(self.config.device)  # what is not there is an error now, not in a job's log
+        device_of(self.config.device)  # a missing device is an error now, not in a job's log
         for scenario in self.config.scenario:
             folder = self.out / file_stem(scenario) / self.table
             require_writable(folder / "table.md")
@@ -79,12 +79,12 @@ class _Paper:
 
 @dataclass(frozen=True)
 class Main(_Paper):
-    """UGAT beside direct transfer and every control an honest table needs.
+    """Compare UGAT with direct transfer and with all controls.
 
-    Trained on in plain sim, under domain randomisation, with random and with constant delays of
-    greens, fine-tuned on as much real data, trained in the real domain, and the best rule tuned
-    there. Finished trainings are kept in --runs and used again, by the other tables, too; a killed
-    run goes on where it was.
+    The controls are: more training in plain sim, domain randomisation, random and constant delays
+    of greens, fine-tuning on as much real data, training in the real domain, and the best rule,
+    tuned there. Finished trainings are kept in --runs, and all tables use them again. A killed run
+    continues where it stopped.
 
     Examples:
         ugat-marl paper main
@@ -97,7 +97,7 @@ class Main(_Paper):
 
 @dataclass(frozen=True)
 class Ablation(_Paper):
-    """UGAT without its parts: static α, no gate, no uncertainty, no grounding (paper, Table 3).
+    """UGAT without its parts: static α, no gate, no uncertainty, no grounding (Table 3).
 
     Examples:
         ugat-marl paper ablation
@@ -109,7 +109,7 @@ class Ablation(_Paper):
 
 @dataclass(frozen=True)
 class Alpha(_Paper):
-    """Static thresholds α against the dynamic one (paper, Table 4).
+    """Compare static thresholds α with the dynamic one (paper, Table 4).
 
     Examples:
         ugat-marl paper alpha
@@ -120,7 +120,9 @@ class Alpha(_Paper):
 
 @dataclass(frozen=True)
 class Uncertainty(_Paper):
-    """Evidential, Concrete Dropout, Deep Ensembles and none, as bars of the gaps (paper, Fig. 4).
+    """Compare evidential, Concrete Dropout, Deep Ensembles and none (paper, Fig. 4).
+
+    The gaps are drawn as bars.
 
     Examples:
         ugat-marl paper uncertainty --domains V1 V2 V3 V4
@@ -131,7 +133,7 @@ class Uncertainty(_Paper):
 
 @dataclass(frozen=True)
 class Gap(_Paper):
-    """Loss of direct transfer in each real domain, as radar charts (paper, Fig. 3).
+    """Draw the loss of direct transfer in each real domain as radar charts (Fig. 3).
 
     Examples:
         ugat-marl paper gap --scenario single-v1 grid2x2-v1

@@ -1,4 +1,4 @@
-"""``ugat-marl policy-gap``: the worth of a diagnosis to policies."""
+"""``ugat-marl policy-gap``: measure what a diagnosis changes for policies."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from ugat_marl.scenarios import Network
 
 @dataclass(frozen=True)
 class PolicyGap:
-    """Measure how much nearer a diagnosis brings policies to the real domain.
+    """Measure by how much a diagnosis shrinks the gap of policies to the real domain.
 
-    They are played in sim, in the corrected scenario and in the real domain.
+    The policies are played in sim, in the corrected scenario and in the real domain.
 
     The travel times are printed, and added to DIR/diagnosis.json and report.html.
 
@@ -36,13 +36,13 @@ class PolicyGap:
 
     Attributes:
         scenario: The scenario that was diagnosed.
-        directory: What diagnose wrote, its --out.
-        real: The domain the data were recorded in, as given to record. A street cannot be
-            played in.
+        directory: Directory that diagnose wrote, its --out.
+        real: Domain in which the data were recorded, as given to record. Data of a street have
+            none.
         policies: Rules (fixed-time:30, largest-queue:20, max-pressure:10, programme, random)
             and files of trained policies.
-        seeds: Number of episodes of each policy in each world.
-        first_seed: Seed of the first of them.
+        seeds: Number of episodes of each policy in each of the three.
+        first_seed: Seed of the first episode.
         duration_s: Length of an episode in s.
         workers: Simulations at a time.
     """
@@ -88,7 +88,7 @@ class PolicyGap:
         )
         record = write_policy_gap(self.directory, record, gap)
         page = self.directory / REPORT
-        if page.is_file():  # without it, none was wanted
+        if page.is_file():  # diagnose --no-report writes no page
             commands = commands_on_page(page)
             write_diagnosis_page(record, Network.read(scenario), page, commands)
         title = f"{scenario.id}: average travel time in s, real: {describe(self.real)}"

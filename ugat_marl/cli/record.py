@@ -1,4 +1,4 @@
-"""``ugat-marl record``: measured data of any domain under any controller."""
+"""``ugat-marl record``: record measured data of a domain under a controller."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ugat_marl.progress import Bars
 
 @dataclass(frozen=True)
 class Record:
-    """Measure a simulated world as a street is measured: detections and signals.
+    """Measure a simulation as a street is measured: detections and signals.
 
     Examples:
         ugat-marl record single-v1 --domain V4 --out measured
@@ -27,20 +27,20 @@ class Record:
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
-        out: Directory to write (docs/reference/measured-data.md); measured data in it are replaced.
-        domain: World to measure: sim, V1 to V4, effects (headway=1.4+acceleration=1), or the
+        out: Directory to write (docs/reference/measured-data.md). Old measured data in it are
+            replaced.
+        domain: Domain to measure: sim, V1 to V4, effects (headway=1.4+acceleration=1), or the
             directory of another scenario on the same network.
         policy: Controller of the signals: a rule (fixed-time:30, largest-queue:20,
             max-pressure:10, programme, random) or the file of a trained policy.
-        periods: Number of days. The last 40 % are marked as held out: a diagnosis is judged on
-            them.
+        periods: Number of days. The last 40 % are held out: a diagnosis is judged on them.
         seed: Root of the seeds of all days.
         duration_s: Length of a day in s.
-        same_demand: Use the scenario's own vehicles on every day; else each day is drawn anew.
+        same_demand: Use the scenario's own vehicles on every day, instead of drawing each day anew.
         detector_length_m: Length of the detection zones in m; 0 for points.
-        speeds: Whether the detectors measure speeds and lengths.
-        lanes: Also vehicles, halting and mean speed per lane and second.
-        trajectories: Also the position of every vehicle at every second.
+        speeds: Measure speeds and lengths at the detectors.
+        lanes: Also record vehicles, halting and mean speed per lane and second.
+        trajectories: Also record the position of every vehicle at every second.
         workers: Simulations at a time.
     """
 

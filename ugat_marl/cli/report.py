@@ -1,4 +1,4 @@
-"""``ugat-marl report``: trainings as one page."""
+"""``ugat-marl report``: show trainings on one page."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _FLAT = ("ugat",)
 
 @dataclass(frozen=True)
 class Report:
-    """Put trainings on one page of HTML that needs no network: open it, print it, send it.
+    """Write one HTML page about trainings, which needs no network connection.
 
-    Folders of `ugat-marl train`, jobs and tables of `ugat-marl paper`, or folders of these. A
-    training may be under way or broken; the page says what is missing.
+    It reads folders of `ugat-marl train`, jobs and tables of `ugat-marl paper`, or folders of
+    these. A training may be unfinished or broken; the page lists the missing parts.
 
     Examples:
         ugat-marl report runs/first
@@ -38,7 +38,7 @@ class Report:
     Attributes:
         runs: Folders, one or more.
         out: Page to write.
-        pictures: Folder for the pictures as SVG and PNG, too.
+        pictures: Folder for the pictures as SVG and PNG.
     """
 
     runs: Annotated[
@@ -56,7 +56,7 @@ class Report:
     ] = None
 
     def run(self, console: Console) -> int:
-        """Read the folders, write the page, and say what is missing."""
+        """Read the folders, write the page, and print the missing parts."""
         if not self.runs:
             raise OptionError("name at least one folder of a run, such as runs/first")
         records = read_records(self.runs)
@@ -78,7 +78,7 @@ class Report:
 
 
 def again(record: RunRecord | TableRecord) -> list[str]:
-    """Return the commands that run something again, and what to do with it next."""
+    """Return the commands that repeat or continue a run, and the next commands to use."""
     if isinstance(record, TableRecord):
         return [record.command] if record.command else []
     folder = str(record.directory)
@@ -102,10 +102,10 @@ def _train(record: RunRecord, folder: str) -> list[str]:
 
 
 def train_options(settings: Mapping[str, Any]) -> list[str]:
-    """The options of ``ugat-marl train`` that lead to these settings; what is usual is left out.
+    """Return the options of ``ugat-marl train`` that give these settings, without defaults.
 
     Args:
-        settings: Of a `TransferConfig`, as JSON has them; unknown ones are passed over.
+        settings: Settings of a `TransferConfig`, read from JSON; unknown ones are ignored.
     """
     usual = json.loads(json.dumps(asdict(TransferConfig("-")), default=str))
     usual.pop("scenario")

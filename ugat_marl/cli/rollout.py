@@ -1,4 +1,4 @@
-"""``ugat-marl rollout``: record transitions of any policy in any domain, or film it."""
+"""``ugat-marl rollout``: record transitions of a policy in a domain, or film an episode."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class VideoConfig:
     Attributes:
         from_s: Begin of the film, in s from the begin of the episode.
         length_s: Length of the film, in s of traffic.
-        speed: Seconds of traffic per second of video; one frame is one second of traffic.
+        speed: Seconds of traffic per second of video. Each frame is one second of traffic.
         size: Longer side of the picture of a network, in pixels.
     """
 
@@ -49,7 +49,7 @@ class VideoConfig:
 
 @dataclass(frozen=True)
 class Rollout:
-    """Record transitions, for `train --real-log` or for study, or film an episode.
+    """Record transitions (for example for `train --real-log`), or film an episode.
 
     Examples:
         ugat-marl rollout single-v1 --domain V4 --policy largest-queue:20 --out v4.parquet
@@ -64,16 +64,17 @@ class Rollout:
         domain: Domain to record in.
         episodes: Number of episodes.
         seed: Root of the episodes' seeds.
-        epsilon: Chance of a random phase, so that the log holds actions the policy does not take.
+        epsilon: Chance of a random phase. The log then also holds actions that the policy would not
+            take.
         observation: Observation to record: count, queue, pressure, waiting, density, movements.
-        neighbours: Distance, in roads, up to which other intersections are recorded too.
+        neighbours: Distance in roads up to which other intersections are observed too.
         duration_s: Length of an episode in s; default: the scenario's own.
-        crossings: Also record when vehicles cross the stop lines: timed grounding reads it.
+        crossings: Also record when vehicles cross the stop lines, for timed grounding.
         workers: Simulations at a time.
         ray: Record on Ray instead.
         video: Video to write: .mp4 (needs ffmpeg: pip install 'ugat-marl[video]'), .webp or .gif
-            (need nothing). It is of an episode of its own, without random phases.
-        beside: A second policy, filmed beside the first in the same episode.
+            (need nothing). It shows a separate episode without random phases.
+        beside: A second policy, filmed beside the first with the same seed.
         film: Part of the episode to film.
     """
 

@@ -1,4 +1,4 @@
-"""``ugat-marl scenario check``: facts about a scenario, and checks of it."""
+"""``ugat-marl scenario check``: show facts about a scenario and check it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ MOST_APPROACHES = 8
 
 @dataclass(frozen=True)
 class ScenarioCheck:
-    """Show what a controller will face; exit with 1 if something has to be mended.
+    """Show facts about a scenario; exit with 1 if something has to be mended.
 
     It plays an episode under the network's own programme and one under a good rule.
 
@@ -58,14 +58,14 @@ class ScenarioCheck:
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
-        domain: Domain to look at, or to check in.
-        headroom: Seeds to measure the headroom with: 25 episodes each. 0 leaves it out.
+        domain: Domain that is shown or checked.
+        headroom: Number of seeds for the headroom, 25 episodes each. 0 leaves it out.
         simulate: Play the two episodes.
         seed: Seed of the episodes.
         json: Print JSON instead of tables.
         conformance: Run the conformance kit on scenario and environment instead.
-        observation: Observation the kit checks with.
-        duration_s: Length of the episodes, s (of the kit: 300).
+        observation: Observation for the conformance kit.
+        duration_s: Length of the episodes, s (300 for the conformance kit).
         workers: Simulations at a time.
     """
 
@@ -182,7 +182,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _intersections(agents: Sequence[IntersectionFacts]) -> Table:
-    """Return one row for intersections that are alike."""
+    """Return the table of intersections, with one row for all that are alike."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for item in agents:
         groups.setdefault(_row(item), []).append(item.id)
@@ -241,7 +241,7 @@ def _runs(runs: Sequence[Run]) -> Table:
 
 
 def _headroom(rows: Sequence[Row]) -> Table:
-    """Return the headroom per domain: the loss elsewhere of the rule that is best in sim."""
+    """Return the table of headroom: in each domain, the loss of the rule that is best in sim."""
     holds = [f"{hold_s} s" for hold_s in HOLDS_S]
     table = _table(
         "Headroom: ATT [s] of the largest-queue rule held so long", "domain", *holds,

@@ -1,4 +1,4 @@
-"""``ugat-marl scenario draw``: every intersection with its phases, as pictures."""
+"""``ugat-marl scenario draw``: draw every intersection with its phases."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ScenarioDraw:
     out: Path
 
     def run(self, console: Console) -> int:
-        """Draw."""
+        """Draw and print the folder."""
         scenario = load_scenario(self.scenario)
         require_writable(self.out / "network.svg")
         files = draw_network(scenario, self.out, Bars(console))

@@ -1,4 +1,4 @@
-"""``ugat-marl scenario list``: the networks and domains by name."""
+"""``ugat-marl scenario list``: list the named scenarios and domains."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ugat_marl.scenarios import Network, check_demand, resco_maps, shipped_scena
 
 @dataclass(frozen=True)
 class ScenarioList:
-    """List the scenarios and domains that can be named.
+    """List the scenarios and domains that have a name.
 
     Examples:
         ugat-marl scenario list

@@ -1,4 +1,4 @@
-"""``ugat-marl scenario new``: a scenario from any road network and any demand."""
+"""``ugat-marl scenario new``: make a scenario from a road network and demand."""
 
 from __future__ import annotations
 
@@ -54,22 +54,22 @@ class ScenarioNew:
         name: Directory to write; its last part is the scenario's name.
         grid: Rows and columns of a grid, as in 4x4.
         arterial: Intersections along a main road.
-        osm: OpenStreetMap extract that you have: .osm, .osm.gz, or .osm.pbf (extra osm).
+        osm: File of OpenStreetMap: .osm, .osm.gz, or .osm.pbf (needs the extra osm).
         guess_signals: Put lights at large junctions of --osm that have none.
         sumo: SUMO configuration (with its vehicles) or network.
         cityflow: CityFlow's roadnet.json and flow.json (with its vehicles).
-        exact_drivers: Keep CityFlow's headways, and drive without chance; without it vehicles keep
-            their size, accelerations and speed, and follow each other as SUMO's do.
+        exact_drivers: Keep CityFlow's headways, and drive without randomness. Without this option,
+            vehicles keep size, accelerations and speed, and follow each other as SUMO's do.
         routes: Route files for the network.
         vph: Vehicles an hour at every road into the network.
         turns: Shares of left turns, straight on and right turns, for --vph.
         counts: CSV file of counts: edge,count or from,to,count; also begin_s,end_s.
         od: CSV file of origins and destinations: from,to,count; also begin_s,end_s.
         seed: Seed of the vehicles of --vph, --counts and --od.
-        spacing_m: Between intersections of a grid or arterial, m.
+        spacing_m: Distance between intersections of a grid or arterial, m.
         speed_mps: Speed limit of a grid or arterial, m/s.
-        phases: Green phases: those of the source; those of the programme; derived from the
-            conflicts; the same with permitted left turns.
+        phases: Green phases: as the source gives them; those of the programme; derived from the
+            conflicts; derived with permitted left turns.
         begin_s: Start of an episode on the clock of the routes, s.
         duration_s: Length of an episode, s.
         link: Leave the files of --sumo and --routes where they are.
@@ -99,7 +99,7 @@ class ScenarioNew:
     force: bool = False
 
     def run(self, console: Console) -> int:
-        """Make the scenario and say what it is."""
+        """Make the scenario and print its facts."""
         roads, vehicles = self._roads(), self._vehicles()
         made = make_scenario(
             self.name,
@@ -178,7 +178,7 @@ class ScenarioNew:
         return settings
 
     def _command(self) -> str:
-        """The call that makes the same scenario again."""
+        """Return the command line that makes the same scenario again."""
         words = ["ugat-marl", "scenario", "new", str(self.name)]
         for item in fields(self):
             value = getattr(self, item.name)

@@ -1,4 +1,4 @@
-"""``ugat-marl train``: train across the gap and print what was won."""
+"""``ugat-marl train``: train across the gap and print the comparison."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ugat_marl.reporting import calibration_picture, transfer_picture, transfer_
 
 @dataclass(frozen=True)
 class Train:
-    """Trains policies by UGAT on a scenario and judges them in sim and in the real domain.
+    """Train policies by UGAT; evaluate them in sim and in the real domain.
 
     Examples:
         ugat-marl train grid2x2-v1 --real V4
@@ -31,10 +31,10 @@ class Train:
         ugat-marl train grid4x4-v1 --real V4 --ray auto
 
     Attributes:
-        config: What to train, where, and how to judge it.
+        config: Settings of the training and of the evaluation.
         out: Folder of the run; default: runs/SCENARIO-REAL-sSEED.
-        resume: Go on with the run in that folder.
-        ray: Play roll-outs and the search for the best rule on Ray; learning stays here.
+        resume: Continue the run in that folder.
+        ray: Play roll-outs and search for the best rule on Ray; learning stays on this machine.
     """
 
     config: Annotated[TransferConfig, arg(name="")]
@@ -43,7 +43,7 @@ class Train:
     ray: RayAddress = None
 
     def run(self, console: Console) -> int:
-        """Train, evaluate, print the table, draw it."""
+        """Train and evaluate; print and draw the table."""
         config = self.config
         if self.out == Path():
             raise OptionError("--out is empty; give the name of a folder")
@@ -68,6 +68,6 @@ class Train:
 
 
 def _names(config: TransferConfig) -> tuple[str, str]:
-    """Return scenario and real domain; of paths the last part."""
+    """Return scenario and real domain; a path gives its last part."""
     scenario, real = config.scenario, describe(config.real)
     return Path(scenario).name.removesuffix(".sumocfg"), Path(real).name

@@ -1,4 +1,4 @@
-"""``ugat-marl tune``: the best settings of the rules in a domain."""
+"""``ugat-marl tune``: find the best settings of rules in a domain."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ugat_marl.reporting import tuning_table
 
 @dataclass(frozen=True)
 class Tune:
-    """Finds the settings with which each rule does best in a domain, by racing them.
+    """Find the best settings of each rule in a domain by racing them.
 
     Examples:
         ugat-marl tune single-v1 --domain V4
@@ -36,8 +36,8 @@ class Tune:
         duration_s: Length of an episode in s.
         workers: Simulations at a time.
         ray: Play on Ray instead.
-        fresh: Play anew what is remembered from an earlier call.
-        out: JSON file for every setting tried.
+        fresh: Repeat episodes that an earlier call has stored.
+        out: JSON file with all settings that were tried.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
