@@ -18,7 +18,7 @@ _NO_TIME = frozenset({"triggered", "containerTriggered", "split", "now", "begin"
 
 
 SPARE_S = 600.0
-"""SUMO reads route files ahead by this time at most."""
+"""Longest time, s, by which SUMO reads route files ahead."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Demand:
     """A count of the vehicles written in a scenario's files.
 
     Attributes:
-        vehicles: Single vehicles and trips that depart within the episode.
-        flows: Flows within the episode, each of which makes many vehicles.
-        routed: Whether the route files hold single vehicles with their own edges only.
+        vehicles: Number of single vehicles and trips that depart within the episode.
+        flows: Number of flows within the episode; each flow makes many vehicles.
+        routed: True if the route files hold only single vehicles with their own edges.
     """
 
     vehicles: int
@@ -43,14 +43,14 @@ def check_demand(
     *,
     whole: bool = True,
 ) -> Demand:
-    """Read all route files and check that they can be driven.
+    """Read all route files and check that SUMO can simulate them.
 
     Args:
-        scenario: Whose files.
+        scenario: The scenario with the files.
         network: Its network.
-        reporter: Shows progress where a file is long.
-        whole: Whether to read on after the end of the episode; vehicles are in the order of their
-            departures, so no vehicle within it is missed.
+        reporter: Shows progress if a file is long.
+        whole: True to read on after the end of the episode. Vehicles are sorted by departure, so
+            with False no vehicle of the episode is missed.
 
     Raises:
         ScenarioError: A route uses an edge the network does not have, vehicles are not in the order

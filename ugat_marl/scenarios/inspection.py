@@ -1,4 +1,4 @@
-"""Facts a controller will face in a scenario: intersections, phases, and traffic."""
+"""Facts about a scenario for its controllers: intersections, phases and traffic."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import GREEN
 
 SHORT_M = 50.0
-"""Shorter lanes at lights show little of a queue."""
+"""Length below which a lane at a light shows little of a queue."""
 
 SATURATION_VPH = 1800.0
-"""Vehicles an hour that a lane discharges in green: a headway of 2 s."""
+"""Vehicles per hour that a lane discharges in permanent green: one every 2 s."""
 FILLINGS = 3.0
-"""Least length of a useful episode, in multiples of the time the network needs to fill."""
+"""Least length of a useful episode, in multiples of the time in which the network fills."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class PhaseFacts:
     """One green phase.
 
     Attributes:
-        state: As SUMO writes it.
-        protected: Movements with green that need not wait, as ``edge turn``.
-        permitted: Movements with green that must let others pass (``g``).
-        crossings: Crossings with green.
+        state: State in SUMO's letters.
+        protected: Movements with protected green (``G``), as ``edge turn``.
+        permitted: Movements with permitted green (``g``), which give way to others.
+        crossings: Number of crossings with green.
     """
 
     state: str
@@ -48,12 +48,12 @@ class ApproachFacts:
     """One road that leads to a traffic light.
 
     Attributes:
-        edge: The road.
-        lanes: Its lanes.
-        vph: Vehicles an hour whose routes come by.
-        flow_ratio: That as a share of what its lanes would discharge in permanent green.
-        saturation: The same under the network's own programme; above 1 a queue grows without end.
-            None if there is no programme.
+        edge: SUMO id of the road.
+        lanes: Number of its lanes at the light.
+        vph: Vehicles per hour whose routes use the road.
+        flow_ratio: `vph` divided by the flow its lanes would discharge in permanent green.
+        saturation: `vph` divided by the flow its lanes discharge under the network's own programme.
+            Above 1 the queue grows without end. None if there is no programme or no green.
     """
 
     edge: str
@@ -68,31 +68,30 @@ class IntersectionFacts:
     """One agent.
 
     Attributes:
-        id: SUMO's id of its traffic light.
-        junctions: Junctions it controls; more than one are joined under one controller.
-        lanes: Incoming lanes.
-        links: Ways across.
-        movements: Approaches times their turns.
-        conflicts: Pairs of links whose ways cross or merge.
-        phases: What it chooses from.
-        unserved_lanes: Lanes to which no phase gives green.
-        unserved_links: Links that are green in no phase, as ``lane -> lane``.
-        partly_served: Lanes that some phase serves in one direction only: a vehicle that waits for
+        id: SUMO id of its traffic light.
+        junctions: Ids of the junctions it controls.
+        lanes: Number of incoming lanes.
+        links: Number of links for vehicles.
+        movements: Number of different pairs of approach and turn.
+        conflicts: Number of pairs of links that cross or merge.
+        phases: Green phases the agent chooses from.
+        unserved_lanes: Incoming lanes that no phase serves.
+        unserved_links: Links that no phase serves, as ``lane -> lane``.
+        partly_served: Lanes that some phase serves in one direction only. A vehicle that waits for
             the other direction blocks them.
-        lanes_behind: Short lanes with which vehicles on the lanes behind are counted.
-        short_lanes: Lanes shorter than `SHORT_M` of a road that goes on upstream, where vehicles
-            are not counted.
-        always_green: Links that are green in every phase: the signal never stops them.
-        right_on_red: Links that may go on red after a stop.
-        u_turns: Links that turn around.
-        crossings: Links for people on foot.
-        unserved_crossings: Those of them that are green in no phase.
-        foot_phases: Phases in which people on foot alone have green: a controller that sees
-            vehicles has no reason to choose them.
-        clashes: Crossings with green while vehicles that cross them need not wait, as ``phase n:
-            edge turn``.
-        uncontrolled: Links at its junctions without a light.
-        approaches: Its roads with their traffic.
+        lanes_behind: Short incoming lanes that are counted together with their upstream lanes.
+        short_lanes: Lanes shorter than `SHORT_M` whose upstream vehicles are not counted.
+        always_green: Number of links that are green in every phase.
+        right_on_red: Number of links that may go on red after a stop.
+        u_turns: Number of links that turn around.
+        crossings: Number of links for people on foot.
+        unserved_crossings: Number of crossings that are green in no phase.
+        foot_phases: Number of phases with green for people on foot only. A controller that sees
+            vehicles alone has no reason to choose them.
+        clashes: Protected greens of vehicles across a crossing with green, as ``phase n: edge
+            turn``.
+        uncontrolled: Number of links at its junctions without a light.
+        approaches: Incoming roads with their traffic.
     """
 
     id: str
@@ -120,20 +119,20 @@ class IntersectionFacts:
 
 @dataclass(frozen=True)
 class Survey:
-    """A scenario as its controllers meet it.
+    """Facts about a scenario.
 
     Attributes:
-        scenario: Its id.
+        scenario: Id of the scenario.
         duration_s: Length of an episode.
-        decisions: Decisions in it.
-        vehicles: Vehicles that depart within it.
-        flows: Flows within it.
-        first_s: Seconds until the first of them departs.
-        fill_s: Seconds within which 95 in 100 of them could cross the network at the speed limits.
-        shortest_episode_s: Shortest useful episode: until the first vehicle, and `FILLINGS` times
-            as long as the network needs to fill.
-        intersections: The agents.
-        uncontrolled: Traffic lights that are no agents: they have fewer than two green phases.
+        decisions: Number of decisions in an episode.
+        vehicles: Number of vehicles that depart within an episode.
+        flows: Number of flows within an episode.
+        first_s: Seconds until the first vehicle departs.
+        fill_s: Driving time that 95 % of the routes do not exceed at the speed limits, s.
+        shortest_episode_s: Shortest useful episode, s: `first_s` plus `FILLINGS` times `fill_s`,
+            rounded up to whole decisions.
+        intersections: Facts about each agent.
+        uncontrolled: Traffic lights with fewer than two green phases; they are no agents.
     """
 
     scenario: str
@@ -153,7 +152,7 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
 
     Args:
         scenario: The scenario.
-        reporter: Shows progress where a route file is long.
+        reporter: Shows progress if a route file is long.
 
     Raises:
         ScenarioError: The scenario cannot be controlled or driven.
@@ -183,7 +182,7 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
 
 
 def _short(scenario: Scenario, network: Network) -> set[str]:
-    """Return the lanes with which more would be counted if agents looked as far as `SHORT_M`."""
+    """Return the lanes that would get more upstream lanes with a reach of `SHORT_M`."""
     if scenario.control.reach_m >= SHORT_M or "mesosim" in scenario.settings.sumo:
         return set()
     farther = Network.read(scenario.with_control(reach_m=SHORT_M))
@@ -249,7 +248,7 @@ def _in_part(lane: str, item: Intersection) -> bool:
 
 
 def _clashes(item: Intersection, rules: RightOfWay) -> Iterator[str]:
-    """Yield the protected greens of vehicles across a crossing that is green."""
+    """Yield the protected greens of vehicles across a crossing with green."""
     for number, phase in enumerate(item.phases):
         walks = [walk for walk in item.crossings if phase[walk.index] in GREEN]
         through = [link for link in item.links if phase[link.index] == "G"]
@@ -301,7 +300,7 @@ def _approaches(item: Intersection, network: Network, traffic: _Traffic) -> Sequ
 
 
 def _green_s(item: Intersection, lane: str) -> float:
-    """Return the green of a lane per cycle of the programme, s; the mean over its links."""
+    """Return the seconds of green of a lane per cycle of the programme, mean over its links."""
     indices = [link.index for link in item.links if link.from_lane == lane]
     shown = [
         sum(seconds for seconds, state in item.programme if state[index] in GREEN)
@@ -323,7 +322,13 @@ def _free_links(root: ET.Element) -> Counter[str]:
 
 @dataclass(frozen=True)
 class _Traffic:
-    """Traffic by the routes: vehicles an hour by road, and driving times."""
+    """Traffic from the routes.
+
+    Attributes:
+        vph: Road to the vehicles per hour whose routes use it.
+        first_s: Seconds until the first vehicle departs.
+        fill_s: Driving time that 95 % of the routes do not exceed at the speed limits, s.
+    """
 
     vph: Counter[str]
     first_s: float

@@ -1,4 +1,4 @@
-"""Ways across the junctions of a ``.net.xml``: links, crossings, right of way."""
+"""Links, crossings and right of way at the junctions of a ``.net.xml``."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ CROSSING = "c"
 """Direction of a link for people on foot."""
 
 _ROUNDS = 50
-"""Rounds of the iteration for roundabouts; the error shrinks by a factor with each round."""
+"""Rounds of the iteration for roundabouts. Each round shrinks the error by a factor."""
 
 Matrix = Mapping[str, Sequence[int]]
-"""Per junction, a bit mask of other rows for each row of its right-of-way matrix."""
+"""Junction to a bit mask of other rows for each row of its right-of-way matrix."""
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,12 @@ class Link:
     """A way across an intersection, controlled by one letter of the signal state.
 
     Attributes:
-        index: Position of its letter; several links may share one.
+        index: Position of its letter in the state; several links may share one letter.
         from_lane: Incoming lane.
         to_lane: Outgoing lane.
         direction: SUMO's letter: s straight, l/L left, r/R right, t turn-around; c for a crossing.
-        junction: Junction it crosses.
-        request: Its row in that junction's right-of-way matrix, or -1 if the network has none.
+        junction: Id of the junction.
+        request: Row of the link in the junction's right-of-way matrix, or -1 if there is none.
     """
 
     index: int
@@ -75,8 +75,8 @@ def links_of(root: ET.Element) -> dict[str, list[Link]]:
 def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
     """Return the crossings for people on foot of every traffic light.
 
-    Their rows are the last ones of the junction's matrix, in the order of their numbers. A crossing
-    that shows a light at either end is one link with the letter of its first end.
+    Crossings have the last rows of the junction's matrix, in the order of their numbers. A crossing
+    with a light at each end gives one link, with the letter of its first end.
     """
     numbers: dict[str, list[int]] = defaultdict(list)
     for edge in root.iter("edge"):
@@ -107,14 +107,14 @@ def foes_of(root: ET.Element) -> dict[str, list[int]]:
 
 
 def yields_of(root: ET.Element) -> dict[str, list[int]]:
-    """Return, per junction and row, a bit mask of the rows it gives way to."""
+    """Return, per junction and row, a bit mask of the rows that this row gives way to."""
     return _matrix(root, "response")
 
 
 def neighbours_of(
     links: Mapping[str, Sequence[Link]], root: ET.Element
 ) -> dict[str, tuple[str, ...]]:
-    """Return the traffic lights reached along roads without another light in between."""
+    """Return the neighbours of each traffic light: roads join them with no light in between."""
     enters = {link.from_edge: tls for tls, own in links.items() for link in own}
     following: dict[str, set[str]] = defaultdict(set)
     for item in root.iter("connection"):
@@ -137,7 +137,7 @@ def neighbours_of(
 
 
 def right_on_red_of(root: ET.Element) -> frozenset[str]:
-    """Return the junctions where right turns may go on red after a stop."""
+    """Return the junctions where vehicles may turn right on red after a stop."""
     return frozenset(
         item.get("id", "")
         for item in root.iter("junction")
@@ -173,11 +173,11 @@ def _request_of(via: str) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class Upstream:
-    """Lanes and roads upstream of a lane at a light.
+    """Lanes and roads upstream of a lane at a light, with shares in (0, 1].
 
     Attributes:
-        lanes: Lanes inside junctions and outside to the share of their vehicles that is counted.
-        roads: Roads to the share of the vehicles waiting to enter the network there.
+        lanes: Lane, inside or outside of junctions, to the counted share of its vehicles.
+        roads: Road to the counted share of the vehicles that wait to enter the network there.
     """
 
     lanes: dict[str, float] = field(default_factory=dict[str, float])
@@ -187,24 +187,24 @@ class Upstream:
 def behind_of(
     root: ET.Element, lengths_m: Mapping[str, float], reach_m: float, lights: Container[str]
 ) -> dict[str, Upstream]:
-    """Find the lanes behind short lanes at lights, whose vehicles are on their way to the light.
+    """Find the lanes upstream of short lanes at lights.
 
-    Networks made of maps have lanes at lights that are cut off by a node of the map, some shorter
-    than a vehicle. The rest of the queue is on the lanes behind and would not be seen.
+    In networks made from maps, a node of the map may cut a lane at a light short, even shorter than
+    a vehicle. The rest of the queue stands on upstream lanes and would not be counted.
 
     Args:
         root: The ``<net>``.
         lengths_m: Length of every lane outside of junctions, m.
-        reach_m: Distance looked upstream. Whole lanes are added until one begins so far from the
-            light or farther.
-        lights: The traffic lights that matter; others count as plain nodes.
+        reach_m: Distance from the light up to which lanes are added. A lane is added as a whole if
+            it ends within this distance.
+        lights: Traffic lights that count as lights; other lights count as plain nodes.
 
     Returns:
-        For each shorter lane at a light the lanes and roads counted with it. The share of a lane is
-        the share of its ways that lead to the lane at the light: one over their number at every
-        node, U-turns not counted. Lanes at a light of their own are not behind another one.
-        Where a lane begins nearer than `reach_m`, vehicles that wait to enter on its road, each on
-        any of its lanes, are behind it.
+        The lanes and roads counted with each lane at a light that is shorter than `reach_m`. The
+        share of a lane is the probability that a vehicle on it comes to the lane at the light, if
+        it chooses each way at a node equally often (U-turns excluded). Lanes that end at a light
+        themselves are never upstream lanes. Vehicles that wait to enter a road count if a lane of
+        that road begins within `reach_m`; they are spread evenly over the lanes of the road.
     """
     ways = _ways(root, lights)
     widths = Counter(map(edge_of, ways.number))
@@ -231,9 +231,9 @@ class _Ways:
     """Connections between lanes outside of junctions.
 
     Attributes:
-        feeds: For each lane those that lead to it without a light, with the lanes inside the
-            junction in between.
-        number: In how many ways each lane leads on.
+        feeds: For each lane, the lanes that lead to it without a light, each with the lanes inside
+            the junction between them.
+        number: Number of ways onward from each lane.
         at_lights: Lanes that end at a light.
     """
 
@@ -272,7 +272,7 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
 def _begins(
     lane: str, ways: _Ways, lengths_m: Mapping[str, float], reach_m: float
 ) -> dict[str, float]:
-    """Return each lane's distance from its begin to the light, m, nearest first."""
+    """Return the distance from each lane's begin to the light, m, nearest first (Dijkstra)."""
     found: dict[str, float] = {}
     waiting = [(lengths_m.get(lane, reach_m), lane)]
     while waiting:
@@ -290,8 +290,11 @@ def _begins(
 def _shares(lane: str, near: Sequence[str], ways: _Ways) -> dict[str, float]:
     """Return the share of each lane's vehicles that come to `lane`, by all ways through `near`.
 
-    The shares solve one linear equation per lane, by fixed-point iteration: roundabouts need more
-    than one round, and each round adds a smaller share.
+    With ``number(f)`` ways onward from lane f, the shares solve
+
+        share(lane) = 1,  share(f) = sum of share(n) / number(f) over the lanes n that f leads to.
+
+    Fixed-point iteration solves this. Roundabouts need more rounds, and each round adds less.
     """
     shares = {lane: 1.0}
     for _ in range(_ROUNDS + len(near)):  # a chain of n lanes takes n rounds

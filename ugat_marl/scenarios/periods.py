@@ -16,7 +16,7 @@ Split = Literal["fit", "heldout"]
 
 
 SignalLog = tuple[tuple[float, str], ...]
-"""States of a traffic light: ``(since_s, state)`` at every change, in order of time."""
+"""States of a traffic light: ``(since_s, state)`` at every change, sorted by time."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,10 @@ class Detector:
     Attributes:
         id: Name.
         lane: SUMO id of the lane.
-        position_m: Upstream end of the zone, from the lane's start.
+        position_m: Distance of the zone's upstream end from the lane's start.
         length_m: Length of the zone; 0 for a point.
-        kind: ``advance`` upstream of a stop line, ``stop`` at it, ``exit`` behind the intersection.
+        kind: ``advance`` upstream of a stop line, ``stop`` at the stop line, ``exit`` downstream of
+            the intersection.
     """
 
     id: str
@@ -40,13 +41,13 @@ class Detector:
 
 @dataclass(frozen=True, eq=False)
 class Passages:
-    """Vehicles over one detector in one period, in order of time; all arrays ``(passages,)``.
+    """Vehicles over one detector in one period, sorted by time; all arrays ``(passages,)``.
 
     Attributes:
-        on_s: When the front reached the zone; NaN if that was before the period.
-        off_s: When the rear left the zone; NaN if that was after the period.
-        speed_mps: Speed, NaN where it was not measured.
-        length_m: Length of the vehicle, NaN where it was not measured.
+        on_s: Time at which the front reached the zone; NaN if before the period.
+        off_s: Time at which the rear left the zone; NaN if after the period.
+        speed_mps: Speed; NaN if not measured.
+        length_m: Length of the vehicle; NaN if not measured.
     """
 
     on_s: NDArray[np.float64]
@@ -72,15 +73,15 @@ class Passages:
 
 @dataclass(frozen=True, eq=False)
 class Period:
-    """One stretch of measurement; two periods are two days, or two stretches of one.
+    """One interval of measurement. Two periods are on two days, or apart on one day.
 
     Attributes:
         id: Name.
         begin_s: Start on the scenario's clock.
         end_s: End on the scenario's clock.
-        split: Whether models are fitted to it, or judged on it.
+        split: ``fit`` if models are fitted to this period, ``heldout`` if they are judged on it.
         signals: Traffic light to its log; the first entry is at or before `begin_s`.
-        passages: Detector to its vehicles; a detector that reported nothing is left out.
+        passages: Detector to its passages; detectors without passages are left out.
     """
 
     id: str
@@ -92,5 +93,5 @@ class Period:
 
 
 def deciding_letter(states: Sequence[str]) -> str:
-    """Return the letter that vehicles on several links obey: green before yellow before red."""
+    """Return the letter that counts for a lane with several links: green, else yellow, else red."""
     return next((x for x in "GgYyur" if x in states), "r")

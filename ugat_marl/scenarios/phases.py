@@ -1,6 +1,6 @@
-"""Links that may be green together: phases of a programme, or derived from the conflicts.
+"""Phases: those of a programme, or sets of links derived from their conflicts.
 
-The conflicts are those of the junction's own right-of-way matrix (``<request foes=...>``).
+The conflicts come from the junction's own right-of-way matrix (``<request foes=...>``).
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from ugat_marl.scenarios.junctions import (
 from ugat_marl.scenarios.signals import GREEN, YELLOW
 
 MOST_PHASES = 64
-"""More maximal conflict-free sets than this mean a junction that needs an explicit list."""
+"""Most derived phases of a junction. With more, its phases must be listed."""
 
 
 Movement = tuple[str, str]
 """Approach (edge) and direction."""
 
 Clash = Callable[[Link, Link], bool]
-"""Whether two links must not be green together."""
+"""Function that is True if two links must not be green together."""
 
 
 def programme_phases(programme: Sequence[tuple[float, str]]) -> tuple[str, ...]:
@@ -51,10 +51,10 @@ def are_foes(a: Link, b: Link, foes: Matrix) -> bool:
 
 
 def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple[int, int] | None:
-    """Return two links that both have protected green though their paths cross, or None.
+    """Return the indices of two links with protected green whose paths cross, or None.
 
-    Only crossings that involve a through movement count: many networks draw opposing left turns so
-    tightly that the matrix calls them foes, and give a merging right turn a standing green.
+    Only conflicts with a through movement count. In many networks opposing left turns are drawn so
+    tightly that the matrix calls them foes, and merging right turns are always green.
     """
     green = [link for link in links if phase[link.index] == "G"]
     for position, a in enumerate(green):
@@ -71,12 +71,12 @@ def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple
 
 @dataclass(frozen=True)
 class RightOfWay:
-    """Right of way at the junctions of a network: conflicts, and who waits.
+    """Right of way at the junctions of a network: conflicts and priorities.
 
     Attributes:
-        foes: Rows that cross or merge.
-        yields: Rows that each row gives way to; empty where that is not needed.
-        right_on_red: Junctions where right turns may go on red after a stop.
+        foes: Rows that cross or merge with each row.
+        yields: Rows that each row gives way to; empty if not needed.
+        right_on_red: Junctions where vehicles may turn right on red after a stop.
     """
 
     foes: Matrix
@@ -99,26 +99,26 @@ def conflict_free_phases(
 ) -> tuple[str, ...]:
     """Return all maximal sets of compatible movements, as SUMO states.
 
-    A movement is a group of links with one approach and one direction; movements that share a
-    letter of the state count as one. Right turns follow: they are green with every phase that gives
-    green to a lane they share or that they do not conflict with.
-    On a 4-arm junction with left lanes this gives the eight phases of the UGAT paper.
+    A movement is a group of links with one approach and one direction. Movements that share a
+    letter of the state count as one. Right turns are added to every phase that they do not conflict
+    with; if they share a lane with another movement, one of these must be green as well. On a
+    junction with four arms and left lanes this gives the eight phases of the UGAT paper.
 
-    A crossing is green in every phase in which only turning vehicles cross it and wait (``g``):
-    right turns if there is such a phase, else left turns too. A crossing that no phase can serve
-    gets green in a phase for people on foot alone.
+    A crossing is green in every phase in which only turning vehicles cross it; these wait (``g``).
+    Phases with right turns only are preferred, else left turns count too. Crossings that no phase
+    can serve get green in a phase for people on foot alone.
 
     Args:
         links: Links of one traffic light.
         rules: Right of way at its junctions.
-        width: Letters of a state.
-        source: What to call the traffic light in errors.
+        width: Number of letters of a state.
+        source: Name of the traffic light in errors.
         crossings: Links for people on foot.
-        permitted: Whether left turns may go together with the traffic opposite, which they let pass
+        permitted: True if left turns may go together with opposite traffic, to which they give way
             (``g``).
 
     Returns:
-        Distinct states, through movements before left turns, in a fixed order.
+        Distinct states in a fixed order, through movements before left turns.
 
     Raises:
         ScenarioError: The network has no right-of-way matrix, or there are too many sets.
@@ -145,7 +145,7 @@ def conflict_free_phases(
 
 
 def _permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
-    """Return a conflict test that allows left turns to wait for the approach opposite."""
+    """Return a conflict test that allows left turns that wait for opposite traffic."""
     through = [link for link in links if link.direction == "s"]
     crossing = {
         (a.from_edge, b.from_edge) for a in through for b in through if are_foes(a, b, rules.foes)
@@ -189,7 +189,7 @@ def _with_crossings(
 
 
 def state_of(green: Sequence[Link], links: Sequence[Link], rules: RightOfWay, width: int) -> str:
-    """Return the state with green for links: protected, or permitted where a link must wait."""
+    """Return the state with green for links: ``G``, or ``g`` if a link must wait for another."""
     letters = ["r"] * width
     for link in links:
         if link.junction in rules.right_on_red and turn_of(link) == "r":
@@ -208,7 +208,7 @@ def _maximal_phases(
     clash: Clash,
     source: str,
 ) -> list[set[Movement]]:
-    """Return maximal sets of movements, each with the right turns that may go with it."""
+    """Return maximal sets of compatible movements, with the right turns that fit each set."""
     main = [name for name in groups if name not in following]
     compatible = {
         a: {b for b in main if b != a and not _groups_conflict(groups[a], groups[b], clash)}
@@ -233,7 +233,7 @@ def _movements(links: Sequence[Link]) -> dict[Movement, list[Link]]:
     groups: dict[Movement, list[Link]] = {}
     for link in links:
         groups.setdefault((link.from_edge, _turn(link.direction)), []).append(link)
-    # A right turn joins the movement it shares a letter with, not the other way round.
+    # Right turns come last, so that they join the movement they share a letter with.
     for name in sorted(groups, key=lambda name: name[1] == "r"):
         letters = {link.index for link in groups.get(name, ())}
         while joined := [
@@ -281,7 +281,7 @@ def _right_may_go(
 def _maximal_cliques(
     compatible: Mapping[Movement, set[Movement]], source: str
 ) -> Iterator[frozenset[Movement]]:
-    """Bron-Kerbosch without pivoting: the graphs have a dozen nodes."""
+    """Yield all maximal cliques (Bron-Kerbosch). The graphs are small, so it needs no pivoting."""
     found = 0
     stack = [(frozenset[Movement](), set(compatible), set[Movement]())]
     while stack:
@@ -303,17 +303,17 @@ def _maximal_cliques(
 
 
 def suited(network: Path) -> tuple[dict[str, str], list[str]]:
-    """Find the lights that conflict-free phases do not suit, and a source of phases that does.
+    """Find the lights for which conflict-free phases do not fit, and a better source of phases.
 
-    Where a lane serves straight on and left turns, a phase for one of them alone is blocked by the
-    first vehicle that waits for the other. There left turns are permitted. A light with too many
-    conflicts to derive phases, or with a single derived phase, keeps the phases of its programme.
+    If a lane serves both straight on and left turns, a vehicle that waits for one of them blocks a
+    phase for the other. At such lights left turns are permitted. Lights with fewer than two derived
+    phases keep the phases of their programme, if it has at least two.
 
     Args:
         network: The ``.net.xml``.
 
     Returns:
-        Source of the phases by light, and notes.
+        Light to the source of its phases, and notes for the user.
     """
     root = parse_xml(read_bytes(network), str(network))
     rules = RightOfWay(foes_of(root), yields_of(root))

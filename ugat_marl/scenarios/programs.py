@@ -1,4 +1,4 @@
-"""SUMO's own programs and tools, run with a list of options; their complaints become errors."""
+"""SUMO's own programs and tools, run with a list of options. Their failures become errors."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from pathlib import Path
 from ugat_marl.errors import ScenarioError
 
 _MOST_WORDS = 60
-"""Words kept of a program's complaint; netconvert can complain for pages."""
+"""Most words quoted from a program's error; netconvert can print pages."""
 
 
 def sumo_program(name: str) -> Path:
-    """Return the path of a program in the eclipse-sumo wheel, not of its wrapper in Python."""
+    """Return the path of a program in the eclipse-sumo wheel, not of its Python wrapper."""
     import sumo
 
     return Path(sumo.SUMO_HOME) / "bin" / name
 
 
 def netconvert(arguments: Sequence[str], output: Path) -> str:
-    """Make a network, without the comment that holds date and paths.
+    """Make a network with netconvert, and remove the comment with date and paths.
 
     Args:
-        arguments: Options without the output.
+        arguments: Options of netconvert without the output.
         output: The ``.net.xml`` to write.
 
     Returns:
-        Its warnings; empty if there were none.
+        Warnings of netconvert; empty if there were none.
 
     Raises:
-        ScenarioError: It refused; holds its words.
+        ScenarioError: netconvert refused; the message quotes it.
     """
     said = run_program(
         "netconvert", [str(sumo_program("netconvert")), *arguments, "-o", str(output)]
@@ -50,11 +50,11 @@ def tool(script: str, arguments: Sequence[str]) -> None:
     """Run one of SUMO's tools written in Python.
 
     Args:
-        script: Its name, ``routeSampler.py`` say.
-        arguments: Its options.
+        script: Name of the tool, such as ``routeSampler.py``.
+        arguments: Options of the tool.
 
     Raises:
-        ScenarioError: It failed; holds its last words.
+        ScenarioError: The tool failed; the message quotes it.
     """
     path = sumo_program("netconvert").parent.parent / "tools" / script
     run_program(script, [sys.executable, str(path), *arguments])
@@ -63,8 +63,12 @@ def tool(script: str, arguments: Sequence[str]) -> None:
 def run_program(name: str, command: Sequence[str]) -> str:
     """Run a program and return its standard error.
 
+    Args:
+        name: Name of the program in errors.
+        command: The program and its options.
+
     Raises:
-        ScenarioError: It failed.
+        ScenarioError: The program failed; the message quotes it.
     """
     environment = {**os.environ, "SUMO_HOME": str(sumo_program(name).parent.parent)}
     done = subprocess.run(
@@ -76,7 +80,7 @@ def run_program(name: str, command: Sequence[str]) -> str:
 
 
 def _errors(said: str) -> str:
-    """Return the lines that are errors; there are warnings between them."""
+    """Return the lines that are errors, without the warnings between them."""
     return "\n".join(line for line in said.splitlines() if "rror" in line)
 
 

@@ -1,4 +1,4 @@
-"""Vehicles of a demand with their routes: read from route files, or routed by duarouter."""
+"""Vehicles of a demand with their routes, read from route files or computed by duarouter."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from ugat_marl.scenarios.settings import seconds_of
 
 
 class OwnEdges:
-    """Detector of route files that hold nothing but single vehicles with their own edges."""
+    """Test of a route file: does it hold only single vehicles with their own edges?"""
 
     def __init__(self) -> None:
         self._holds = True
-        self._waiting = False  # for the route of the vehicle before
+        self._waiting = False  # True between a <vehicle> and its <route>
 
     @property
     def lost(self) -> bool:
-        """True once something else was read; later tags cannot change that."""
+        """True once another kind of demand was read; this is final."""
         return not self._holds
 
     def read(self, item: Tag) -> None:
-        """Take the next opening tag."""
+        """Read the next opening tag."""
         if item.name in ("vehicle", "trip", "flow", "route", "routeDistribution"):
             single = item.name == "vehicle" and "route" not in item.attributes
             self._holds &= item.name == "route" or (single and not self._waiting)
             self._waiting = single
 
     def ended(self) -> bool:
-        """Return True if the whole file held nothing else."""
+        """Return True if the whole file held only such vehicles; call this after the last tag."""
         return self._holds and not self._waiting
 
 
@@ -46,7 +46,7 @@ def as_vehicles(scenario: Scenario) -> Scenario:
     """Return the same demand as single vehicles with routes; duarouter resolves trips and flows.
 
     Raises:
-        ScenarioError: duarouter refuses; its own words are in the message.
+        ScenarioError: duarouter refuses; the message quotes it.
     """
     if all(map(_holds_single_vehicles, scenario.routes)):
         return scenario
@@ -57,7 +57,7 @@ def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
     """Yield the edges of every vehicle that departs within the scenario's time.
 
     Args:
-        scenario: Any scenario; `as_vehicles` is applied if need be.
+        scenario: Any scenario; `as_vehicles` turns its trips and flows into vehicles.
     """
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
@@ -72,12 +72,13 @@ def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
 def departures(
     scenario: Scenario, *, routed: bool, reporter: Reporter | None = None
 ) -> Iterator[tuple[str, float, list[str]]]:
-    """Yield name, departure and roads of every vehicle that departs before the end.
+    """Yield name, departure in s, and roads of every vehicle that departs before the end.
 
     Args:
-        scenario: Whose demand; it has passed `check_demand`.
-        routed: Whether it holds single vehicles with roads only; others are routed before.
-        reporter: Shows progress where a file is long.
+        scenario: Scenario that has passed `check_demand`.
+        routed: True if its route files hold only single vehicles with their own edges. Otherwise
+            `as_vehicles` routes them first.
+        reporter: Shows progress if a file is long.
     """
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
@@ -87,7 +88,7 @@ def departures(
             if tag.name == "vehicle":
                 name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
                 depart = seconds_of(text) if text[:1].isdigit() else begin
-                if depart >= end:  # they are in the order of their departures
+                if depart >= end:  # vehicles are sorted by departure
                     break
             elif tag.name == "route" and "id" not in tag.attributes:
                 yield name, depart, tag.attributes.get("edges", "").split()
@@ -105,7 +106,7 @@ def _holds_single_vehicles(document: Document) -> bool:
 
 @functools.lru_cache(maxsize=8)
 def _content_holds_single_vehicles(document: Document, size: int, changed_ns: int) -> bool:
-    """Do the same, cached for a file as long as it does not change."""
+    """Test the file; the size and time of change make the cache forget a changed file."""
     del size, changed_ns
     singles = OwnEdges()
     for tag in document.scan():
@@ -149,10 +150,10 @@ def _routed_by_duarouter(scenario: Scenario) -> Document:
 
 
 def _for_sumo(document: Document, directory: Path) -> Path:
-    """Return a path SUMO can read: a plain file where it lies, else a copy in `directory`."""
+    """Return a path SUMO can read: the file itself if it is plain, else a copy in `directory`."""
     path = document.path
     plain = path is not None and document.content is None and path.suffix != ".gz"
-    if path is not None and plain and "," not in str(path.resolve()):  # it ends a name for SUMO
+    if path is not None and plain and "," not in str(path.resolve()):  # SUMO splits names at ","
         return path.resolve()
     copy = directory / document.name.removesuffix(".gz").replace(",", "_")
     with replacing(copy) as temporary, temporary.open("wb") as file:

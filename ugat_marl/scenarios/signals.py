@@ -1,7 +1,7 @@
 """Signal timing as pure functions: requested phase -> min green, yellow, all-red, green.
 
-The machine never shows green and then red without yellow, holds every green for the minimum, and
-does not change its mind while clearing. It knows nothing of SUMO.
+The state machine shows yellow between green and red, unless its duration is 0. It holds every green
+for the minimum, and it completes each clearance that it has begun. It does not depend on SUMO.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from ugat_marl.errors import OptionError, ScenarioError
 GREEN = frozenset("Gg")
 YELLOW = frozenset("yYu")
 STATES = frozenset("rugGyYoOs")
-"""Letters SUMO knows: red, red-yellow, green (minor, major), yellow, off, right-on-red."""
+"""SUMO's letters: red, red-yellow, green (minor g, major G), yellow, off, right on red (s)."""
 
 Segment = tuple[float, str]
 """A duration in seconds and the state shown for it."""
 
 _INSTANT_S = 1e-6
-"""Sums of tenths are not exact in binary; SUMO counts in milliseconds."""
+"""Tolerance in comparisons of times: sums of tenths are not exact, and SUMO counts milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class SignalState(NamedTuple):
     """State of the signal machine of one intersection.
 
     Attributes:
-        phase: Green phase shown, or cleared towards.
-        origin: Green phase being cleared; equal to `phase` when green.
-        elapsed_s: Seconds since the green began, or since the clearance began.
+        phase: Green phase that is shown, or that follows the current clearance.
+        origin: Green phase before the current clearance; equal to `phase` when green.
+        elapsed_s: Seconds since the green or the clearance began.
     """
 
     phase: int
@@ -69,12 +69,12 @@ class SignalState(NamedTuple):
 
 
 def initial_state(timing: SignalTiming) -> SignalState:
-    """Return phase 0, green for long enough that any phase may follow."""
+    """Return phase 0, green for the minimum green, so that any phase may follow."""
     return SignalState(0, 0, timing.min_green_s)
 
 
 def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) -> bool:
-    """Return True if a request made now is begun within the next `within_s` seconds."""
+    """Return True if a change requested now begins within the next `within_s` seconds."""
     wait = timing.min_green_s - state.elapsed_s
     if state.clearing:
         wait = timing.clearance_s - state.elapsed_s + timing.min_green_s
@@ -82,10 +82,10 @@ def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) ->
 
 
 def begins_when_asked(timing: SignalTiming, interval_s: float) -> bool:
-    """Return True if every green begins within the decision that asks for it.
+    """Return True if every green begins within the decision that requests it.
 
-    That holds if the clearance is shorter than an interval and the minimum green no longer than
-    the rest. Then a light may change at once at every decision.
+    This holds if the clearance is shorter than an interval and the minimum green fits into the rest
+    of the interval. Then a light may change at once at every decision.
     """
     left_s = interval_s - timing.clearance_s
     return left_s > _INSTANT_S and timing.min_green_s <= left_s + _INSTANT_S
@@ -100,23 +100,23 @@ def advance(
 ) -> tuple[SignalState, list[Segment]]:
     """Run the machine of one intersection for `seconds` under one request.
 
-    A clearance in progress is completed, the minimum green is held, and then the requested phase
-    follows behind yellow and all-red. Links that are green in both phases stay green in between.
+    The machine completes a running clearance, holds the minimum green, and then shows yellow,
+    all-red and the requested phase. Links that are green in both phases stay green in between.
 
     Args:
         phases: Green states of the intersection, one letter per link.
         state: State of the machine.
-        requested: Index of the phase asked for.
+        requested: Index of the requested phase.
         seconds: Length of the decision interval.
         timing: Clearance and minimum green.
 
     Returns:
-        The state afterwards, and what is shown: segments whose durations add up to `seconds`.
+        The state afterwards, and the segments shown. Their durations add up to `seconds`.
     """
     assert 0 <= requested < len(phases)
     if requested == state.phase and not state.clearing:
         return state.later(seconds), [(seconds, phases[requested])]
-    if not state.clearing:  # a long green behaves like one of the minimum: few cases to remember
+    if not state.clearing:  # beyond the minimum, the age of a green does not matter: fewer cases
         state = SignalState(state.phase, state.origin, min(state.elapsed_s, timing.min_green_s))
     after, shown = _course(tuple(phases), state, requested, seconds, timing)
     return after, list(shown)
@@ -130,7 +130,7 @@ def _course(
     seconds: float,
     timing: SignalTiming,
 ) -> tuple[SignalState, tuple[Segment, ...]]:
-    """Do the work of `advance`, cached: the machine has few states and visits each many times."""
+    """Compute `advance`. The cache helps because the machine visits few states many times."""
     shown: list[Segment] = []
     left = seconds
     while left > _INSTANT_S:
@@ -174,13 +174,13 @@ def _append(shown: list[Segment], segment: Segment) -> None:
 
 @functools.cache
 def yellow_between(origin: str, target: str) -> str:
-    """Return yellow where a green ends; green where it goes on, with the weaker of both rights."""
+    """Return yellow where a green ends; green where it continues, ``g`` if either one is ``g``."""
     return "".join(_ending(a, b, "y") for a, b in zip(origin, target, strict=True))
 
 
 @functools.cache
 def red_between(origin: str, target: str) -> str:
-    """Return red where a green ended or is about to begin; green where it goes on."""
+    """Return red where a green ended or is about to begin; green where it continues."""
     return "".join(_ending(a, b, "r") for a, b in zip(origin, target, strict=True))
 
 
@@ -197,9 +197,10 @@ class LateGreen(NamedTuple):
 
     Attributes:
         commanded: State commanded last, one letter per link.
-        shown: State shown last.
-        waiting_s: Seconds until each link's green is shown; 0 if nothing is held back.
-        owed_s: Late green not yet given to each link, less than one step.
+        shown: State shown last, one letter per link.
+        waiting_s: Seconds until each link's green is shown; 0 if it is not delayed, infinite if its
+            green was never shown before its yellow.
+        owed_s: Delay not yet given to each link, less than one step.
     """
 
     commanded: str
@@ -209,7 +210,7 @@ class LateGreen(NamedTuple):
 
     @classmethod
     def after(cls, state: str) -> LateGreen:
-        """Return the memory of a light that has shown `state` for long."""
+        """Return the memory of a light that shows `state` and has no delays."""
         nothing = (0.0,) * len(state)
         return cls(state, state, nothing, nothing)
 
@@ -219,18 +220,22 @@ def with_late_green(
 ) -> tuple[LateGreen, list[Segment]]:
     """Delay greens: every link that turns green stays red for `late_s` first.
 
-    The time is lost at the start of the green, the end stays where it is. Greens are held back by
-    whole steps of the simulation. The rest is added to the link's next green, so that the mean over
-    many greens is `late_s`. A green shorter than its delay is not shown, nor is its yellow.
+    The end of the green does not move. Greens are delayed by whole steps of the simulation, and the
+    remainder is added to the delay of the link's next green:
+
+        steps = floor((owed + late_s) / step_s),  owed' = owed + late_s - steps * step_s.
+
+    The mean delay over many greens is therefore `late_s`. If a green is shorter than its delay,
+    neither it nor its yellow is shown.
 
     Args:
         segments: Commanded states.
-        late_s: Time lost, in s.
-        step_s: Length of a simulation step.
+        late_s: Delay of each green, s.
+        step_s: Length of a simulation step, s.
         before: Memory of earlier commands.
 
     Returns:
-        The new memory, and the states shown: segments of the same total duration.
+        The new memory, and the segments shown. Their total duration is that of `segments`.
     """
     shown: list[Segment] = []
     state = before
@@ -252,12 +257,12 @@ def with_late_green(
 
 
 class GreenDelays:
-    """Holds greens back at many traffic lights: always, by their late green, or at one decision.
+    """Delay greens at many traffic lights: always by their late green, or once on request.
 
     Args:
-        shown: Traffic light to the state it has shown for long.
-        late_s: Traffic light to the time every green loses, in s; lights left out lose nothing.
-        step_s: Length of a simulation step.
+        shown: Traffic light to the state it shows at the start.
+        late_s: Traffic light to the delay of each green, s; lights left out have no delay.
+        step_s: Length of a simulation step, s.
     """
 
     def __init__(
@@ -267,14 +272,14 @@ class GreenDelays:
         self._step_s = step_s
         self._asked: Mapping[str, float] = {}
         self._commanded = dict(shown)
-        self._held: dict[str, LateGreen] = {}  # lights that wait, or owe a fraction of a step
+        self._held: dict[str, LateGreen] = {}  # lights with a delayed link or an owed remainder
 
     def ask(self, seconds: Mapping[str, float]) -> None:
         """Set, per traffic light, the extra delay in s of greens that begin in the next `hold`."""
         self._asked = seconds
 
     def hold(self, plans: Mapping[str, list[Segment]]) -> dict[str, list[Segment]]:
-        """Return the segments shown instead of `plans`, which are one decision of every light."""
+        """Return the segments shown instead of `plans`, which hold one decision of every light."""
         shown = dict(plans)
         for tls, plan in plans.items():
             late = self._late_s.get(tls, 0.0) + self._asked.get(tls, 0.0)
@@ -290,7 +295,7 @@ class GreenDelays:
 
 
 def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -> LateGreen:
-    """Return the memory when `commanded` begins; its `shown` holds the letters that wait."""
+    """Return the memory when `commanded` begins; its `shown` holds the letters of delayed links."""
     if commanded == state.commanded:
         return state
     shown, waiting, owed = list(state.shown), list(state.waiting_s), list(state.owed_s)
@@ -312,7 +317,13 @@ def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -
 def delayed_log(
     log: Sequence[tuple[float, str]], late_s: float, step_s: float
 ) -> tuple[tuple[float, str], ...]:
-    """Apply `with_late_green` to the log of a light, ``(since_s, state)`` at every change."""
+    """Apply `with_late_green` to the log of a light.
+
+    Args:
+        log: ``(since_s, state)`` at every change.
+        late_s: Delay of each green, s.
+        step_s: Length of a simulation step, s.
+    """
     if len(log) < 2:
         return tuple(log)
     state = LateGreen.after(log[0][1])
@@ -336,10 +347,11 @@ def check_phases(phases: Sequence[str], links: int, source: str) -> None:
     Args:
         phases: Green states.
         links: Number of links the traffic light controls.
-        source: What to call the list in errors.
+        source: Name of the list in errors.
 
     Raises:
-        ScenarioError: A wrong length, an unknown letter, yellow, no green, or a phase given twice.
+        ScenarioError: A phase has a wrong length, an unknown letter, yellow or no green, or is
+            listed twice.
     """
     seen: dict[str, int] = {}
     for index, phase in enumerate(phases):
