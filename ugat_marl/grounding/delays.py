@@ -183,11 +183,11 @@ class EpisodeRewards:
     """Mean rewards per decision of one policy in single episodes.
 
     Attributes:
-        street: ``(episodes, agents)``.
-        simulated: In the simulation with all greens late by 0, 1, 2, ... s,
+        street: Rewards in the real domain, ``(episodes, agents)``.
+        simulated: Rewards in the simulation with all greens late by 0, 1, 2, ... s,
             ``(delays, episodes, agents)``.
-        before: What earlier policies got on the street, each ``(episodes, agents)``: they, too,
-            tell how much the rewards of an episode vary.
+        before: Rewards of earlier policies on the street, each ``(episodes, agents)``; used only to
+            measure how much rewards vary between episodes.
     """
 
     street: Floats

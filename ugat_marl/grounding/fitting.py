@@ -1,12 +1,11 @@
 """Training of f and h: settings, held-out episodes, early stopping, and inputs off the data.
 
-The best weights are kept. Whether an episode is held out depends on its number alone, so a log that
-grows by concatenation never moves an episode from one side to the other and a warm start never
-meets a held-out episode it was trained on.
+Each fit keeps its best weights. The number of an episode alone decides if it is held out. So an
+episode never changes sides when a log grows, and a warm start was never trained on held-out data.
 
-The evidential loss alone says nothing about inputs far from the data, where a network of ReLUs
-grows ever more confident: on planted dynamics u was 0.26 on the data and 0.10 off it. So h is also
-trained on invented inputs (`OffData`), on which it has to be unsure.
+The evidential loss alone does not limit the confidence far from the data, where a network of ReLUs
+grows more and more confident. On planted dynamics u was 0.26 on the data and 0.10 off it. So h is
+also trained to be unsure on invented inputs (`OffData`).
 """
 
 from __future__ import annotations
@@ -39,28 +38,28 @@ class FitConfig:
     """Settings of the training of f and h.
 
     Attributes:
-        uncertainty: Method by which h says that it is unsure: "edl" (evidential), "dropout"
-            (Concrete Dropout), "ensemble" (Deep Ensembles), or "none", with which every grounded
-            action is taken.
-        pairs: Transitions that h learns from in phase grounding: "observed" ones, as in the paper,
-            or "smoothed" ones (s, the expectation of a model of the simulation for a). f, whose
-            output h has to read, predicts means; single transitions scatter around them.
-        members: Networks of an ensemble.
-        passes: Thinned networks that dropout averages over.
-        epochs: Most passes over the training rows.
+        uncertainty: Method for the uncertainty of h: "edl" (evidential), "dropout" (Concrete
+            Dropout), "ensemble" (Deep Ensembles), or "none", with which every grounded action is
+            taken.
+        pairs: Transitions from which h learns in phase grounding: "observed" ones, as in the paper,
+            or "smoothed" ones with the next state that a model of the simulation predicts. Later h
+            reads predictions of f; these are means, and single transitions scatter around means.
+        members: Number of networks of an ensemble.
+        passes: Number of thinned networks that dropout averages over.
+        epochs: Largest number of passes over the training rows.
         batch_size: Rows per agent and update.
-        learning_rate: Of Adam.
+        learning_rate: Learning rate of Adam.
         patience: Epochs without a lower held-out loss after which training ends.
-        held_out_every: Every n-th episode is held out; of a single episode, the last n-th part.
-        kl_epochs: Epochs over which the divergence term of the evidential loss and the certainty on
-            invented inputs are annealed in.
-        kl_weight: Final weight of that divergence, for "edl"; 1 is Sensoy et al. With eight phases
+        held_out_every: n; every n-th episode is held out, or the last n-th part of a single one.
+        kl_epochs: Epochs over which the weights of the divergence term of the evidential loss and
+            of the certainty on invented inputs rise linearly from 0.
+        kl_weight: Final weight of that divergence, for "edl"; 1 in Sensoy et al. With eight phases
             that often look alike, 1 keeps h from learning: on grid2x2-v1 its held-out accuracy is
             0.60 (u 0.90, AUROC of u 0.72) against 0.70 (0.48, 0.73) at 0.1.
-        off_data_weight: Weight of the certainty h shows on invented inputs (`off_data`), for all
-            but "none"; 0 is each method as its paper has it, under which u need not rise off the
+        off_data_weight: Weight of the certainty of h on invented inputs (`OffData`), for all
+            methods but "none". With 0 each method is that of its paper, and u need not rise off the
             data.
-        warm_start: Go on from the current weights instead of drawing new ones.
+        warm_start: Continue from the current weights instead of drawing new ones.
     """
 
     uncertainty: MethodName = "edl"
@@ -79,7 +78,7 @@ class FitConfig:
 
     @property
     def method(self) -> Method:
-        """The uncertainty that h is given."""
+        """Method of uncertainty of h."""
         return Method(self.uncertainty, self.members, self.passes)
 
     def __post_init__(self) -> None:
@@ -104,10 +103,10 @@ EpochCallback = Callable[[str, int, float], None]
 """Called as ``callback("forward" or "inverse", epoch, held_out_loss)`` after every epoch."""
 
 RowLoss = Callable[[Tensor, int], Tensor]
-"""Loss of some columns of the data in an epoch (-1: the final form, of held-out rows).
+"""Loss of some columns of the data in an epoch; epoch -1 is the final loss, for held-out rows.
 
-Columns are ``(batch,)`` and losses ``(agents, batch)``; in an ensemble, where every member has an
-order of its own, columns are ``(members, batch)`` and losses ``(agents, members, batch)``.
+Columns are ``(batch,)`` and losses ``(agents, batch)``. Every member of an ensemble has its own
+order: columns are ``(members, batch)`` and losses ``(agents, members, batch)``.
 """
 
 
@@ -161,7 +160,7 @@ def refuse_mismatch(real: TransitionLog, simulated: TransitionLog) -> None:
 
 
 OFF_DATA_REACH = 1.5
-"""Half-width of the box in units of the observed range: three times as wide as the data."""
+"""Half-width of the box in units of the observed range; the box is three times as wide."""
 
 
 @dataclass(frozen=True)
@@ -170,10 +169,10 @@ class OffData:
 
     Attributes:
         inputs: ``(agents, n, width)`` unscaled inputs of h.
-        candidates: Columns of `inputs` to start from, ``(m,)``.
-        low: ``(agents, 1, width)`` lower end of the box; ``high`` the upper.
-        kept: ``(agents, 1, width)`` bool, phases: never redrawn.
-        change: ``(agents, 1, width)`` bool, the change of the features.
+        candidates: ``(m,)`` positions along n from which observed rows are drawn.
+        low: ``(agents, 1, width)`` lower end of the box; `high` is the upper end.
+        kept: ``(agents, 1, width)`` bool, columns that are never redrawn, such as phases.
+        change: ``(agents, 1, width)`` bool, columns of the change of the features.
     """
 
     inputs: Tensor
@@ -187,12 +186,14 @@ class OffData:
     def around(
         cls, inputs: Tensor, weight: Tensor, view: View, fixed: Tensor | None = None
     ) -> OffData:
-        """Return the box around the rows of `inputs` with weight, ``(agents, n)``.
+        """Return the box around the rows of `inputs` with weight.
+
+            centre = (high + low) / 2,    ends = centre -+ OFF_DATA_REACH * (high - low)
 
         Args:
             inputs: ``(agents, n, width)``: the observation, and directly behind it the change.
-            weight: ``(agents, n)``.
-            view: Knows the length of an observation, and the columns that show phases.
+            weight: ``(agents, n)`` weights of the rows; rows with 0 are ignored.
+            view: View of h, with the length of observations and the columns of phases.
             fixed: ``(agents, 1, width)`` bool, further columns that are never redrawn.
         """
         own = weight.bool()[..., None]
@@ -219,9 +220,9 @@ class OffData:
 
         Args:
             count: Rows per agent.
-            generator: Source of the draws, on the CPU wherever the inputs are.
-            state_share: Share of rows in which the state is drawn, too; in the others it is an
-                observed one with a change that it never had.
+            generator: Source of the draws, on the CPU for inputs on any device.
+            state_share: Share of rows with a drawn state and change. The other rows have an
+                observed state and a drawn change.
         """
         device = self.inputs.device
         rows = torch.randint(len(self.candidates), (count,), generator=generator).to(device)
@@ -237,8 +238,8 @@ class Changes:
     """Data from which a model of changes learns.
 
     Attributes:
-        name: Of the model, in seeds and for the callback.
-        observation: ``(agents, n, view.width)``, as the model's view makes it.
+        name: Name of the model, for seeds and the callback.
+        observation: ``(agents, n, view.width)`` observations in the model's view.
         outcome: ``(agents, n, features or more)``, the features afterwards.
         action: ``(agents, n)`` int64, phases.
         extra: ``(agents, n, extra)`` further inputs, if there are any.
@@ -271,13 +272,13 @@ class Questions:
 
 @dataclass(frozen=True)
 class Fitter:
-    """One fit of several models: how, with which randomness, and where.
+    """Settings, seed and device for the fit of several models.
 
     Attributes:
-        config: How to train.
-        seed: Decides fresh weights, the order of batches, and the inputs drawn off the data.
-        on_epoch: Called after every epoch.
-        device: Where the models are trained; they come from the CPU and end there.
+        config: Settings of the training.
+        seed: Seed of fresh weights, of the order of batches, and of inputs off the data.
+        on_epoch: Function called after every epoch.
+        device: Device of the training; the models are on the CPU before and after it.
     """
 
     config: FitConfig
@@ -286,15 +287,17 @@ class Fitter:
     device: torch.device = CPU
 
     def split(self, data: StackedTransitions, stack: Stack) -> Split:
-        """Hold out episodes as `split` does, by the settings of this fit."""
+        """Hold out episodes as `split` does, with the settings of this fit."""
         return split(data, self.config.held_out_every, stack)
 
     def fit_changes(self, model: ForwardModel, lesson: Changes, rows: Split) -> ForwardReport:
         """Fit a model of changes by least squares, each agent on its own rows.
 
+        The loss of a row is the mean over outputs of (prediction - change / scale)^2.
+
         Args:
-            model: Changed in place.
-            lesson: What it learns from.
+            model: Model of changes, changed in place.
+            lesson: Data of the fit.
             rows: Rows to train on and to hold out.
         """
         change = model.change(lesson.observation, lesson.outcome)
@@ -323,8 +326,8 @@ class Fitter:
         """Fit a model that answers with a class, with the loss of its method of uncertainty.
 
         Args:
-            model: Changed in place; the head learns from all agents at once.
-            lesson: What it learns from.
+            model: Inverse model, changed in place; its head learns from all agents at once.
+            lesson: Data of the fit.
             rows: Rows to train on and to hold out.
         """
         config = self.config
@@ -342,8 +345,7 @@ class Fitter:
             return model.standardise(off_data.draw(number, generator, state_share=0.5))
 
         def loss(columns: Tensor, epoch: int) -> Tensor:
-            # Annealing lets a fresh model gather evidence before it is punished for misleading
-            # some.
+            # A fresh model has to gather evidence first; misleading evidence is punished later.
             share = annealing(epoch, config.kl_epochs) if fresh and epoch >= 0 else 1.0
             about = Lesson(
                 held_out=epoch < 0,
@@ -371,9 +373,9 @@ class Fitter:
     ) -> TrainingRecord:
         """Train until the held-out loss has stopped falling; the model keeps its best weights.
 
-        Model, columns of the data and `rows` are on one device; `generator` is on the CPU. The
-        held-out loss has all its terms from the start: that it does not fall in the `annealed`
-        epochs, in which they come into training one by one, says nothing.
+        Model, data and `rows` are on one device; `generator` is on the CPU. The held-out loss has
+        all its terms from the start, but the training gets some of them gradually in the first
+        `annealed` epochs. So patience is not counted in these epochs.
         """
         config, members = self.config, model.members
         best = _Best(model, rows.train.device)
@@ -381,7 +383,7 @@ class Fitter:
         def held_out() -> Tensor:
             return model.loss_by_part(_mean_loss(loss, rows.held_out, members))
 
-        if bool(model.fitted):  # a warm start that only makes things worse must change nothing
+        if bool(model.fitted):  # keeps the weights of a warm start that does not improve
             best.offer(held_out())
         optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
         columns = rows.train.any(0).nonzero()[:, 0]
@@ -410,7 +412,7 @@ class Fitter:
 
 
 class _Best:
-    """The weights with the lowest held-out loss, each part of the model for itself."""
+    """Weights with the lowest held-out loss, kept separately for each part of the model."""
 
     def __init__(self, model: TrainableModel, device: torch.device) -> None:
         self._model = model
@@ -435,7 +437,7 @@ class _Best:
 
 def taken(data: Tensor, columns: Tensor) -> Tensor:
     """Return some columns of ``(agents, n, ...)``; each member may have its own."""
-    # The same as indexing, which takes seven times as long.
+    # Plain indexing gives the same, but takes seven times as long.
     return data.index_select(1, columns) if columns.dim() == 1 else data[:, columns]
 
 
@@ -457,13 +459,13 @@ def _epoch(
     found: list[Tensor] = []
     for batch in batches:
         own = taken(weight, batch)
-        # Each agent's mean, summed: an agent learns as fast among many as it would alone.
+        # The sum of the agents' means: the gradient of an agent does not depend on the others.
         mean = (loss(batch, epoch) * own).sum(-1) / own.sum(-1).clamp(min=1.0)
         optimiser.zero_grad(set_to_none=True)
         mean.sum().backward()
         optimiser.step()
         found.append(mean.detach().mean())
-    # Read once at the end: a GPU would be waited for at every batch.
+    # Read once at the end, because each read waits for the GPU.
     return sum(torch.stack(found).cpu().tolist()) / len(batches)
 
 

@@ -1,7 +1,7 @@
 """Inverse models h_i: the action of the simulation that leads from one state to another.
 
-Every intersection has an encoder of its own; one head is shared by all of them. Phases an
-intersection does not have are masked, and its uncertainty counts its own number of phases.
+Every intersection has its own encoder; all share one head. Phases that an intersection does not
+have are masked, and its uncertainty uses its own number of phases.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class InverseConfig:
     Attributes:
         hidden: Sizes of the hidden layers of an encoder.
         embedding: Size of the output of an encoder, which the shared head reads.
-        include_phase: True if h sees the phase of s'. Off: the phase alone would give the action
-            away, and h would never look at the traffic.
+        include_phase: True if h sees the phase of s'. Off by default: this phase alone reveals the
+            action, and h would ignore the traffic.
     """
 
     hidden: tuple[int, ...] = (128, 128)
@@ -53,12 +53,12 @@ class AnswerModel(TrainableModel):
     """A network that answers inputs with one of some classes and an uncertainty.
 
     Args:
-        view: The agents, and what their models see beside their own state.
+        view: The agents, and the inputs of their models beside their own state.
         config: Shape of the models.
         fan_in: Number of inputs of each agent.
         valid_answers: ``(agents, classes)`` bool, the classes each agent has.
         generator: Source of the initial weights.
-        method: Which uncertainty; the evidential one unless given.
+        method: Method of uncertainty; evidential by default.
     """
 
     valid_answers: Tensor
@@ -83,20 +83,20 @@ class AnswerModel(TrainableModel):
 
     @property
     def members(self) -> int:
-        """Networks of an ensemble, 1 of the other methods."""
+        """Number of networks of an ensemble; 1 for the other methods."""
         return self.net.members
 
     @property
     def parts(self) -> int:
-        """The members of an ensemble; the head of each is shared by all agents."""
+        """Number of members; the agents share the head of a member, so they are one part."""
         return self.net.members
 
     def loss_by_part(self, loss: Tensor) -> Tensor:
-        """Return the mean loss over agents of every member."""
+        """Return the mean loss over agents for each member, ``(members,)``."""
         return loss.mean(0).view(-1)
 
     def renew(self, method: Method, generator: torch.Generator) -> None:
-        """Forget everything: make a new network of this method, weights from `generator`."""
+        """Make a new, unfitted network of this method with weights from `generator`."""
         self.method = method
         shape = NetShape(
             self._fan_in, self.config.hidden, self.config.embedding, self.valid_answers
@@ -126,8 +126,8 @@ class InverseModel(AnswerModel):
         stack: The agents.
         config: Shape of the models.
         generator: Source of the initial weights.
-        method: Which uncertainty; the evidential one unless given.
-        view: What the models see beside s and s'; nothing unless given.
+        method: Method of uncertainty; evidential by default.
+        view: Inputs of the models beside s and s'; none by default.
     """
 
     columns: Tensor
@@ -153,9 +153,9 @@ class InverseModel(AnswerModel):
         """Return the state, and directly behind it the change of its features; unscaled.
 
         Args:
-            observation: ``(agents, batch, view.width)``, as `view` makes it.
-            next_features: ``(agents, batch, features)`` of s', with the phase if included; columns
-                of a whole next observation beyond them are ignored.
+            observation: ``(agents, batch, view.width)`` inputs from `view`.
+            next_features: ``(agents, batch, features)`` features of s', with the phase if included.
+                Further columns are ignored.
         """
         size = max(self.stack.heads(self.config.include_phase))
         change = next_features[..., :size] - observation[..., :size]
@@ -164,7 +164,7 @@ class InverseModel(AnswerModel):
         return both.gather(2, columns) * self.valid_inputs
 
     def predict(self, observation: Tensor, next_features: Tensor) -> InversePrediction:
-        """Name the action that h holds responsible for the step from s to s'."""
+        """Answer with the action that h assigns to the step from s to s'."""
         return self.answer(self.inputs(observation, next_features))
 
 
@@ -186,10 +186,10 @@ class DelayModel(AnswerModel):
     Args:
         stack: The agents.
         config: Shape of the models.
-        most_s: Longest delay; the classes are 0, 1, ..., `most_s` s.
+        most_s: Longest delay in s; the classes are 0, 1, ..., `most_s` s.
         generator: Source of the initial weights.
-        method: Which uncertainty; the evidential one unless given.
-        view: What the models see beside s, a and the change; nothing unless given.
+        method: Method of uncertainty; evidential by default.
+        view: Inputs of the models beside s, a and the change; none by default.
     """
 
     def __init__(
@@ -213,9 +213,9 @@ class DelayModel(AnswerModel):
         """Return state, change and action directly behind each other; unscaled.
 
         Args:
-            observation: ``(agents, batch, view.width)``, as `view` makes it.
+            observation: ``(agents, batch, view.width)`` inputs from `view`.
             action: ``(agents, batch)`` int64, the phase that turns green.
-            change: ``(agents, batch, features)``.
+            change: ``(agents, batch, features)`` change of the features, unscaled.
         """
         batch = action.shape[1]
         found = torch.zeros(len(self._fan_in), batch, max(self._fan_in))
@@ -240,5 +240,5 @@ class DelayModel(AnswerModel):
         return found
 
     def predict(self, observation: Tensor, action: Tensor, change: Tensor) -> InversePrediction:
-        """Name the delay that h holds responsible for a change."""
+        """Answer with the delay that h assigns to a change."""
         return self.answer(self.inputs(observation, action, change))

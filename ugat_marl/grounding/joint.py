@@ -1,12 +1,11 @@
-"""Grounding of neighbours at the same time: models see the phases that will really run.
+"""Grounding of neighbours at the same time, for models that see the phases of neighbours.
 
-Models that see their neighbours are told which phases run there, and those are only known once the
-neighbours are grounded. With roads in both directions each agent is upstream of one that is
-upstream of it, so that no order of the agents gives each the final phases of the others. The answer
-is a fixed point: all agents are grounded for the phases the others ask for, again for those that
-would then run, and so on until nothing changes. Neighbours change their answers in turn, or two of
-them could alternate for ever. An agent that does not settle keeps its own action, so that the
-search always ends.
+Such models need the phases that run at the neighbours. These are only known once the neighbours are
+grounded. Roads lead in both directions, so no order of the agents solves this. Grounding searches a
+fixed point instead. It grounds all agents for the phases that the policy asks for, then for the
+phases that would run, and so on until nothing changes. Neighbours change their answers in turn;
+otherwise two of them could alternate for ever. An agent that does not settle keeps its own action,
+so the search always ends.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ from numpy.typing import NDArray
 from ugat_marl.grounding.gate import Gate
 
 PASSES = 10
-"""Times all agents are grounded before some that have not settled keep their own actions."""
+"""Number of passes after which agents that still change keep their own actions."""
 
 Answer = Callable[[NDArray[np.int64]], tuple[NDArray[np.int64], NDArray[np.float32]]]
-"""Grounded actions and their u, ``(agents,)`` each, if these phases run everywhere."""
+"""Function from the phases that run, ``(agents,)``, to grounded actions and their u."""
 
 
 @dataclass(frozen=True)
 class Settled:
-    """Answers that fit together: each was given for the phases that will run.
+    """Answers that agree: each was given for the phases that will run.
 
     Attributes:
-        grounded: ``(agents,)`` int64.
-        u: ``(agents,)`` float32.
+        grounded: ``(agents,)`` int64 grounded actions.
+        u: ``(agents,)`` float32 uncertainties.
         allowed: ``(agents,)`` bool, false where the grounded action is masked or never settled;
             None if there are no masks.
     """
@@ -43,7 +42,7 @@ class Settled:
 
 
 def turns(agents: Sequence[str], near: Mapping[str, Sequence[str]]) -> NDArray[np.bool_]:
-    """Return groups of agents without neighbours among them, ``(turns, agents)`` bool."""
+    """Return groups of agents, ``(turns, agents)`` bool; a group contains no two neighbours."""
     pairs = {(a, b) for a in agents for b in near.get(a, ())}
     turn: dict[str, int] = {}
     for agent in agents:
@@ -53,10 +52,10 @@ def turns(agents: Sequence[str], near: Mapping[str, Sequence[str]]) -> NDArray[n
 
 
 def running(actions: NDArray[np.int64], permitted: NDArray[np.bool_] | None) -> NDArray[np.int64]:
-    """Return the phases that run if these are asked for: a light that may not change stays.
+    """Return the phases that run if these are asked for; a light that may not change stays.
 
     Args:
-        actions: ``(agents,)``.
+        actions: ``(agents,)`` phases asked for.
         permitted: ``(agents, phases)`` action masks.
     """
     if permitted is None:
@@ -80,12 +79,12 @@ def together(
     actions: NDArray[np.int64],
     permitted: NDArray[np.bool_] | None,
 ) -> Settled:
-    """Ground all agents until the phases they were told of are those that will run.
+    """Ground all agents until the assumed phases are those that will run.
 
     Args:
-        answer: Asks the models; called at least once.
-        gate: Says which answers would be taken; its books are left alone.
-        in_turn: ``(turns, agents)`` bool, as `turns` makes it.
+        answer: Function that asks the models; called at least once.
+        gate: Gate that decides which answers would be taken; nothing is logged.
+        in_turn: ``(turns, agents)`` bool, groups of `turns`.
         actions: ``(agents,)`` the policy's actions.
         permitted: ``(agents, phases)`` action masks.
     """
@@ -106,7 +105,7 @@ def together(
                 turn = (turn + 1) % len(in_turn)
             movers = in_turn[turn] & changes
             turn = (turn + 1) % len(in_turn)
-            if count == PASSES:  # an agent that gave up never moves again: these are new ones
+            if count == PASSES:  # agents given up never move again, so the search ends
                 given_up = given_up | movers
                 will_run = own
             told = np.where(movers, will_run, told)

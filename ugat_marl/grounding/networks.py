@@ -1,11 +1,9 @@
 """Building blocks of all models: batched products, scaled inputs, a common base.
 
-Products of many intersections are taken at the processor's full width and in its cache. torch
-multiplies float32 with MKL, which on an AMD EPYC was half as fast as oneDNN: 109 against 227
-GFLOP/s, as if half of each vector lay idle. torch brings oneDNN as well, but only asks it for
-products of float32 where less precision is allowed. Processors without units for bfloat16 tiles
-then compute in plain float32 all the same, only faster; on others numbers would really be rounded.
-So `full_width` tries oneDNN, and takes it only where nothing is rounded.
+torch multiplies float32 with MKL. On an AMD EPYC it was half as fast as oneDNN: 109 against 227
+GFLOP/s. torch contains oneDNN, but uses it for float32 only if less precision is allowed.
+Processors without units for bfloat16 tiles then still compute in float32; other processors round.
+So `full_width` tests oneDNN, and uses it only where nothing is rounded.
 """
 
 from __future__ import annotations
@@ -23,26 +21,26 @@ from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.view import View
 
 SMALLEST_SPREAD = 1e-3
-"""A number that varied less than this is not scaled up: its noise would be mistaken for traffic."""
+"""Smallest standard deviation that is scaled to 1; scaling smaller ones would amplify noise."""
 
 FARTHEST = 5.0
-"""Inputs are cut off at this many standard deviations, so that a rare lane cannot dominate."""
+"""Limit of inputs in standard deviations; it keeps a rare lane from dominating."""
 
 MANY = 16
-"""Networks side by side from which on this pays: fewer lose more by oneDNN's overhead."""
+"""Least number of networks for oneDNN; with fewer its overhead costs more than it saves."""
 
 ROWS_AT_ONCE = 8192
-"""Rows, of all networks together, whose hidden layers still fit into a cache of a few MiB."""
+"""Rows of all networks together whose hidden layers fit into a cache of a few MiB."""
 
 
 def rows_at_once(networks: int) -> int:
-    """Return the rows of each of so many networks that are answered in one product."""
+    """Return the number of rows per network to answer in one product."""
     return min(2048, max(64, ROWS_AT_ONCE // networks))
 
 
 @contextlib.contextmanager
 def full_width(networks: int) -> Iterator[None]:
-    """Multiply batches of so many networks by oneDNN, where that is as precise and faster."""
+    """Multiply batches of this many networks with oneDNN, if it is as precise and faster."""
     setting: Any = getattr(torch.backends.mkldnn, "matmul", None)  # torch 2.9 has it, 2.4 does not
     asked_for = setting is not None and setting.fp32_precision != "none"  # the user's own choice
     if networks < MANY or setting is None or asked_for or not _is_exact(setting):
@@ -64,7 +62,7 @@ def _allowed(setting: Any) -> Iterator[None]:
 
 @functools.cache
 def _is_exact(setting: Any) -> bool:
-    """Return True if products keep the last bits of float32 although they need not."""
+    """Return True if products keep all bits of float32 with the lower precision allowed."""
     if not torch.backends.mkldnn.is_available():
         return False
     numbers, one = torch.full((2, 64, 64), 1.0 + 2.0**-23), torch.eye(64).repeat(2, 1, 1)
@@ -73,7 +71,9 @@ def _is_exact(setting: Any) -> bool:
 
 
 class Standardiser(nn.Module):
-    """Maps each agent's inputs to mean 0 and deviation 1 of the data it was fitted to.
+    """Maps each agent's inputs to mean 0 and standard deviation 1 over the fitted data.
+
+        (inputs - mean) / spread, limited to -FARTHEST to FARTHEST
 
     Args:
         agents: Number of agents.
@@ -89,7 +89,7 @@ class Standardiser(nn.Module):
         self.register_buffer("spread", torch.ones(agents, 1, width))
 
     def fit(self, inputs: Tensor, weight: Tensor) -> None:
-        """Take mean and deviation of ``(agents, n, width)`` rows with weights ``(agents, n)``."""
+        """Set mean and spread from ``(agents, n, width)`` rows with weights ``(agents, n)``."""
         share = (weight / weight.sum(1, keepdim=True))[..., None]
         mean = (share * inputs).sum(1, keepdim=True)
         spread = (share * (inputs - mean) ** 2).sum(1, keepdim=True).sqrt()
@@ -102,15 +102,15 @@ class Standardiser(nn.Module):
 
 
 class TrainableModel(nn.Module, abc.ABC):
-    """A model of all intersections whose parts keep their own best weights in training.
+    """Base of models of all intersections; each part keeps its own best weights in training.
 
-    Parts share no weight, and every parameter holds them in order, so that
-    ``parameter.view(parts, -1)`` has one row for each.
+    Parts share no weight. Every parameter holds them in order, so ``parameter.view(parts, -1)`` has
+    one row for each.
 
     Attributes:
         stack: The agents.
-        view: What the model sees beside an agent's own state and action.
-        fitted: Scalar bool, whether the model has been fitted.
+        view: Inputs of the model beside an agent's own state and action.
+        fitted: Scalar bool, true once the model has been fitted.
     """
 
     fitted: Tensor
@@ -124,7 +124,7 @@ class TrainableModel(nn.Module, abc.ABC):
     @property
     @abc.abstractmethod
     def members(self) -> int:
-        """Networks side by side that read the rows in orders of their own."""
+        """Number of networks side by side, each with its own order of the rows."""
 
     @property
     @abc.abstractmethod

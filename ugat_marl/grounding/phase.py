@@ -37,7 +37,7 @@ from ugat_marl.policies import one_thread
 from ugat_marl.seeding import torch_generator
 
 DISCRIMINATES = 0.55
-"""AUROC below which u is called uninformative in the warnings."""
+"""AUROC of u below which a warning calls u uninformative."""
 
 
 class PhaseTransform(Transform):
@@ -45,7 +45,7 @@ class PhaseTransform(Transform):
 
     Args:
         layouts: Agent to the division of its observation, in the environment's order.
-        seed: Decides the initial weights.
+        seed: Seed of the initial weights.
         forward: Shape of the forward models.
         inverse: Shape of the inverse models.
         gate: Settings of alpha.
@@ -85,7 +85,7 @@ class PhaseTransform(Transform):
         fitter: Fitter,
         rewards: EpisodeRewards | None = None,
     ) -> PhaseReport:
-        """Fit f on the real log, and h on the simulated log; rewards are left alone."""
+        """Fit f on the real log, and h on the simulated log; rewards are not used."""
         del rewards
         refuse_mismatch(real, simulated)
         f, h = self.forward, self.inverse
@@ -117,9 +117,10 @@ class PhaseTransform(Transform):
         permitted: NDArray[np.bool_] | None,
         earlier: Sequence[Moment],
     ) -> Grounding:
-        """Ask f, then h, then the gate; where neighbours are seen, until all answers fit together.
+        """Ask f, then h, then the gate; models that see neighbours are asked several times.
 
-        Line numbers are those of Algorithm 1 (`ugat`).
+        `joint` repeats the questions until the answers of all agents agree. Line numbers are those
+        of Algorithm 1 (`ugat`).
         """
         asked = torch.from_numpy(actions)[:, None]
 
@@ -153,27 +154,27 @@ def fit_forward(model: ForwardModel, log: TransitionLog, fitter: Fitter) -> Forw
     """Fit f alone on a log of the real world, by least squares on the change of the features.
 
     Args:
-        model: Changed in place.
-        log: What the *asked* action does there is learnt.
-        fitter: How to train.
+        model: Forward model, changed in place.
+        log: Transitions with the outcomes of the *asked* actions.
+        fitter: Settings, seed and device of the training.
 
     Raises:
-        LogError: The log is of other agents, or too short to be split.
+        LogError: The log has other agents, or is too short to be split.
     """
     return _fit_forward(model, stack_log(log, model.stack), fitter)
 
 
 @one_thread()
 def fit_inverse(model: InverseModel, log: TransitionLog, fitter: Fitter) -> PhaseInverseReport:
-    """Fit h alone on a log of the simulation, with the loss of the method asked for.
+    """Fit h alone on a log of the simulation, with the loss of the fitter's method.
 
     Args:
-        model: Changed in place; the head learns from all agents at once.
-        log: Which *executed* action did what is learnt.
-        fitter: How to train.
+        model: Inverse model, changed in place; its head learns from all agents at once.
+        log: Transitions with the outcomes of the *executed* actions.
+        fitter: Settings, seed and device of the training.
 
     Raises:
-        LogError: The log is of other agents, or too short to be split.
+        LogError: The log has other agents, or is too short to be split.
     """
     data = stack_log(log, model.stack)
     return _fit_inverse(model, data, data.next_observation, fitter)
@@ -185,9 +186,9 @@ def _fit_forward(model: ForwardModel, data: StackedTransitions, fitter: Fitter) 
 
 
 def _expected(forward: ForwardModel, data: StackedTransitions, fitter: Fitter) -> Tensor:
-    """Return what the simulation makes of its states and actions in the mean.
+    """Return the expected next features of simulated states and actions, ``(agents, n, outputs)``.
 
-    ``(agents, n, outputs)``, by a model of the shape of `forward` that is fitted to the simulation.
+    They are predictions of a model with the shape of `forward`, fitted to the simulation.
     """
     generator, seen = torch_generator(fitter.seed, "simulated"), forward.view.of(data)
     model = ForwardModel(forward.stack, forward.config, generator, view=forward.view)
@@ -200,7 +201,7 @@ def _expected(forward: ForwardModel, data: StackedTransitions, fitter: Fitter) -
 def _fit_inverse(
     model: InverseModel, data: StackedTransitions, outcome: Tensor, fitter: Fitter
 ) -> PhaseInverseReport:
-    """Fit h to read `outcome`, ``(agents, n, features or more)``, as what followed."""
+    """Fit h to name the executed action from `outcome`, ``(agents, n, features or more)``."""
     rows = fitter.split(data, model.stack)
     inputs = model.inputs(model.view.of(data), outcome)
     off_data = OffData.around(inputs, rows.train, model.view)
@@ -214,14 +215,14 @@ def _fit_inverse(
 
 @dataclass(frozen=True)
 class PhaseInverseReport(InverseReport):
-    """Held-out quality of h, per agent where an array.
+    """Held-out quality of h; arrays ``(agents,)``.
 
     Attributes:
         accuracy: Share of right answers.
         chance: 1 / number of phases.
-        majority: Accuracy of always answering the phase most frequent in training.
-        mean_u: Mean uncertainty.
-        auroc: u against being wrong, agent by agent; `calibration` has the same and more, pooled.
+        majority: Accuracy of the most frequent phase in training as the constant answer.
+        mean_u: Mean uncertainty, in [0, 1].
+        auroc: AUROC of u for wrong answers; `calibration` has it pooled over agents.
     """
 
     accuracy: Floats
@@ -243,16 +244,16 @@ class PhaseReport(FitReport):
     """Worth of f and h of phase grounding, alone and together.
 
     Attributes:
-        inverse: h, on held-out simulated transitions.
-        agreement: Per agent, share of held-out simulated states in which h, fed by f, answers the
-            action that f was given. Without a gap and with a perfect f this is h's accuracy; what
-            is missing is the gap and the errors of both models. It says how much grounding would
-            change if every grounded action were taken. `mean_u_on_predictions` is of these answers.
-        accuracy_on_real: Per agent, share of held-out real transitions whose action h names. What
-            it lacks of h's own accuracy is the gap itself, in actions, without f's part in it.
-        mean_u_on_real: Per agent, mean u of these answers: how foreign the real world is to h.
-        accuracy_on_means: Per agent, accuracy of h on held-out simulated states and what a model of
-            the simulation expects of their actions: means, such as f predicts.
+        inverse: Quality of h on held-out simulated transitions.
+        agreement: Per agent, share of held-out simulated states in which h, given the prediction of
+            f, answers with the action that f was given. Without a gap and with a perfect f it is
+            the accuracy of h. 1 - agreement is the share of actions that grounding would change
+            without a gate. `mean_u_on_predictions` is the mean u of these answers.
+        accuracy_on_real: Per agent, share of held-out real transitions whose action h names. Its
+            distance from the accuracy of h measures the gap without the errors of f.
+        mean_u_on_real: Per agent, mean u of these answers.
+        accuracy_on_means: Per agent, accuracy of h on held-out simulated states whose next features
+            are predicted by a model of the simulation. Like those of f, they are means.
     """
 
     inverse: PhaseInverseReport
@@ -262,7 +263,7 @@ class PhaseReport(FitReport):
     accuracy_on_means: Floats
 
     def doubts(self) -> Iterator[str]:
-        """Yield sentences on what is wrong, some of them empty."""
+        """Yield sentences about problems; some of them are empty."""
         h, u = self.inverse, self.calibration
         yield from self.forward.doubts("f", self.agents)
         poor = h.accuracy <= h.majority
@@ -279,9 +280,10 @@ class PhaseReport(FitReport):
             )
 
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
-        """Return the agents whose models may be obeyed, ``(agents,)``, for `Gate.trust`.
+        """Return true for trusted agents, ``(agents,)`` bool, for `Gate.trust`.
 
-        f has learnt something, and h beats both the most frequent phase and `least_accuracy`.
+        An agent is trusted if f has learnt something there, the accuracy of h is above that of the
+        most frequent phase, and it is at least `least_accuracy`.
         """
         h = self.inverse
         better = self.forward.learnt & (h.accuracy > h.majority)
@@ -339,7 +341,7 @@ def _inverse_report(
 def on_predictions(
     forward: ForwardModel, inverse: InverseModel, data: StackedTransitions, held_out: Tensor
 ) -> tuple[Floats, Floats]:
-    """Return, per agent, agreement and mean u of h fed by f in held-out simulated states."""
+    """Return agreement and mean u, per agent, of h on predictions of f in held-out states."""
     predicted = forward.predict(forward.view.of(data), data.executed)
     return _accuracy(inverse, data, predicted, held_out)
 
@@ -348,7 +350,7 @@ def on_predictions(
 def on_transitions(
     inverse: InverseModel, data: StackedTransitions, held_out: Tensor
 ) -> tuple[Floats, Floats]:
-    """Return, per agent, accuracy and mean u of h on transitions as they happened."""
+    """Return accuracy and mean u, per agent, of h on recorded transitions."""
     return _accuracy(inverse, data, data.next_observation, held_out)
 
 
@@ -356,7 +358,7 @@ def on_transitions(
 def _accuracy(
     inverse: InverseModel, data: StackedTransitions, next_features: Tensor, held_out: Tensor
 ) -> tuple[Floats, Floats]:
-    """Return, per agent, accuracy and mean u of h asked what led to `next_features`."""
+    """Return accuracy and mean u, per agent, of h given `next_features`."""
     answer = inverse.predict(inverse.view.of(data), next_features)
     share = held_out.double() / held_out.double().sum(1, keepdim=True)
     agreement = ((answer.action == data.executed) * share).sum(1)

@@ -1,6 +1,6 @@
-"""Reports of a fit: held-out errors of f, calibration of u, and the base of what a fit returns.
+"""Reports of a fit: held-out errors of f, calibration of u, and the base of all reports.
 
-All numbers are measured on episodes that the models did not see in training.
+All numbers are measured on held-out rows, which the models did not see in training.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Numbers = NDArray[np.floating] | NDArray[np.integer] | NDArray[np.bool_]
 
 QUANTILES = 5
-"""Groups of rising u in which errors are counted."""
+"""Number of groups of rising u for error rates."""
 
 # --- calibration statistics
 
@@ -40,15 +40,15 @@ def spearman(one: Numbers, other: Numbers) -> float:
 
 
 def auroc(score: Numbers, positive: NDArray[np.bool_]) -> float:
-    """Return the probability that a positive scores above a negative, ties half.
+    """Return the probability that a positive scores above a negative; ties count half.
 
-    This is the statistic of Mann and Whitney over the number of pairs. NaN if there are no
-    positives or no negatives.
+    This is the statistic of Mann and Whitney over the number of pairs; NaN without positives or
+    without negatives.
     """
     pairs = int(positive.sum()) * int((~positive).sum())
     if not pairs:
         return float("nan")
-    exact = score.astype(np.float64)  # the sum of ranks would be one of float32 otherwise
+    exact = score.astype(np.float64)  # scipy would sum ranks in float32 otherwise
     test: Any = stats.mannwhitneyu(exact[positive], exact[~positive], method="asymptotic")
     return float(test.statistic / pairs)
 
@@ -66,9 +66,9 @@ def rate_by_quantile(score: Numbers, hit: NDArray[np.bool_], bins: int) -> tuple
 def risk_by_coverage(u: Numbers, wrong: NDArray[np.bool_], bins: int) -> tuple[float, ...]:
     """Return the error rate among the 1/bins, 2/bins, ... of the answers with the lowest u.
 
-    The risk-coverage curve of selective classification (El-Yaniv and Wiener, JMLR 2010): what a
-    gate that lets so many answers pass lets through. Equal u share their errors evenly, so that it
-    is flat for a u that says nothing. NaN for a share without an answer.
+    This is the risk-coverage curve of selective classification (El-Yaniv and Wiener, JMLR 2010): a
+    gate that accepts this share of the answers has this error rate. Answers with equal u share
+    their errors evenly, so the curve is flat for a constant u. NaN for a share without an answer.
     """
     _, group, counts = np.unique(u, return_inverse=True, return_counts=True)
     rate = np.bincount(group, weights=wrong) / counts
@@ -82,8 +82,10 @@ def expected_calibration_error(
 ) -> float:
     """Return the mean distance of confidence from accuracy over equally wide bins of confidence.
 
+        sum over bins of |sum of (confidence - correct) in the bin| / number of answers
+
     Guo, Pleiss, Sun, Weinberger, "On Calibration of Modern Neural Networks", ICML 2017, equation 3,
-    with their 15 bins. Confidence is the probability of the answer given; NaN without an answer.
+    with their 15 bins. Confidence is the probability of the answer; NaN without answers.
     """
     if not len(correct):
         return float("nan")
@@ -111,7 +113,7 @@ def complaint(text: str, where: NDArray[np.bool_], agents: Sequence[str]) -> str
 
 
 def mean_of_known(u: Floats) -> Floats:
-    """Return u per agent, NaN replaced by the mean of the other agents; of all by 1, the most."""
+    """Return u per agent with NaN replaced by the mean of the others, or by 1 if all are NaN."""
     known = u[~np.isnan(u)]
     return np.where(np.isnan(u), known.mean() if known.size else 1.0, u)
 
@@ -124,12 +126,12 @@ class TrainingRecord:
     """Course of a training.
 
     Attributes:
-        epochs: Epochs run before held-out loss stopped falling.
-        train_loss: Mean loss of the last epoch, over agents.
-        held_out_loss: Mean held-out loss of the weights that were kept.
-        split: "episodes", or "steps" where the log has only one episode.
-        train_rows: Rows trained on, over all agents.
-        held_out_rows: Rows held out, over all agents.
+        epochs: Number of epochs run.
+        train_loss: Mean training loss of the last epoch, over agents.
+        held_out_loss: Mean held-out loss of the kept weights.
+        split: "episodes", or "steps" if the log has only one episode.
+        train_rows: Number of rows trained on, over all agents.
+        held_out_rows: Number of rows held out, over all agents.
     """
 
     epochs: int
@@ -153,10 +155,10 @@ class ForwardReport:
     """Held-out error of f, per agent: root mean squares in the unit of the features.
 
     Attributes:
-        training: How the training went.
-        error: Of f.
-        no_change: Of predicting that nothing changes.
-        mean_outcome: Of predicting the mean of what follows, whatever the state.
+        training: Course of the training.
+        error: Error of f.
+        no_change: Error of the prediction that nothing changes.
+        mean_outcome: Error of the mean next features in training as the constant prediction.
     """
 
     training: TrainingRecord
@@ -166,16 +168,19 @@ class ForwardReport:
 
     @property
     def ratio(self) -> Floats:
-        """Error over the error of no change, per agent: below 1, f has learnt something."""
+        """Ratio error / no_change, per agent; below 1, f is better than predicting no change."""
         return self.error / np.maximum(self.no_change, 1e-12)
 
     @property
     def learnt(self) -> NDArray[np.bool_]:
-        """Agents whose f beats both: without the second, it does so on rows that are mixed up."""
+        """Agents whose f beats no change and the mean outcome.
+
+        On shuffled rows f beats no change, but not the mean outcome.
+        """
         return (self.ratio < 1.0) & (self.error < self.mean_outcome)
 
     def doubts(self, model: str, agents: Sequence[str]) -> Iterator[str]:
-        """Yield what is wrong with the model of that name; sentences, some of them empty."""
+        """Yield sentences about problems of the model of this name; some of them are empty."""
         poor = self.ratio >= 1.0
         mixed = ~self.learnt & ~poor
         yield complaint(f"{model} is no better than predicting no change", poor, agents)
@@ -201,13 +206,12 @@ def forward_report(
     """Measure predicted changes on held-out rows.
 
     Args:
-        model: A model of changes.
-        predicted: ``(agents, n, outputs)`` changes, as the model predicts them.
-        happened: ``(agents, n, outputs)`` changes, as they happened.
-        off_mean: ``(agents, n, outputs)``, by how much the features that followed differ from
-            their mean in training.
+        model: Model of changes.
+        predicted: ``(agents, n, outputs)`` predicted changes.
+        happened: ``(agents, n, outputs)`` true changes.
+        off_mean: ``(agents, n, outputs)`` next features minus their mean in training.
         held_out: ``(agents, n)`` weights of the held-out rows.
-        training: How the training went.
+        training: Course of the training.
     """
     outputs = model.valid_outputs.sum(-1)[:, 0].double()
     share = (held_out / held_out.sum(1, keepdim=True)).double()
@@ -221,16 +225,16 @@ def forward_report(
 
 @dataclass(frozen=True)
 class Calibration:
-    """Power of u to tell right from wrong, and known from unknown, over all agents together.
+    """Quality of u over all agents together: wrong answers and inputs off the data need a high u.
 
     Attributes:
-        spearman: Rank correlation of u with being wrong.
+        spearman: Rank correlation of u with wrong answers.
         auroc: Probability that u is higher for a wrong answer than for a right one.
         error_by_quantile: Error rate in fifths of rising u.
         risk_by_coverage: Error rate of the fifth with the lowest u, of two fifths, ..., of all.
         ece: Expected calibration error of the probability of the answer.
         mean_u: Mean u on held-out data.
-        mean_u_off_data: Mean u on states and changes drawn around, not from, the data.
+        mean_u_off_data: Mean u on states and changes drawn around the data (`OffData`).
         auroc_off_data: Probability that u is higher off the data than on it.
     """
 
@@ -254,9 +258,9 @@ class Calibration:
         """Measure answers on held-out rows and answers off the data.
 
         Args:
-            answer: To all rows, ``(agents, n)``.
-            wrong: ``(agents, n)`` bool, the wrong ones among them.
-            held_out: ``(agents, n)`` bool.
+            answer: Answers to all rows, ``(agents, n)``.
+            wrong: ``(agents, n)`` bool, true for wrong answers.
+            held_out: ``(agents, n)`` bool, true for held-out rows.
             off_data: Answers to invented rows.
         """
         on_u, on_wrong = answer.u[held_out].numpy(), wrong[held_out].numpy()
@@ -292,9 +296,9 @@ class InverseReport(abc.ABC):
     """Held-out quality of h.
 
     Attributes:
-        training: How the training went.
-        calibration: u against wrong answers, pooled over agents.
-        uncertainty: Where u came from.
+        training: Course of the training.
+        calibration: Quality of u, pooled over agents.
+        uncertainty: Method of uncertainty.
     """
 
     training: TrainingRecord
@@ -308,14 +312,14 @@ class InverseReport(abc.ABC):
 
 @dataclass(frozen=True)
 class FitReport(abc.ABC):
-    """Worth of f and h after a fit, alone and together.
+    """Quality of f and h after a fit, alone and together.
 
     Attributes:
-        agents: Names, the order of all arrays.
-        forward: f, on held-out real transitions.
-        inverse: h, on held-out simulated transitions.
-        mean_u_on_predictions: Per agent, mean u of h's answers to what f predicts: what the gate
-            will see. NaN where an agent has no such rows.
+        agents: Names of the agents, in the order of all arrays.
+        forward: Errors of f on held-out real transitions.
+        inverse: Quality of h on held-out simulated transitions.
+        mean_u_on_predictions: Per agent, mean u of h's answers to predictions of f, as the gate
+            gets them. NaN for an agent without such rows.
     """
 
     agents: tuple[str, ...]
@@ -330,7 +334,7 @@ class FitReport(abc.ABC):
 
     @property
     def expected_u(self) -> Floats:
-        """Mean u to expect at the gate, per agent; of all agents where one has no rows."""
+        """Mean u to expect at the gate, per agent; the mean of the others for one without rows."""
         return mean_of_known(self.mean_u_on_predictions)
 
     @property
@@ -340,15 +344,15 @@ class FitReport(abc.ABC):
 
     @abc.abstractmethod
     def doubts(self) -> Iterator[str]:
-        """Yield sentences on what is wrong, some of them empty."""
+        """Yield sentences about problems; some of them are empty."""
 
     @abc.abstractmethod
     def trusted(self, least_accuracy: float = 0.0) -> NDArray[np.bool_]:
-        """Return the agents whose models may be obeyed, ``(agents,)``, for `Gate.trust`.
+        """Return true for trusted agents, ``(agents,)`` bool, for `Gate.trust`.
 
         Args:
-            least_accuracy: How good h must be there, from 0 to 1; 0 asks only that the models beat
-                their trivial rivals.
+            least_accuracy: Required quality of h, from 0 to 1; 0 requires only that the models beat
+                trivial answers.
         """
 
     @abc.abstractmethod

@@ -1,8 +1,8 @@
 """Observations and transitions of unequal intersections as padded tensors, one row each.
 
-An observation is ``features | phase one-hot | context``; the part that f predicts and h compares is
-its head: the features, with the phase behind them where a model asks for it. So every quantity is
-padded on the right only, and an intersection's own numbers always start at 0.
+An observation is ``features | phase one-hot | context``. Its head is the part that f predicts and h
+compares: the features, followed by the phase if a model includes it. All padding is on the right,
+so an intersection's own numbers always start at column 0.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Stack:
     Attributes:
         layouts: Agent to the division of its observation.
         agents: Agent names; index i of every tensor's first axis is ``agents[i]``.
-        sizes: Observation length of each agent; ``width`` is the largest.
-        phases: Number of phases of each agent; ``actions`` is the largest.
+        sizes: Observation length of each agent; `width` is the largest.
+        phases: Number of phases of each agent; `actions` is the largest.
         valid_actions: ``(agents, actions)`` bool, the phases each agent has.
     """
 
@@ -41,11 +41,11 @@ class Stack:
         self.valid_actions = mask_of(self.phases)
 
     def heads(self, include_phase: bool) -> list[int]:
-        """Return the length of each agent's predicted part: features, with phase if asked for."""
+        """Return the length of each agent's head: features, plus phases if included."""
         return [layout.features + layout.phases * include_phase for layout in self.layouts.values()]
 
     def current_phase(self, observation: Tensor) -> Tensor:
-        """Return the phase shown, ``(agents, batch)``, by ``(agents, batch, width)`` rows."""
+        """Return the phase, ``(agents, batch)``, in ``(agents, batch, width)`` observations."""
         found = torch.zeros(observation.shape[:2], dtype=torch.long)
         for i, layout in enumerate(self.layouts.values()):
             shown = observation[i, :, layout.features : layout.features + layout.phases]
@@ -60,7 +60,7 @@ class Stack:
         return torch.from_numpy(rows)
 
     def masks(self, masks: Mapping[str, NDArray[np.int8] | None]) -> NDArray[np.bool_]:
-        """Return action masks as ``(agents, actions)`` bool; all phases of an agent without one."""
+        """Return action masks as ``(agents, actions)`` bool; an agent without one may do all."""
         rows = self.valid_actions.numpy().copy()
         for row, agent, phases in zip(rows, self.agents, self.phases, strict=True):
             mask = masks.get(agent)
@@ -78,11 +78,11 @@ class StackedTransitions:
         next_observation: ``(agents, n, width)`` float32.
         served_features: ``(agents, n, features)`` float32, as in `Transitions`; None if they were
             not measured everywhere.
-        asked: ``(agents, n)`` int64, the action the policy chose.
+        asked: ``(agents, n)`` int64, the action that the policy chose.
         executed: ``(agents, n)`` int64, the phase that was served.
-        delay_s: ``(agents, n)`` float32, for how long its green was held back.
+        delay_s: ``(agents, n)`` float32, delay of its green, in s.
         episode: ``(agents, n)`` int64, counted from 0 without gaps; -1 in padding.
-        step: ``(agents, n)`` int64.
+        step: ``(agents, n)`` int64, number of the decision in its episode.
         weight: ``(agents, n)`` float32, 1 for a row, 0 for padding.
     """
 
@@ -98,16 +98,16 @@ class StackedTransitions:
 
     @property
     def outcome(self) -> Tensor:
-        """Features that show best what a green did: those served if measured, else those after.
+        """Features that show the effect of a green: the served ones if measured, else the next.
 
-        Counts after ten seconds hardly know when a green began: often the same number of vehicles
-        has got through, and others have arrived.
+        The next features hardly depend on the start of the green: after ten seconds often the same
+        number of vehicles has passed, and others have arrived.
         """
         return self.next_observation if self.served_features is None else self.served_features
 
 
 def refuse_other_agents(log: TransitionLog, stack: Stack) -> None:
-    """Refuse transitions of other agents, or with other observations, than those of the stack."""
+    """Refuse a log whose agents or observations differ from those of the stack."""
     if dict(log.provenance.layouts) != stack.layouts:
         raise LogError(
             f"the transition log of {log.provenance.scenario} "
@@ -121,7 +121,7 @@ def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
     """Return all transitions of a log as padded tensors.
 
     Raises:
-        LogError: The log is of other agents, or an agent has no rows.
+        LogError: The log has other agents, or an agent has no rows.
     """
     refuse_other_agents(log, stack)
     rows = [log.transitions(agent) for agent in stack.agents]

@@ -15,16 +15,16 @@ from ugat_marl.policies import Learner, Policy
 
 @dataclass
 class State:
-    """Everything of a run that a checkpoint holds.
+    """Complete state of a run, as stored in a checkpoint.
 
     Attributes:
-        learner: The policy in training.
+        learner: Learner of the policy.
         transform: f, h and gate.
-        direct: The policy after plain training: direct transfer.
-        simulated: D_sim.
-        real: D_real.
-        pretrained: Episodes of plain training so far.
-        iteration: Iterations completed.
+        direct: Policy after plain training, for direct transfer.
+        simulated: Logs of D_sim.
+        real: Logs of D_real.
+        pretrained: Number of episodes of plain training so far.
+        iteration: Number of completed iterations.
     """
 
     learner: Learner
@@ -54,11 +54,11 @@ class State:
         run.save({"pretrained": self.pretrained, "iteration": self.iteration}, write)
 
     def restore(self, run: Run, load_policy: Callable[[Path], Policy]) -> None:
-        """Bring a fresh state to where the run's checkpoint stands, if there is one.
+        """Restore the run's checkpoint into a fresh state; without one, nothing changes.
 
         Raises:
             CheckpointError: The checkpoint cannot be used.
-            LogError: One of its logs cannot.
+            LogError: One of its logs cannot be used.
         """
         if not run.resumable:
             return

@@ -1,21 +1,21 @@
-"""Methods by which h says that it is unsure: a loss to train h with, and answers with a u.
+"""Methods for the uncertainty of h: each has a loss for training, and answers with a u.
 
-A method is a network with an encoder per intersection and one head shared by all, whose outputs it
-reads in its own way. u is always in [0, 1] and comparable in its ends: 0 is one action beyond
-doubt, 1 knows nothing and gives every phase of the intersection the same probability.
+The network of a method has one encoder per intersection and one head shared by all. The methods
+differ in how they read its outputs. u is always in [0, 1]. With u = 0 one action is certain; with
+u = 1 all phases of the intersection have the same probability.
 
 - ``edl``: u = K / S of a Dirichlet distribution (Sensoy, Kaplan, Kandemir, "Evidential Deep
   Learning to Quantify Classification Uncertainty", NeurIPS 2018).
 - ``dropout`` (Gal, Hron, Kendall, "Concrete Dropout", NeurIPS 2017) and ``ensemble``
   (Lakshminarayanan, Pritzel, Blundell, "Simple and Scalable Predictive Uncertainty Estimation using
   Deep Ensembles", NeurIPS 2017): the predictive entropy of the mean over networks, in units of its
-  maximum log K (`normalised_entropy`). Not the mutual information of network and action, which is
-  blind to states in which several actions lead to the same next one: all networks agree on a coin
-  flip there, and the gate would take it. The evidence of ``edl`` is low in such states, too.
+  maximum log K (`normalised_entropy`). The mutual information of network and action would not do:
+  it is low where several actions lead to the same next state and all networks agree on equal
+  probabilities. The evidence of ``edl`` is low in such states, too.
 - ``none``: u = 0.
 
-Rows may have different numbers of classes: a mask says which are theirs, and K is their number, row
-by row. Shapes are ``(..., K)`` for logits, concentrations and masks (broadcastable), ``(...)`` for
+Rows may have different numbers of classes. A mask marks the classes of a row, and K is their
+number. Shapes are ``(..., K)`` for logits, concentrations and masks (broadcastable), ``(...)`` for
 losses and u.
 """
 
@@ -35,7 +35,7 @@ from ugat_marl.errors import OptionError
 from ugat_marl.policies import BatchedLinear, BatchedMLP
 
 MOST = 100
-"""Members or passes above which a number is taken for a mistake."""
+"""Largest number of members or passes; larger ones are taken for a mistake."""
 
 MethodName = Literal["edl", "dropout", "ensemble", "none"]
 METHODS: tuple[MethodName, ...] = ("edl", "dropout", "ensemble", "none")
@@ -47,8 +47,8 @@ class Method:
 
     Attributes:
         name: "edl", "dropout", "ensemble" or "none".
-        members: Networks of an ensemble.
-        passes: Thinned networks that dropout averages over.
+        members: Number of networks of an ensemble.
+        passes: Number of thinned networks that dropout averages over.
     """
 
     name: MethodName = "edl"
@@ -80,7 +80,7 @@ class InversePrediction:
 
     @classmethod
     def joined(cls, parts: Sequence[InversePrediction]) -> InversePrediction:
-        """Return the answers to some rows and those to the next ones as one."""
+        """Return the answers to consecutive parts of a batch as one, joined along the rows."""
         return cls(
             torch.cat([part.action for part in parts], 1),
             torch.cat([part.probability for part in parts], 1),
@@ -93,13 +93,13 @@ class Lesson:
     """Arguments of a loss beside the rows; every method takes what it needs.
 
     Attributes:
-        held_out: True if the rows are held out: the loss only ranks weights then.
-        generator: Source of all that is drawn; on the CPU wherever the rows are.
-        rows: ``(agents,)`` rows each agent is trained on in all.
-        share: Part, 0 to 1, by which terms that keep fresh weights from learning are annealed in.
+        held_out: True for held-out rows, whose loss only ranks weights.
+        generator: Source of all draws; on the CPU for rows on any device.
+        rows: ``(agents,)`` number of training rows of each agent.
+        share: Current share of the final weights, 0 to 1; it rises while h is annealed.
         kl_weight: Final weight of the divergence of misleading evidence.
         off_data_weight: Final weight of certainty on invented inputs.
-        invent: Standardised inputs off the data, a number of rows per agent.
+        invent: Function from a number of rows per agent to standardised inputs off the data.
     """
 
     held_out: bool
@@ -117,7 +117,7 @@ class NetShape:
 
     Attributes:
         fan_in: Number of inputs of each agent.
-        hidden: Hidden layers of an encoder.
+        hidden: Sizes of the hidden layers of an encoder.
         embedding: Size of the output of an encoder, which the head reads.
         valid_actions: ``(agents, 1, actions)`` bool, the phases each agent has.
     """
@@ -129,13 +129,13 @@ class NetShape:
 
 
 class AnswerNet(nn.Module, abc.ABC):
-    """A method: the network of h, its loss, and how its answers are read.
+    """Base of the methods: the network of h, its loss, and its answers.
 
     Args:
-        shape: Sizes.
+        shape: Sizes of the network.
         generator: Source of the initial weights.
-        members: Networks side by side. They share no weight; every parameter holds them in order,
-            so that ``parameter.view(members, -1)`` has one row for each.
+        members: Number of networks side by side. They share no weight. Every parameter holds them
+            in order, so ``parameter.view(members, -1)`` has one row for each.
     """
 
     valid_actions: Tensor
@@ -147,14 +147,14 @@ class AnswerNet(nn.Module, abc.ABC):
         self.encoders = BatchedMLP(fan_in, shape.hidden, shape.embedding, generator)
         bound = shape.embedding**-0.5
         self.head = nn.Linear(shape.embedding, members * shape.valid_actions.shape[-1])
-        with torch.no_grad():  # nn.Linear draws from the global generator; ours must decide
+        with torch.no_grad():  # nn.Linear drew from the global generator; redraw from ours
             for part in self.head.parameters():
                 part.copy_((torch.rand(part.shape, generator=generator) * 2 - 1) * bound)
         self.register_buffer("valid_actions", shape.valid_actions, persistent=False)
 
     @abc.abstractmethod
     def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
-        """Return the tensor that `row_loss` and `certainty` read, rows on the last axis but one."""
+        """Return the tensor that `row_loss` and `certainty` read, ``(agents, ..., rows, K)``."""
 
     @abc.abstractmethod
     def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
@@ -162,17 +162,19 @@ class AnswerNet(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def certainty(self, outputs: Tensor) -> Tensor:
-        """Return the certainty about rows off the data, in nats; 0 for even odds.
+        """Return the certainty about rows off the data, in nats; 0 for equal probabilities.
 
-        ``(agents, count)`` or ``(agents, members, count)``.
+        The shape is ``(agents, count)`` or ``(agents, members, count)``.
         """
 
     def loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
         """Return the loss of every row, in the shape of `target`, with the certainty off the data.
 
+            loss = row loss + off_data_weight * share * mean certainty on invented inputs
+
         Args:
             inputs: ``(agents, batch, width)`` standardised, or ``(agents, members, batch, width)``
-                if every member has rows of its own.
+                if every member has its own rows.
             target: ``(agents, batch)`` or ``(agents, members, batch)`` int64, the true actions.
             lesson: Further arguments of a loss.
         """
@@ -182,7 +184,7 @@ class AnswerNet(nn.Module, abc.ABC):
         invented = lesson.invent(rows // 2 + 1)
         if inputs.dim() > invented.dim():
             invented = invented[:, None].expand(-1, self.members, -1, -1)
-        # One pass for both: two would read all weights, and sum all their gradients, twice.
+        # One pass for both, because two would read all weights and sum their gradients twice.
         outputs = self.outputs(torch.cat([inputs, invented], -2), lesson)
         error = self.row_loss(outputs[..., :rows, :], target, lesson)
         certain = self.certainty(outputs[..., rows:, :])
@@ -190,11 +192,11 @@ class AnswerNet(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def answer(self, inputs: Tensor) -> InversePrediction:
-        """Answer ``(agents, batch, width)`` standardised inputs, each row for itself."""
+        """Answer ``(agents, batch, width)`` standardised inputs, row by row."""
 
 
 def log_probability(logits: Tensor, mask: Tensor) -> Tensor:
-    """Return the log of the softmax over the classes a row has; minus infinity for others."""
+    """Return the log of the softmax over the classes of a row; minus infinity for others."""
     return logits.masked_fill(~mask, -math.inf).log_softmax(-1)
 
 
@@ -204,10 +206,13 @@ def negative_log_likelihood(logits: Tensor, target: Tensor, mask: Tensor) -> Ten
 
 
 def divergence_from_even(logits: Tensor, mask: Tensor) -> Tensor:
-    """Return the KL divergence of the softmax from even odds among a row's classes, in nats.
+    """Return the KL divergence between equal probabilities and the softmax p of a row, in nats.
 
-    Its gradient is that of the cross-entropy with even odds, with which Hendrycks, Mazeika and
-    Dietterich, "Deep Anomaly Detection with Outlier Exposure", ICLR 2019, teach what is unknown.
+        KL = -(1 / K) sum_k log p_k - log K
+
+    Its gradient is that of the cross-entropy with equal probabilities. Hendrycks, Mazeika and
+    Dietterich, "Deep Anomaly Detection with Outlier Exposure", ICLR 2019, train with it on
+    outliers.
     """
     own, count = log_probability(logits, mask).masked_fill(~mask, 0.0), mask.sum(-1)
     return -own.sum(-1) / count - count.log()
@@ -216,9 +221,11 @@ def divergence_from_even(logits: Tensor, mask: Tensor) -> Tensor:
 def normalised_entropy(probability: Tensor, mask: Tensor) -> Tensor:
     """Return the entropy over its maximum log K, in [0, 1]; K is a row's number of classes.
 
-    Of the mean over networks this is the predictive entropy (Gal, "Uncertainty in Deep Learning",
-    2016, section 3.3; Lakshminarayanan et al., NeurIPS 2017, section 3.5): what the data leave
-    open and what the networks disagree on, together. A single class has entropy 0.
+        u = -sum_k p_k log p_k / log K
+
+    For the mean over networks this is the predictive entropy (Gal, "Uncertainty in Deep Learning",
+    2016, section 3.3; Lakshminarayanan et al., NeurIPS 2017, section 3.5). It contains the noise of
+    the data and the disagreement of the networks. A single class has entropy 0.
     """
     most = mask.sum(-1).clamp(min=2).log()
     return (torch.special.entr(probability).sum(-1) / most).clamp(0.0, 1.0)
@@ -267,9 +274,12 @@ def divergence_from_uniform(alpha: Tensor, mask: Tensor) -> Tensor:
 
 
 class _Divergence(torch.autograd.Function):
-    """Divergence from uniform with its derivative in closed form: all digammas have cancelled.
+    """Divergence from uniform with its derivative in closed form; S is the sum of all alpha_k.
 
-    With S the total: dKL/d alpha_k = (alpha_k - 1) trigamma(alpha_k) - (S - K) trigamma(S).
+    KL = log Gamma(S) - log Gamma(K) - sum_k log Gamma(alpha_k)
+         + sum_k (alpha_k - 1) (digamma(alpha_k) - digamma(S))
+
+    dKL/d alpha_k = (alpha_k - 1) trigamma(alpha_k) - (S - K) trigamma(S)
     """
 
     @staticmethod
@@ -311,8 +321,8 @@ def annealing(epoch: int, epochs: int = 10) -> float:
 class EvidentialNet(AnswerNet):
     """One network whose outputs are evidence; u = K / S.
 
-    Outputs become the concentration of a Dirichlet distribution over class probabilities. Its mean
-    is the prediction; the lack of evidence is u.
+    The outputs give the concentrations of a Dirichlet distribution over class probabilities. Its
+    mean is the prediction; S is the sum of its concentrations.
     """
 
     def forward(self, inputs: Tensor) -> Tensor:
@@ -326,12 +336,12 @@ class EvidentialNet(AnswerNet):
         return self(inputs)
 
     def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
-        """Return the evidential loss, its divergence annealed in."""
+        """Return the evidential loss with the current weight of the divergence."""
         weight = lesson.kl_weight * lesson.share
         return evidential_loss(outputs, target, self.valid_actions, weight)
 
     def certainty(self, outputs: Tensor) -> Tensor:
-        """Return the divergence of the evidence from none."""
+        """Return the divergence from a Dirichlet without evidence."""
         return divergence_from_uniform(outputs, self.valid_actions)
 
     def answer(self, inputs: Tensor) -> InversePrediction:
@@ -347,31 +357,33 @@ class EvidentialNet(AnswerNet):
 # --- dropout: thinned networks
 
 COIN_TEMPERATURE = 0.1
-"""Of the relaxed coin, as in the paper."""
+"""Temperature of the relaxed coin, as in the paper."""
 
 START_RATE = 0.1
-"""Rate of a fresh network, as in the authors' code."""
+"""Dropout rate of a fresh network, as in the authors' code."""
 
 RATE_SPEED = 10.0
-"""Rates learn so much faster than weights: a fit is a few hundred updates long."""
+"""Factor by which rates learn faster than weights, because a fit has only a few hundred updates."""
 
 LENGTH_SCALE = 1e-2
-"""l of the prior, as in the authors' code: weights of a hundred would be no surprise."""
+"""Length scale l of the prior, as in the authors' code; it allows weights of about 1 / l."""
 
 SMALLEST_RATE = 1e-6
-"""Rates and draws keep this distance from 0 and 1, where logarithms end."""
+"""Smallest distance of rates and draws from 0 and 1, where logarithms are infinite."""
 
 ROWS_IN_DROPOUT = 256
-"""Rows answered at once, which bounds the memory of all passes over them."""
+"""Rows answered at once; this limits the memory of all passes."""
 
 
 def thinned(inputs: Tensor, logit: Tensor, draw: Tensor) -> Tensor:
-    """Return inputs times a relaxed coin, 0 at rate p, over 1 - p, so that the mean stays.
+    """Return inputs with units left out at rate p, divided by 1 - p to keep the mean.
+
+        inputs * (1 - sigmoid((logit p + logit draw) / COIN_TEMPERATURE)) / (1 - p)
 
     Args:
-        inputs: Any shape; units last.
+        inputs: Any shape; units on the last axis.
         logit: log p - log (1 - p), broadcastable.
-        draw: Uniform numbers in [0, 1), broadcastable: above 1 - p leaves a unit out.
+        draw: Uniform numbers in [0, 1), broadcastable; a draw above 1 - p leaves a unit out.
     """
     dropped = torch.sigmoid((logit + torch.logit(draw, SMALLEST_RATE)) / COIN_TEMPERATURE)
     return inputs * (1.0 - dropped) / torch.sigmoid(-logit)
@@ -380,16 +392,19 @@ def thinned(inputs: Tensor, logit: Tensor, draw: Tensor) -> Tensor:
 def divergence(weight: Tensor, logit: Tensor, units: Tensor | int) -> Tensor:
     """Return the divergence of a layer's posterior from the prior, in nats, up to a constant.
 
-    The objective of Concrete Dropout is the likelihood of the data and, over their number N, the
-    divergence of the posterior over thinned networks from a Gaussian prior of length scale l. For
-    an affine map W of n inputs with rate p it is l^2 (1 - p) |W|^2 / 2 - n H(p), H being the
-    entropy of a coin. Much data press the rates down, little data let H pull them up.
+    The loss of Concrete Dropout is the negative log-likelihood per row plus this divergence over
+    the number of rows. The prior is Gaussian with length scale l. For an affine map W of n inputs
+    with rate p, and the entropy H of a coin, the divergence is
+
+        l^2 (1 - p) |W|^2 / 2 - n H(p)
+
+    With many data the rates fall; with few data H raises them.
 
     Args:
-        weight: ``(..., inputs, outputs)``, 0 for inputs it does not have. `thinned` divides what
-            the layer is given by 1 - p, so the W of the formula is weight / (1 - p).
-        logit: ``(...)`` of its rate.
-        units: Number of its inputs, ``(...)`` or the same for all.
+        weight: ``(..., inputs, outputs)``, 0 for missing inputs. `thinned` divides the layer's
+            inputs by 1 - p, so the W of the formula is weight / (1 - p).
+        logit: ``(...)`` log odds of the rate p.
+        units: Number of inputs, ``(...)`` or the same for all.
     """
     p = torch.sigmoid(logit).clamp(SMALLEST_RATE, 1.0 - SMALLEST_RATE)
     entropy = torch.special.entr(p) + torch.special.entr(1.0 - p)
@@ -400,15 +415,15 @@ def divergence(weight: Tensor, logit: Tensor, units: Tensor | int) -> Tensor:
 class DropoutNet(AnswerNet):
     """One network, thinned before every affine map at a learned rate of that map.
 
-    Gal et al. 2017: a network with random units left out is a draw from an approximate posterior
-    over networks. The coin that leaves units out is relaxed, so that its rate has a gradient.
+    A network with random units left out is a draw from an approximate posterior over networks (Gal
+    et al. 2017). The coin that leaves units out is relaxed to give its rate a gradient.
 
-    An intersection's encoder has rates of its own. Answers average over `passes` thinned networks
-    that were drawn when this one was made and are kept in checkpoints: the same input always gets
-    the same answer, whatever it is asked together with, and u needs no generator when it is used.
+    Each intersection's encoder has its own rates. Answers average over `passes` thinned networks.
+    These are drawn once, when the network is made, and are kept in checkpoints. So the same input
+    always gets the same answer.
 
     Args:
-        shape: Sizes.
+        shape: Sizes of the network.
         generator: Source of the initial weights and of the thinned networks.
         passes: Number of thinned networks, T in the papers.
     """
@@ -435,19 +450,19 @@ class DropoutNet(AnswerNet):
 
     @property
     def rates(self) -> list[Tensor]:
-        """Learned dropout rates, layer by layer: ``(agents,)``, and ``(1,)`` for the head."""
+        """Learned dropout rates of each layer: ``(agents,)``, and ``(1,)`` for the head."""
         return [torch.sigmoid(logit.detach()).flatten() for logit in self._logits()]
 
     def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
-        """Return cross-entropy of one thinned network per row, and the divergence by all rows.
+        """Return the cross-entropy of one thinned network per row, plus divergence / rows.
 
-        Held-out rows are judged by the whole network and by its likelihood alone.
+        The loss of held-out rows is the cross-entropy of the whole network alone.
         """
         likelihood = negative_log_likelihood(outputs, target, self.valid_actions)
         return likelihood if lesson.held_out else likelihood + self._divergence(lesson.rows)
 
     def certainty(self, outputs: Tensor) -> Tensor:
-        """Return the divergence from even odds of one thinned network per row."""
+        """Return the divergence from equal probabilities, with one thinned network per row."""
         return divergence_from_even(outputs, self.valid_actions)
 
     def answer(self, inputs: Tensor) -> InversePrediction:
@@ -460,7 +475,7 @@ class DropoutNet(AnswerNet):
         return [RATE_SPEED * logit for logit in self.slow_logits]
 
     def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
-        """Return logits ``(agents, batch, actions)``, every row from a network thinned anew."""
+        """Return logits ``(agents, batch, actions)``, each row from a newly thinned network."""
         if lesson.held_out:
             return self.head(torch.relu(self.encoders(inputs)))
         x = inputs
@@ -470,7 +485,7 @@ class DropoutNet(AnswerNet):
         return x
 
     def _maps(self) -> list[BatchedLinear | nn.Linear]:
-        """Return the affine maps in their order, the head last; a ReLU lies between any two."""
+        """Return the affine maps in order, the head last; a ReLU follows each but the head."""
         return [*(m for m in self.encoders.layers if isinstance(m, BatchedLinear)), self.head]
 
     def _mean(self, inputs: Tensor) -> Tensor:
@@ -484,7 +499,7 @@ class DropoutNet(AnswerNet):
         return log_probability(x, self.valid_actions[:, None]).exp().mean(1)
 
     def _divergence(self, rows: Tensor) -> Tensor:
-        """Return the divergence per row, ``(agents, 1)``; that of the head is shared by all."""
+        """Return the divergence per row, ``(agents, 1)``; all rows share that of the head."""
         *maps, head = (layer.weight for layer in self._maps())
         logits = [logit.flatten() for logit in self._logits()]
         total = divergence(maps[0] * self.own_inputs, logits[0], self.fan_in)
@@ -500,14 +515,14 @@ class DropoutNet(AnswerNet):
 class EnsembleNet(AnswerNet):
     """Networks side by side in one batched product; u is the entropy of their mean.
 
-    Lakshminarayanan et al. 2017: networks that differ in their initial weights and in the order of
-    their data agree where there are data and need not agree elsewhere. Every member has all rows,
-    each in an order of its own: the paper found bootstrap samples to do harm (section 2.4). Its
-    adversarial training is left out, as its inputs have no common scale here.
+    The networks differ in their initial weights and in the order of their data. They agree where
+    there are data and need not agree elsewhere (Lakshminarayanan et al. 2017). Every member is
+    trained on all rows, because bootstrap samples were harmful in the paper (section 2.4). Its
+    adversarial training is left out, because the inputs here have no common scale.
     """
 
     def logits(self, inputs: Tensor) -> Tensor:
-        """Return logits ``(agents, members, batch, actions)``; inputs as of `loss` and `answer`."""
+        """Return logits ``(agents, members, batch, actions)`` for inputs of `loss` or `answer`."""
         if inputs.dim() == 3:
             inputs = inputs[:, None].expand(-1, self.members, -1, -1)
         agents, members, rows, width = inputs.shape
@@ -530,7 +545,7 @@ class EnsembleNet(AnswerNet):
         return negative_log_likelihood(outputs, own, self.valid_actions[:, None]).view(target.shape)
 
     def certainty(self, outputs: Tensor) -> Tensor:
-        """Return the divergence from even odds, member by member."""
+        """Return the divergence from equal probabilities, member by member."""
         certain = divergence_from_even(outputs, self.valid_actions[:, None])
         return certain if self.members > 1 else certain[:, 0]
 
@@ -541,13 +556,13 @@ class EnsembleNet(AnswerNet):
 
 
 class PlainNet(EnsembleNet):
-    """One network without uncertainty: u = 0, so that every grounded action is taken.
+    """One network without uncertainty: u = 0, so the gate takes every grounded action.
 
-    This is the grounded action transformation without a gate (GAT; Hanna and Stone, AAAI 2017).
+    This is grounded action transformation without a gate (GAT; Hanna and Stone, AAAI 2017).
     """
 
     def loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
-        """Return the cross-entropy alone: without u there is nothing to teach off the data."""
+        """Return the cross-entropy alone; without u no training off the data is needed."""
         return self.row_loss(self.outputs(inputs, lesson), target, lesson)
 
     def answer(self, inputs: Tensor) -> InversePrediction:

@@ -1,9 +1,9 @@
 """Views: the inputs of models beside an agent's own state, from earlier and from neighbours.
 
-A view widens the observations of a `Stack` to the right, so that an agent's own numbers still begin
-at 0: ``own | earlier ones, each with the phase that ran | neighbours, each with the phase that
-runs``. The same function makes it of a log and while an episode runs. Where an episode has not
-lasted long enough, its first observation stands in for earlier ones, without a phase.
+A view widens the observations of a `Stack` to the right, so an agent's own numbers still begin at
+column 0: ``own | earlier ones, each with the phase that ran | neighbours, each with the phase that
+runs``. Logs and running episodes use the same function. At the start of an episode, its first
+observation, without a phase, replaces the missing earlier ones.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ugat_marl.grounding.stacked import Stack, StackedTransitions
 from ugat_marl.scenarios import within_hops
 
 Neighbours = Mapping[str, Sequence[str]]
-"""Agent to the agents around it."""
+"""Agent to the agents one road away."""
 
 UNKNOWN = -1
 """Phase of a decision before the first one of an episode."""
@@ -32,11 +32,11 @@ class InputsConfig:
     """Inputs of f and h beside the intersection's own state and action.
 
     Attributes:
-        history: Observations f sees, the current one and the last ones before it, with the phases
-            that ran since.
-        hops: Number of roads to the farthest intersections whose features and phases f and h see,
-            with the phases that run in the step. The joint-local grounding of JL-GAT (Turnau et al.
-            2025).
+        history: Number of the last observations f sees, the current one included, with the phases
+            that ran between them.
+        hops: Distance in roads up to which f and h see the features and phases of other
+            intersections, with the phases that run in the step: the joint-local grounding of
+            JL-GAT (Turnau et al. 2025).
     """
 
     history: int = 1
@@ -52,7 +52,7 @@ class InputsConfig:
         """Return the neighbours that each agent's models see, nearest first; none without hops.
 
         Raises:
-            OptionError: There are hops, but nothing, or nothing sensible, is known of neighbours.
+            OptionError: There are hops, but neighbours are missing or do not fit the agents.
         """
         if not self.hops:
             return {}
@@ -85,8 +85,8 @@ class Moment:
     """Decisions of all agents, in any number of episodes.
 
     Attributes:
-        observation: ``(agents, n, width)`` float32.
-        executed: ``(agents, n)`` int64, the phases that ran from then on; -1 is not known.
+        observation: ``(agents, n, width)`` float32, padded observations.
+        executed: ``(agents, n)`` int64, the phases that ran next; -1 if unknown.
     """
 
     observation: Tensor
@@ -94,16 +94,16 @@ class Moment:
 
 
 class View:
-    """A way to widen observations by earlier ones and by those of neighbours.
+    """Extension of observations by earlier ones and by those of neighbours.
 
     Args:
         stack: The agents.
-        history: Observations of an agent itself, the current one included.
+        history: Number of observations of an agent itself, the current one included.
         near: Agent to the neighbours it sees; agents that are left out see none.
 
     Attributes:
-        sizes: Length of each agent's widened observation; ``width`` is the largest.
-        lights: ``(agents, 1, width)`` bool, columns of phases: 0 or 1, and one of them is 1.
+        sizes: Length of each agent's widened observation; `width` is the largest.
+        lights: ``(agents, 1, width)`` bool, true for columns of phases (one-hot).
         joint: True if some agent sees a neighbour.
     """
 
@@ -127,10 +127,9 @@ class View:
         """Return widened observations ``(agents, n, width)``.
 
         Args:
-            now: ``(agents, n, stack.width)``, what is observed.
-            running: ``(agents, n)`` int64, the phases that run from now on; of an agent's own
-                nothing is shown.
-            earlier: The decisions before, latest first; as many as there have been.
+            now: ``(agents, n, stack.width)`` current observations.
+            running: ``(agents, n)`` int64, the phases that run next; only neighbours see them.
+            earlier: Earlier decisions of the episode, latest first.
         """
         if self.history == 1 and not self.joint:
             return now
@@ -166,12 +165,12 @@ class View:
         return self.seen(data.observation, data.executed, earlier)
 
     def _shown(self, phase: Tensor) -> Tensor:
-        """Return phases ``(agents, n)`` one-hot; an unknown one is zeros."""
+        """Return phases ``(agents, n)`` as one-hot; zeros for an unknown phase."""
         shown = nn.functional.one_hot(phase.clamp(min=0), self.stack.actions)
         return shown * (phase != UNKNOWN)[..., None].float()
 
     def _places(self, agent: str) -> list[tuple[int, bool]]:
-        """Return each number's column in a row of all moments; and if it is a light."""
+        """Return, for each input, its column in a row of all moments, and True for a phase."""
         stack = self.stack
 
         def moment(name: str, lag: int, end: int, executed: bool) -> list[tuple[int, bool]]:

@@ -1,4 +1,4 @@
-"""Sources of transitions: roll-outs in a domain, or a log of the street."""
+"""Sources of transitions: roll-outs in a domain, or a log of the real domain."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed
 
 EPISODES_PER_DELAY = 2
-"""The fewest that tell how much chance there is in one."""
+"""Roll-outs for each delay; at least two are needed to measure their scatter."""
 
 
 class World(Protocol):
@@ -33,11 +33,11 @@ class World(Protocol):
         ...
 
     def stop(self) -> None:
-        """End a `collect` that is under way in another thread, with `Stopped`."""
+        """End a `collect` that runs in another thread; it raises `Stopped`."""
         ...
 
     def close(self) -> None:
-        """Give up what the world holds."""
+        """Release the resources of the world."""
         ...
 
 
@@ -45,13 +45,13 @@ class SimulatedWorld:
     """Roll-outs in a domain.
 
     Args:
-        make_env: Makes an environment of the domain.
-        name: Distinguishes the seeds of two worlds.
-        episodes: Roll-outs per iteration.
+        make_env: Function that makes an environment of the domain.
+        name: Name that separates the seeds of two worlds.
+        episodes: Number of roll-outs per iteration.
         epsilon: Chance of a random phase.
-        most_delay_s: Longest of the random delays of greens; 0 for none.
-        workers: An executor that plays each roll-out in an environment of its own; anything else:
-            those of `collect` one after the other here, in one environment.
+        most_delay_s: Longest random delay of greens, in s; 0 for none.
+        workers: With an executor, each roll-out has its own environment. Otherwise `collect` runs
+            its roll-outs one after the other in one environment.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class SimulatedWorld:
         self._stop = Stop()
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
-        """Play the iteration's episodes and return their transitions."""
+        """Run the iteration's episodes and return their transitions."""
         seeds = [
             derive_seed(seed, "roll-out", self._name, iteration, episode)
             for episode in range(self._episodes)
@@ -89,16 +89,16 @@ class SimulatedWorld:
     def under_delays(
         self, policy: Policy, iteration: int, seed: int, on_done: Callable[[], object]
     ) -> list[TransitionLog]:
-        """Play roll-outs for each delay of 0, 1, ... s up to the longest, which every green has.
+        """Run roll-outs in which all greens have the same delay, for 0, 1, ... `most_delay_s` s.
 
-        Each has traffic of its own: a busy hour would make all delays look short. There are
-        `EPISODES_PER_DELAY` of each.
+        There are `EPISODES_PER_DELAY` roll-outs for each delay. Each has its own traffic, because
+        one busy hour would make all delays look short.
 
         Args:
-            policy: Who acts.
-            iteration: Decides the seeds, with `seed`.
-            seed: As for `collect`.
-            on_done: Called after each of `roll_outs_under_delays`.
+            policy: Policy that acts.
+            iteration: Number of the iteration; it decides the seeds, with `seed`.
+            seed: Root seed, as for `collect`.
+            on_done: Function called after each roll-out.
         """
         lates = range(self._most_delay_s + 1)
         parts = [
@@ -122,18 +122,18 @@ class SimulatedWorld:
         parts: Sequence[tuple[int, int | None]],
         on_done: Callable[[], object] = lambda: None,
     ) -> list[TransitionLog]:
-        """Play roll-outs by their seeds and constant delays, in that order."""
+        """Run a roll-out for each pair of seed and constant delay; return logs in this order."""
         alone = _RollOutAlone(self._make_env, self._most_delay_s, policy, self._epsilon)
         given = [(*part, self._stop) for part in parts]
         logs: dict[int, TransitionLog] = {}
         for number, log in as_done(workers, alone.play, given, self._stop):
             logs[number] = log
             on_done()
-        self._stop = Stop()  # the other is set now, since nobody waits any more
+        self._stop = Stop()  # `as_done` has set the old one at its end
         return [logs[number] for number in range(len(parts))]
 
     def stop(self) -> None:
-        """End the roll-out that is under way."""
+        """Stop the running roll-outs."""
         self._stop.set()
 
     def close(self) -> None:
@@ -159,12 +159,12 @@ def _recorded(env: AnyParallelEnv, policy: Policy, seed: int, stop: Stop) -> Tra
 
 @dataclass(frozen=True)
 class _RollOutAlone:
-    """Roll-outs in environments of their own, wherever they are played.
+    """Roll-outs that each have their own environment, in any process.
 
     Attributes:
-        make_env: Makes an environment of the domain.
-        most_delay_s: Longest of the random delays of greens; 0 for none.
-        policy: Who acts.
+        make_env: Function that makes an environment of the domain.
+        most_delay_s: Longest random delay of greens, in s; 0 for none.
+        policy: Policy that acts.
         epsilon: Chance of a random phase.
     """
 
@@ -174,9 +174,9 @@ class _RollOutAlone:
     epsilon: float
 
     def play(self, seed: int, always_s: int | None, stop: Stop) -> TransitionLog:
-        """Play one, with random delays or always the same."""
+        """Run one roll-out, with random delays or with the constant delay `always_s`."""
         env = _delayed(self.make_env, self.most_delay_s, always_s)
-        own = copy.deepcopy(self.policy)  # some remember their episode, and others play beside it
+        own = copy.deepcopy(self.policy)  # policies with memory must not share it between threads
         try:
             return _recorded(env, Exploring(own, self.epsilon), seed, stop)
         finally:
@@ -185,16 +185,16 @@ class _RollOutAlone:
 
 @dataclass(frozen=True)
 class RollOut:
-    """Settings that roll-outs have in common; sent to every process that plays one.
+    """Common settings of roll-outs; sent to every process that runs one.
 
     Attributes:
         scenario: The network and its traffic.
-        domain: The domain they are played in.
-        options: Of the environment; those the policy relies on are added.
-        make: Makes who acts; rules remember their episode, so that each has its own.
+        domain: Domain of the roll-outs.
+        options: Options of the environment; those that the policy needs are added.
+        make: Function that makes the policy, a new one for each roll-out.
         epsilon: Chance of a random phase.
-        observation: What is recorded.
-        neighbours: How many roads away intersections are recorded too.
+        observation: Name of the recorded observation.
+        neighbours: Distance in roads up to which other intersections are recorded, too.
     """
 
     scenario: Scenario
@@ -206,7 +206,7 @@ class RollOut:
     neighbours: int = 0
 
     def play(self, seed: int, stop: Stop) -> tuple[TransitionLog, Scores]:
-        """Play one episode in an environment of its own."""
+        """Run one episode in its own environment; return its transitions and scores."""
         probe = parallel_env(self.scenario, self.domain, **self.options)
         policy = self.make(probe)
         options = {**self.options, **policy.env_options}
@@ -231,14 +231,14 @@ def roll_outs(
     reporter: Reporter | None = None,
     title: str = "rolling out",
 ) -> tuple[TransitionLog, tuple[Scores, ...]]:
-    """Play episodes, several at a time, and record them in the order of their seeds.
+    """Run episodes, several at a time, and record them in the order of their seeds.
 
     Args:
-        each: What they have in common.
-        seeds: One for each.
-        workers: Simulations at a time; None for the number of cores; or an executor.
-        reporter: Shows progress.
-        title: What to call the work there.
+        each: Common settings of the roll-outs.
+        seeds: One seed for each episode.
+        workers: Number of simulations at a time; None for the number of cores; or an executor.
+        reporter: Display of the progress.
+        title: Name of the work in this display.
 
     Returns:
         All transitions, and the scores of every episode.
@@ -255,12 +255,12 @@ def roll_outs(
 
 
 class RecordedWorld:
-    """A log that was measured or recorded before; no simulator stands in for the street.
+    """World that consists of a recorded log; nothing is simulated.
 
     Args:
         log: The transitions.
-        env: The simulation they are to be compared with.
-        held_out_every: As for `FitConfig`.
+        env: Simulation to compare them with.
+        held_out_every: Held-out share, as in `FitConfig`.
 
     Raises:
         LogError: The log's agents, observation or decision interval are not those of `env`, or
@@ -286,7 +286,7 @@ class RecordedWorld:
                     f"{env.scenario.id!r} with the same options"
                 )
         stack = Stack(env.layouts)
-        split(stack_log(log, stack), held_out_every, stack)  # now rather than after hours
+        split(stack_log(log, stack), held_out_every, stack)  # raises now instead of after hours
         self._log = log
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
@@ -295,7 +295,7 @@ class RecordedWorld:
         return self._log if iteration == 0 else None
 
     def stop(self) -> None:
-        """Do nothing: nothing is under way."""
+        """Do nothing; `collect` returns at once."""
 
     def close(self) -> None:
-        """Do nothing: there is nothing to give up."""
+        """Do nothing; a log holds no resources."""

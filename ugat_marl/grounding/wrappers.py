@@ -1,4 +1,4 @@
-"""Environments around the simulation: with grounded actions, and with greens late by chance."""
+"""Environments around the simulation: with grounded actions, and with random delays of greens."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ LEAST_CHANCE = 0.5
 
 
 class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
-    """Executes grounded actions in the wrapped simulation; the learner never notices.
+    """Executes grounded actions in the wrapped simulation, without changes to the learner.
 
-    This is E_sim of Algorithm 1 in lines 9 to 15 (`ugat`); line numbers below are those.
+    This is E_sim of Algorithm 1 in lines 9 to 15 (`ugat`); the comments give these line numbers.
 
-    A learner sees the observations and rewards that its action had in the grounded world and stores
-    its own action beside them. What was done instead is in the infos of `reset` and `step`:
+    A learner gets the observations and rewards of the grounded simulation, and stores its own
+    action with them. The infos of `reset` and `step` describe the grounding:
 
     - ``grounded_action``: int, the inverse model's answer; -1 at reset.
-    - ``uncertainty``: float, its u in [0, 1]; 1.0 at reset.
+    - ``uncertainty``: float, u of this answer in [0, 1]; 1.0 at reset.
     - ``accepted``: int, 1 if the grounded action was executed.
-    - ``delay_s``: float, for how long the agent's greens were held back; 0.0 at reset.
+    - ``delay_s``: float, delay of the agent's green in s; 0.0 at reset.
 
     A grounded action that the agent's action mask forbids is never executed. An epoch of the gate
-    is an episode of this environment. Models with a history see the observations and the phases
-    of the episode; by ``executed_action`` in the infos, where the environment says so.
+    is an episode of this environment. Models with a history see the earlier observations and phases
+    of the episode. The phases are ``executed_action`` in the infos, if the environment gives it.
 
     Args:
         env: The simulation.
@@ -90,7 +90,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         return observations, rewards, terminations, truncations, _extended(infos, acting, taken)
 
     def _notice(self, observations: dict[str, Any], infos: Infos) -> None:
-        """Keep what the next grounding needs, in copies: learners scale observations in place."""
+        """Keep copies for the next grounding, because learners may scale observations in place."""
         stack = self.transform.stack
         self._seen = stack.observations(observations)
         self._allowed = stack.masks({a: infos.get(a, {}).get("action_mask") for a in stack.agents})
@@ -146,15 +146,15 @@ def _refuse_misfit(env: AnyParallelEnv, transform: Transform) -> None:
 
 
 class RandomDelays(BaseParallelWrapper[str, Any, Any]):
-    """Delays greens by random whole seconds, and says so in the infos, under ``delay_s``.
+    """Delays greens by random whole seconds; the infos give the delay in ``delay_s``.
 
-    The share of delayed greens is drawn anew for every episode, so that traffic flows in some and
-    jams in others: the effect of a delay has to be known in both.
+    Every episode draws its own share of delayed greens. So traffic flows in some episodes and jams
+    in others, and the models learn the effect of a delay in both.
 
     Args:
-        env: An environment of the suite.
-        most_s: Longest delay.
-        always_s: In place of random delays, the same for every green; None for random ones.
+        env: A `TrafficEnv`, wrapped or not.
+        most_s: Longest delay, in s.
+        always_s: Constant delay of all greens, in s; None for random delays.
     """
 
     def __init__(self, env: AnyParallelEnv, most_s: int, always_s: int | None = None) -> None:
