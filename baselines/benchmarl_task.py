@@ -1,9 +1,10 @@
 """QMIX and VDN of BenchMARL, which learn one value for all intersections together.
 
-`TrafficTask` makes any environment of the suite a task of BenchMARL, with which its own experiments
-run as well. The learner below takes algorithm, losses, replay and optimisers from such an
-experiment, and plays the episodes itself, so that it can be stopped and taken up again. Agents are
-padded and told whose observation they see, share one network, and are masked by their infos.
+`TrafficTask` turns an environment of the suite into a task of BenchMARL; BenchMARL's own
+experiments run on it, too. The learner below takes algorithm, losses, replay and optimisers from
+such an experiment. It plays the episodes itself, so it can be interrupted and resumed. All agents
+share one network: observations are padded and carry a one-hot of the agent. Infos hold the action
+masks.
 
     python baselines/benchmarl_task.py --scenario grid2x2-v1 --episodes 100 --out runs/qmix
     python baselines/benchmarl_task.py --scenario mixed-v1 --algorithm vdn
@@ -49,14 +50,14 @@ from ugat_marl.seeding import derive_seed
 ALGORITHMS = ("qmix", "vdn")
 _GROUP = "agents"
 _STATE_DEPENDENCE = 0.1
-"""What is left of the drawn weights by which QMIX's mixing follows the state."""
+"""Factor on the initial weights from the state to QMIX's mixing weights."""
 _LINEAR_DOWN_TO = 3.0
-"""Input of the mixing network's units where agents' values are 0; below 0 their ELU saturates."""
+"""Initial bias of the mixing network's units; their ELU is linear above 0 and saturates below."""
 
 
 @dataclass(frozen=True)
 class BenchMARLConfig:
-    """Settings of the learner; a decision is one of all agents together."""
+    """Settings of the learner; one decision covers all agents."""
 
     algorithm: Literal["qmix", "vdn"] = "qmix"
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
@@ -64,13 +65,13 @@ class BenchMARLConfig:
     learning_rate: float = 1e-3  # step size of Adam
     discount: float = 0.8  # weight of the next decision's value (gamma)
     max_gradient: float = 5.0  # longer gradients are scaled down to this norm
-    replay: int = 2_000  # decisions it remembers: the jams of the beginning drown what comes later
+    replay: int = 2_000  # decisions it stores; few, or the first jams outweigh later decisions
     batch: int = 64  # decisions in a gradient step
     update_every: int = 20  # decisions played between updates; the end of an episode ends one too
-    updates: int = 10  # gradient steps then
-    explore: int = 2_400  # decisions over which random actions get rare
-    least_exploration: float = 0.05  # share of random actions that stays
-    target_rate: float = 0.01  # share by which the target network follows at each gradient step
+    updates: int = 10  # gradient steps of one update
+    explore: int = 2_400  # decisions over which the share of random actions falls
+    least_exploration: float = 0.05  # final share of random actions
+    target_rate: float = 0.01  # step of the target network to the network in each gradient step
 
     def __post_init__(self) -> None:
         if self.algorithm not in ALGORITHMS:
@@ -79,17 +80,20 @@ class BenchMARLConfig:
 
 
 class World(PettingZooWrapper):
-    """TorchRL's wrapper, which forgets the masks of agents that an episode's end has retired."""
+    """TorchRL's wrapper with all agents, also at the end of an episode.
+
+    TorchRL drops the masks of agents that are no longer in `env.agents`.
+    """
 
     @property
     def agents(self) -> list[str]:
-        """All of them, at the end too, where masks decide what the last state is worth."""
+        """All agents. At the end, too: the value of the last state needs their masks."""
         return self._env.possible_agents
 
 
 def world_of(env: AnyParallelEnv) -> World:
-    """The environment as TorchRL's, its agents one group of equals; it is reset."""
-    with warnings.catch_warnings():  # "tested using PettingZoo 1.24.3", at each call
+    """Return the environment as TorchRL's, all agents in one group; this resets it."""
+    with warnings.catch_warnings():  # each call warns: "tested using PettingZoo 1.24.3"
         warnings.simplefilter("ignore")
         groups = {_GROUP: list(env.possible_agents)}
         return World(agent_indicator(pad(env)), return_state=True, group_map=groups)
@@ -99,9 +103,9 @@ class TrafficTask(TaskClass):
     """A task of BenchMARL: ``Experiment(task=TrafficTask(make, decisions), ...)``.
 
     Args:
-        make: Makes an environment of the suite, one for each call. BenchMARL pickles it: a function
-            of a module, or a `functools.partial` of one.
-        decisions: In an episode.
+        make: Makes an environment of the suite with each call. BenchMARL pickles it, so it must be
+            a function of a module, or a `functools.partial` of one.
+        decisions: Number of decisions in an episode.
     """
 
     def __init__(self, make: Callable[[], AnyParallelEnv], decisions: int = 360) -> None:
@@ -111,37 +115,37 @@ class TrafficTask(TaskClass):
 
     @staticmethod
     def env_name() -> str:
-        """Return the name of the package the task comes from."""
+        """Return the name of this package."""
         return "ugat_marl"
 
     def get_env_fun(
         self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
     ) -> Callable[[], Any]:
-        """Makes the environment where it is needed."""
+        """Return a function that makes the environment on a device."""
         return lambda: world_of(self._make()).to(device)
 
     def supports_continuous_actions(self) -> bool:
-        """Phases are no numbers."""
+        """Return False: actions are phases."""
         return False
 
     def supports_discrete_actions(self) -> bool:
-        """Phases are chosen."""
+        """Return True: actions are phases."""
         return True
 
     def has_render(self, env: Any) -> bool:
-        """BenchMARL makes videos of its own, which are not needed here."""
+        """Return False, so that BenchMARL records no videos."""
         return False
 
     def max_steps(self, env: Any) -> int:
-        """Decisions in an episode."""
+        """Return the number of decisions in an episode."""
         return self._decisions
 
     def group_map(self, env: Any) -> dict[str, list[str]]:
-        """One group."""
+        """Return the agents of the only group, by its name."""
         return env.group_map
 
     def state_spec(self, env: Any) -> Any:
-        """All observations, once."""
+        """Return the space of the state of the whole network."""
         return Composite({"state": env.observation_spec["state"].clone()})
 
     def observation_spec(self, env: Any) -> Any:
@@ -153,11 +157,11 @@ class TrafficTask(TaskClass):
         return self._only(env, "action_mask")
 
     def info_spec(self, env: Any) -> Any:
-        """Return None: nothing here learns from infos."""
+        """Return None: the learners do not use infos."""
         return None
 
     def action_spec(self, env: Any) -> Any:
-        """A phase for each agent."""
+        """Return the spaces of actions: one phase for each agent."""
         return env.full_action_spec
 
     def _only(self, env: Any, name: str) -> Any:
@@ -167,7 +171,7 @@ class TrafficTask(TaskClass):
 
 
 class Unwritten(Experiment):
-    """An experiment that leaves no folder of pickled settings behind."""
+    """An experiment that writes no folder of pickled settings."""
 
     def _setup_name(self) -> None:
         self.name = self.environment_name = self.task_name = "traffic"
@@ -180,7 +184,7 @@ class Unwritten(Experiment):
 
 
 class BenchMARL(LibraryLearner):
-    """Learns by QMIX or VDN; a `ugat_marl.policies.protocols.Learner`."""
+    """Learner by QMIX or VDN; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: BenchMARLConfig | None = None, seed: int = 0
@@ -198,10 +202,10 @@ class BenchMARL(LibraryLearner):
             self._begin_as_a_sum()
 
     def _begin_as_a_sum(self) -> None:
-        """Makes QMIX's first value the sum of its agents' values, as VDN's is, or nearly so.
+        """Start QMIX with a total value that is nearly the sum of its agents' values, as in VDN.
 
-        As layers are drawn, the mixing network multiplies it by four or more: agents' networks then
-        have to learn what is a quarter as large, in the same noise.
+        Default initial weights multiply the sum by four or more. The agents' values would then be a
+        quarter as large, with the same noise.
         """
         weight = self.config.mixing**-0.5
         with torch.no_grad():
@@ -220,7 +224,7 @@ class BenchMARL(LibraryLearner):
         given = self.config
         config = ExperimentConfig.get_from_yaml()
         config.loggers, config.create_json, config.evaluation = [], False, False
-        config.collect_with_grad = True  # no collector: `_train` plays
+        config.collect_with_grad = True  # BenchMARL then makes no collector; `_train` plays
         config.max_n_frames, config.exploration_anneal_frames = 10**9, given.explore
         config.lr, config.gamma, config.clip_grad_val = (
             given.learning_rate,
@@ -266,7 +270,7 @@ class BenchMARL(LibraryLearner):
     def _update(self, played: Any) -> None:
         experiment = self._experiment
         kept = played.exclude(*experiment._get_excluded_keys(_GROUP))
-        # the sum, not BenchMARL's mean: each agent's part of the value is then of order one
+        # r = Σ_i r_i, not BenchMARL's mean: each agent's share of the value is then of order one.
         kept.set(("next", "reward"), kept["next", _GROUP, "reward"].sum(-2))
         self._buffer.extend(experiment.algorithm.process_batch(_GROUP, kept))
         for _ in range(self.config.updates):
@@ -274,7 +278,7 @@ class BenchMARL(LibraryLearner):
         self._explorer().step(len(played))
 
     def _explorer(self) -> Any:
-        """Return the module that replaces greedy actions by random ones."""
+        """Return the module that replaces some greedy actions by random ones."""
         return self._experiment.group_policies[_GROUP][-1]
 
     def _actors(self) -> Sequence[Sequence[nn.Linear]]:
@@ -315,13 +319,13 @@ class BenchMARL(LibraryLearner):
 
 @dataclass(frozen=True)
 class Args(BaselineArgs):
-    """Trains QMIX or VDN of BenchMARL on one scenario."""
+    """Train QMIX or VDN of BenchMARL on one scenario."""
 
     benchmarl: Annotated[BenchMARLConfig, tyro.conf.arg(name="")] = BenchMARLConfig()
 
 
 def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
-    """Trains and evaluates; writes the results if `args.out` is given."""
+    """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: BenchMARL(env, args.benchmarl, args.seed), on_episode)
 
 

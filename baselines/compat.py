@@ -1,8 +1,9 @@
 """Matrix of learners and environments: equal and unequal intersections, masks, real roads.
 
-Every learner trains a little in each of the environments below, in a process of its own, so that
-one that hangs or dies says so and harms no other. The matrix has what was found, the versions it
-was found with, and how many decisions a second that is (training included; orders of magnitude).
+Every learner trains a few episodes in each of the environments below. It has its own process: a
+learner that hangs or dies does not stop the others. The matrix shows the version of each library
+and the speed in decisions per second, training included, or the failure. Speeds are orders of
+magnitude.
 
     python baselines/compat.py
     python baselines/compat.py --learners sb3-ppo maskable-ppo
@@ -34,7 +35,7 @@ PATIENCE_S = 900.0
 
 
 def environment(name: str) -> Any:
-    """The environment of a column."""
+    """Return the environment of a column."""
     if name.endswith("-v1"):
         return parallel_env(name, duration_s=120)
     words = name.split()
@@ -45,7 +46,7 @@ COLUMNS = ("equal", "unequal", "equal masks", "unequal masks", "grid2x2-v1", "mi
 
 
 def attempt(learner: str, column: str) -> str:
-    """Trains, plays an episode, and says how fast the training was."""
+    """Train, play an episode, and return the speed of the training in decisions per second."""
     with contextlib.closing(environment(column)) as env:
         made = learner_factory(learner)(env, 0)
         lengths: list[int] = []
@@ -69,11 +70,11 @@ def attempt(learner: str, column: str) -> str:
 
 @dataclass(frozen=True)
 class Compat:
-    """Runs the learners in all environments and prints the matrix.
+    """Run the learners in all environments and print the matrix.
 
     Attributes:
-        learners: Names; all that are known, if none is given.
-        only: Used by the command itself: one learner, its results as JSON.
+        learners: Names of learners; default: all.
+        only: For internal use: run one learner and print its results as JSON.
         need_all: Count a library that is not installed as a failure.
     """
 
@@ -82,7 +83,7 @@ class Compat:
     need_all: bool = False
 
     def run(self) -> int:
-        """Returns 1 if something failed."""
+        """Run the command; return 1 if something failed."""
         if self.only:
             print(json.dumps({column: tried(self.only, column) for column in COLUMNS}))
             return 0
@@ -109,7 +110,7 @@ class Compat:
 
 
 def tried(learner: str, column: str) -> str:
-    """The speed, or the error in one line."""
+    """Return the result of `attempt`, or the error in one line."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -121,7 +122,7 @@ def tried(learner: str, column: str) -> str:
 
 
 def in_a_process(learner: str) -> dict[str, str]:
-    """Train a learner in each environment and return what came of it."""
+    """Train a learner in each environment, in another process; return the results by column."""
     command = [sys.executable, "-P", __file__, "--only", learner]
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
     try:
@@ -143,7 +144,7 @@ def in_a_process(learner: str) -> dict[str, str]:
 
 
 def short(text: str) -> str:
-    """A cell."""
+    """Return a result in the form of a table's cell."""
     if text.endswith("/s"):
         return text.removesuffix("/s")
     return "-" if "is not installed" in text else "fails"

@@ -1,8 +1,8 @@
-"""IPPO and MAPPO on the suite's environments, in one file and with nothing but torch and numpy.
+"""IPPO and MAPPO on the suite's environments, in one file, with torch and numpy only.
 
-Proximal policy optimisation (Schulman et al. 2017) by every intersection for itself (IPPO, de Witt
-et al. 2020), or with a critic that sees the whole network (MAPPO, Yu et al. 2022), and the details
-that matter (Huang et al. 2022, "The 37 implementation details of PPO").
+Proximal policy optimisation (Schulman et al. 2017). In IPPO each critic sees the observation of
+its intersection (de Witt et al. 2020); in MAPPO it sees the whole network (Yu et al. 2022). Details
+follow Huang et al. (2022), "The 37 implementation details of PPO".
 
     python baselines/ippo.py --scenario grid2x2-v1 --episodes 100 --out runs/ippo
     python baselines/ippo.py --scenario mixed-v1 --centralised
@@ -40,7 +40,7 @@ from ugat_marl.policies import (
 from ugat_marl.policies import EpisodeCallback as Callback
 from ugat_marl.seeding import derive_seed, torch_generator
 
-_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # names in Adam's state
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class IPPOConfig:
     """Settings of the learner."""
 
     centralised: bool = False  # the critic sees env.state() (MAPPO), not an observation (IPPO)
-    shared: bool = True  # one actor and critic for all agents, told whose they are; or one for each
+    shared: bool = True  # one actor and critic for all agents, with a one-hot; or one for each
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
     learning_rate: float = 1e-3  # step size of Adam
     anneal_episodes: int = 0  # the step size falls to 0 over so many episodes; 0 keeps it
@@ -61,7 +61,7 @@ class IPPOConfig:
     update_every: int = 120  # decisions in a roll-out; the end of an episode ends one too
     epochs: int = 8  # passes over each roll-out
     minibatch: int = 30  # decisions (of all agents) in a gradient step
-    reward_scale: float | None = None  # factor on rewards; none: by their mean and deviation so far
+    reward_scale: float | None = None  # factor on rewards; none: standardise with running moments
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -78,10 +78,11 @@ class IPPOConfig:
 def network(
     agents: AgentSet, config: IPPOConfig, n_in: int, n_out: int, gain: float, rng: torch.Generator
 ) -> nn.Module:
-    """Perceptrons from ``(agents, batch, n_in)`` to ``(agents, batch, n_out)``.
+    """Return perceptrons from ``(agents, batch, n_in)`` to ``(agents, batch, n_out)``.
 
-    Weights are orthogonal, those of the last layer times `gain`, and biases zero. A shared one is
-    told whose input it computes, as by `ugat_marl.envs.wrappers.agent_indicator`.
+    Weights are orthogonal: times `gain` in the last layer, times √2 before. Biases are zero. A
+    shared perceptron gets a one-hot of the agent, as `ugat_marl.envs.wrappers.agent_indicator`
+    adds it.
     """
     if config.shared:
         made: nn.Module = SharedMLP(len(agents), n_in, config.hidden, n_out, rng)
@@ -98,10 +99,19 @@ def network(
 
 
 def gae(rewards: Tensor, values: Tensor, discount: float, gae_lambda: float) -> Tensor:
-    """Generalised advantage estimates (Schulman et al. 2016, equation 16), ``(agents, decisions)``.
+    """Return generalised advantage estimates (Schulman et al. 2016, equation 16).
 
-    `rewards` has no end in between. `values` are those before each decision and the one after the
-    last, ``(agents, decisions + 1)``: it bootstraps the roll-out, be it cut off or truncated.
+    δ_t = r_t + γ V_{t+1} - V_t and A_t = δ_t + γ λ A_{t+1}.
+
+    Args:
+        rewards: Rewards r without an end of an episode in between, ``(agents, decisions)``.
+        values: Values V before each decision and after the last, ``(agents, decisions + 1)``. The
+            last one bootstraps the roll-out.
+        discount: γ.
+        gae_lambda: λ.
+
+    Returns:
+        Advantages A, ``(agents, decisions)``.
     """
     errors = rewards + discount * values[:, 1:] - values[:, :-1]
     for i in reversed(range(errors.shape[1] - 1)):
@@ -110,7 +120,16 @@ def gae(rewards: Tensor, values: Tensor, discount: float, gae_lambda: float) -> 
 
 
 class Decision(NamedTuple):
-    """A decision of all agents: inputs, choice and outcome, all ``(agents, ...)``."""
+    """A decision of all agents: inputs, choice and outcome, all ``(agents, ...)``.
+
+    Attributes:
+        observation: Input of the actors.
+        viewed: Input of the critics.
+        allowed: Action masks, ``(agents, actions)``.
+        action: Chosen actions, ``(agents,)``.
+        log_probability: Log-probabilities of the chosen actions, ``(agents,)``.
+        reward: Rewards, ``(agents,)``.
+    """
 
     observation: Tensor
     viewed: Tensor
@@ -121,10 +140,10 @@ class Decision(NamedTuple):
 
 
 class IPPO:
-    """Learns by PPO for all agents of `env`, equal or not; a `Learner` of the suite.
+    """Learner by PPO for all agents of `env`, equal or not; a `Learner` of the suite.
 
-    Roll-outs are bootstrapped with the critic's value where an episode is truncated; only where an
-    agent terminates, its future counts as zero reward.
+    A roll-out that ends by truncation is bootstrapped with the critic's value. If an agent
+    terminates, its future rewards count as zero.
     """
 
     def __init__(self, env: Env, config: IPPOConfig | None = None, seed: int = 0) -> None:
@@ -142,15 +161,15 @@ class IPPO:
         self._critic = network(agents, config, n_in, 1, 1.0, rng)
         self._weights = flatten_parameters(nn.ModuleList([self._actor, self._critic]))
         self._adam = torch.optim.Adam([self._weights], eps=1e-5)
-        # of what observations and states are divided by, so that small numbers are heard at once
+        # Scales of observations and states: without them, small inputs have little effect at first.
         self._seen, self._stated = InputScale(agents.widest_observation), InputScale(n_in)
-        # of each agent's rewards so far: their number, their sum, the sum of their squares
+        # Number, sum and sum of squares of each agent's rewards so far.
         self._rewards = torch.zeros(3, len(agents), 1, dtype=torch.float64)
 
     def learn(
         self, env: Env, episodes: int, seed: int, on_episode: Callback | None = None
     ) -> NetworkPolicy:
-        """Trains for `episodes` more; what it draws depends on `seed` and their number so far."""
+        """Train further `episodes`; random choices depend on `seed` and the episodes so far."""
         if AgentSet.of(env) != self.agents:
             raise OptionError(f"agents are {AgentSet.of(env)}, this learner's {self.agents}")
         with one_thread():
@@ -161,20 +180,21 @@ class IPPO:
         return self.policy()
 
     def policy(self) -> NetworkPolicy:
-        """The current policy, greedy; a snapshot.
+        """Return a snapshot of the current greedy policy.
 
-        It is of DQN's class, with logits in place of Q, so that all of `ugat-marl` reads its files.
+        Its class is DQN's, with logits in place of Q, so all commands of `ugat-marl` read its
+        files.
         """
         parameters = reading_unscaled(self._actor, torch.from_numpy(self._seen.factors))
         hidden, shared = self.config.hidden, self.config.shared
         return NetworkPolicy(self.agents, hidden, parameters, self.env_options, shared)
 
     def save(self, path: Path) -> None:
-        """Writes the whole state, from which `load` goes on to the same numbers."""
+        """Write the whole state; after `load`, training continues with the same numbers."""
         write_checkpoint(path, "baselines.ippo", self._content())
 
     def load(self, path: Path) -> None:
-        """Restores what `save` wrote; a `CheckpointError` if that is of another learner."""
+        """Restore the state that `save` wrote; raise `CheckpointError` for another learner's."""
         content, own = read_checkpoint(path, "baselines.ippo"), self._content()
         for name, value in own.items():
             found = content.get(name)
@@ -230,7 +250,7 @@ class IPPO:
         return {"return": total} | told
 
     def _look(self, env: Env, observations: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """Return the inputs of actors and critics, scaled by all they have seen so far."""
+        """Return the inputs of actors and critics, scaled by the running scales."""
         rows = self.agents.stack(observations)
         self._seen.note(rows, places(self.agents))
         seen = torch.from_numpy(rows * self._seen.factors)
@@ -245,7 +265,10 @@ class IPPO:
         return self._actor(seen).masked_fill(~allowed, -1e8).log_softmax(-1)
 
     def _draw(self, seen: Tensor, allowed: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
-        """An action drawn for each agent, by the Gumbel trick, and its logarithmic probability."""
+        """Draw an action for each agent and return actions and log-probabilities, ``(agents,)``.
+
+        Gumbel trick: the argmax of log p - log(-log U), U uniform in (0, 1), has probabilities p.
+        """
         with torch.no_grad():
             logs = self._log_probabilities(seen[:, None], allowed[:, None]).squeeze(1)
             uniform = torch.rand(logs.shape, generator=rng).clamp_min(1e-9)
@@ -259,7 +282,8 @@ class IPPO:
         config, (centre, scale) = self.config, self._reward_scale(batch.reward)
         with torch.no_grad():
             values = self._critic(torch.cat((batch.viewed, after[:, None]), dim=1)).squeeze(-1)
-            nothing = -centre * scale / (1 - config.discount)  # no reward for ever, in our unit
+            # Reward 0 is (0 - centre) * scale after scaling; for ever: divided by 1 - discount.
+            nothing = -centre * scale / (1 - config.discount)
             values[:, -1] = torch.where(over, nothing.squeeze(-1), values[:, -1])
             rewards = (batch.reward - centre) * scale
             returns = gae(rewards, values, config.discount, config.gae_lambda) + values[:, :-1]
@@ -273,7 +297,10 @@ class IPPO:
         return losses
 
     def _reward_scale(self, rewards: Tensor) -> tuple[Tensor, Tensor]:
-        """Centre and scale of each agent's rewards, these ones included, ``(agents, 1)``."""
+        """Return centre and scale of each agent's rewards so far, these included, ``(agents, 1)``.
+
+        The scaled reward is (r - mean) / deviation. A given `reward_scale` is used with centre 0.
+        """
         if self.config.reward_scale is not None:
             return torch.zeros(len(rewards), 1), torch.tensor(self.config.reward_scale)
         self._rewards += torch.stack([rewards.double() ** k for k in range(3)]).sum(2, keepdim=True)
@@ -287,6 +314,7 @@ class IPPO:
         ratio = (chosen - part.log_probability).exp()
         advantages = returns - values
         gain = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+        # PPO, equation 7: loss = -E[min(ratio * gain, clip(ratio, 1 - ε, 1 + ε) * gain)].
         clipped = ratio.clamp(1 - self.config.clip, 1 + self.config.clip)
         policy_loss = -torch.minimum(ratio * gain, clipped * gain).mean()
         value_loss = 0.5 * (self._critic(part.viewed).squeeze(-1) - returns).square().mean()
@@ -295,19 +323,19 @@ class IPPO:
         (loss - self.config.entropy_weight * entropy).backward()
         nn.utils.clip_grad_norm_([self._weights], self.config.max_gradient)
         self._adam.step()
-        self._adam.zero_grad(set_to_none=False)  # the networks' gradients are views of it
+        self._adam.zero_grad(set_to_none=False)  # the networks' gradients are views of this one
         return [number.item() for number in (policy_loss, value_loss, entropy)]
 
 
 @dataclass(frozen=True)
 class Args(BaselineArgs):
-    """Trains IPPO, or with --centralised MAPPO, on one scenario."""
+    """Train IPPO, or with --centralised MAPPO, on one scenario."""
 
     ppo: Annotated[IPPOConfig, tyro.conf.arg(name="")] = IPPOConfig()
 
 
 def train(args: Args, on_episode: Callback | None = None) -> Result:
-    """Trains and evaluates; writes the results if `args.out` is given."""
+    """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: IPPO(env, args.ppo, args.seed), on_episode)
 
 

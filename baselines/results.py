@@ -1,8 +1,8 @@
 """Results of the learners: trainings over several seeds, beside fixed time and the best rule.
 
-Every training is a process of its own in a folder of its own under `--runs`. A killed run goes on
-where it was, and more seeds or episodes later train only those. A page and a table for each
-scenario say which library it was, how fast, and the travel times of the last and of the best
+Every training has its own process and its own folder under `--runs`. An interrupted run resumes. A
+later run with more seeds or episodes does only the additional trainings. Each scenario gets a page
+and a table: library and speed of each learner, and the travel times of its last and its best
 evaluation.
 
     python baselines/results.py --scenarios grid4x4-v1 --episodes 30
@@ -30,11 +30,11 @@ from ugat_marl.reporting import curves_as_csv, curves_page
 
 @dataclass(frozen=True)
 class Results:
-    """Trains the learners on the scenarios and writes the results beside those of the rules.
+    """Train learners on scenarios and write their results beside the rules'.
 
     Attributes:
         scenarios: Scenarios, a page each.
-        config: What is trained, and how it is judged.
+        config: Options of trainings and evaluations.
         jobs: Trainings at a time.
         out: Folder of pages and tables.
         runs: Folder of the trainings.
@@ -54,7 +54,7 @@ class Results:
         """Train, judge and write; return 1 if a training failed."""
         console, failures = Console(), dict[str, str]()
         scenarios = {name: load_scenario(name) for name in self.scenarios}
-        for name in scenarios:  # what is wrong is said before anything is trained
+        for name in scenarios:  # a folder that is not writable is an error before the trainings
             require_writable(self.out / f"{file_stem(name)}.md")
         for name, scenario in scenarios.items():
             page = self.out / f"{file_stem(name)}.md"
