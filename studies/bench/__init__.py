@@ -1,8 +1,8 @@
-"""The suite's figures, measured: speed of the environment, cost and worth of learning, memory.
+"""Benchmarks: speed of the environment, cost and strength of learning, memory.
 
 Every bench is a frozen dataclass of options with a ``run()`` that returns a `Report`: rows, targets
-and what they were measured on. Ratios are taken between runs of the same round, next to each other
-in time, since a machine's speed drifts by more than what is measured.
+and the machine. Ratios are taken between runs of the same round, which follow each other directly,
+because the speed of a machine drifts by more than the measured differences.
 """
 
 from studies.bench.device import DeviceBench

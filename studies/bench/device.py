@@ -1,4 +1,4 @@
-"""``bench device``: number of intersections from which on a GPU is faster."""
+"""``bench device``: find the number of intersections from which on a GPU is faster."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ _PROGRAM = ["-m", "studies.bench.device_program"]
 
 @dataclass(frozen=True)
 class DeviceBench:
-    """Time of an update of DQN and of a fit of f and h, on the CPU and on a GPU, size by size.
+    """Time updates of DQN and fits of f and h on the CPU and on a GPU.
 
-    Observations, rewards and transitions are random: nothing is simulated. Every round measures
-    each size on the CPU and directly after it on the GPU. Times are wall time, with all that goes
-    back and forth; the CPU computes on one thread, as it does in training.
+    Observations, rewards and transitions are random; nothing is simulated. Every round measures
+    each size on the CPU and directly after it on the GPU. Times are wall time and include all
+    transfers. The CPU computes on one thread, as in training.
 
     Examples:
         python -m studies.bench device --device cuda --out device.json
         python -m studies.bench device --device cuda:1 --sizes 64 256 --rounds 9
 
     Attributes:
-        device: What is compared with the CPU: cuda, or cuda:N.
+        device: Device to compare with the CPU: cuda, or cuda:N.
         sizes: Numbers of intersections.
         rounds: Repetitions; medians and quartiles are over these.
         updates: Updates that are timed together.
         batch_size: Transitions per update and intersection.
         epochs: Passes over the rows in each of the three trainings of a fit.
-        steps: Decisions in each of the four episodes that are fitted.
-        seed: Of all that is drawn.
+        steps: Decisions in each of the four episodes of the log.
+        seed: Seed of all random numbers.
         out: JSON file to write.
     """
 
@@ -71,10 +71,10 @@ class DeviceBench:
         """Measure, and write `out` if it is given.
 
         Args:
-            reporter: Is told what is being measured.
+            reporter: Reporter of the progress.
 
         Raises:
-            OptionError: Torch sees no such GPU.
+            OptionError: Torch finds no such GPU.
             MeasurementError: The measured process failed.
         """
         device_of(self.device)
@@ -91,7 +91,7 @@ def compared(found: dict[str, Any], settings: dict[str, Any]) -> Report:
     """Tabulate the times of both devices, and note from which size on the device is faster.
 
     Args:
-        found: What `device_program.measure` returns.
+        found: Result of `device_program.measure`.
         settings: Options of the bench.
     """
     sizes, device = settings["sizes"], settings["device"]
@@ -122,8 +122,8 @@ def pays_from(sizes: Sequence[int], ratios: Sequence[float]) -> int | None:
     """Return the smallest size from which on the device is faster; None if it never is.
 
     Args:
-        sizes: Rising.
-        ratios: Time on the CPU over time on the other device, one per size.
+        sizes: Sizes in ascending order.
+        ratios: For each size, time on the CPU / time on the other device.
     """
     first: int | None = None
     for size, ratio in zip(reversed(sizes), reversed(ratios), strict=True):

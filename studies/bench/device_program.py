@@ -1,4 +1,4 @@
-"""Measured program: updates of DQN and fits of f and h, on the CPU and elsewhere in turn."""
+"""Measured program: updates of DQN and fits of f and h, on the CPU and on a GPU in turn."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from ugat_marl.policies import CPU, DQN, DQNConfig, device_of
 from ugat_marl.seeding import numpy_generator, torch_generator
 
 LAYOUT = AgentLayout(features=16, phases=8)
-"""Of every intersection, that of a crossing with four lanes on each approach."""
+"""Layout of the observations of every intersection: a crossing with four lanes per approach."""
 
 EPISODES = 4
-"""One of them is held out."""
+"""Episodes of the log; one is held out."""
 
 
 def random_log(agents: int, steps: int, seed: int) -> TransitionLog:
-    """Draw random transitions in the form of recorded ones."""
+    """Draw random transitions in the form of a recorded log."""
     layouts = {f"agent_{index}": LAYOUT for index in range(agents)}
     seeds = tuple(range(EPISODES))
     told = Provenance("random", "", "sim", seeds, 10.0, "count", layouts)
@@ -57,7 +57,7 @@ class Updates:
         self._updates: int = request["updates"]
 
     def time(self) -> float:
-        """Return wall ms of one update, with its weights handed to the acting networks."""
+        """Return wall ms of one update, including the copy of weights to the acting networks."""
         began = time.perf_counter()
         for _ in range(self._updates):
             self._learner._update(self._generator)
@@ -72,12 +72,12 @@ class Fits:
         self, request: Mapping[str, Any], log: TransitionLog, device: torch.device
     ) -> None:
         self._log, self._device, self._seed = log, device, request["seed"]
-        # held-out loss does not fall on noise: without that patience it would be over at once
+        # held-out loss does not fall on noise, so less patience would end the fit at once
         self._config = FitConfig(epochs=request["epochs"], patience=request["epochs"])
         self._transform = PhaseTransform(log.provenance.layouts, self._seed)
 
     def time(self) -> float:
-        """Return wall s of a whole fit, with reading the log and scoring the models."""
+        """Return wall s of a whole fit, including reading the log and scoring the models."""
         fitter = Fitter(self._config, self._seed, device=self._device)
         began = time.perf_counter()
         self._transform.fit(self._log, self._log, fitter)
@@ -85,7 +85,7 @@ class Fits:
 
 
 def measure(request: Mapping[str, Any]) -> dict[str, Any]:
-    """Measure all sizes on both devices, round by round, after a first use that is not counted."""
+    """Measure all sizes on both devices, round by round, after a first fit that is not counted."""
     torch.set_num_threads(1)
     there = device_of(request["device"])
     devices = {"cpu": CPU, "device": there}

@@ -1,4 +1,4 @@
-"""``bench env``: simulated seconds per wall second, as a ratio to SUMO alone."""
+"""``bench env``: measure simulated seconds per wall second, as a ratio to SUMO alone."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ Run = dict[str, Any]
 ``arrived``."""
 
 SUMO_RL_TIMING: Mapping[str, float] = {"yellow_s": 2.0, "all_red_s": 0.0, "min_green_s": 5.0}
-"""The clearance and minimum green sumo-rl has by default; it knows no all-red."""
+"""Default clearance and minimum green of sumo-rl, which has no all-red."""
 BARE, INPROCESS, PROCESS = "libsumo alone", "ugat-marl in-process", "ugat-marl worker process"
 SUMO_RL_USUAL, SUMO_RL_LEAN = f"sumo-rl {SUMO_RL}", f"sumo-rl {SUMO_RL} without metrics"
 OWN_TIMING, SUMO_RL_CLEARANCE = "own", "sumo-rl's"
 
 Variant = tuple[str, str]
-"""Whose signal timing, and who does the work."""
+"""Origin of the signal timing, and the program that is measured."""
 
 
 @dataclass(frozen=True)
 class EnvBench:
-    """Speed of the environment against SUMO alone and against sumo-rl.
+    """Compare the speed of the environment with SUMO alone and with sumo-rl.
 
-    Every measured episode has a process of its own. A round measures all variants one after the
-    other, each round beginning with another one, and ratios are taken within a round. SUMO alone
-    replays the very signal states the environment showed, at the same seconds, with the same
-    options and no output; the same vehicles enter and arrive, or the bench fails. sumo-rl gets the
-    same actions, and the environment its clearance times, so that both have the same traffic.
+    Every measured episode runs in its own process. A round measures all variants one after the
+    other; each round begins with another variant. Ratios are taken within a round. SUMO alone
+    replays the signal states of the environment at the same seconds, with the same options and no
+    output. If other vehicles enter or arrive, the bench fails. sumo-rl gets the same actions, and
+    the environment gets the clearance times of sumo-rl, so both have the same traffic.
 
     Examples:
         python -m studies.bench env --rounds 3 --out speed.json
 
     Attributes:
-        scenarios: What to simulate.
+        scenarios: Scenarios to simulate.
         rounds: Repetitions; medians and quartiles are over these.
         duration_s: Simulated seconds per episode.
-        decision_interval_s: Seconds from decision to decision; None for the scenario's own (10).
+        decision_interval_s: Seconds between decisions; None for the scenario's own (10).
         seed: Seed of the simulation and of the random actions.
-        sumo_rl: Whether to compare with sumo-rl, which is installed into an environment of its own
-            the first time.
-        cache: Folder for that environment.
+        sumo_rl: Compare with sumo-rl. The first time, it is installed into its own virtual
+            environment.
+        cache: Folder for this virtual environment.
         out: JSON file to write.
     """
 
@@ -73,10 +73,10 @@ class EnvBench:
         """Measure, and write `out` if it is given.
 
         Args:
-            reporter: Is told how far the measuring has come.
+            reporter: Reporter of the progress.
 
         Raises:
-            MeasurementError: A measured process failed, or did not do the same work.
+            MeasurementError: A measured process failed, or had different traffic.
         """
         reporter = reporter or Silent()
         other = install_sumo_rl(self.cache, reporter.say) if self.sumo_rl else None
@@ -182,7 +182,8 @@ _SAME_TRAFFIC = 0.02
 def _check_round(runs: Mapping[Variant, Run]) -> None:
     """Require the same vehicles in the suite and in SUMO alone, and nearly the same in sumo-rl.
 
-    (It keeps a green protected through a yellow after which it is permissive; the suite does not.)
+    sumo-rl differs in one case: it keeps a green protected during a yellow after which the green is
+    permissive.
     """
     for timing in dict.fromkeys(timing for timing, _ in runs):
         own = {who: run for (whose, who), run in runs.items() if whose == timing}
@@ -191,7 +192,7 @@ def _check_round(runs: Mapping[Variant, Run]) -> None:
 
 
 def _speeds(runs: list[Run]) -> list[float]:
-    """Episodes per wall second."""
+    """Return episodes per wall second."""
     return [1.0 / run["steps_s"] for run in runs]
 
 
@@ -218,7 +219,7 @@ def _targets(scenario: str, runs: Mapping[Variant, list[Run]]) -> list[Target]:
 
 
 def _ceiling(scenario: str, runs: Mapping[Variant, list[Run]]) -> str:
-    """Return a note on the largest possible speed-up over sumo-rl."""
+    """Return a note on the largest possible gain of speed over sumo-rl."""
     bare, other = (
         _speeds(runs[SUMO_RL_CLEARANCE, BARE]),
         _speeds(runs[SUMO_RL_CLEARANCE, SUMO_RL_USUAL]),
@@ -254,12 +255,12 @@ class Task:
         duration_s: float,
         seed: int,
     ) -> Task:
-        """Run an episode with random actions and notes what is needed to repeat it.
+        """Run an episode with random actions and record the requests that repeat it.
 
         Args:
-            scenario: What to simulate.
+            scenario: Scenario to simulate.
             control: Changes to its signal timing.
-            folder: An empty folder that lives as long as the task.
+            folder: An empty folder that exists as long as the task.
             duration_s: Simulated seconds.
             seed: Seed of simulation and actions.
         """
@@ -294,7 +295,7 @@ class Task:
         return self._counted(in_fresh_process([_FOLDER / "env_libsumo_program.py"], self.bare))
 
     def by_suite(self, simulator: str) -> Run:
-        """Play the episode in the suite, its simulator in this or in another process."""
+        """Play the episode in the suite, with the simulator in this or in another process."""
         return self._counted(_episode({**self.request, "simulator": simulator}))
 
     def by_sumo_rl(self, sumo_rl: SumoRl, *, metrics: bool) -> Run:
@@ -318,8 +319,8 @@ def _episode(request: Mapping[str, Any]) -> dict[str, Any]:
 def find_scenario(name: str, sumo_rl: SumoRl | None) -> tuple[str | Path, str | None]:
     """Return the source of a scenario, and a note for the reader.
 
-    RESCO networks come from an installed sumo-rl wheel, from the environment the bench made for
-    sumo-rl, or are replaced by the shipped 4x4 grid.
+    RESCO networks come from an installed sumo-rl or from the virtual environment of the bench.
+    Without both, the shipped 4x4 grid replaces them.
     """
     if not name.startswith("resco:") or find_spec("sumo_rl") is not None:
         return name, None
@@ -336,11 +337,11 @@ def require_same_work(runs: Mapping[str, Run], tolerance: float = 0.0) -> None:
     """Refuse to compare episodes with different traffic.
 
     Args:
-        runs: Name to run; the first is what the others are compared with.
-        tolerance: Difference of the vehicles that entered and arrived that is let pass, as a share.
+        runs: Name to run; the others are compared with the first.
+        tolerance: Largest allowed difference of the vehicles that entered and arrived, as a share.
 
     Raises:
-        MeasurementError: They differ by more.
+        MeasurementError: A difference is larger.
     """
     first = next(iter(runs.values()))
     for run in runs.values():

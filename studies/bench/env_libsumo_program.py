@@ -1,7 +1,7 @@
 """Measured program: SUMO alone shows given signal states at given seconds, and nothing else.
 
-The yardstick of `studies.bench.env`: libsumo without the suite, so that this and the simulator
-are the only files that import it.
+`studies.bench.env` compares all variants with it. It uses libsumo without the suite. Only this file
+and the simulator import libsumo.
 """
 
 from __future__ import annotations

@@ -16,14 +16,14 @@ from ugat_marl.simulation import Launch, LibsumoSimulator, Plans, Snapshot, Trip
 
 
 class RecordingSimulator:
-    """A simulator in this process that notes what it was started with and when signals changed.
+    """A simulator in this process that records its launch and every change of signals.
 
     Args:
-        folder: Where files written for the simulation are kept.
+        folder: Folder for the files of the simulation.
 
     Attributes:
-        switches: ``[time_s, [[traffic light, state], ...]]``, changes only, in order of time.
-        launch: What it was started with, or None.
+        switches: Changes of signals, ``[time_s, [[traffic light, state], ...]]``, in order of time.
+        launch: Launch of the simulation; None before the first start.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -35,7 +35,7 @@ class RecordingSimulator:
         self.launch: Launch | None = None
 
     def start(self, launch: Launch) -> Snapshot:
-        """Start a simulation and forgets what was noted."""
+        """Start a simulation and forget the earlier record."""
         self.launch, self._now, self._shown, self.switches = launch, launch.begin_s, {}, []
         snapshot = self._simulator.start(launch)
         shutil.copytree(launch.directory, self._folder, dirs_exist_ok=True)
@@ -56,11 +56,11 @@ class RecordingSimulator:
         return self._simulator.advance(seconds, plans)
 
     def vehicles(self) -> VehiclePicture:
-        """Positions of all vehicles now."""
+        """Return the current positions of all vehicles."""
         return self._simulator.vehicles()
 
     def signals(self) -> dict[str, str]:
-        """State of every traffic light now."""
+        """Return the current state of every traffic light."""
         return self._simulator.signals()
 
     def finish(self) -> Trips:
@@ -72,7 +72,7 @@ class RecordingSimulator:
         self._simulator.close()
 
     def bare_request(self) -> dict[str, Any]:
-        """Return the request with which `studies.bench.env_libsumo_program` does the same."""
+        """Return the request for `studies.bench.env_libsumo_program` to repeat the episode."""
         assert self.launch is not None
         pairs = zip(self.launch.arguments[::2], self.launch.arguments[1::2], strict=True)
         kept = [
@@ -90,9 +90,9 @@ class RecordingSimulator:
 
 
 def random_actions(env: TrafficEnv, seed: int) -> list[dict[str, int]]:
-    """Actions of a whole episode, drawn before the clock runs.
+    """Return random actions of a whole episode, drawn before the time is measured.
 
-    The first decision keeps every first phase, as sumo-rl does whatever it is told.
+    The first decision keeps every first phase, because sumo-rl always does so.
     """
     generator = numpy_generator(seed, "bench", "actions")
     agents = env.possible_agents
@@ -107,12 +107,12 @@ def episode(request: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         request: ``scenario``, ``control`` (changes to its timing), ``duration_s``, ``seed``,
-            ``simulator`` (see `EnvOptions`), and ``record``: a folder, if requests for the bare
-            replay and for sumo-rl are wanted.
+            ``simulator`` (see `EnvOptions`), and ``record``: a folder for the requests to SUMO
+            alone and to sumo-rl, or None.
 
     Returns:
-        Wall seconds of the reset and of all steps (the scores included), seconds of CPU this very
-        process used for the latter, and the vehicles that entered and arrived.
+        Wall seconds of the reset and of all steps (scores included), CPU seconds of this process
+        for the steps, and the vehicles that entered and arrived.
     """
     simulator, seed = request["simulator"], request["seed"]
     scenario = load_scenario(request["scenario"]).with_control(**request["control"])
@@ -122,7 +122,7 @@ def episode(request: dict[str, Any]) -> dict[str, Any]:
     if recorder is not None:
         env._simulator = recorder
     if simulator != "inprocess":
-        env.reset(seed=seed)  # starts the warm parent, once in the life of a user's process
+        env.reset(seed=seed)  # the first reset also starts the warm parent, once per process
     began = time.perf_counter()
     env.reset(seed=seed)
     started, computed = time.perf_counter(), time.process_time()

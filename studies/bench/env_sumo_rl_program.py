@@ -1,6 +1,6 @@
 """Measured program: an episode of sumo-rl.
 
-Runs in an environment of its own (see `studies.bench.sumo_rl`), without this suite.
+It runs in its own virtual environment (see `studies.bench.sumo_rl`), without this suite.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``bench all``: every figure in one report."""
+"""``bench all``: run all benches that measure time and memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ugat_marl.progress import Reporter
 
 @dataclass(frozen=True)
 class AllBench:
-    """All benches that measure the machine's time and memory, one after the other.
+    """Run all benches of time and memory, one after the other.
 
     Examples:
         python -m studies.bench all --env.rounds 3 --out bench
@@ -35,10 +35,10 @@ class AllBench:
     out: Path | None = None
 
     def run(self, reporter: Reporter | None = None) -> list[Report]:
-        """Measure all of them; each report is written as soon as it is there.
+        """Measure all of them; write each report when its bench ends.
 
         Args:
-            reporter: Is told how far the measuring has come.
+            reporter: Reporter of the progress.
 
         Raises:
             MeasurementError: A measured process failed.

@@ -1,4 +1,4 @@
-"""``bench fitting``: cost and calibration of each uncertainty of the inverse models."""
+"""``bench fitting``: measure cost and calibration of each uncertainty of the inverse models."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ _PROGRAM = ["-m", "studies.bench.fitting_program"]
 
 @dataclass(frozen=True)
 class FittingBench:
-    """Cost and calibration of the methods of uncertainty, on the same transitions.
+    """Measure cost and calibration of the methods of uncertainty.
 
-    A rule with 30 % random phases is rolled out in sim and in another domain. Every method is then
-    fitted to the simulated transitions with its default settings, all in turn, round by round, each
-    round with another seed. Times are CPU seconds of one thread.
+    A rule with 30 % random phases is rolled out in sim and in another domain. In every round, each
+    method is fitted to the same simulated transitions with its default settings. Each round has
+    another seed. Times are CPU seconds of one thread.
 
     Examples:
         python -m studies.bench fitting --out fitting.json
 
     Attributes:
-        scenario: What to simulate.
-        domain: Where h is asked about transitions that it was not fitted to.
-        episodes: Roll-outs in each of the two; one of them in four is held out.
+        scenario: Scenario to simulate.
+        domain: Domain of the transitions that h was not fitted to.
+        episodes: Roll-outs in sim and in the domain; one in four is held out.
         duration_s: Simulated seconds per episode.
         rounds: Fits of every method; medians and quartiles are over these.
-        epochs: Most epochs of a fit.
-        off_data_weight: How much certainty on invented inputs costs in a fit.
+        epochs: Largest number of epochs of a fit.
+        off_data_weight: Weight of the penalty for certainty on invented inputs.
         seed: Seed of simulation, exploration and weights.
         out: JSON file to write.
     """
@@ -54,7 +54,7 @@ class FittingBench:
         """Measure, and write `out` if it is given.
 
         Args:
-            reporter: Is told what is being measured.
+            reporter: Reporter of the progress.
 
         Raises:
             MeasurementError: The measured process failed.

@@ -31,11 +31,11 @@ from ugat_marl.seeding import torch_generator
 RULE = "largest-queue:20"
 EPSILON = 0.3
 ANSWERS = 200
-"""Answers that are timed together."""
+"""Answers of a model that are timed together."""
 
 
 def recorded(request: Mapping[str, Any], domain: str) -> TransitionLog:
-    """Roll-outs of the rule with random phases in between."""
+    """Return roll-outs of the rule with random phases in between."""
     options: dict[str, Any] = {"duration_s": request["duration_s"]}
     rule = controller_for(RULE, parallel_env(request["scenario"], domain, **options))
     env = parallel_env(request["scenario"], domain, **options, **rule.env_options)
@@ -79,7 +79,7 @@ def measured(
 
 @torch.no_grad()
 def answer_ms(model: InverseModel) -> float:
-    """CPU milliseconds of one answer for all agents."""
+    """Return CPU milliseconds of one answer for all agents."""
     row = torch.ones(len(model.stack.agents), 1, model.stack.width)
     began = time.process_time()
     for _ in range(ANSWERS):
@@ -93,7 +93,7 @@ def measure(request: Mapping[str, Any]) -> dict[str, Any]:
     simulated, real = recorded(request, "sim"), recorded(request, request["domain"])
     options = {name: request[name] for name in ("epochs", "off_data_weight")}
     configs = {method: FitConfig(uncertainty=method, **options) for method in METHODS}
-    for config in configs.values():  # what is loaded on first use is nobody's cost
+    for config in configs.values():  # loading on first use must not count
         measured(replace(config, epochs=1), simulated, real, request["seed"])
     found: dict[str, list[dict[str, float]]] = {method: [] for method in METHODS}
     for number in range(request["rounds"]):

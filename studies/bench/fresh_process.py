@@ -1,7 +1,7 @@
 """Run one measured program in a fresh process, so that no measurement warms up another.
 
-A program is called as ``python program request.json result.json``. It has a temporary folder of its
-own, and everything it prints is kept for the case that it fails.
+A program is called as ``python program request.json result.json``. It runs in its own temporary
+folder. If it fails, its output becomes part of the message.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ def in_fresh_process(
     variables: Mapping[str, str] | None = None,
     timeout_s: float = 3600.0,
 ) -> dict[str, Any]:
-    """Run a program and returns its result.
+    """Run a program and return its result.
 
     Args:
         program: Arguments of Python: ``["-m", module]`` or ``[path]``.
-        request: What the program is told, JSON-able.
-        python: Interpreter.
+        request: Input of the program, as values for JSON.
+        python: Python interpreter.
         variables: Environment variables to add; one thread per process is the default.
-        timeout_s: Patience.
+        timeout_s: Longest time of the program, in seconds.
 
     Raises:
         MeasurementError: The program failed, took too long or left no result.
@@ -69,7 +69,7 @@ def in_fresh_process(
 
 
 def _variables(scratch: Path, more: Mapping[str, str]) -> dict[str, str]:
-    # The checkout comes last, so that an installed suite is the one that is measured.
+    # The checkout comes last, so that an installed suite is measured if there is one.
     entries = [entry or str(Path.cwd()) for entry in sys.path]
     path = os.pathsep.join(dict.fromkeys([*entries, str(CHECKOUT)]))
     return {

@@ -1,4 +1,4 @@
-"""``bench learning``: cost of learning in an episode, and of many agents in an update."""
+"""``bench learning``: measure the cost of learning in an episode, and of agents in an update."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ _PROGRAM = ["-m", "studies.bench.learning_program"]
 
 @dataclass(frozen=True)
 class LearningBench:
-    """Cost of independent DQN, one batched update of all agents per decision.
+    """Measure the cost of DQN with one batched update of all agents per decision.
 
-    A training episode is compared with the same episode without a learner: the same seed and the
-    same actions, which are random, so that the traffic is the same to the vehicle. Both alternate
-    in one process, with the environment's simulator in its worker process.
+    A training episode is compared with the same episode without a learner. Seed and random actions
+    are the same, so the traffic is the same. Both alternate in one process; the simulator of the
+    environment runs in its worker process.
 
     Examples:
         python -m studies.bench learning --out learning.json
 
     Attributes:
-        scenario: What to simulate.
+        scenario: Scenario to simulate.
         rounds: Pairs of episodes; medians and quartiles are over these.
         duration_s: Simulated seconds per episode.
-        warmup_decisions: Decisions before the first update; measuring begins after them.
+        warmup_decisions: Decisions before the first update; the measurement begins after them.
         updates: Updates per repetition in the comparison of one agent with all.
         repetitions: Repetitions of that comparison.
         seed: Seed of simulation, exploration and weights.
@@ -57,7 +57,7 @@ class LearningBench:
         """Measure, and write `out` if it is given.
 
         Args:
-            reporter: Is told what is being measured.
+            reporter: Reporter of the progress.
 
         Raises:
             MeasurementError: The measured process failed.

@@ -1,4 +1,4 @@
-"""Measured program: training episodes, the same without a learner, and single updates."""
+"""Measured program: training episodes, the same episodes without a learner, single updates."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Vector = NDArray[np.float32]
 
 
 class Tape(BaseParallelWrapper[str, Vector, int]):
-    """Note seed and actions of an episode, and play them again without a learner."""
+    """Record seed and actions of an episode, and play them again without a learner."""
 
     def __init__(self, env: TrafficEnv) -> None:
         super().__init__(env)
@@ -34,28 +34,28 @@ class Tape(BaseParallelWrapper[str, Vector, int]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Vector], dict[str, dict[str, Any]]]:
-        """Start an episode and forgets the actions of the one before."""
+        """Start an episode and forget the actions of the last one."""
         self.seed, self.actions = seed, []
         return self.env.reset(seed=seed, options=options)
 
     def step(self, actions: Mapping[str, int]) -> Any:
-        """Note and make one decision."""
+        """Record and execute one decision."""
         self.actions.append(dict(actions))
         return self.env.step(dict(actions))
 
     def play(self) -> None:
-        """Play the noted episode again."""
+        """Play the recorded episode again."""
         self.env.reset(seed=self.seed)
         for actions in self.actions:
             self.env.step(actions)
 
 
 class Noise(ParallelEnv[str, Any, Any]):
-    """An environment without traffic, whose agents have the spaces of others.
+    """An environment without traffic, whose agents have given spaces.
 
     Args:
         spaces: Observation size and number of actions of each agent.
-        decisions: Length of an episode.
+        decisions: Decisions of an episode.
     """
 
     observation_spaces: dict[str, Box]
@@ -117,7 +117,7 @@ class Noise(ParallelEnv[str, Any, Any]):
 
 
 def config_of(request: Mapping[str, Any]) -> DQNConfig:
-    """The suite's settings, except that every action is random."""
+    """Return the default settings of DQN, except that every action is random."""
     return DQNConfig(
         epsilon_start=1.0,
         epsilon_end=1.0,
@@ -127,7 +127,7 @@ def config_of(request: Mapping[str, Any]) -> DQNConfig:
 
 
 def paired_episodes(request: Mapping[str, Any]) -> dict[str, Any]:
-    """Training episodes and their replays, alternating; wall seconds of each."""
+    """Play training episodes and their replays in turn; return the wall seconds of each."""
     env = parallel_env(request["scenario"], duration_s=request["duration_s"])
     tape = Tape(env)
     learner = DQN.of(tape, config_of(request), request["seed"])
@@ -160,7 +160,7 @@ def paired_episodes(request: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def update_costs(request: Mapping[str, Any], spaces: list[tuple[int, int]]) -> dict[str, Any]:
-    """Wall seconds per update of one agent and of all, alternating."""
+    """Return wall seconds per update of one agent and of all, measured in turn."""
     torch.set_num_threads(1)
     generator = torch_generator(request["seed"], "bench", "updates")
     learners: list[DQN] = []

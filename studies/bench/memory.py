@@ -1,4 +1,4 @@
-"""``bench memory``: growth of an environment over many resets."""
+"""``bench memory``: measure the growth of an environment over many resets."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ SIMULATORS = ("process", "inprocess")
 
 @dataclass(frozen=True)
 class MemoryBench:
-    """Memory, processes and open files over many resets of one environment.
+    """Measure memory, processes and open files over many resets of an environment.
 
     Examples:
         python -m studies.bench memory --resets 50
 
     Attributes:
-        scenario: What to simulate.
-        resets: Resets in all.
-        settled: Reset after which everything has been loaded; growth counts from there.
+        scenario: Scenario to simulate.
+        resets: Number of resets.
+        settled: Reset after which everything is loaded; growth is counted from here.
         steps: Steps after each reset.
-        seed: Seed of the actions; the episodes' seeds follow from it.
+        seed: Seed of the actions; the seeds of the episodes follow from it.
         out: JSON file to write.
     """
 
@@ -48,7 +48,7 @@ class MemoryBench:
         """Measure, and write `out` if it is given.
 
         Args:
-            reporter: Is told what is being measured.
+            reporter: Reporter of the progress.
 
         Raises:
             MeasurementError: The measured process failed.
@@ -85,7 +85,7 @@ class MemoryBench:
 
 
 def growth_of(early: float, late: float) -> float:
-    """Return the relative growth; 0 from 0 to 0, infinite from 0 to more."""
+    """Return the growth relative to `early`; from 0 to 0 it is 0, from 0 to more infinite."""
     if early == 0:
         return 0.0 if late == 0 else float("inf")
     return late / early - 1

@@ -1,4 +1,4 @@
-"""Measured program: resets one environment again and again and looks at its processes."""
+"""Measured program: reset one environment many times and measure its processes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.seeding import numpy_generator
 
 Process = tuple[int, int, float]
-"""Process id, its parent's id, resident memory in MiB."""
+"""Process id, id of the parent, resident memory in MiB."""
 
 
 def processes() -> list[Process]:
-    """All processes this one can see."""
+    """Return all processes that this one can see."""
     root = Path("/proc")
     if not (root / "self" / "statm").exists():
         listing = ["ps", "-A", "-o", "pid=,ppid=,rss="]
@@ -31,7 +31,7 @@ def processes() -> list[Process]:
     found: list[Process] = []
     for folder in root.iterdir():
         if folder.name.isdecimal():
-            with contextlib.suppress(OSError):  # it has ended meanwhile
+            with contextlib.suppress(OSError):  # the process may have ended meanwhile
                 parent = (folder / "stat").read_text().rpartition(")")[2].split()[1]
                 pages = (folder / "statm").read_text().split()[1]
                 found.append((int(folder.name), int(parent), int(pages) * page_mib))
@@ -39,7 +39,7 @@ def processes() -> list[Process]:
 
 
 def family(table: Sequence[Process], root: int) -> dict[int, float]:
-    """Resident memory in MiB of a process and all its descendants, by process id."""
+    """Return the resident memory in MiB of a process and all descendants, by process id."""
     members = {root}
     while more := {pid for pid, parent, _ in table if parent in members} - members:
         members |= more
@@ -47,19 +47,19 @@ def family(table: Sequence[Process], root: int) -> dict[int, float]:
 
 
 def open_files(pids: Iterable[int]) -> int:
-    """Open file descriptors of processes; of this one alone where the system hides the others."""
+    """Return the number of open files of processes; only of this one if others are hidden."""
     if Path("/proc/self/fd").exists():
         return sum(entries(Path("/proc", str(pid), "fd")) for pid in pids)
     return entries(Path("/dev/fd"))
 
 
 def entries(folder: Path) -> int:
-    """Number of entries of a folder."""
+    """Return the number of entries of a folder."""
     return sum(1 for _ in folder.iterdir())
 
 
 def look() -> dict[str, float]:
-    """Return memory, processes and files, which must not grow."""
+    """Return the numbers that must not grow: memory, processes and files."""
     members = family(processes(), os.getpid())
     return {
         "own memory [MiB]": members[os.getpid()],
@@ -71,7 +71,7 @@ def look() -> dict[str, float]:
 
 
 def resets(request: Mapping[str, Any]) -> dict[str, Any]:
-    """Reset and step; return what was seen early and late."""
+    """Reset and step; return the numbers early and late."""
     env = parallel_env(request["scenario"], simulator=request["simulator"])
     generator = numpy_generator(request["seed"], "bench", "memory")
     found: dict[str, dict[str, float]] = {}

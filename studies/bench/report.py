@@ -1,4 +1,4 @@
-"""Report of a bench: rows of numbers, targets, and the machine they belong to."""
+"""Report of a bench: rows of numbers, targets, and the machine."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Spread:
     """Median and quartiles of repeated measurements.
 
     Attributes:
-        median: Half of the values lie below.
+        median: Median of the values.
         low: First quartile.
         high: Third quartile.
-        values: All of them, in the order they were taken.
+        values: All values, in the order of measurement.
     """
 
     median: float
@@ -38,13 +38,13 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """The spread of at least one value; quartiles interpolate linearly."""
+        """Return the spread of at least one value; quartiles are interpolated linearly."""
         low, median, high = np.quantile(np.asarray(values, dtype=np.float64), [0.25, 0.5, 0.75])
         return cls(float(median), float(low), float(high), tuple(float(v) for v in values))
 
     @classmethod
     def of_ratios(cls, above: Sequence[float], below: Sequence[float]) -> Spread:
-        """The spread of ``above[i] / below[i]``: each ratio within one round."""
+        """Return the spread of ``above[i] / below[i]``, each ratio within one round i."""
         return cls.of([a / b for a, b in zip(above, below, strict=True)])
 
     def __str__(self) -> str:
@@ -53,13 +53,13 @@ class Spread:
 
 @dataclass(frozen=True)
 class Target:
-    """A figure the suite means to reach.
+    """A goal for a measured number.
 
     Attributes:
-        name: What is measured.
-        measured: Median.
-        limit: What it is compared with.
-        at_least: Whether `measured` has to reach `limit`, or must not exceed it.
+        name: Name of the measured number.
+        measured: Median of the measurements.
+        limit: Value to compare it with.
+        at_least: True if `measured` must be at least `limit`; false if at most.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Target:
 
     @property
     def met(self) -> bool:
-        """True if the figure reaches its limit; false for nan."""
+        """True if the goal is reached; false for nan."""
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit
 
     def __str__(self) -> str:
@@ -83,14 +83,14 @@ class Report:
     """Result of a bench.
 
     Attributes:
-        bench: Its name on the command line.
-        settings: Its options, seeds included.
-        rows: One mapping per thing measured, same keys; values are text, numbers or `Spread`.
-        targets: Figures to reach.
-        notes: What a reader must know to judge the numbers.
+        bench: Name of the bench on the command line.
+        settings: Options of the bench, seeds included.
+        rows: Measurements, as mappings with the same keys; values are text, numbers or `Spread`.
+        targets: Goals for measured numbers.
+        notes: Remarks that a reader needs to judge the numbers.
         machine: CPU, Python, versions, date and command line.
-        by: Columns of `rows` that part them into tables.
-        aside: Columns for the JSON file alone.
+        by: Columns of `rows` whose values divide them into tables.
+        aside: Columns that only the JSON file shows.
     """
 
     bench: str
@@ -108,7 +108,7 @@ class Report:
         return all(target.met for target in self.targets)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; nan becomes None."""
+        """Return plain values for JSON; nan becomes None."""
         targets = [{**asdict(target), "met": target.met} for target in self.targets]
         return {
             "bench": self.bench,
@@ -120,13 +120,14 @@ class Report:
         }
 
     def write(self, path: Path) -> None:
-        """Write the report as JSON; an interrupted write leaves an older file as it was."""
+        """Write the report as JSON; an interrupted write does not damage an older file."""
         write_whole(path, json.dumps(self.as_dict(), indent=2, allow_nan=False) + "\n")
 
     def tables(self) -> Group:
-        """Rows, targets and notes for a terminal of 80 columns.
+        """Return rows, targets and notes for a terminal of 80 columns.
 
-        One table for each value of `by`; of a spread the median, as the JSON file holds the rest.
+        There is one table for each value of `by`. It shows the median of a spread; the JSON file
+        holds the rest.
         """
         groups: dict[str, list[Mapping[str, Any]]] = {}
         for row in self.rows:
@@ -163,7 +164,7 @@ def require_positive(bench: str, **options: float) -> None:
 
 
 def _short(number: float) -> str:
-    """Three or more significant digits, without exponents."""
+    """Return a number with three or more significant digits, without exponent."""
     if not math.isfinite(number):
         return "-"
     size = abs(number)

@@ -1,4 +1,4 @@
-"""``bench scale``: many simulations, large networks, processes that die."""
+"""``bench scale``: measure many simulations, large networks, and processes that die."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Figure:
     """One row of the table.
 
     Attributes:
-        name: What is measured.
-        value: It.
-        reach: What it has to reach.
-        aim: What it should reach.
-        at_least: Whether it has to be as large as that, or as small.
+        name: Name of the measured number.
+        value: Measured value.
+        reach: Value that it must reach; None without a target.
+        aim: Value that would be better still.
+        at_least: True if the value must be at least `reach`; false if at most.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Figure:
 
     @property
     def target(self) -> Target:
-        """Target for the report."""
+        """Return the target for the report."""
         middle = self.value.median if isinstance(self.value, Spread) else self.value
         return Target(self.name, middle, self.reach, self.at_least)
 
@@ -56,31 +56,31 @@ class Figure:
 
 @dataclass(frozen=True)
 class ScaleBench:
-    """Many simulations at once: speed, size, leaks, deaths.
+    """Measure many simulations at once: speed, size, leaks, dying processes.
 
-    Every measured program has processes of its own. In each round the variants that are compared
-    take turns, and ratios are taken within a round. Signals show green after green, 30 s each, so
-    that traffic flows and is the same in all variants.
+    Every measured program runs in its own processes. In each round the compared variants take
+    turns, and ratios are taken within a round. Signals show each green for 30 s in turn, so traffic
+    flows and is the same in all variants.
 
     Examples:
         python -m studies.bench scale --rounds 3 --out scale.json
         python -m studies.bench scale --parts size decision --sides 4 8
 
     Attributes:
-        parts: What to measure: workers, grounded, size, decision, leaks, kills, learner, ray.
-        scenario: A grid for all but size, decision, leaks and kills.
+        parts: Parts to measure: workers, grounded, size, decision, leaks, kills, learner, ray.
+        scenario: A grid for all parts but size, decision, leaks and kills.
         small: A scenario for leaks and kills.
-        rounds: Repetitions of what is compared.
+        rounds: Repetitions of each comparison.
         decisions: Measured decisions of an episode.
-        settled: Decisions before them, in which the network fills.
+        settled: Decisions before the measurement, in which the network fills.
         sides: Intersections along each side of the generated grids.
-        vph: Vehicles an hour at every road into these.
-        environments: Environments opened and closed.
-        resets: Their resets, in all.
+        vph: Vehicles per hour at every road into the generated grids.
+        environments: Environments that are opened and closed for leaks.
+        resets: Resets of all these environments together.
         episodes: Episodes in which processes are killed.
-        kills: How many.
-        learner: Whose training is divided into SUMO, torch and all else.
-        seed: Of simulations and deaths.
+        kills: Number of processes that are killed.
+        learner: Learner whose CPU time is divided into SUMO, torch and the rest.
+        seed: Seed of the simulations and of the kills.
         out: JSON file to write.
     """
 
@@ -112,10 +112,10 @@ class ScaleBench:
         """Measure, and write `out` if it is given.
 
         Args:
-            reporter: Is told how far the measuring has come.
+            reporter: Reporter of the progress.
 
         Raises:
-            MeasurementError: A measured program failed, or did not do the same work.
+            MeasurementError: A measured program failed, or had different traffic.
         """
         reporter = reporter or Silent()
         measured: dict[str, Callable[[Reporter], list[Figure]]] = {
@@ -326,13 +326,13 @@ class ScaleBench:
         return {"settled": self.settled, "decisions": self.decisions}
 
     def _ask(self, work: str, **request: Any) -> Run:
-        # One decision more than is measured: none of the episodes ends, which would cost a reset.
+        # One decision more than is measured, because the end of an episode would cost a reset.
         length_s = 10.0 * (self.settled + self.decisions + 1)
         told = {"duration_s": length_s, "seed": self.seed, **request, "work": work}
         return in_fresh_process(_PROGRAM, told)
 
     def _grid(self, folder: Path, side: int, reporter: Reporter) -> Path:
-        # Only two parts need grids, and all that makes networks takes a while to load.
+        # Only two parts need grids, and these modules load slowly.
         from ugat_marl.scenarios import from_turns, make_scenario, rectangle
 
         target = folder / f"grid{side}x{side}"
@@ -365,7 +365,7 @@ def _milliseconds(runs: list[Run], what: str) -> Spread:
 
 
 def _cpu_cost(runs: list[Run]) -> Spread:
-    """Milliseconds of CPU per agent and step, of the simulation and of its user."""
+    """Return CPU milliseconds per agent and step, of the simulation and of its user."""
     spent = [run["simulation_cpu_s"] + run["user_cpu_s"] for run in runs]
     each = zip(spent, runs, strict=True)
     return Spread.of([1e3 * cpu_s / (run["steps"] * run["agents"]) for cpu_s, run in each])

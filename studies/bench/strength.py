@@ -1,7 +1,7 @@
-"""``bench strength``: a policy beside the best rule, in the very domain it was trained in.
+"""``bench strength``: compare a policy with the best rule in the domain of its training.
 
-A table across a gap measures transfer only if its learner is not under-trained. So the learner is
-trained and judged in one and the same domain, beside the rule that is best there.
+A table across a gap measures transfer only if its learner is not under-trained. So this bench
+trains and evaluates a learner in one domain, and compares it with the best rule there.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ from ugat_marl.policies import DQN_NAME, DQNConfig, require_device_name
 from ugat_marl.progress import Reporter, Silent
 
 STEADY = 1.05
-"""The mean of the last evaluations may be so much above the best one."""
+"""Largest ratio of the mean of the last evaluations to the best one."""
 
 
 @dataclass(frozen=True)
 class StrengthBench:
-    """Compares a learner with the best rule in the domain it is trained in.
+    """Compare a learner with the best rule in the domain of its training.
 
-    Every greedy policy is evaluated on the same seeds, and so is the rule, which is chosen on
-    others unless it is named. Evaluated are the policies after every `every` episodes and after
-    each of the `last` last ones.
+    Greedy policies are evaluated after every `every` episodes and after each of the `last` last
+    ones. All policies and the rule are evaluated on the same seeds. If no rule is named, it is
+    chosen on other seeds.
 
     Examples:
         python -m studies.bench strength --scenario grid2x2-v1 --domain V4 --out strength.json
 
     Attributes:
-        scenario: What to simulate.
-        domain: Where to train and to evaluate.
+        scenario: Scenario to simulate.
+        domain: Domain of training and evaluation.
         episodes: Episodes of training.
         every: Episodes from one evaluation to the next.
-        last: Evaluations at the end that have to be close to the best one.
+        last: Number of evaluations at the end, which have to be close to the best one.
         seeds: Seeds of training, one policy each.
-        evaluation_seeds: Episodes behind every evaluation.
-        rule: The rule to compare with; default: the best one of `evaluation.best_rules`.
-        tuning_seeds: Episodes behind the choice of the rule.
+        evaluation_seeds: Episodes of every evaluation.
+        rule: Rule to compare with; default: the best one of `evaluation.best_rules`.
+        tuning_seeds: Episodes for the choice of the rule.
         duration_s: Simulated seconds per episode; default: the scenario's own.
-        observation: What agents see.
-        reward: What agents want; they are judged by travel time.
-        neighbours: How many roads away intersections are seen too.
-        learner: The algorithm: dqn, the suite's own, or a baseline.
+        observation: Observation of the agents.
+        reward: Reward of the agents; they are judged by travel time.
+        neighbours: Distance in roads up to which other intersections are observed too.
+        learner: Learner: dqn, or a baseline.
         learner_settings: Settings of a baseline as NAME=VALUE.
-        device: Where dqn's updates are computed: cpu, cuda, or cuda:N.
+        device: Device of dqn's updates: cpu, cuda, or cuda:N.
         dqn: Settings of dqn.
         out: JSON file to write.
     """
@@ -116,9 +116,11 @@ class StrengthBench:
         """Train and measure, and write `out` if it is given.
 
         Args:
-            reporter: Is told how far it has come.
+            reporter: Reporter of the progress.
         """
-        self.spec.factory(self.device)  # what is not there is said now, not after the search
+        self.spec.factory(
+            self.device
+        )  # a missing library or device is an error now, not after the search
         scenario, plan = load_scenario(self.scenario), self.plan
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             folder = Path(name)

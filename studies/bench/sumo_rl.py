@@ -1,7 +1,7 @@
-"""sumo-rl in an environment of its own: it needs an older PettingZoo than the suite.
+"""sumo-rl in its own virtual environment, because it needs an older PettingZoo than the suite.
 
-The wheel of sumo-rl also holds the RESCO networks, so that the bench finds them here when they are
-not installed beside the suite.
+The wheel of sumo-rl also holds the RESCO networks. The bench finds them here if they are not
+installed beside the suite.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from ugat_marl.files import write_whole
 
 SUMO_RL = "1.4.5"
 PETTINGZOO = "1.24.3"
-"""The newest PettingZoo under which sumo-rl 1.4.5 can be constructed."""
+"""Newest PettingZoo that works with sumo-rl 1.4.5."""
 
 _OWN_VERSIONS = (
     "gymnasium", "numpy", "pandas", "pillow", "sumolib", "traci", "typing_extensions",
     "cloudpickle", "Farama-Notifications", "python-dateutil", "tzdata",
 )  # fmt: skip
-"""Packages that have the same version there as here, where they are installed here."""
+"""Packages that get the same version there as here, if they are installed here."""
 
 
 @dataclass(frozen=True)
 class SumoRl:
-    """An environment with sumo-rl.
+    """A virtual environment with sumo-rl.
 
     Attributes:
-        python: Its interpreter.
+        python: Python interpreter of the virtual environment.
         networks: Folder of the RESCO networks.
-        versions: What is installed.
+        versions: Versions of the installed packages.
     """
 
     python: Path
@@ -53,14 +53,14 @@ class SumoRl:
 
 
 def install_sumo_rl(cache: Path, say: Callable[[str], None]) -> SumoRl:
-    """The environment below `cache`, installed if it is not there yet.
+    """Return the virtual environment below `cache`; install it if it is missing.
 
     Args:
-        cache: Where such environments are kept.
-        say: Is told before anything is installed.
+        cache: Folder of virtual environments.
+        say: Function that prints a line before the installation.
 
     Raises:
-        MeasurementError: Installing failed; pip's words are in the message.
+        MeasurementError: The installation failed; the message quotes pip.
     """
     libsumo = version_of("libsumo")
     wanted = [f"sumo-rl=={SUMO_RL}", f"pettingzoo=={PETTINGZOO}", f"libsumo=={libsumo}"]
@@ -77,7 +77,7 @@ def install_sumo_rl(cache: Path, say: Callable[[str], None]) -> SumoRl:
 
 
 def _install(folder: Path, python: Path, wanted: list[str]) -> None:
-    shutil.rmtree(folder, ignore_errors=True)  # an interrupted run's
+    shutil.rmtree(folder, ignore_errors=True)  # an interrupted run may have left it
     folder.parent.mkdir(parents=True, exist_ok=True)
     _run([sys.executable, "-m", "venv", str(folder)], "no virtual environment could be made")
     same = versions_of(*_OWN_VERSIONS)
@@ -92,7 +92,7 @@ def _install(folder: Path, python: Path, wanted: list[str]) -> None:
 
 
 def _found(python: Path) -> dict[str, Any]:
-    """Ask the environment what it holds, without importing sumo-rl."""
+    """Return the packages of the virtual environment, without importing sumo-rl."""
     program = (
         "import importlib.metadata as m, importlib.util as u, json; "
         "print(json.dumps({'networks': u.find_spec('sumo_rl').submodule_search_locations[0] "
