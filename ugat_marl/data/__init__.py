@@ -1,8 +1,9 @@
-"""Data: what is recorded, read and kept in files. Nothing here computes statistics.
+"""Data: values that are recorded and kept in files. Nothing here computes statistics over runs.
 
 - `transitions`: the log of transitions of roll-outs, one row per episode, step and agent.
 - `measured`: measured data of a street, their readers (CSV, Parquet, ATSPM) and their writer.
-- `runs`: the folder of a training run; `checkpoints`: dictionaries of tensors.
+- `runs`: the folder of a training run.
+- `checkpoints`: dictionaries of tensors.
 - `scores`: the measures of an episode.
 """
 

@@ -1,4 +1,4 @@
-"""Checkpoints: dictionaries of tensors and plain values, whole and finite or refused."""
+"""Checkpoints: dictionaries of tensors and plain values. Damaged or non-finite ones are refused."""
 
 from __future__ import annotations
 
@@ -21,10 +21,15 @@ _UNREADABLE = (
 
 
 def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
-    """Write `content` so that `path` holds the old checkpoint or the new one, never half.
+    """Write `content` to `path`, which then holds the old checkpoint or the whole new one.
+
+    Args:
+        path: The file.
+        kind: Kind of checkpoint, which `read_checkpoint` compares.
+        content: Tensors and plain values.
 
     Raises:
-        CheckpointError: A number in `content` is not finite; the file at `path` is left as it was.
+        CheckpointError: A number in `content` is not finite. The file at `path` stays unchanged.
     """
     require_finite(content, str(path), "was not written over")
     with replacing(path) as temporary:
@@ -32,10 +37,11 @@ def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
-    """Read what `write_checkpoint` wrote, without executing anything from the file.
+    """Read a file of `write_checkpoint`; no code from the file is executed.
 
     Raises:
-        CheckpointError: Missing, cut short, of another kind, or with a number that is not finite.
+        CheckpointError: The file is missing, cut short, of another kind, or holds a number that is
+            not finite.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: no such checkpoint file")
@@ -56,7 +62,11 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
 
 
 def _require_sums(path: Path) -> None:
-    """Compare the check sums of the archive, which torch does not: a flipped bit is an error."""
+    """Refuse an archive with a wrong check sum, such as after a flipped bit; torch does not check.
+
+    Raises:
+        ValueError: A check sum is wrong.
+    """
     with zipfile.ZipFile(path) as archive:
         damaged = archive.testzip()
     if damaged is not None:
@@ -66,8 +76,13 @@ def _require_sums(path: Path) -> None:
 def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> None:
     """Refuse NaN and infinity anywhere below `content`.
 
+    Args:
+        content: Tensors and plain values, nested.
+        name: Name of the file in errors.
+        consequence: End of the message: what this means for the file.
+
     Raises:
-        CheckpointError: Names the entry that is not finite.
+        CheckpointError: An entry is not finite; the message names it.
     """
     for key, tensor in _tensors("", content):
         if not bool(torch.isfinite(tensor).all()):
@@ -81,12 +96,12 @@ def tensors_like(
 
     Args:
         path: The checkpoint, for messages.
-        found: The tensors it holds; those not needed are left out.
-        own: The learner's tensors, with the names, shapes and types needed.
+        found: Tensors of the checkpoint; those that the learner does not need are left out.
+        own: The learner's tensors, with the required names, shapes and types.
 
     Raises:
-        CheckpointError: One is of another shape or type.
-        KeyError: One is missing.
+        CheckpointError: A tensor has another shape or type.
+        KeyError: A tensor is missing.
     """
     for name, tensor in own.items():
         given = found[name]

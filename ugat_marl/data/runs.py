@@ -1,8 +1,8 @@
 """Folder of a training run: metrics, checkpoints, and how a run is resumed.
 
-A checkpoint is a folder that appears by one rename, so that a killed run has lost at most the stage
-in progress. Metrics are rewritten whole at every checkpoint; a resumed run drops the rows of the
-stage it repeats and ends with the same file as an unbroken one.
+A checkpoint is a folder that is renamed into place when it is complete. A killed run loses only the
+work since its last checkpoint. Metrics are rewritten whole at every checkpoint. A resumed run drops
+the rows of the work it repeats and ends with the same file as an unbroken run.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Metrics:
     rows: list[tuple[str, int, str, float]] = field(default_factory=list)
 
     def add(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
-        """Append a number of values."""
+        """Append one row for each of the numbers."""
         self.rows += [(stage, step, name, float(value)) for name, value in numbers.items()]
 
     def write(self, path: Path) -> None:
@@ -52,7 +52,7 @@ class Metrics:
 
     @classmethod
     def read(cls, path: Path) -> Metrics:
-        """Read what `write` wrote.
+        """Read a file of `write`.
 
         Raises:
             CheckpointError: The file is missing, cut short or of another form.
@@ -76,7 +76,7 @@ class Run:
     Args:
         directory: The folder.
         identity: Values that must be equal to resume the run: settings, scenario, seed.
-        resume: Go on from the checkpoint in the folder, if there is one.
+        resume: True to continue from the checkpoint in the folder, if there is one.
         reporter: Shows progress.
 
     Raises:
@@ -112,11 +112,11 @@ class Run:
         return (self.directory / CHECKPOINT / "state.json").is_file()
 
     def save(self, state: Mapping[str, Any], write: Callable[[Path], None]) -> None:
-        """Make the next checkpoint.
+        """Save the next checkpoint.
 
         Args:
-            state: Plain values: the progress of the run.
-            write: Writes everything else into the folder it is given.
+            state: Progress of the run, as plain values.
+            write: Function that writes all other files into a given folder.
         """
         fresh = self.directory / f".{CHECKPOINT}.new"
         fresh.mkdir(parents=True)
@@ -136,10 +136,10 @@ class Run:
         """Restore the checkpoint.
 
         Args:
-            read: Reads what `write` wrote.
+            read: Function that reads the files that `write` of `save` wrote.
 
         Returns:
-            The state.
+            The progress of the run, as given to `save`.
 
         Raises:
             CheckpointError: The checkpoint cannot be used.
@@ -156,7 +156,7 @@ class Run:
         return state
 
     def log(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
-        """Keep numbers in the metrics and show them on TensorBoard."""
+        """Add numbers to the metrics and, if finite, to TensorBoard."""
         self.metrics.add(stage, step, numbers)
         board = self._tensorboard(step)
         for name, value in numbers.items():
@@ -175,22 +175,22 @@ class Run:
             from torch.utils.tensorboard import SummaryWriter
 
             folder = self.directory / "tensorboard"
-            again = step if folder.exists() else None  # hides what a killed run logged from here on
+            again = step if folder.exists() else None  # hides rows that a killed run logged later
             self._board = SummaryWriter(str(folder), purge_step=again)
         return self._board
 
 
 def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
-    """Write all options of a run, and the versions it is made with, for readers.
+    """Write all options of a run and the versions of its packages, for readers.
 
-    ``run.json`` holds only what must be the same for `--resume`.
+    ``run.json`` holds only the values that must be equal for `--resume`.
     """
     content = {"settings": settings, "versions": versions_of(*_VERSIONS)}
     write_whole(directory / SETTINGS, json.dumps(content, indent=1, default=str) + "\n")
 
 
 def locked(directory: Path) -> IO[str]:
-    """Return a file that stays locked while it is open; a killed process releases it.
+    """Lock a folder: return a file that stays locked while it is open; a killed process frees it.
 
     Raises:
         OptionError: Another process has locked the folder.
@@ -230,7 +230,7 @@ def _short(value: Any) -> str:
 
 
 def _remove_remains(directory: Path) -> None:
-    """Clear what a run killed in the middle of a rename left, keeping a whole checkpoint."""
+    """Remove remains of a killed run; keep one whole checkpoint."""
     current, old = directory / CHECKPOINT, directory / f".{CHECKPOINT}.old"
     fresh = directory / f".{CHECKPOINT}.new"
     if old.exists() and not current.exists():
@@ -241,16 +241,16 @@ def _remove_remains(directory: Path) -> None:
 
 
 def remove_temporaries(directory: Path) -> None:
-    """Remove files that were being written (`files.replacing`) when their process was killed.
+    """Remove temporary files of `files.replacing` that a killed process left.
 
-    Only the process that has locked the folder may call it.
+    Only the process that has locked the folder may call this.
     """
     for remains in directory.glob(".*.tmp"):
         remains.unlink(missing_ok=True)
 
 
 def version_of(distribution: str) -> str | None:
-    """Installed version of a package, or None."""
+    """Return the installed version of a package, or None."""
     try:
         return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
@@ -258,5 +258,5 @@ def version_of(distribution: str) -> str | None:
 
 
 def versions_of(*distributions: str) -> dict[str, str | None]:
-    """Return the installed version of each package, or None, by name."""
+    """Return package to installed version, or None if it is not installed."""
     return {name: version_of(name) for name in distributions}

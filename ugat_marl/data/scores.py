@@ -19,17 +19,17 @@ class Scores:
     Attributes:
         att_s: Average travel time in s over all vehicles due, from the scheduled departure to the
             arrival or the end of the episode.
-        att_finished_s: The same over the vehicles that arrived.
-        throughput: Vehicles that arrived.
-        reward: Mean over decisions and agents of the reward the environment gave; evaluations are
-            paid by queues, whatever a policy was trained for.
+        att_finished_s: Average travel time in s over the vehicles that arrived.
+        throughput: Number of vehicles that arrived.
+        reward: Mean over decisions and agents of the environment's reward. Evaluations use the
+            queue reward, independent of the reward in training.
         queue: Mean over decisions and intersections of the halting vehicles on incoming lanes.
-        delay: Mean over decisions and incoming lanes of 1 - v / v_max (unitless; 0 for an empty
+        delay: Mean over decisions and incoming lanes of 1 - v / v_max (no unit; 0 for an empty
             lane), as in the tables of the UGAT paper.
         delay_s: Mean over vehicles due of time loss plus departure delay, in s.
-        due: Vehicles scheduled to depart before the end.
-        departed: Vehicles that entered the network.
-        backlog: Vehicles due at the end that never entered.
+        due: Number of vehicles scheduled to depart before the end.
+        departed: Number of vehicles that entered the network.
+        backlog: Number of vehicles due that never entered the network.
         hidden: Measures of a domain with an objective; see `ugat_marl.envs.OBJECTIVE_MEASURES`.
     """
 
@@ -54,25 +54,25 @@ MEASURES: dict[str, str] = {
     "delay": "delay [1 - v/vmax]",
     "delay_s": "delay [s]",
 }
-"""The five measures of the paper and delay in seconds, with their headings."""
+"""The five measures of the paper and the delay in seconds, each with its heading in tables."""
 MORE_IS_BETTER = ("throughput", "reward")
-"""Measures of which more is better."""
+"""Measures for which a larger value is better."""
 
 
 def relative_slowness(
     speed_mps: NDArray[np.float64], limit_mps: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return 1 - v / v_max of each lane, clipped to [0, 1] (vehicles may speed a little)."""
+    """Return 1 - v / v_max of each lane, clipped to [0, 1] because vehicles may exceed v_max."""
     return np.minimum(np.maximum(1.0 - speed_mps / limit_mps, 0.0), 1.0)
 
 
 @dataclass
 class EpisodeRecorder:
-    """Sums, decision by decision, from which `Scores` are made.
+    """Running sums over the decisions of an episode, from which it makes `Scores`.
 
     Args:
         lanes: The measured lanes.
-        incoming: For each intersection the positions of its incoming lanes.
+        incoming: For each intersection, the indices of its incoming lanes in `lanes`.
     """
 
     lanes: LaneTable

@@ -1,9 +1,9 @@
 """Transition logs: written by roll-outs, read by grounding.
 
 A log holds one row per (episode, step, agent): the observation of the intersection, the phase its
-policy asked for, the phase that was served, the delay of its green, the reward, and the next
-observation. Simulated and measured logs have the same form; their provenance, in the metadata of
-the Parquet file, tells them apart.
+policy requested, the phase that was served, the delay of its green, the reward, and the next
+observation. Simulated and measured logs have the same form. The provenance in the metadata of the
+Parquet file tells them apart.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FORMAT = 1
 METADATA_KEY = "ugat_marl.data.transitions"
 SOURCES = ("simulated", "measured")
 
-# Logs that differ in one of these describe different processes; one model cannot be fitted to both.
+# One model cannot be fitted to logs that differ in one of these: they describe two processes.
 SAME_IN_CONCATENATION = (
     "scenario",
     "scenario_hash",
@@ -64,9 +64,10 @@ class AgentLayout:
     """Layout of an agent's observation vector: features | phase one-hot | context.
 
     Attributes:
-        features: Traffic numbers of the intersection itself; what f predicts and h compares.
+        features: Count of traffic numbers of the intersection itself. The forward model predicts
+            them and the inverse model compares them.
         phases: Number of green phases, the size of the action space and of the one-hot part.
-        context: Numbers about the neighbours; may be 0.
+        context: Count of numbers about the neighbours; may be 0.
     """
 
     features: int
@@ -85,19 +86,19 @@ class AgentLayout:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Origin of a log, with everything a reader needs to use it without its writer.
+    """Origin of a log, with all facts that a reader needs.
 
     Attributes:
         scenario: Scenario id.
         scenario_hash: Hash of the scenario with the domain's effects applied ("" if measured
             without one).
-        domain: "sim", "V1" ..., or the name of the place that was measured.
+        domain: "sim", "V1" ..., or the name of the measured place.
         seeds: Seed of every episode, in order; empty if measured.
         decision_interval_s: Seconds between two rows of one agent.
         observation: Name of the observation function.
-        layouts: Agent to the division of its observation vector, in the order of the agents.
+        layouts: Agent to the layout of its observation vector, in the order of the agents.
         source: "simulated" or "measured".
-        versions: Package to version, of whatever could change the numbers.
+        versions: Package to version, for packages that can change the numbers.
         units: Column to unit.
     """
 
@@ -128,10 +129,11 @@ class Provenance:
 
     @classmethod
     def from_json(cls, text: str) -> Provenance:
-        """Read what `to_json` wrote.
+        """Read the text that `to_json` returned.
 
         Raises:
-            LogError: Not JSON, of a newer format, or fields missing, unknown or of the wrong type.
+            LogError: The text is not JSON or has another format. Or a field is missing, unknown or
+                of the wrong type.
         """
         try:
             content = json.loads(text)
@@ -149,14 +151,14 @@ class Transitions:
 
     Attributes:
         observation: ``(n, d)`` float32.
-        action: ``(n,)`` int64, the phase the policy asked for.
+        action: ``(n,)`` int64, the phase the policy requested.
         executed: ``(n,)`` int64, the phase that was served.
-        delay_s: ``(n,)`` float32, for how long a beginning green was held back on purpose.
+        delay_s: ``(n,)`` float32, the intended delay of a green that begins in this step.
         reward: ``(n,)`` float32.
         next_observation: ``(n, d)`` float32.
-        served_features: ``(n, features)`` float32, the features at first without the vehicles that
-            left, averaged over the interval: what was served, and how early. ``(n, 0)`` if some
-            row was not measured.
+        served_features: ``(n, features)`` float32, the features at the start of the step without
+            the vehicles that left, averaged over the interval. They show how many vehicles were
+            served and how early. ``(n, 0)`` if a row was not measured.
         episode: ``(n,)`` int64.
         step: ``(n,)`` int64.
     """
@@ -179,7 +181,7 @@ class TransitionLog:
     """Checked table of transitions with its provenance.
 
     Args:
-        provenance: Where the rows come from.
+        provenance: Origin of the rows.
         frame: Columns as in `SCHEMA`; wider number types are converted.
 
     Raises:
@@ -215,7 +217,7 @@ class TransitionLog:
         """Return the rows of one agent, ordered by episode and step.
 
         Raises:
-            LogError: The log knows no such agent.
+            LogError: The log has no such agent.
         """
         if agent not in self.provenance.layouts:
             raise LogError(f"the log has no agent {agent!r}; it has {', '.join(self.agents)}")
@@ -223,7 +225,7 @@ class TransitionLog:
         layout = self.provenance.layouts[agent]
 
         def vectors(column: str, size: int = layout.size) -> NDArray[np.float32]:
-            if rows.is_empty():  # exploding nothing still gives one null
+            if rows.is_empty():  # explode() of an empty column gives one null
                 return np.zeros((0, size), np.float32)
             return rows[column].explode().to_numpy().reshape(-1, size).copy()
 
@@ -249,7 +251,7 @@ class TransitionLog:
         """Return the logs as one, with episodes renumbered from 0.
 
         Raises:
-            LogError: No logs, or logs of different scenarios, domains, observations or layouts.
+            LogError: There are no logs, or they differ in one of `SAME_IN_CONCATENATION`.
         """
         if not logs:
             raise LogError("no transition logs to concatenate; give at least one")
@@ -270,16 +272,17 @@ class TransitionLog:
         return TransitionLog(provenance, pl.concat(frames))
 
     def write(self, path: Path) -> None:
-        """Write the log as Parquet; an existing file is replaced whole or left as it was."""
+        """Write the log as Parquet. An existing file is replaced whole or stays unchanged."""
         with replacing(path) as temporary:
             self.frame.write_parquet(temporary, metadata={METADATA_KEY: self.provenance.to_json()})
 
     @classmethod
     def read(cls, path: Path | str) -> TransitionLog:
-        """Read and check what `write` wrote, here or elsewhere.
+        """Read and check a file of `write`, written on this machine or another one.
 
         Raises:
-            LogError: Missing, cut short, not a transition log, or with impossible contents.
+            LogError: The file is missing, cut short, not a transition log, or has impossible
+                values.
         """
         frame, metadata = read_parquet(Path(path))
         if METADATA_KEY not in metadata:
@@ -298,7 +301,11 @@ _NONE = np.zeros(0, np.float32)
 
 
 class TransitionRecorder:
-    """Collector of transitions while an episode runs; cheap per step, a table at the end."""
+    """Collector of transitions during episodes. It keeps plain rows and makes the table at the end.
+
+    Args:
+        provenance: Origin of the rows.
+    """
 
     def __init__(self, provenance: Provenance) -> None:
         self._provenance = provenance
@@ -324,7 +331,16 @@ class TransitionRecorder:
     ) -> None:
         """Add one step of all agents; the arrays are copied.
 
-        Without delays no green was held back, without served features none were measured.
+        Args:
+            episode: Number of the episode.
+            step: Number of the decision in the episode.
+            observations: Observation of each agent before the step.
+            actions: Phase each policy requested.
+            executed: Phase each intersection served.
+            rewards: Reward of each agent.
+            next_observations: Observation of each agent after the step.
+            delays_s: Intended delay of each agent's green, s; None for no delays.
+            served: Served features of each agent; None if not measured.
 
         Raises:
             LogError: An agent of the provenance is missing in one of the mappings.
@@ -352,7 +368,7 @@ class TransitionRecorder:
             kept.append(row)
 
     def log(self) -> TransitionLog:
-        """Return everything recorded so far as a checked log."""
+        """Return all recorded steps as a checked log."""
         frames = [
             self._agent_frame(agent, layout, rows)
             for (agent, layout), rows in zip(
@@ -392,7 +408,7 @@ class TransitionRecorder:
 
 
 def _stacked(agent: str, layout: AgentLayout, vectors: list[NDArray[np.float32]]) -> pl.Series:
-    """Equal vectors as one list column, without a Python object per number."""
+    """Return vectors of equal length as one list column, without a Python object per number."""
     for vector in vectors:
         if vector.shape != (layout.size,):
             raise LogError(
@@ -416,7 +432,7 @@ def read_parquet(path: Path) -> tuple[pl.DataFrame, dict[str, str]]:
     """Return the table in a Parquet file and the file's metadata.
 
     Raises:
-        LogError: Missing, unreadable, cut short or damaged.
+        LogError: The file is missing, unreadable, cut short or damaged.
     """
     _refuse_half_file(path)
     try:
@@ -442,7 +458,7 @@ def checked(
         features: Agent to its number of features.
 
     Raises:
-        LogError: Names the column, and the first row at fault.
+        LogError: A value is impossible; the message names the column and usually the first bad row.
     """
     frame = _converted(frame)
     for column in SCHEMA:

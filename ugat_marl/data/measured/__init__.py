@@ -1,7 +1,10 @@
 """Measured data of a street.
 
-- `values`: the data in memory; `tables`: the files and their columns, read without trust.
-- `reading`: a directory becomes `values.Measured`; `passages`: on and off become vehicles.
-- `coverage`: findings on what is missing; `writing`: the way back.
-- `atspm`, `atspm_mapping`: logs of signal controllers.
+- `values`: the data in memory.
+- `tables`: the files and their columns, checked while they are read.
+- `reading`: reader of a directory, which returns `values.Measured`.
+- `passages`: passages of vehicles from on and off events.
+- `coverage`: findings on missing data.
+- `writing`: writer of a directory.
+- `atspm`, `atspm_mapping`: import of logs of signal controllers.
 """

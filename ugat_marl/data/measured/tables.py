@@ -1,4 +1,4 @@
-"""Tables of measured data: files and columns, read without trusting them."""
+"""Tables of measured data: their files and columns, checked while they are read."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ ROW = "row"
 Kind = Literal["text", "number"]
 
 CLOCK_JUMP_S = 60.0
-"""A step back by more is a clock set back; by less, a late delivery."""
+"""A larger step back in time means a clock set back; a smaller one means a late delivery."""
 FEW_ROWS = 10
-"""Fewer rows do not tell a clock set back from rows out of order."""
+"""With fewer rows, a clock set back looks the same as rows out of order."""
 MOST_OUTSIDE = 0.5
-"""Share of the rows that may lie outside of their periods."""
+"""Largest share of a period's rows that may lie outside of the period."""
 EPOCH = 1e8
-"""Larger times are dates, not seconds of a scenario."""
+"""Times above this are dates, not seconds of a scenario."""
 
 PERIOD = "period"
 """Column with the index of the row's period."""
@@ -44,9 +44,9 @@ class Table:
 
     Attributes:
         stem: File name without suffix.
-        columns: Required columns and what they hold.
-        optional: Further columns; empty cells are allowed in them.
-        suffixes: File types it may have, the default first.
+        columns: Required column to its kind.
+        optional: Optional column to its kind; these columns may have empty cells.
+        suffixes: Allowed file types, the default first.
     """
 
     stem: str
@@ -58,7 +58,7 @@ class Table:
         """Return the file in a directory, or None.
 
         Raises:
-            MeasuredDataError: It is there twice.
+            MeasuredDataError: The directory has the file in two types.
         """
         found = [path for path in self._paths(directory) if path.exists()]
         if len(found) > 1:
@@ -140,19 +140,19 @@ TABLES = (PERIODS, DETECTORS, SIGNALS, DETECTIONS, LANES, TRAJECTORIES, COUNTS)
 
 
 def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
-    """Read the columns of `table` in a file, numbers as Float64, and `ROW`.
+    """Read the columns of `table` from a file, numbers as Float64, and add `ROW`.
 
     Args:
         path: The file.
-        table: What it should hold.
-        found: Findings; columns that are not read are added.
+        table: Expected columns.
+        found: Findings; unknown columns are added to them.
 
     Returns:
         One row per row of the file, in its order. Missing optional columns are null.
 
     Raises:
-        MeasuredDataError: Unreadable, cut short, columns missing, text where numbers belong, or
-            empty cells in required columns.
+        MeasuredDataError: The file is unreadable or cut short. Or a column is missing, has text
+            instead of numbers, or is required and has empty cells.
     """
     raw = read_raw(path, found)
     wanted = {**table.columns, **table.optional}
@@ -177,10 +177,10 @@ def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
 
 
 def read_raw(path: Path, found: list[Finding]) -> pl.DataFrame:
-    """Read all columns of a CSV or Parquet file; those of a CSV file as text.
+    """Read all columns of a CSV or Parquet file; columns of a CSV file are text.
 
     Raises:
-        MeasuredDataError: Unreadable, damaged or cut short.
+        MeasuredDataError: The file is unreadable, damaged or cut short.
     """
     return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, found)
 
@@ -260,9 +260,9 @@ def _read_parquet(path: Path) -> pl.DataFrame:
 
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
-    """Keep a block that fails from writing to standard error.
+    """Drop the standard error of a block if the block fails.
 
-    Threads of polars print their own stack traces there before Python learns of the error.
+    Threads of polars print their own stack traces there before they raise the error in Python.
     """
     sys.stderr.flush()
     try:
@@ -326,10 +326,10 @@ def _bytes(path: Path) -> bytes:
 
 
 def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
-    """Numbers as Float64; empty cells and NaN are null.
+    """Return cells as Float64; empty cells and NaN become null.
 
     Raises:
-        MeasuredDataError: Text, infinity, or a column of another type.
+        MeasuredDataError: A cell is text or infinite, or the column has another type.
     """
     name, start = cells.name, 1 if path.suffix == ".parquet" else 2
     if cells.dtype == pl.String:
@@ -354,10 +354,10 @@ def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
 
 
 def to_texts(path: Path, cells: pl.Series) -> pl.Series:
-    """Return names as text; empty cells are null.
+    """Return cells as text; empty cells become null.
 
     Raises:
-        MeasuredDataError: A column that holds no names.
+        MeasuredDataError: The column holds no names.
     """
     dtype = cells.dtype
     known = isinstance(dtype, pl.String | pl.Categorical | pl.Enum | pl.Null)
@@ -389,14 +389,15 @@ def with_period(
     """Return the rows within their periods, times rounded to 1 ms, with the column `PERIOD`.
 
     Args:
-        path: Where the rows come from.
+        path: File of the rows.
         frame: Rows with ``period_id`` and ``time_s``.
         periods: The periods.
-        found: Findings; what is left out is added.
-        early: Whether rows before the begin of a period are kept.
+        found: Findings; rows that are left out are added to them.
+        early: True to keep rows before the begin of a period.
 
     Raises:
-        MeasuredDataError: No row of a known period, or most rows of a period outside of it.
+        MeasuredDataError: No row belongs to a known period, or most rows of a period lie outside
+            of it.
     """
     index = {period.id: i for i, period in enumerate(periods)}
     frame = frame.with_columns(
@@ -465,13 +466,13 @@ def in_order(
     time: NDArray[np.float64],
     found: list[Finding],
 ) -> NDArray[np.int64]:
-    """Return the order by stream and time; rows of one stream at the same time keep theirs.
+    """Return row indices sorted by stream and time; equal rows keep their order.
 
     Args:
-        path: Where the rows come from.
-        key: Stream of each row ``(n,)``.
-        time: ``(n,)`` s.
-        found: Findings; a sort that was needed is added.
+        path: File of the rows.
+        key: Number of the stream of each row, ``(n,)``.
+        time: Time of each row, s, ``(n,)``.
+        found: Findings; one is added if the rows were not sorted.
     """
     as_found = np.argsort(key, kind="stable")
     back = len(_steps_back(key[as_found], time[as_found]))
@@ -490,19 +491,19 @@ def refuse_set_back(
 ) -> None:
     """Refuse streams whose clock was set back.
 
-    A file that is merely out of order steps back all the time. A file whose pieces are in the wrong
-    order has no time twice.
+    Two other cases are accepted. Rows out of order step back many times. A file with swapped pieces
+    steps back, but ends before it began, so no time occurs twice.
 
     Args:
-        path: Where the rows come from.
-        key: Stream of each row ``(n,)``; what is exported on its own is a stream of its own.
-        time: ``(n,)`` s.
-        row: Number of the row in its file ``(n,)``.
-        name: What to call a stream in messages.
+        path: File of the rows.
+        key: Number of the stream of each row, ``(n,)``. Rows that were exported separately are
+            separate streams.
+        time: Time of each row, s, ``(n,)``.
+        row: Number of each row in its file, ``(n,)``.
+        name: Function that names a stream in messages.
 
     Raises:
-        MeasuredDataError: The clock of a stream was set back, so that some of its time is there
-            twice.
+        MeasuredDataError: The clock of a stream was set back, so some time occurs twice.
     """
     as_found = np.argsort(key, kind="stable")
     stream, clock = key[as_found], time[as_found]
@@ -526,5 +527,5 @@ def refuse_set_back(
 
 
 def _steps_back(stream: NDArray[np.int64], clock: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Rows that are earlier than the one before them in their stream."""
+    """Return the indices of rows that are earlier than the row before them in their stream."""
     return np.flatnonzero((stream[1:] == stream[:-1]) & (np.diff(clock) < 0)) + 1

@@ -1,4 +1,4 @@
-"""Measured data of a street, or of the same detectors in a simulation, as plain values."""
+"""Measured data of a street, or of simulated detectors, as plain values."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from polars import selectors
 from ugat_marl.scenarios import Detector, Period, Split
 
 HELD_OUT_SHARE = 0.4
-"""Share of the periods, the last ones, that is held out where the files do not say."""
+"""Share of the periods that is held out by default. The last periods are held out."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Gap in the data, or something that looks wrong in them.
+    """Gap in the data, or a sign that they are wrong.
 
     Attributes:
-        text: What, where, and how much.
-        rules_out: Names of effects that cannot be examined because of it.
+        text: Sentence with the fault, its place and its extent.
+        rules_out: Names of effects that cannot be examined because of this finding.
     """
 
     text: str
@@ -31,16 +31,18 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """All that was measured on one network.
+    """All measured data of one network.
 
     Attributes:
         detectors: Detection zones.
-        periods: Stretches of measurement, in the order of ``periods.csv``.
-        lanes: Per lane and second: ``period_id, time_s, lane_id, vehicles, halting,
-            mean_speed_mps``; or None.
-        trajectories: ``period_id, vehicle_id, time_s, lane_id, position_m, speed_mps``; or None.
-        counts: ``period_id, begin_s, end_s, detector_id, count``; or None.
-        findings: What the check of the files had to say.
+        periods: Periods of measurement, in the order of ``periods.csv``.
+        lanes: Table of lanes at instants, or None. Columns: ``period_id, time_s, lane_id, vehicles,
+            halting, mean_speed_mps``.
+        trajectories: Table of vehicles at instants, or None. Columns: ``period_id, vehicle_id,
+            time_s, lane_id, position_m, speed_mps``.
+        counts: Table of counts, or None. Columns: ``period_id, begin_s, end_s, detector_id,
+            count``.
+        findings: Findings from the checks of the files.
     """
 
     detectors: tuple[Detector, ...]
@@ -56,12 +58,12 @@ class Measured:
 
     @property
     def has_events(self) -> bool:
-        """True if single vehicles were detected, and not only counted."""
+        """True if detectors reported single vehicles, and not only counts."""
         return any(period.passages for period in self.periods)
 
     @property
     def has_speeds(self) -> bool:
-        """True if speeds of single vehicles were measured."""
+        """True if detectors measured speeds of single vehicles."""
         return any(
             bool(np.isfinite(passages.speed_mps).any())
             for period in self.periods
@@ -70,10 +72,10 @@ class Measured:
 
     @property
     def hash(self) -> str:
-        """SHA-256 over all that was measured, as 64 hex digits.
+        """SHA-256 over all measured data, as 64 hex digits.
 
-        Times count to the millisecond, as the files hold them, so that what was written and read
-        again has the hash that it had.
+        Times are rounded to the millisecond, as in the files. So writing and reading do not change
+        the hash.
         """
         digest = hashlib.sha256()
         for item in self.detectors:
@@ -107,6 +109,6 @@ def _canonical(numbers: NDArray[np.float64]) -> bytes:
 
 
 def split_periods(count: int) -> tuple[Split, ...]:
-    """Return the default split: the last 40 % are held out, of two periods or more at least one."""
+    """Return the default split: the last 40 % are held out, at least one of two or more."""
     held = min(max(round(HELD_OUT_SHARE * count), 1), count - 1) if count > 1 else 0
     return ("fit",) * (count - held) + ("heldout",) * held

@@ -1,4 +1,4 @@
-"""Writer of measured data, as the directory that `read_measured` reads."""
+"""Writer of measured data: makes the directory that `read_measured` reads."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from ugat_marl.scenarios import Passages, Period
 
 
 def write_measured(measured: Measured, directory: Path, *, csv: bool = False) -> Path:
-    """Write measured data; the directory is there whole or not at all.
+    """Write measured data. The directory appears whole or not at all.
 
-    Passages are written as `as_logged` has them: to the millisecond, within their period, and one
+    Passages are written in the form of `as_logged`: times in milliseconds, within their period, one
     vehicle at a time.
 
     Args:
-        measured: What to write; its findings are not written.
-        directory: New, empty, or measured data that are replaced.
-        csv: Whether to write CSV where Parquet is the default.
+        measured: The data; their findings are not written.
+        directory: A new or empty directory, or one with measured data, which are replaced.
+        csv: True to write CSV where Parquet is the default.
 
     Returns:
         `directory`.
 
     Raises:
-        OutputError: The directory holds other things, or cannot be written.
+        OutputError: The directory holds other files, or cannot be written.
     """
     require_replaceable(directory)
     suffix = ".csv" if csv else ".parquet"
@@ -79,10 +79,10 @@ def write_measured(measured: Measured, directory: Path, *, csv: bool = False) ->
 
 
 def require_replaceable(directory: Path) -> None:
-    """Refuse a directory that `write_measured` would not replace; to be asked before measuring.
+    """Refuse a directory that `write_measured` would not replace. Call this before measuring.
 
     Raises:
-        OutputError: It holds other things, or is a file.
+        OutputError: The directory holds other files, or is a file.
     """
     if not directory.exists():
         return
@@ -170,7 +170,7 @@ def _events(period: Period, detector: str, passages: Passages) -> pl.DataFrame:
     is_on = np.tile([True, False], len(passages))
     inside = np.isfinite(time)
     nothing = np.full(len(passages), np.nan)
-    # Speed and length are known when the rear has left, or else with the front.
+    # Speed and length belong to the off event; without one they are written with the on event.
     with_off = inside[1::2]
     values = [
         np.stack(
@@ -196,7 +196,7 @@ def _events(period: Period, detector: str, passages: Passages) -> pl.DataFrame:
 
 
 def _ordered(frame: pl.DataFrame, table: Table) -> pl.DataFrame:
-    """Return the frame in the columns of the table, NaN as an empty cell."""
+    """Return the frame with the columns of the table; NaN becomes an empty cell."""
     columns = [name for name in (*table.columns, *table.optional) if name in frame.columns]
     kinds = {**table.columns, **table.optional}
     return frame.select(
