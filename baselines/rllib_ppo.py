@@ -1,9 +1,9 @@
 """PPO of RLlib with several policies: one for each kind of intersection.
 
-Agents of the same group (`<group>_<n>`: the same phases, the same lanes) share a policy, told which
-of them it is; groups have policies of their own, so that nothing is padded. RLlib's environment
-runner plays whole episodes, its learner updates; masks come as ``action_mask`` in observations. All
-of it in this process: no Ray is started.
+Agents of one group (`<group>_<n>`: the same phases, the same lanes) share a policy, which gets a
+one-hot of the agent. Each group has its own policy, so nothing is padded. RLlib's environment
+runner plays whole episodes; its learner updates. Observations hold masks as ``action_mask``. All
+runs in this process, without Ray.
 
     python baselines/rllib_ppo.py --scenario grid2x2-v1 --episodes 100 --out runs/rllib
     ugat-marl train mixed-v1 --learner rllib-ppo
@@ -66,7 +66,7 @@ class RLlibConfig:
 
 
 class Spaces:
-    """An environment that can be asked for its spaces and no more: nothing is played for that."""
+    """Stand-in for an environment that only knows its spaces; RLlib asks it before training."""
 
     def __init__(self, env: AnyParallelEnv) -> None:
         self.agents = list(env.possible_agents)
@@ -74,30 +74,31 @@ class Spaces:
         self.actions = {agent: env.action_space(agent) for agent in self.agents}
 
     def reset(self) -> None:
-        """Nothing happens."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing."""
 
     def observation_space(self, agent: str) -> Any:
-        """Return the space of what the agent sees."""
+        """Return the observation space of an agent."""
         return self.observations[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Return the space of its actions."""
+        """Return the action space of an agent."""
         return self.actions[agent]
 
 
 class Seat(ParallelPettingZooEnv):
-    """Environment in the form RLlib's runner wants; `par_env` changes with each `learn`."""
+    """Environment in the form of RLlib's runner; each `learn` sets another `par_env`."""
 
     def __init__(self, context: Mapping[str, Any]) -> None:
         super().__init__(context["spaces"])
 
     def step(self, action_dict: dict[str, Any]) -> Any:
-        """Tells of the end of all only: all agents truncated is terminated to RLlib 2.60.
+        """Take a step; report only the truncation of all agents together.
 
-        `MultiAgentEpisode` would then take the future for worth nothing.
+        If every agent is truncated by itself, RLlib 2.60 takes that for a termination, and
+        `MultiAgentEpisode` counts the future as worth 0.
         """
         observations, rewards, _, truncated, infos = self.par_env.step(action_dict)
         over = {"__all__": all(truncated.values())}
@@ -105,7 +106,7 @@ class Seat(ParallelPettingZooEnv):
 
 
 class RLlib(LibraryLearner):
-    """Learns by RLlib's PPO; a `ugat_marl.policies.protocols.Learner`."""
+    """Learner by RLlib's PPO; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: RLlibConfig | None = None, seed: int = 0
@@ -114,7 +115,8 @@ class RLlib(LibraryLearner):
         super().__init__(env, "baselines.rllib.ppo")
         self._groups = groups_of(self.agents)
         self._decisions = decisions_of(env)
-        logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)  # its errors are raised, too
+        # RLlib logs errors that it raises as well.
+        logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
         with kept_generators(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             config_of_library = self._library_config(env, derive_seed(seed, "rllib", "weights"))
@@ -181,7 +183,7 @@ class RLlib(LibraryLearner):
                 played = self._runner.sample(num_episodes=1)
                 self._update(played)
         except RuntimeError as error:
-            if isinstance(error.__cause__, UgatMarlError):  # what the environment had to say
+            if isinstance(error.__cause__, UgatMarlError):  # the environment's own error message
                 raise error.__cause__ from None
             raise
         finally:
@@ -209,7 +211,10 @@ class RLlib(LibraryLearner):
         return [self._layers_of(row) for row in range(len(self.agents))]
 
     def _layers_of(self, row: int) -> list[nn.Linear]:
-        """One agent's network: that of its group, the one-hot at its input a part of the bias."""
+        """Return an agent's network: that of its group, with the one-hot added to the first bias.
+
+        W [x; e_i] + b = W_x x + (b + column i of W_e).
+        """
         module = self._learner.module[self._groups[self.agents.names[row]]].unwrapped()
         first, *rest = [*linear_layers(module.encoder.actor_encoder), *linear_layers(module.pi)]
         size = self.agents.observation_sizes[row]
@@ -241,13 +246,13 @@ class RLlib(LibraryLearner):
 
 @dataclass(frozen=True)
 class Args(BaselineArgs):
-    """Trains PPO of RLlib on one scenario, with a policy for each kind of intersection."""
+    """Train PPO of RLlib on one scenario, with one policy per group of agents."""
 
     ppo: Annotated[RLlibConfig, tyro.conf.arg(name="")] = RLlibConfig()
 
 
 def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
-    """Trains and evaluates; writes the results if `args.out` is given."""
+    """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: RLlib(env, args.ppo, args.seed), on_episode)
 
 

@@ -1,10 +1,10 @@
 """Stable-Baselines3's PPO and DQN, and MaskablePPO of sb3-contrib, with one network for all agents.
 
-Every intersection is an environment of its own in `ugat_marl.envs.adapters.sb3.AgentsVecEnv`,
-padded and
-told whose it is. MaskablePPO asks that for masks. PPO and DQN of the library know none: here they
-read them at the end of the observation, where the policies below take them off again and give
-actions that are not allowed no probability, or no value. DQN also explores among what is allowed.
+`ugat_marl.envs.adapters.sb3.AgentsVecEnv` makes each intersection one environment; observations are
+padded and carry a one-hot of the agent. MaskablePPO asks this environment for action masks. PPO and
+DQN of the library have no masks: here the observation ends with the mask. The policies below remove
+it, and give forbidden actions the probability 0, or the lowest value. DQN explores only among
+allowed actions.
 
     python baselines/sb3.py --scenario grid2x2-v1 --episodes 100 --out runs/sb3
     python baselines/sb3.py --scenario mixed-v1 --algorithm dqn
@@ -49,12 +49,12 @@ from ugat_marl.policies import (
 
 ALGORITHMS = ("ppo", "maskable-ppo", "dqn")
 _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-_FORBIDDEN = -1e8  # in the place of logits and Q; not infinite, or the gradients are not numbers
+_FORBIDDEN = -1e8  # logit or Q of forbidden actions; finite, because -inf makes gradients nan
 
 
 @dataclass(frozen=True)
 class SB3Config:
-    """Settings of the learner; a decision is one of all agents together."""
+    """Settings of the learner; one decision covers all agents."""
 
     algorithm: Literal["ppo", "maskable-ppo", "dqn"] = "maskable-ppo"
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
@@ -62,7 +62,7 @@ class SB3Config:
     discount: float = 0.95  # weight of the next decision's value (gamma)
     max_gradient: float = 0.5  # longer gradients are scaled down to this norm
     # PPO
-    update_every: int = 120  # decisions in a roll-out, or a few more: it has to divide an episode
+    update_every: int = 120  # least decisions in a roll-out; the next divisor of an episode counts
     epochs: int = 8  # passes over each roll-out
     minibatch: int = 30  # decisions in a gradient step
     gae_lambda: float = 0.95  # from one-step (0) to Monte Carlo (1) advantages
@@ -70,12 +70,12 @@ class SB3Config:
     entropy_weight: float = 0.01  # weight of the entropy bonus
     value_weight: float = 0.5  # weight of the critic's squared error
     # DQN
-    replay: int = 20_000  # decisions it remembers
+    replay: int = 20_000  # decisions it stores
     batch: int = 512  # transitions, each of one agent, in a gradient step
     warmup: int = 100  # decisions before it learns
-    explore: int = 2_400  # decisions over which random actions get rare
-    least_exploration: float = 0.03  # share of random actions that stays
-    target_rate: float = 0.01  # share by which the target network follows at each step
+    explore: int = 2_400  # decisions over which the share of random actions falls
+    least_exploration: float = 0.03  # final share of random actions
+    target_rate: float = 0.01  # step of the target network to the network in each update
 
     def __post_init__(self) -> None:
         if self.algorithm not in ALGORITHMS:
@@ -84,22 +84,22 @@ class SB3Config:
 
 
 class WithoutMask(BaseFeaturesExtractor):
-    """The observation without the mask at its end."""
+    """Feature extractor: the observation without the mask at its end."""
 
     def __init__(self, observation_space: spaces.Box, actions: int) -> None:
         super().__init__(observation_space, observation_space.shape[0] - actions)
         self.actions = actions
 
     def forward(self, observations: Tensor) -> Tensor:
-        """``(batch, size + actions)`` to ``(batch, size)``."""
+        """Return ``(batch, size)`` of ``(batch, size + actions)``."""
         return observations[:, : -self.actions]
 
 
 class MaskedActorCritic(ActorCriticPolicy):
-    """PPO's policy; actions that the mask at the end of the observation forbids have no chance."""
+    """PPO's policy; actions that the mask at the observation's end forbids have probability 0."""
 
     def extract_features(self, obs: Tensor, *rest: Any) -> Tensor:
-        """Comes before every distribution: the mask is kept for it."""
+        """Return the features and keep the mask; the library then makes the distribution."""
         self._allowed = obs[:, -int(self.action_space.n) :] > 0.5
         return super().extract_features(obs, *rest)
 
@@ -109,25 +109,25 @@ class MaskedActorCritic(ActorCriticPolicy):
 
 
 class MaskedQNetwork(QNetwork):
-    """Q of actions that the mask at the end of the observation forbids is lower than all others."""
+    """Q-network; actions that the mask at the observation's end forbids have the lowest Q."""
 
     def forward(self, obs: Tensor) -> Tensor:
-        """``(batch, size + actions)`` to ``(batch, actions)``."""
+        """Return Q, ``(batch, actions)``, of ``(batch, size + actions)``."""
         allowed = obs[:, -int(self.action_space.n) :] > 0.5
         return super().forward(obs).masked_fill(~allowed, _FORBIDDEN)
 
 
 class MaskedDQNPolicy(LibraryPolicy):
-    """DQN's policy of such networks."""
+    """DQN's policy with masked Q-networks."""
 
     def make_q_net(self) -> QNetwork:
-        """The library makes one for acting and one as target."""
+        """Return a masked Q-network; the library asks for the acting one and the target."""
         arguments = self._update_features_extractor(self.net_args, features_extractor=None)
         return MaskedQNetwork(**arguments).to(self.device)
 
 
 class MaskedDQN(DQN):
-    """DQN that explores among the actions that are allowed, each agent for itself."""
+    """DQN that explores among allowed actions; each agent explores independently."""
 
     def predict(
         self,
@@ -136,7 +136,10 @@ class MaskedDQN(DQN):
         episode_start: Any = None,
         deterministic: bool = False,
     ) -> tuple[Any, Any]:
-        """Greedy but for a share of the agents, ``(agents,)``; the library explores all or none."""
+        """Return actions, ``(agents,)``: random for a share of the agents, greedy for the others.
+
+        The library itself lets all agents explore at a step, or none.
+        """
         greedy, state = self.policy.predict(observation, state, episode_start, deterministic=True)
         if deterministic:
             return greedy, state
@@ -153,7 +156,7 @@ class MaskedDQN(DQN):
 
 
 class Seeds(BaseCallback):
-    """Seeds what the library draws by how far it has come, so that it can be taken up anywhere."""
+    """Callback that seeds the library's generators by the number of steps, for exact resumes."""
 
     def __init__(self, seed: int) -> None:
         super().__init__()
@@ -167,7 +170,7 @@ class Seeds(BaseCallback):
 
 
 class SB3(LibraryLearner):
-    """Learns by one of the library's algorithms; a `ugat_marl.policies.protocols.Learner`."""
+    """Learner by one of the library's algorithms; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(self, env: AnyParallelEnv, config: SB3Config | None = None, seed: int = 0) -> None:
         self.config = config or SB3Config()
@@ -226,7 +229,10 @@ class SB3(LibraryLearner):
         return AgentsVecEnv([agent_indicator(pad(env))], masks_in_observation=not by_itself)
 
     def _exploration(self) -> float:
-        """Share of random actions; the library's own schedule would depend on calls of `learn`."""
+        """Return the share of random actions.
+
+        The library's own schedule depends on the calls of `learn`, so it would change on a resume.
+        """
         config = self.config
         done = self._model.num_timesteps / len(self.agents) - config.warmup
         return max(config.least_exploration, 1 - max(done, 0) / config.explore)
@@ -244,7 +250,7 @@ class SB3(LibraryLearner):
 
     def _actors(self) -> Sequence[Sequence[nn.Linear]]:
         policy = self._model.policy
-        if self.config.algorithm == "dqn":  # the running mean of what was learned is steadier
+        if self.config.algorithm == "dqn":  # the target is a running mean of the network: steadier
             return [linear_layers(policy.q_net_target)]
         return [[*linear_layers(policy.mlp_extractor.policy_net), policy.action_net]]
 
@@ -287,13 +293,13 @@ class SB3(LibraryLearner):
 
 @dataclass(frozen=True)
 class Args(BaselineArgs):
-    """Trains PPO, MaskablePPO or DQN of Stable-Baselines3 on one scenario."""
+    """Train PPO, MaskablePPO or DQN of Stable-Baselines3 on one scenario."""
 
     sb3: Annotated[SB3Config, tyro.conf.arg(name="")] = SB3Config()
 
 
 def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
-    """Trains and evaluates; writes the results if `args.out` is given."""
+    """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: SB3(env, args.sb3, args.seed), on_episode)
 
 

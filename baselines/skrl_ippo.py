@@ -1,12 +1,12 @@
-"""IPPO and MAPPO of skrl: PPO by every intersection for itself.
+"""IPPO and MAPPO of skrl: PPO with an update for each intersection.
 
-skrl's wrapper, trainer and memories. It knows no masks: here they stand at the end of the
-observation, where the policy below takes them off and gives actions that are not allowed no
-probability. Critics see the same observation (IPPO), and `env.state()` with it (MAPPO).
+Wrapper, trainer and memories are skrl's. skrl has no action masks: here the observation ends with
+the mask. The policy below removes it and gives forbidden actions the probability 0. Critics see
+the same observation (IPPO), and `env.state()` with it (MAPPO).
 
-skrl updates agent after agent. Those of a group (`<group>_<n>`: the same phases, the same lanes)
-share their networks and Adam, so that each learns from what all have seen; `--no-shared` is skrl's
-own way, with networks for each, and needs many times as many episodes.
+skrl updates agent after agent. Agents of one group (`<group>_<n>`: the same phases, the same lanes)
+share their networks and Adam, so each learns from the data of all. With `--no-shared` each agent
+has its own networks, as usual in skrl; training then needs many times as many episodes.
 
     python baselines/skrl_ippo.py --scenario grid2x2-v1 --episodes 100 --out runs/skrl
     python baselines/skrl_ippo.py --scenario mixed-v1 --centralised
@@ -48,7 +48,7 @@ from ugat_marl.policies import (
 )
 
 _PREPROCESSED = ("observation", "state", "value")
-_FORBIDDEN = -1e8  # in the place of logits; not infinite, or the entropy is not a number
+_FORBIDDEN = -1e8  # logit of forbidden actions; finite, because -inf makes the entropy nan
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class SkrlConfig:
     """Settings of the learner."""
 
     centralised: bool = False  # the critics see env.state(), too (MAPPO)
-    shared: bool = True  # networks for each group of equal intersections; or for each of them
+    shared: bool = True  # one network pair for each group of equal agents; or one for each agent
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers
     learning_rate: float = 1e-3  # step size of Adam
     discount: float = 0.95  # weight of the next decision's value (gamma)
@@ -65,8 +65,8 @@ class SkrlConfig:
     entropy_weight: float = 0.01  # weight of the entropy bonus
     value_weight: float = 0.5  # weight of the critic's squared error
     max_gradient: float = 0.5  # longer gradients are scaled down to this norm
-    update_every: int = 120  # decisions in a roll-out, or a few more: it has to divide an episode
-    epochs: int = 8  # passes over each roll-out; fewer, at least 2, by those that share networks
+    update_every: int = 120  # least decisions in a roll-out; the next divisor of an episode counts
+    epochs: int = 8  # passes over a roll-out; divided among agents that share networks, at least 2
     minibatches: int = 4  # parts of a roll-out, one for each gradient step
 
     def __post_init__(self) -> None:
@@ -74,7 +74,7 @@ class SkrlConfig:
 
 
 class Actor(CategoricalMixin, Model):
-    """Logits of one agent's actions, out of its observation without the mask behind it."""
+    """Actor: from an observation, without the mask at its end, to the logits of the actions."""
 
     def __init__(self, spaces: Mapping[str, Any], hidden: Sequence[int]) -> None:
         Model.__init__(self, **spaces, device="cpu")
@@ -84,7 +84,7 @@ class Actor(CategoricalMixin, Model):
         )
 
     def compute(self, inputs: Mapping[str, Any], role: str) -> tuple[Tensor, dict[str, Any]]:
-        """Skrl asks for logits and makes the distribution."""
+        """Return masked logits; skrl makes the distribution from them."""
         seen = inputs["observations"]
         allowed = seen[:, -self.num_actions :] > 0.5
         logits = self.network(seen[:, : -self.num_actions])
@@ -92,7 +92,7 @@ class Actor(CategoricalMixin, Model):
 
 
 class Critic(DeterministicMixin, Model):
-    """The value of an observation, or of that and the state of the whole network."""
+    """Critic: from an observation, with --centralised also `env.state()`, to its value."""
 
     def __init__(self, spaces: Mapping[str, Any], hidden: Sequence[int], centralised: bool) -> None:
         Model.__init__(self, **spaces, device="cpu")
@@ -102,12 +102,12 @@ class Critic(DeterministicMixin, Model):
         self.network = perceptron(size, hidden, 1)
 
     def compute(self, inputs: Mapping[str, Any], role: str) -> tuple[Tensor, dict[str, Any]]:
-        """Skrl asks for values."""
+        """Return the values."""
         return self.network(torch.cat([inputs[key] for key in self._keys], dim=-1)), {}
 
 
 class Skrl(LibraryLearner):
-    """Learns by skrl's IPPO or MAPPO; a `ugat_marl.policies.protocols.Learner`."""
+    """Learner by skrl's IPPO or MAPPO; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: SkrlConfig | None = None, seed: int = 0
@@ -128,7 +128,7 @@ class Skrl(LibraryLearner):
             for agent in self.agents.names
         }
         self._groups = groups_of(self.agents) if config.shared else {a: a for a in spaces}
-        self._models: dict[str, dict[str, Any]] = {}  # of each group
+        self._models: dict[str, dict[str, Any]] = {}  # actor and critic by group
         with kept_generators():
             seed_generators(seed, "skrl", "weights")
             for agent, own in spaces.items():
@@ -137,7 +137,7 @@ class Skrl(LibraryLearner):
                     made = {"policy": Actor(own, config.hidden), "value": critic}
                     self._models[self._groups[agent]] = made
             self._learning = self._made(spaces)
-        self._adams: dict[str, Any] = {}  # of each group, too
+        self._adams: dict[str, Any] = {}  # optimiser by group
         for agent, group in self._groups.items():
             own = self._adams.setdefault(group, self._learning.optimizers[agent])
             self._learning.optimizers[agent] = own
@@ -181,7 +181,7 @@ class Skrl(LibraryLearner):
 
     def _train(self, env: TrainingEnv, episodes: int, seed: int) -> None:
         world = wrap_env(appended_mask(env), wrapper="pettingzoo", verbose=False)
-        for _ in range(episodes):  # one by one: skrl would go on drawing from one stream
+        for _ in range(episodes):  # a trainer per episode, so each episode can have its own seed
             seed_generators(seed, "skrl", "episode", self.episodes)
             trainer = SequentialTrainer(
                 env=world,
@@ -194,7 +194,7 @@ class Skrl(LibraryLearner):
                 },
             )
             trainer.train()
-            self._learning.tracking_data.clear()  # skrl keeps all it tracks until it is written
+            self._learning.tracking_data.clear()  # never written here, so it would grow for ever
 
     def _actors(self) -> Sequence[Sequence[nn.Linear]]:
         own = [self._models[self._groups[agent]]["policy"] for agent in self.agents.names]
@@ -220,13 +220,13 @@ class Skrl(LibraryLearner):
 
 @dataclass(frozen=True)
 class Args(BaselineArgs):
-    """Trains IPPO, or with --centralised MAPPO, of skrl on one scenario."""
+    """Train IPPO, or with --centralised MAPPO, of skrl on one scenario."""
 
     ppo: Annotated[SkrlConfig, tyro.conf.arg(name="")] = SkrlConfig()
 
 
 def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
-    """Trains and evaluates; writes the results if `args.out` is given."""
+    """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: Skrl(env, args.ppo, args.seed), on_episode)
 
 

@@ -1,18 +1,18 @@
 """Stable-Baselines3's PPO through SuperSuit, as many pages on PettingZoo show it.
 
-It works, and it is here because it is so common; `sb3.py` is the same learner without these faults
+It works, and it is here because it is so common. `sb3.py` is the same learner without these faults
 of SuperSuit 3.11:
 
-- Its vector environment never says that an end is a truncation: PPO takes the end of an episode,
-  where traffic goes on, for the end of all, and learns that nothing is worth anything there.
-- It has no `seed`: `PPO(seed=...)` fails. Here every episode is seeded by `TrainingEnv` within.
-- `concat_vec_envs_v1` copies the environment and never closes the copies, and with worker processes
-  loses what they learn of rewards; so it is left out here.
-- `pad_action_space_v0` turns an action that does not exist into action 0, in silence. Here
-  `ugat_marl.envs.wrappers.pad` pads, which refuses it, and masks see to it that it is never chosen.
-- `agent_indicator_v0` takes every step through PettingZoo's other interface and back, and steps a
-  `GroundedEnv` whose episode is over; `ugat_marl.envs.wrappers.agent_indicator` does not.
-- It carries no masks; here they are a part of the observation.
+- Its vector environment never reports a truncation. PPO takes the end of an episode for a
+  termination and learns the value 0 there, although traffic continues.
+- It has no `seed`: `PPO(seed=...)` fails. Here the inner `TrainingEnv` seeds every episode.
+- `concat_vec_envs_v1` copies the environment and never closes the copies. With worker processes it
+  loses their records of rewards. It is not used here.
+- `pad_action_space_v0` silently turns an action that does not exist into action 0. Here
+  `ugat_marl.envs.wrappers.pad` raises an error instead, and masks exclude such actions.
+- `agent_indicator_v0` converts every step to PettingZoo's other interface and back, and steps a
+  `GroundedEnv` after the end of its episode. `ugat_marl.envs.wrappers.agent_indicator` does not.
+- It has no action masks. Here the observation ends with the mask.
 
     python baselines/supersuit_ppo.py --scenario grid2x2-v1 --episodes 100 --out runs/supersuit
 """
@@ -36,13 +36,13 @@ _sb3: Any = load_baseline("sb3-ppo")
 
 @dataclass(frozen=True)
 class SuperSuitConfig(_sb3.SB3Config):
-    """Settings of the learner; those of PPO in `sb3.py`."""
+    """Settings of the learner, as for PPO in `sb3.py`."""
 
     algorithm: Literal["ppo"] = "ppo"
 
 
 class SuperSuitPPO(_sb3.SB3):
-    """Learns by PPO in SuperSuit's vector environment; a `ugat_marl.policies.protocols.Learner`."""
+    """Learner by PPO in SuperSuit's environment; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: SuperSuitConfig | None = None, seed: int = 0
@@ -56,13 +56,13 @@ class SuperSuitPPO(_sb3.SB3):
 
 @dataclass(frozen=True)
 class Args(BaselineArgs):
-    """Trains PPO of Stable-Baselines3 through SuperSuit on one scenario."""
+    """Train PPO of Stable-Baselines3 through SuperSuit on one scenario."""
 
     sb3: Annotated[SuperSuitConfig, tyro.conf.arg(name="")] = SuperSuitConfig()
 
 
 def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
-    """Trains and evaluates; writes the results if `args.out` is given."""
+    """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: SuperSuitPPO(env, args.sb3, args.seed), on_episode)
 
 

@@ -1,8 +1,8 @@
 """MAPPO of TorchRL: PPO for all intersections, with a critic that sees the whole network.
 
-TorchRL's own wrapper of PettingZoo environments, its masked distributions, generalised advantages
-and clipped loss. Agents are one group with one actor, padded and told whose observation it is; the
-critic reads `env.state()`, and for whom it computes. Masks come from the infos.
+The wrapper of PettingZoo environments, masked distributions, generalised advantages and clipped
+loss are TorchRL's. All agents share one actor: observations are padded and carry a one-hot of the
+agent. The critic sees `env.state()` and the one-hot. Infos hold the action masks.
 
     python baselines/torchrl_mappo.py --scenario grid2x2-v1 --episodes 100 --out runs/torchrl
     ugat-marl train grid2x2-v1 --learner torchrl-mappo
@@ -44,7 +44,7 @@ _GROUP = "agents"
 
 @dataclass(frozen=True)
 class TorchRLConfig:
-    """Settings of the learner; a decision is one of all agents together."""
+    """Settings of the learner; one decision covers all agents."""
 
     hidden: tuple[int, ...] = (64, 64)  # sizes of the hidden layers of actor and critic
     learning_rate: float = 1e-3  # step size of Adam
@@ -63,7 +63,7 @@ class TorchRLConfig:
 
 
 class Critic(nn.Module):
-    """The value of a state for each agent, by one network that is told for whom."""
+    """Critic: value of a state for each agent, by one network with a one-hot of the agent."""
 
     def __init__(self, agents: int, state: int, hidden: Sequence[int]) -> None:
         super().__init__()
@@ -71,7 +71,7 @@ class Critic(nn.Module):
         self.network = perceptron(state + agents, hidden, 1)
 
     def forward(self, state: Tensor) -> Tensor:
-        """``(..., state)`` to ``(..., agents, 1)``."""
+        """Return values, ``(..., agents, 1)``, of states, ``(..., state)``."""
         agents = self._agents
         seen = state.unsqueeze(-2).expand(*state.shape[:-1], agents, -1)
         whose = torch.eye(agents).expand(*state.shape[:-1], agents, agents)
@@ -79,7 +79,7 @@ class Critic(nn.Module):
 
 
 class TorchRLMAPPO(LibraryLearner):
-    """Learns by TorchRL's PPO; a `ugat_marl.policies.protocols.Learner`."""
+    """Learner by TorchRL's PPO; a `ugat_marl.policies.protocols.Learner`."""
 
     def __init__(
         self, env: AnyParallelEnv, config: TorchRLConfig | None = None, seed: int = 0
@@ -133,7 +133,7 @@ class TorchRLMAPPO(LibraryLearner):
     def _train(self, env: TrainingEnv, episodes: int, seed: int) -> None:
         with (
             warnings.catch_warnings()
-        ):  # of PettingZoo's version, and of advantages over all agents
+        ):  # TorchRL warns of PettingZoo's version and of advantages over all agents
             warnings.simplefilter("ignore")
             world = PettingZooWrapper(
                 agent_indicator(pad(env)),
@@ -187,13 +187,13 @@ class TorchRLMAPPO(LibraryLearner):
 
 @dataclass(frozen=True)
 class Args(BaselineArgs):
-    """Trains MAPPO of TorchRL on one scenario."""
+    """Train MAPPO of TorchRL on one scenario."""
 
     mappo: Annotated[TorchRLConfig, tyro.conf.arg(name="")] = TorchRLConfig()
 
 
 def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
-    """Trains and evaluates; writes the results if `args.out` is given."""
+    """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: TorchRLMAPPO(env, args.mappo, args.seed), on_episode)
 
 

@@ -1,4 +1,4 @@
-"""Puts the overview in results/README.md together again, from the tables beside it.
+"""Write the overview in results/README.md anew from the tables in results/.
 
 python results/overview.py
 """
@@ -22,7 +22,7 @@ BEGIN, END = "<!-- overview -->\n", "<!-- end of overview -->\n"
 GROUNDED = (TIMED, matched_name("timed"))
 CONSTANT = "constant delay"
 BESIDE = ("there", "*matched*")
-"""Folders of tables of what else is known in the domains, beside the same direct transfer."""
+"""Folders with tables of further settings in the same domains and with equal direct transfer."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Outcome:
     """Outcome of one setting in one domain.
 
     Attributes:
-        att_s: Travel time there in s, mean over training seeds.
-        gap_s: That minus the travel time in the simulation.
+        att_s: Travel time in the domain in s, mean over training seeds.
+        gap_s: `att_s` minus the travel time in the simulation, in s.
     """
 
     att_s: float
@@ -39,11 +39,11 @@ class Outcome:
 
 
 Column = Mapping[str, Outcome]
-"""The outcomes in one domain, by setting."""
+"""Outcomes in one domain, by setting."""
 
 
 def columns(table: Path) -> dict[str, Column]:
-    """The domains of a `table.csv`."""
+    """Return the outcomes of a `table.csv`, by domain."""
     found: dict[str, dict[str, Outcome]] = defaultdict(dict)
     with table.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -53,9 +53,10 @@ def columns(table: Path) -> dict[str, Column]:
 
 
 def known(table: Path) -> dict[str, Column]:
-    """The domains of a `table.csv`, with the rows of the tables `BESIDE` it.
+    """Return the outcomes of a `table.csv` and of the tables `BESIDE` it, by domain.
 
-    They belong together where direct transfer, which all have, is the same to the digit.
+    Another table is added only where its direct transfer is equal to the digit: then the
+    evaluations agree.
     """
     found, scenario = columns(table), table.parent.parent
     for other in (path for name in BESIDE for path in sorted(scenario.glob(f"{name}/table.csv"))):
@@ -66,24 +67,30 @@ def known(table: Path) -> dict[str, Column]:
 
 
 def regret_s(setting: str, column: Column) -> float:
-    """Travel time above that of the best of all, in s."""
+    """Return the travel time minus that of the best setting, in s."""
     return column[setting].att_s - min(own.att_s for own in column.values())
 
 
 def won_back(setting: str, column: Column) -> float:
-    """Share of direct transfer's regret that is gone; nan where it is the best of all."""
+    """Return the share of direct transfer's regret that a setting removes.
+
+    1 - regret(setting) / regret(direct); nan if direct transfer is the best setting.
+    """
     start = regret_s(DIRECT, column)
     return 1.0 - regret_s(setting, column) / start if start > 0 else math.nan
 
 
 def reduction(setting: str, column: Column) -> float:
-    """Change of direct transfer's gap, as a share; nan where it has none to make smaller."""
+    """Return the change of direct transfer's gap, as a share.
+
+    gap(setting) / gap(direct) - 1, negative for a smaller gap; nan if direct transfer has no gap.
+    """
     start = column[DIRECT].gap_s
     return column[setting].gap_s / start - 1.0 if start > 0 else math.nan
 
 
 def overview(folder: Path = FOLDER) -> str:
-    """The overview as Markdown: every domain of every table of transfer, and their means."""
+    """Return the overview as Markdown: every domain of every table of transfer, and means."""
     lines = [
         "| table | | direct transfer (regret) | UGAT, timed | timed, rewards matched "
         "| more plain `sim` | constant delay | trained in real | best rule there |",
@@ -94,7 +101,8 @@ def overview(folder: Path = FOLDER) -> str:
         place = table.parent.relative_to(folder)
         name = f"[{place.parts[0]}{place.name.removeprefix('main').replace('-', ', ')}]"
         first = f"{name}({place}/table.md)"
-        shared = {domain.partition("+")[2] for domain in found}  # in sim as well: the table's own
+        # Effects that all domains of a table share are in its sim, too, and are left out.
+        shared = {domain.partition("+")[2] for domain in found}
         for domain, column in found.items():
             short = domain.partition("+")[0] if len(shared) == 1 else domain
             lines.append(_line(first, short, column))
@@ -139,7 +147,7 @@ def _mean(found: Sequence[Column]) -> str:
 
 
 def with_overview(page: str, folder: Path = FOLDER) -> str:
-    """The page with the overview of today between its marks."""
+    """Return the page with a new overview between its marks."""
     if BEGIN not in page or END not in page:
         raise ValueError(f"the overview belongs between {BEGIN.strip()} and {END.strip()}")
     before, _, rest = page.partition(BEGIN)
