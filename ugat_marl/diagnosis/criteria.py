@@ -1,8 +1,9 @@
 """Usual criteria on counts: GEH, and the four of FHWA.
 
-GEH below 5 on 85 % of the counts is a common criterion (UK TAG unit M3.1). Those of the Traffic
-Analysis Toolbox, volume III (FHWA-HOP-18-036, 2019, chapter 5) compare the simulation with one
-representative day, interval by interval, in the measure of how much measured days differ.
+GEH below 5 on 85 % of the counts is a common criterion (UK TAG unit M3.1). The criteria of FHWA are
+in the Traffic Analysis Toolbox, volume III (FHWA-HOP-18-036, 2019, chapter 5). They compare the
+simulation with one representative day, interval by interval, relative to the variation between
+measured days.
 """
 
 from __future__ import annotations
@@ -22,16 +23,17 @@ _COUNTED = ("count_stop", "count_exit")
 
 @dataclass(frozen=True)
 class Criteria:
-    """Criteria met by the counts of a simulation: shares of detectors or of their intervals.
+    """Results of the four criteria: shares of detectors or of their intervals, in [0, 1].
 
     Attributes:
         within_2_sigma: Share of intervals within 1.96 standard deviations of the representative
-            day (criterion I: at least 0.95).
-        within_1_sigma: Within one (criterion II: at least two thirds).
+            day. Criterion I asks for at least 0.95.
+        within_1_sigma: Share of intervals within one standard deviation. Criterion II asks for at
+            least two thirds.
         absolute_error: Share of detectors whose mean absolute error is at most that of the other
-            measured days (criterion III, bounded dynamic absolute error: all of them).
-        systematic_error: Share of detectors whose mean error is at most a third of that
-            (criterion IV, bounded dynamic systematic error: all of them).
+            measured days. Criterion III (bounded dynamic absolute error) asks for 1.
+        systematic_error: Share of detectors whose mean error is at most a third of that. Criterion
+            IV (bounded dynamic systematic error) asks for 1.
     """
 
     within_2_sigma: float
@@ -41,13 +43,18 @@ class Criteria:
 
 
 def hourly(item: Tally) -> Array:
-    """Return vehicles per hour at every stop and exit detector, 0 where there is none."""
+    """Return vehicles per hour at every stop and exit detector, 0 without one; ``(2 places,)``."""
     sums = item.sums[[INDEX[name] for name in _COUNTED]].reshape(-1, 2)
     return 60.0 * sums[:, 0] / np.maximum(sums[:, 1], 1e-9)
 
 
 def geh(measured: Array, simulated: Array) -> Array:
-    """Return ``sqrt(2 (m - c)^2 / (m + c))`` of hourly counts, where there are any."""
+    """Return ``GEH = sqrt(2 (m - c)^2 / (m + c))`` of hourly counts, without empty pairs.
+
+    Args:
+        measured: Counts c, vehicles per hour.
+        simulated: Counts m, vehicles per hour.
+    """
     some = measured + simulated > 1.0
     m, c = simulated[some], measured[some]
     return np.sqrt(2 * (m - c) ** 2 / (m + c))
@@ -57,12 +64,12 @@ def fhwa(measured: Sequence[Tally], simulated: Sequence[Tally], together: int) -
     """Compute the four criteria on the counts of stop and exit detectors.
 
     Args:
-        measured: The measured days, at least `LEAST_DAYS`.
-        simulated: Simulated days; their mean is compared.
-        together: Bins of time that one measured count covers.
+        measured: Tallies of the measured days, at least `THRESHOLDS.least_days`.
+        simulated: Tallies of simulated days; their mean is compared.
+        together: Number of bins of time that one measured count covers.
 
     Returns:
-        None where there are too few days, or no detector counts in all intervals of all days.
+        None if there are too few days, or if no detector counts in all intervals of all days.
     """
     shortest = min(day.bins.shape[-1] for day in (*measured, *simulated))
     bins = min(max(round(THRESHOLDS.interval_s / THRESHOLDS.bin_s), together), shortest)
@@ -88,7 +95,7 @@ def fhwa(measured: Sequence[Tally], simulated: Sequence[Tally], together: int) -
 
 
 def representative(days: Array) -> int:
-    """Find the day that differs least, in relative terms, from the mean of all.
+    """Return the index of the day with the least relative difference from the mean of all days.
 
     Args:
         days: Counts, ``(days, detectors, intervals)``.
@@ -99,7 +106,16 @@ def representative(days: Array) -> int:
 
 
 def _intervals(day: Tally, bins: int, count: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the first counts, and if they are complete, ``(detectors, intervals)``."""
+    """Return counts of the first intervals, and a mask of complete ones.
+
+    Args:
+        day: The day.
+        bins: Number of bins in an interval.
+        count: Number of intervals.
+
+    Returns:
+        Both ``(detectors, intervals)``.
+    """
     rows = [BIN_FEATURES.index(name) for name in _COUNTED]
     sums, known = (values[rows, :, :count].reshape(-1, count) for values in day.gathered(bins))
     return sums, known > 0

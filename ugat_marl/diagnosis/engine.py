@@ -1,4 +1,4 @@
-"""Tallies of simulated days: in parallel, remembered on disk, within a budget of time."""
+"""Tallies of simulated days: computed in parallel, cached on disk, within a budget of time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Usual:
 
     Attributes:
         set_aside: Numbers of its days on which traffic came to a standstill.
-        day_to_day: Robust standard deviation of the vehicles counted on the others.
+        day_to_day: Robust standard deviation of the vehicles counted on the other days.
     """
 
     set_aside: frozenset[int] = frozenset()
@@ -49,29 +49,33 @@ class Usual:
 
     @classmethod
     def of(cls, tallies: Sequence[Tally]) -> Usual:
-        """Tell the ordinary days from the others.
+        """Separate ordinary days from days of standstill.
 
         Args:
-            tallies: All days from the first on.
+            tallies: Days of the scenario as it is, by number from 0 on.
         """
         aside = frozenset(locked_up(tallies))
         return cls(aside, day_to_day([day for n, day in enumerate(tallies) if n not in aside]))
 
 
 def day_to_day(tallies: Sequence[Tally]) -> float:
-    """Return the robust standard deviation of the vehicles counted on a day."""
+    """Return the robust standard deviation of the vehicles counted per day."""
     counts = _counts(tallies)
     return 1.4826 * float(np.median(np.abs(counts - np.median(counts)))) + 1e-9
 
 
 def locked_up(tallies: Sequence[Tally], usual: float = 0.0) -> list[int]:
-    """Find the few days on which traffic came to a standstill, as on no other day of a model.
+    """Find the few days of a model on which traffic came to a standstill.
 
-    One of them widens the noise of everything. Where they are common they are part of the model.
+    A single such day inflates the noise of all statistics. If such days are common, they belong to
+    the model, and none is returned.
 
     Args:
         tallies: Days of one model.
-        usual: Least `day_to_day`, where few days hardly tell it.
+        usual: Lower bound of `day_to_day`, since few days estimate it badly.
+
+    Returns:
+        Indices into `tallies`.
     """
     counts = _counts(tallies)
     spread = max(day_to_day(tallies), usual)
@@ -86,7 +90,7 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 # --- simulated days -------------------------------------------------------------------------------
 
 VERSION = 4
-"""Of features and replays: a tally remembered under another version is not used."""
+"""Version of features and replays; tallies cached under another version are not used."""
 
 _KEPT_DAYS = 40
 
@@ -95,7 +99,7 @@ Done = TypeVar("Done")
 
 
 class OutOfTime(UgatMarlError):
-    """The budget is spent; what is known by then is the answer."""
+    """The budget of time is spent; the diagnosis ends with the results so far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +107,10 @@ class Replicate:
     """Features of a simulated day.
 
     Attributes:
-        tally: Its features.
-        travel_time_s: Mean travel time.
-        counted: The features as they were counted, if what was asked for was put in their place.
-        due: What that was.
+        tally: Features of the day, with counts corrected to the demand if `due` is known.
+        travel_time_s: Mean travel time, s.
+        counted: Features before this correction; None without a correction.
+        due: Vehicles asked for and given; None without a correction.
     """
 
     tally: Tally
@@ -116,19 +120,20 @@ class Replicate:
 
 
 class Engine:
-    """Simulator of days of models, which it reduces and remembers.
+    """Simulator of days of models; it reduces days to tallies and caches them.
 
     Args:
         scenario: The scenario without effects.
         site: Lanes and detectors.
-        replay: Runs SUMO.
-        periods: Measured periods; replicate ``r`` is played under the signals of period
+        replay: Simulator of one day with SUMO.
+        periods: Measured periods; day ``r`` runs under the signals of period
             ``r mod len(periods)``.
-        seed: Root of the days.
-        cache: Folder of remembered tallies, or None.
-        deadline: ``time.monotonic()`` at which new simulations are refused, or None.
+        seed: Root seed of the days.
+        cache: Folder of the cached tallies; None for no cache on disk.
+        deadline: ``time.monotonic()`` after which new simulations are refused; None for no limit.
         workers: Simulations at a time, None for one per core; or an executor that simulates days.
-        base_days: Days of the scenario as it is that say which days are ordinary; 0 if all are.
+        base_days: Number of days of the scenario as it is that decide which days are ordinary; 0 if
+            all days are.
     """
 
     def __init__(
@@ -167,7 +172,7 @@ class Engine:
 
     @property
     def known(self) -> int:
-        """Number of simulated days that are known by now, those of earlier runs included."""
+        """Number of simulated days used so far, with days from the cache."""
         return len(self._known)
 
     def measured(self, periods: Sequence[Period]) -> list[Tally]:
@@ -176,11 +181,11 @@ class Engine:
 
     @contextlib.contextmanager
     def watched(self, advance: Callable[[], None], most: int) -> Iterator[None]:
-        """Report days as they become known, for work that takes an unknown number of them.
+        """Report new days, for work that needs an unknown number of days.
 
         Args:
-            advance: Called after each of them.
-            most: How often at most.
+            advance: Function to call after each new day.
+            most: Largest number of calls.
         """
         calls = iter(range(most))
 
@@ -196,10 +201,10 @@ class Engine:
 
     @functools.cached_property
     def usual(self) -> Usual:
-        """Ordinary days of the scenario as it is; they are simulated if they are not known yet.
+        """Ordinary days of the scenario as it is; the first access simulates unknown days.
 
         Raises:
-            OutOfTime: The budget does not suffice for that.
+            OutOfTime: The budget does not suffice for these days.
         """
         days = self.replicates([], range(self._base_days))
         return Usual.of([day.tally for day in days]) if days else Usual()
@@ -215,12 +220,12 @@ class Engine:
         numbers: Sequence[int],
         advance: Callable[[], None] | None = None,
     ) -> dict[int, Replicate]:
-        """Return simulated days of a model by number, without the few on which traffic stood still.
+        """Return simulated days of a model by number, without the few days of standstill.
 
         Args:
-            effects: The model.
-            numbers: Of its days.
-            advance: Called after every one.
+            effects: Effects of the model.
+            numbers: Numbers of the days.
+            advance: Function to call after each day.
         """
         days = self.replicates(effects, numbers, advance)
         aside = locked_up([day.tally for day in days], self.usual.day_to_day)
@@ -236,13 +241,13 @@ class Engine:
         """Return simulated days of a model, in the order of `numbers`.
 
         Args:
-            effects: The model.
-            numbers: Which days.
-            advance: Called after each of them.
+            effects: Effects of the model.
+            numbers: Numbers of the days.
+            advance: Function to call after each day.
 
         Raises:
-            OutOfTime: The deadline has passed and a day is not remembered.
-            SimulatorError: SUMO refused.
+            OutOfTime: The deadline has passed and a day is not in the cache.
+            SimulatorError: SUMO refused the model.
         """
 
         def one(number: int) -> Replicate:
@@ -259,13 +264,13 @@ class Engine:
         models: Sequence[tuple[Sequence[Effect], Sequence[int]]],
         advance: Callable[[], None] | None = None,
     ) -> None:
-        """Simulate days of many models at once, so that no core waits for the end of each model.
+        """Simulate days of many models at once, so that no core waits for the end of a model.
 
-        What SUMO refuses is left for `replicates` to report.
+        Errors of a model are ignored here; `replicates` raises them.
 
         Args:
-            models: Effects and numbers of days.
-            advance: Called after each model.
+            models: Effects and numbers of days of each model.
+            advance: Function to call after each model.
 
         Raises:
             OutOfTime: The deadline has passed.
@@ -284,12 +289,12 @@ class Engine:
         groups: Sequence[Sequence[Job]],
         advance: Callable[[], None] | None = None,
     ) -> list[list[Done]]:
-        """Do groups of jobs on all workers; the first failure stops what was not begun.
+        """Do groups of jobs on all workers; the first failure cancels jobs that have not begun.
 
         Args:
-            work: Does one.
-            groups: Jobs.
-            advance: Called after each group.
+            work: Function that does one job.
+            groups: Jobs in groups.
+            advance: Function to call after each group.
         """
         with ThreadPoolExecutor(parts_at_a_time(self._workers)) as pool:
             futures = [[pool.submit(work, job) for job in group] for group in groups]
@@ -325,12 +330,12 @@ class Engine:
         day = self._day(effects, number)
         period = self._unmeasured.kept_from(day.period)
         counted = tally(self.site, period, self._greens[number % len(self.periods)])
-        # As precise as what is remembered, so that the answer does not depend on the cache.
+        # The cache holds float32, so round here: the result must not depend on the cache.
         counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
         return self._with_due(counted, day.travel_time_s, day.due)
 
     def _asked_for(self, given: Replicate, effects: tuple[Effect, ...], number: int) -> Replicate:
-        """Return the same simulated day for a model that asks for other vehicles."""
+        """Return a simulated day corrected to the demand of a model with other departures."""
         if given.counted is None or given.due is None:
             return self._counted(effects, number)
         physics = [effect for effect in effects if not effect.on_detectors]
@@ -345,7 +350,7 @@ class Engine:
         return Replicate(corrected(counted, self.site, due), travel_time_s, counted, due)
 
     def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
-        """Return a day as the detectors saw it; faults of detectors cost no further simulation."""
+        """Return a day as the detectors saw it; faults of detectors need no new simulation."""
         faults = tuple(effect for effect in effects if effect.on_detectors)
         physics = tuple(effect for effect in effects if not effect.on_detectors)
         key = self._key(physics, number)
@@ -370,7 +375,7 @@ class Engine:
     def _simulated(self, effects: tuple[Effect, ...], period: Period, seed: int) -> Day:
         if not isinstance(self._workers, Executor):
             return self._replay.simulate(effects, period, seed)
-        # Here a thread waits for it and does what follows, which is little.
+        # This thread waits for the executor; the tally that follows is cheap enough for a thread.
         return self._workers.submit(self._replay.simulate, effects, period, seed).result()
 
     def _key(self, effects: Sequence[Effect], number: int) -> str:
@@ -415,12 +420,17 @@ class Engine:
 
 
 def default_cache() -> Path:
-    """Return the user's cache folder, in which tallies are remembered between runs."""
+    """Return the user's cache folder for tallies."""
     return user_cache("replicates")
 
 
 def _signals_hash(period: Period, answering: bool) -> str:
-    """Return a digest of what a simulated day takes from a measured one."""
+    """Return a digest of the measured data that a simulated day depends on.
+
+    Args:
+        period: The measured period.
+        answering: True if the day gets the measured arrivals.
+    """
     content = (period.begin_s, period.end_s, sorted(period.signals.items()))
     digest = hashlib.sha256(repr(content).encode())
     if answering:

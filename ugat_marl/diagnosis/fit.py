@@ -16,15 +16,15 @@ from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import EVERYWHERE
 
 Change = tuple[dict[str, Array], float]
-"""What moving a free value does to the statistics, and how far it was moved."""
+"""Change of the statistics when a free value moves, by block, and length of this move."""
 
 WIDE = ("network", "intersection")
-"""Blocks that effects on the whole network are fitted to: single lanes add more noise than they
-tell of them."""
+"""Blocks for the fit of effects on the whole network. Single lanes would add more noise than
+information."""
 
 
 def cost_of(model: Fitted) -> float:
-    """Return the cost, by which models are ranked."""
+    """Return the cost of a model, as a key for sorting."""
     return model.cost
 
 
@@ -32,14 +32,14 @@ class Fitter:
     """Simulator and fitter of models against one data set.
 
     Args:
-        engine: Simulates.
-        pools: How places pool.
+        engine: Simulator of days.
+        pools: Pools of places.
         base: Statistics of the scenario as it is.
-        base_days: Its simulated days by their numbers.
+        base_days: Tallies of its simulated days, by number of the day.
         data: Tallies of the periods to fit.
-        days: Simulated days behind each evaluation.
-        price: What every effect must gain.
-        speeds: Whether speeds were measured.
+        days: Number of simulated days for each evaluation.
+        price: Cost of every effect; an effect must reduce the distance by more.
+        speeds: True if speeds were measured.
     """
 
     def __init__(
@@ -64,7 +64,12 @@ class Fitter:
         self.speeds = speeds
 
     def simulate(self, members: Members, days: int | None = None) -> Fitted:
-        """Simulate a set of effects and measure its distance from the data."""
+        """Simulate a set of effects and measure the distance of the data from it.
+
+        Args:
+            members: Hypotheses and values of their free fields.
+            days: Number of days; None for the fitter's.
+        """
         numbers = list(self.base_days)[: days or self.days]
         found = self.engine.ordinary(effects_of(members), numbers)
         reference = Reference(
@@ -80,7 +85,12 @@ class Fitter:
         return Fitted(members, known, reference, distance, cost)
 
     def refine(self, start: Fitted, rounds: int = 3) -> Fitted:
-        """Take Gauss-Newton steps from a simulated model; derivatives are finite differences."""
+        """Take Gauss-Newton steps from a simulated model, with finite differences.
+
+        Args:
+            start: The model to start from.
+            rounds: Largest number of steps.
+        """
         best = start
         jacobian: Array | None = None
         for number in range(rounds):
@@ -110,7 +120,7 @@ class Fitter:
         return best
 
     def settled(self, model: Fitted, errors: Array) -> Fitted:
-        """Take a last step with more days: the search stops as soon as it hardly gains any more.
+        """Take a last step with more days, since the search stops at a small gain.
 
         Args:
             model: The model.
@@ -127,7 +137,7 @@ class Fitter:
         return moved if moved.cost < precise.cost else precise
 
     def fitted(self, start: Fitted) -> Fitted:
-        """Fit the values, and the window where there is one."""
+        """Fit the free values, and the windows of effects that have one."""
         best = self.refine(start)
         if any(set(WINDOW) <= dict(h.fixed).keys() for h, _ in best.members):
             moved = self._windows(best)
@@ -135,9 +145,9 @@ class Fitter:
         return best
 
     def _windows(self, best: Fitted) -> Fitted:
-        """Move begin and end in ever smaller steps, and on as long as that helps.
+        """Move begin and end of windows in ever smaller steps, as long as the cost falls.
 
-        The same few days before and after a move tell whether it helps.
+        The same few days are simulated before and after a move.
         """
         members = best.members
         cost = self.simulate(members, THRESHOLDS.window_days).cost
@@ -158,7 +168,7 @@ class Fitter:
         return found if found.cost < best.cost else best
 
     def whitener(self, model: Fitted) -> Whitener:
-        """Return residuals of a model: on all lanes and minutes only if an effect has a place."""
+        """Return the whitener for a model; it uses lanes and bins if an effect has a place."""
         places = [
             value
             for hypothesis, _ in model.members
@@ -173,9 +183,9 @@ class Fitter:
         return derivatives(self.changes(model), whitener)
 
     def changes(self, model: Fitted) -> list[Change]:
-        """Move every free value; return the change of the statistics and the length of the move.
+        """Move every free value; return the changes of the statistics and the lengths of the moves.
 
-        It is moved so far that what this does is more than chance.
+        A move is lengthened if its change of the statistics may be chance.
         """
         whitener = self.whitener(model)
         found: list[Change] = []
@@ -200,9 +210,9 @@ class Fitter:
         return shrunk(*self.difference(model, members)), (moved[index] - values[index]) or 1.0
 
     def window_changes(self, model: Fitted) -> list[Change]:
-        """Move begin and end of windows a minute towards the middle, in models with free values.
+        """Move begin and end of windows a minute inwards, for effects with free values.
 
-        How strong an effect was is only known together with how long it lasted.
+        Strength and duration of an effect are estimated together, so their errors are correlated.
         """
         found: list[Change] = []
         for place, (hypothesis, values) in enumerate(model.members):
@@ -218,14 +228,23 @@ class Fitter:
     def difference(
         self, model: Fitted, members: Members, days: int | None = None
     ) -> tuple[dict[str, Array], dict[str, Array]]:
-        """Return the change of the statistics that other members make on the same days."""
+        """Return the change of the statistics from a model to other members, on the same days.
+
+        Args:
+            model: The model before the change.
+            members: Members of the changed model.
+            days: Number of days; None for the fitter's.
+
+        Returns:
+            Differences and their variances, by block.
+        """
         numbers = list(model.days)[: days or self.days]
         found = self.engine.ordinary(effects_of(members), numbers)
         before = [model.days[number] for number in found]
         return shift(self.pools, [day.tally for day in found.values()], before)
 
     def _moved(self, model: Fitted, step: Array) -> Members:
-        """Return the model's values after a step, in range and not too far at once."""
+        """Return the model's members after a step, clipped to the ranges and to a longest move."""
         moved: list[tuple[Hypothesis, tuple[float, ...]]] = []
         place = 0
         for hypothesis, values in model.members:
@@ -242,7 +261,7 @@ class Fitter:
 def _moved_a_little(
     hypothesis: Hypothesis, values: tuple[float, ...], index: int, share: float
 ) -> tuple[float, ...]:
-    """Return the values with one of them moved for a derivative, to the side that is in range."""
+    """Return the values with one of them moved for a derivative, inside its range."""
     nominal = hypothesis.nominal[index] if hypothesis.nominal else 0.0
     delta = max(share * abs(values[index] - nominal), hypothesis.least, 1e-3)
     changed = list(values)
@@ -255,7 +274,12 @@ def _moved_a_little(
 
 
 def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
-    """Return the hypothesis with another window, if it has one and something is left of it."""
+    """Return the hypothesis with a moved window; itself without a window or if it gets too short.
+
+    Args:
+        hypothesis: The hypothesis.
+        move: Moves of begin and end, s.
+    """
     known = dict(hypothesis.fixed)
     if not set(WINDOW) <= known.keys():
         return hypothesis
@@ -267,17 +291,20 @@ def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
 
 
 def replaced(members: Members, place: int, values: tuple[float, ...]) -> Members:
-    """Return the members with other values of one of them."""
+    """Return the members with other values for the one at index `place`."""
     hypothesis = members[place][0]
     return (*members[:place], (hypothesis, values), *members[place + 1 :])
 
 
 def _solve(jacobian: Array, residual: Array) -> Array:
-    """Solve least squares with a touch of ridge, each value on its own scale.
+    """Solve ``(J J' + ridge I) x = J r`` for the step x, with the rows of J scaled to length 1.
 
-    Not `scipy.optimize.least_squares`: it asks for residuals at points of its own choice,
-    each of which is a set of simulated days here, and it knows neither grids of values nor days
-    that differ by model. A fit takes one to three steps, each of which is judged by its cost.
+    `scipy.optimize.least_squares` does not fit here. It chooses the points of evaluation itself,
+    and each point costs a set of simulated days. It also knows no grids of values.
+
+    Args:
+        jacobian: J, ``(free values, statistics)``.
+        residual: r, ``(statistics,)``.
     """
     scale = np.sqrt((jacobian**2).sum(axis=1)) + 1e-12
     scaled = jacobian / scale[:, None]
@@ -286,7 +313,7 @@ def _solve(jacobian: Array, residual: Array) -> Array:
 
 
 def derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
-    """Return changes as derivatives of the whitened statistics, ``(changes, statistics)``."""
+    """Return the whitened changes divided by their moves, ``(changes, statistics)``."""
     return np.stack([whitener(change) / delta for change, delta in changes])
 
 
@@ -296,13 +323,16 @@ def derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
 def _crookedness(
     fitter: Fitter, model: Fitted, errors: Array, response: Callable[[dict[str, Array]], Array]
 ) -> Array:
-    """Return the squared error of estimates that comes from statistics that bend.
+    """Return the squared error of the free values because statistics are not linear in them.
+
+    A value that moves by x should move its estimate by x. The error is the mean square of the
+    deviations from the best straight line through these moves.
 
     Args:
-        fitter: Simulates.
+        fitter: Simulator of models.
         model: The model.
-        errors: Standard errors of its free values.
-        response: What a change of the statistics would make of the free values.
+        errors: Standard errors of its free values, ``(free values,)``.
+        response: Function from a change of the statistics to the change of the estimates.
     """
     found: list[float] = []
     for place, (hypothesis, values) in enumerate(model.members):
@@ -332,20 +362,21 @@ def uncertainty(
 ) -> tuple[Array, dict[str, Array]]:
     """Estimate standard errors of the free values, and the variances they give the statistics.
 
-    The parts of the distance depend on each other, so the errors come from how much the estimate
-    would move between simulated days (a sandwich estimate), not from the curvature alone. Where
-    windows begin and end is estimated as well. A value whose change does nothing that is more than
-    chance is not known better than to this change.
+    The parts of the distance depend on each other, so curvature alone gives wrong errors. Instead,
+    each simulated day d gives the change ``(J J')^-1 J r_d`` that it would make in the estimate,
+    and the errors come from the covariance of these changes (a sandwich estimate). Begins and ends
+    of windows are included. If the move of a value changes no statistic beyond chance, this move is
+    added to its error.
 
     Args:
-        fitter: Simulates.
+        fitter: Simulator of models.
         model: The model.
-        days: Simulated days of it, the more the better; none for those it was fitted with.
-        steps: Whether to look, too, how far from straight the way is within the interval: as whole
-            vehicles cross a detector or the start of green, what a value does may come in steps.
+        days: Simulated days of the model, the more the better; empty for its own days.
+        steps: True to add the error of statistics that are not linear in the values. Effects of a
+            value may come in steps, when whole vehicles cross a detector or the start of green.
 
     Returns:
-        Standard errors ``(free values,)``, and variances of the expected statistics per block.
+        Standard errors ``(free values,)``, and variances of the expected statistics by block.
     """
     if not len(model.values):
         return np.empty(0), {

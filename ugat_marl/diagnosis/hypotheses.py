@@ -1,4 +1,4 @@
-"""Library of the effects that may be missing, with the strengths at which they are first tried."""
+"""Library of the effects that may be missing, with the strengths of their first simulations."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ ORDER = (
     "local_speed", "demand_level", "demand_surge", "demand_timing", "turning", "lane_closure",
     "parking",
 )  # fmt: skip
-"""Effects on roads and demand come first, then drivers, trucks, signals, and detectors last."""
+"""Effects on roads and demand, which `ordered` puts first; see there for the rest."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """An effect whose unknown numbers are left open.
+    """An effect with unknown values.
 
     Attributes:
-        name: Of the effect.
-        fixed: Fields that are known: places, windows, models.
-        free: Fields to be fitted.
-        levels: Values of the free fields at which it is first simulated.
-        nominal: Values of the free fields that change nothing, or None if unknown.
-        least: Distance from nominal below which it does not matter in practice.
-        step: Values are multiples of it, if not 0.
-        both: Whether the other side of nominal is the opposite of this one.
-        extreme: Those of `levels` that are looked at, but are no world to be reckoned with.
+        name: Name of the effect.
+        fixed: Names and values of the known fields: places, windows, driver models.
+        free: Names of the fields to fit.
+        levels: Values of the free fields in the first simulations.
+        nominal: Values of the free fields that change nothing; None if there are none.
+        least: Distance from nominal below which the effect does not matter, in the field's unit.
+        step: Grid of the values, in the field's unit; 0 for no grid.
+        both: True if the effect below nominal is the opposite of the effect above.
+        extreme: Members of `levels` that are simulated but too strong for a plausible world.
     """
 
     name: str
@@ -53,17 +53,17 @@ class Hypothesis:
 
     @property
     def faults_only(self) -> bool:
-        """True if it concerns detectors and not traffic."""
+        """True if the effect changes detectors and not traffic."""
         return known_effects()[self.name].on_detectors
 
     def effect(self, values: Sequence[float]) -> Effect:
-        """Make the effect with these values of the free fields, brought into range."""
+        """Make the effect with these values of the free fields, clipped to their ranges."""
         given = dict(self.fixed)
         given |= dict(zip(self.free, self.clipped(values), strict=True))
         return known_effects()[self.name](**given)
 
     def clipped(self, values: Sequence[float]) -> tuple[float, ...]:
-        """Return the values inside the effect's plausible ranges, and on its grid."""
+        """Return the values on the grid of the effect, clipped to their plausible ranges."""
         ranges = known_effects()[self.name].ranges
         found: list[float] = []
         for name, value in zip(self.free, values, strict=True):
@@ -97,7 +97,7 @@ LOCAL = frozenset(
         "swapped",
     }
 )  # fmt: skip
-"""Effects that only a place, and often a window, makes complete: see `local`."""
+"""Effects that need a place, and some a window: see `places`."""
 
 MODELS = ("IDM", "EIDM", "W99")
 """Driver models that are examined."""
@@ -120,7 +120,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
     """Make the hypotheses about the whole network.
 
     Args:
-        scenario: Its vehicle types say where each number is now.
+        scenario: The scenario as it is; its vehicle types give the nominal values.
         allowed: Names of effects to examine.
     """
     found: list[Hypothesis] = []
@@ -164,7 +164,7 @@ def settings_as_members(
 ) -> list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]]:
     """Return the settings of the paper (loads, rain, snow) as starting points of a fit.
 
-    Where drivers are sluggish in several ways at once, no single effect leads there.
+    They change several properties of drivers at once, and single effects do not lead there.
     """
     known = {item.name: item for item in hypotheses}
     found: list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]] = []
@@ -180,7 +180,10 @@ def settings_as_members(
 
 
 def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """Effects into the order in which they are applied: a truck keeps its own acceleration, say."""
+    """Return effects in the order of their application: roads and demand first, detectors last.
+
+    The order matters: trucks come after effects on drivers and so keep their own acceleration.
+    """
 
     def rank(effect: Effect) -> tuple[int, str]:
         if effect.on_detectors:
@@ -195,14 +198,14 @@ def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
 
 
 def examined(name: str) -> Examined:
-    """Return the strengths at which an effect of `GLOBAL` is first simulated."""
+    """Return the strengths of the first simulations of an effect of `GLOBAL`."""
     strengths = known_effects()[name].examined
     assert strengths is not None, name
     return strengths
 
 
 def _nominal(scenario: Scenario, attribute: str, default: float) -> float:
-    """Return the number in the scenario's vehicle types: the mean, or SUMO's default."""
+    """Return the mean of an attribute over the scenario's vehicle types, or `default`."""
     values: list[float] = []
     for text in _attribute(scenario, attribute) if attribute else ():
         try:
@@ -234,7 +237,11 @@ def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:
 def both_ways(
     hypothesis: Hypothesis, values: tuple[float, ...]
 ) -> list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...]]]:
-    """Return both ways in which an effect of the model may change: to nothing, and to more."""
+    """Return two changes of an effect of the model: to nothing, and 40 % farther from nominal.
+
+    Returns:
+        Hypothesis, changed values, present values.
+    """
     if not values or hypothesis.nominal is None:
         return []
     away = tuple(1.4 * v - 0.4 * n for v, n in zip(values, hypothesis.nominal, strict=True))
@@ -244,7 +251,7 @@ def both_ways(
 
 
 def a_few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
-    """Return one strength on each side of nominal: enough to see what is still missing."""
+    """Return one strength on each side of nominal, enough for rounds after the first."""
     levels, nominal = hypothesis.levels, hypothesis.nominal
     if nominal is None or len(levels) < 2:
         return levels
@@ -259,12 +266,12 @@ def effects_of(members: Members) -> tuple[Effect, ...]:
 
 
 def each_left_out(members: Members) -> list[Members]:
-    """Return the set without each of its effects."""
+    """Return the sets that lack one effect each."""
     return [_without(members, index) for index in range(len(members))]
 
 
 def merged(members: Members, new: Members) -> Members:
-    """Return a model with further effects, or with other values; those at nothing are left out."""
+    """Return a model with further effects or other values; effects at nominal are left out."""
     found = {hypothesis.key: (hypothesis, values) for hypothesis, values in members}
     for hypothesis, values in new:
         found[hypothesis.key] = (hypothesis, values)

@@ -1,4 +1,4 @@
-"""Disagreements of data and model: place, regime, size and window, with few false discoveries."""
+"""Disagreements of data and model by place, regime and window, with few false discoveries."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ def locate(
     alpha: float,
     span: tuple[float, float] | None,
 ) -> tuple[Disagreement, ...]:
-    """Find all disagreements that survive the control of false discoveries, strongest first.
+    """Find the disagreements that remain after the control of false discoveries, strongest first.
 
-    The control is that of Benjamini and Hochberg (1995) over all statistics of all pools and all
-    stretches of time. The statistics of a place are then gathered by regime.
+    The procedure of Benjamini and Hochberg (1995) covers all statistics of all pools and all
+    stretches of time. Then the strongest statistic of each place and regime is kept.
 
     Args:
-        site: Lanes.
-        reference: The model.
-        distance: Of the data from it.
-        alpha: Share of false discoveries.
-        span: Begin and end of the periods if they agree, which places bins in time.
+        site: Lanes and detectors.
+        reference: Statistics of the model.
+        distance: Distance of the data from the model.
+        alpha: Largest expected share of false discoveries.
+        span: Begin and end of all periods, s; None if they differ, and then bins of time are not
+            compared.
     """
     found: list[Disagreement] = []
     for name, z in distance.z.items():
@@ -51,12 +52,12 @@ def locate(
 
 
 def discoveries(chances: Sequence[float], tested: int, alpha: float) -> int:
-    """Return how many of some chances are discoveries (Benjamini and Hochberg 1995).
+    """Return the number of discoveries (Benjamini and Hochberg 1995).
 
     Args:
-        chances: The smallest ones, in order.
-        tested: How many were tested in all; the others count as 1.
-        alpha: Share of false discoveries.
+        chances: The smallest p values, in order.
+        tested: Number of all tests; p values that are not given count as 1.
+        alpha: Largest expected share of false discoveries.
     """
     others = [1.0] * (tested - len(chances))
     every = np.array([*chances, *others])
@@ -64,9 +65,9 @@ def discoveries(chances: Sequence[float], tested: int, alpha: float) -> int:
 
 
 def two_sided(z: float) -> float:
-    """Return the two-sided tail of a standardised difference.
+    """Return the two-sided p value of a standardised difference: ``2 Phi(-6 asinh(|z| / 6))``.
 
-    Beyond a few deviations it is heavier than the normal one, as draws of the null are.
+    Its tail is heavier than that of the normal distribution, like that of simulated data sets.
     """
     soft = 6.0 * math.asinh(abs(z) / 6.0)
     return max(2.0 * float(special.ndtr(-soft)), 1e-300)
@@ -136,7 +137,11 @@ def _stretches(
 
 
 def _stretch(z: Array) -> tuple[float, int, int] | None:
-    """Find the contiguous bins with the largest standardised sum."""
+    """Find the contiguous bins with the largest standardised sum, ``sum(z) / sqrt(bins)``.
+
+    Returns:
+        This sum, the first bin and the bin after the last; None without bins.
+    """
     sums = np.concatenate(([0.0], np.cumsum(np.clip(z, -15, 15))))
     best: tuple[float, int, int] | None = None
     for length in range(1, max(int(THRESHOLDS.longest_stretch * len(z)), 1) + 1):

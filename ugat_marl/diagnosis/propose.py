@@ -1,9 +1,8 @@
 """Sets of effects, with their strengths, that would make the measured difference.
 
-Every hypothesis is simulated at a few strengths, and each time the change of the statistics is a
-direction. All sets of up to three directions are fitted to the measured difference by least
-squares, which costs no simulation: so effects that hide each other are proposed together and not
-one after the other.
+Every hypothesis is simulated at a few strengths. Each change of the statistics is a direction, also
+called a ray. Sets of up to three directions are fitted to the measured difference by least
+squares, without further simulations. So effects that hide each other are proposed together.
 """
 
 from __future__ import annotations
@@ -29,11 +28,12 @@ class Direction:
     """Change of the statistics under a hypothesis at one strength.
 
     Attributes:
-        hypothesis: Which.
+        hypothesis: The hypothesis.
         level: Values of its free fields.
-        difference: Change of the statistics, per block.
-        variance: Variance of that change.
-        origin: Values at which nothing changes: the nominal ones, or those of the model so far.
+        difference: Change of the statistics, by block, ``(members, features)``.
+        variance: Variance of that change, by block.
+        origin: Values at which nothing changes: nominal values, or those of the model so far; None
+            if there are none.
     """
 
     hypothesis: Hypothesis
@@ -51,10 +51,10 @@ class Direction:
 
 
 def between(rays: Sequence[Direction]) -> list[Direction]:
-    """Return the rays, and further ones half-way between strengths of the same hypothesis.
+    """Return the rays, and rays at one and two thirds between strengths of the same hypothesis.
 
-    What an effect does is not in proportion to its strength; between two strengths that were
-    simulated it nearly is.
+    The change by an effect is not proportional to its strength, but between two simulated strengths
+    it is nearly linear.
     """
     found = list(rays)
     for first, second in itertools.pairwise(rays):
@@ -85,16 +85,19 @@ def _side(ray: Direction) -> bool:
 def propose(
     rays: Sequence[Direction], whitener: Whitener, price: float, largest: int = 3
 ) -> list[Proposed]:
-    """Find sets of effects, in order of what they would leave.
+    """Find sets of effects, in order of the cost that they would leave.
+
+    For rays A (one per row, whitened) and the measured difference m, the strengths x minimise
+    ``|m - A' x|^2``, and cost = this minimum + price * number of effects.
 
     Args:
-        rays: What hypotheses do.
+        rays: Changes of the statistics under hypotheses.
         whitener: The measured difference and its noise.
-        price: What every further effect must gain.
+        price: Cost of every effect.
         largest: Size of the largest sets.
 
     Returns:
-        Each set of hypotheses once, at its best strengths.
+        Each set of hypotheses once, at its best strengths, least cost first.
     """
     if not rays:
         return []
@@ -106,7 +109,7 @@ def propose(
     best: dict[tuple[object, ...], Proposed] = {}
     kept = list(range(len(rays)))
     for size in range(1, largest + 1):
-        if size == 3 and len(kept) > 40:  # the strongest alone or in pairs
+        if size == 3 and len(kept) > 40:  # all triples would take too long: keep the best rays
             kept = _useful(best, rays, 40)
         for chosen in itertools.combinations(kept, size):
             keys = tuple(sorted(str(rays[index].hypothesis.key) for index in chosen))
@@ -138,7 +141,14 @@ def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
 def _least_squares(
     gram: Array, match: Array, chosen: tuple[int, ...], both: tuple[bool, ...]
 ) -> Array | None:
-    """Return strengths along the rays, within reach; None if one of them does not help."""
+    """Return strengths along the rays, clipped; None if one of the rays does not help.
+
+    Args:
+        gram: Scalar products of all rays, ``(rays, rays)``.
+        match: Scalar products of the rays with the measured difference, ``(rays,)``.
+        chosen: Indices of the rays to use.
+        both: True for rays that may have a negative strength.
+    """
     part = gram[np.ix_(chosen, chosen)]
     try:
         found = np.linalg.solve(
@@ -155,7 +165,7 @@ def _least_squares(
 def _useful(
     best: dict[tuple[object, ...], Proposed], rays: Sequence[Direction], count: int
 ) -> list[int]:
-    """Return the rays of the hypotheses in the best sets so far."""
+    """Return the indices of up to `count` rays, of the hypotheses in the best sets so far."""
     keys: list[str] = []
     for item in sorted(best.values(), key=lambda item: item.expected):
         keys += [str(hypothesis.key) for hypothesis, _ in item.members]
@@ -169,14 +179,14 @@ def _useful(
 
 
 def promising(proposals: Sequence[Proposed]) -> list[Proposed]:
-    """Choose the best sets of each size, if a larger one promises more than a smaller one."""
+    """Choose the best sets of each size; larger sets only if they promise a clearly lower cost."""
     if not proposals:
         return []
     chosen = [item for item in proposals if len(item.members) == 1][:1]
     least = math.inf
     for size in (1, 2, 3):
         own = [item for item in proposals if len(item.members) == size]
-        if own and own[0].expected < 0.95 * least - 20.0:  # more effects must be worth it
+        if own and own[0].expected < 0.95 * least - 20.0:  # more must be gained
             near = [item for item in own if item.expected <= 1.3 * own[0].expected + 50.0]
             chosen += near[: THRESHOLDS.candidates[size - 1]]
             least = own[0].expected
@@ -184,12 +194,12 @@ def promising(proposals: Sequence[Proposed]) -> list[Proposed]:
 
 
 def squared_gap(distance: Distance, base: Reference, periods: int) -> float:
-    """Return squared differences in units of the noise of the scenario as it is.
+    """Return the sum of squared differences in units of the noise of the scenario as it is.
 
     Args:
-        distance: Of a data set from a model.
-        base: The scenario as it is.
-        periods: Periods in the data set.
+        distance: Distance of a data set from a model.
+        base: Statistics of the scenario as it is.
+        periods: Number of periods in the data set.
     """
     total = 0.0
     for name, difference in distance.difference.items():

@@ -1,8 +1,8 @@
-"""Test of what a model leaves against chance, whose distribution is simulated.
+"""Test of the difference between data and a model against simulated chance.
 
-The days of the model are cut in halves: one gives the statistics and their noise, sets of days from
-the other are treated as data. Nothing is looked up in a table, since the parts of the distance
-depend on each other and have heavy tails.
+The days of the model are split into halves. One half gives the statistics and their noise; sets of
+days from the other half are treated as data. Tables of distributions would be wrong, since the
+parts of the distance depend on each other and have heavy tails.
 """
 
 from __future__ import annotations
@@ -36,21 +36,26 @@ from ugat_marl.diagnosis.thresholds import THRESHOLDS
 Array = NDArray[np.float64]
 
 Directed = Callable[[Distance], Mapping[str, float]]
-"""Statistics of a distance."""
+"""Function from a distance to further statistics by name."""
 
 
 class Null:
     """The distribution of the distance under a model.
 
     Args:
-        pools: How places pool.
-        tallies: Simulated days of the model.
-        periods: Periods in a data set.
-        speeds: Whether speeds were measured.
-        directed: Makes further statistics of a distance, which small effects move most, for the
-            model whose distance it is. It is made anew for each half: what was adapted to the days
-            it judges would find them more usual than others.
-        doubt: What the model's means may be off by, see `Reference`; its own days are not.
+        pools: Pools of places.
+        tallies: Tallies of the model's simulated days.
+        periods: Number of periods in a data set.
+        speeds: True if speeds were measured.
+        directed: Function that makes, for a model, further statistics of a distance. Small effects
+            change these most. They are made anew for each half, so that they are never adapted to
+            the days that they judge. None for no further statistics.
+        doubt: Further variance of the model's means in a test of data, see `Reference`; draws from
+            the model's own days do not get it.
+
+    Attributes:
+        reference: Statistics and noise of the model, from all days.
+        expected: Mean total distance of data sets of the model.
     """
 
     def __init__(
@@ -88,12 +93,12 @@ class Null:
     ) -> Residual:
         """Test a data set.
 
-        A network may lock up on one day in a hundred. So a difference must not hang on one day: if
-        it is nothing unusual once some period is left out, that is the chance reported.
+        A difference must not depend on a single day, since a network may lock up on one day in a
+        hundred. If the data without some period are not unusual, the test reports that chance.
 
         Args:
-            data: Its periods.
-            extra: Variance of the expected statistics for the parameters' errors.
+            data: Tallies of the periods.
+            extra: Further variance of the expected statistics, for errors of the free values.
         """
         found = self._judge(self.reference.distance(data, extra=extra))
         if len(data) < 2 or found.p > THRESHOLDS.one_day:
@@ -125,18 +130,20 @@ class Null:
 
 
 def log_normal_tail(value: float, mean: float, deviation: float) -> float:
-    """Return the upper tail of a log-normal distribution, heavier than that of a chi-square.
+    """Return ``Phi((mean - ln value) / deviation)``, the upper tail of a log-normal distribution.
+
+    This tail is heavier than that of a chi-square distribution.
 
     Args:
         value: The value.
         mean: Mean of the logarithms.
-        deviation: Their standard deviation.
+        deviation: Standard deviation of the logarithms.
     """
     return float(special.ndtr((mean - math.log(max(value, 1e-9))) / deviation))
 
 
 def _statistics(found: Distance, directed: Directed | None) -> dict[str, float]:
-    """Return the tested statistics: distances of blocks, largest parts, and directed ones."""
+    """Return the tested statistics: distances of blocks, largest single ones, and directed ones."""
     values = dict(found.parts)
     for name in ("lane", "time"):
         values[f"{name}, largest"] = float(np.abs(found.z[name]).max(initial=0.0)) ** 2
@@ -156,16 +163,18 @@ def _log_moments(values: Sequence[float]) -> tuple[float, float]:
 class MatchedFilters:
     """Matched filters: one for each known direction in which a difference may point.
 
-    What an effect does is spread over many statistics, each of them within its noise. Along its own
-    direction it is one number of unit noise, and so it shows when the sum over everything does not.
+    An effect changes many statistics, each by less than its noise. Its component along its own
+    direction is one number of unit noise, so it may be visible when the total distance is not. With
+    unit direction u and whitened differences z, the statistic is ``max (u z)^2``.
 
     Args:
-        directions: Changes of the statistics, per block.
-        reference: Whose noise.
-        data: The data set, which decides what is used and how precise it is.
-        blocks: Blocks that are looked at.
-        extra: Further variance of the expected statistics.
-        fitted: Changes the model's own parameters make, which a fit has used up.
+        directions: Changes of the statistics by block, one item for each direction.
+        reference: Model that gives the noise.
+        data: Data set that decides which statistics are used and how exact they are.
+        blocks: Names of the blocks to use.
+        extra: Further variance of the expected statistics, by block.
+        fitted: Changes of the statistics by the model's own free values. A fit has removed these
+            directions from the difference, so they are removed from the filters too.
     """
 
     def __init__(
@@ -215,19 +224,19 @@ class MatchedFilters:
 
 
 def _spanned(rows: Array) -> Array:
-    """Return orthonormal columns that span the rows; rows of 0, or the same twice, add nothing."""
+    """Return orthonormal columns that span the rows; zero or dependent rows add no column."""
     _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
     return directions[sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)].T
 
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Directions in which single effects would show in what a model leaves.
+    """Directions in which single effects would change the remaining difference.
 
     Attributes:
-        rays: What effects do, simulated upon the scenario as it is.
-        extra: Variance of the model's statistics for its parameters' errors.
-        fitted: What moving the model's own parameters does.
+        rays: Changes by effects, simulated on top of the scenario as it is.
+        extra: Variance of the model's statistics for errors of its free values, by block.
+        fitted: Changes of the statistics by the model's own free values.
     """
 
     rays: tuple[Direction, ...]
@@ -235,7 +244,12 @@ class Directions:
     fitted: tuple[Mapping[str, Array], ...] = ()
 
     def filters(self, reference: Reference, data: Sequence[Tally]) -> dict[str, MatchedFilters]:
-        """Matched filters on what the pools show, and on what single lanes and minutes show."""
+        """Make matched filters for the pools, and for single lanes and bins of time.
+
+        Args:
+            reference: Model that gives the noise.
+            data: Tallies of the fitted periods.
+        """
         if not self.rays:
             return {}
         wide = [ray.difference for ray in self.rays]

@@ -1,4 +1,4 @@
-"""Selection of the effects: propose, simulate, fit, and stop when what is left is chance."""
+"""Selection of the effects: propose, simulate, fit, and stop when only chance is left."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Period
 
 MOVES_OF_A_VALUE = 8
-"""How often a value is moved, about, until its model is tested; a bar shows how far that is."""
+"""Approximate number of moves of a free value in the test of its model, for the progress bar."""
 
 
 class Selector:
-    """Search for the effects that make the difference.
+    """Search for the effects that explain the difference of data and scenario.
 
     Args:
-        fitter: Simulates and fits.
-        proposer: Finds places and windows.
+        fitter: Simulator and fitter of models.
+        proposer: Finder of places and windows.
         library: Hypotheses about the whole network.
         periods: The fitted periods.
-        effort: Numbers of days.
+        effort: Numbers of simulated days.
         alpha: Level of the tests.
-        null: Makes the test of a model of its days.
-        reporter: Shows progress.
+        null: Function that makes the test of a model from its days.
+        reporter: Display of progress.
 
     Attributes:
-        examined: Effects that were simulated, or for which no place came into question.
+        examined: Names of effects that were simulated, or for which no place was suspicious.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class Selector:
         self.examined: set[str] = set()
 
     def looked_closer(self, base: Tested) -> Tested:
-        """Test the scenario as it is where single effects would show.
+        """Test the scenario as it is along the directions of single effects.
 
         Raises:
-            OutOfTime: The budget does not suffice for that.
+            OutOfTime: The budget does not suffice for their simulation.
         """
         data = self._fitter.data
         self._places = tuple(self._bank(base.model, self._proposer.everywhere(), 0, "places"))
@@ -115,7 +115,7 @@ class Selector:
         return Selected(best, rivals, complete, located.examined | self.examined)
 
     def test(self, model: Fitted) -> Tested:
-        """Simulate more days of a model and tests what it leaves."""
+        """Simulate more days of a model and test the remaining difference."""
         fitter = self._fitter
         moves = len(model.values) * MOVES_OF_A_VALUE * fitter.days
         days = THRESHOLDS.settling_days + self._effort.test + moves
@@ -143,11 +143,11 @@ class Selector:
         return [item.tally for item in found.values()]
 
     def _untested(self, model: Fitted, base: Tested) -> Tested:
-        """Return a model without a test of its own, for which there was no time."""
+        """Return a model with the test of the scenario as it is; there was no time for its own."""
         return Tested(model, base.residual, 0.0 * model.values, {})
 
     def _round(self, start: Tested, number: int) -> Tested | None:
-        """Add, change or remove effects; None if nothing is worth it."""
+        """Add, change or remove effects; return None if no change is worth its price."""
         rays = between(self._library_rays(start.model, number))
         whitener = self._whitener(start.model, WIDE)
         gap = float(whitener.measured @ whitener.measured)
@@ -155,7 +155,7 @@ class Selector:
         enough = chance + THRESHOLDS.look_elsewhere * max(gap - chance, 0.0)
         proposals = propose(rays, whitener, self._fitter.price)
         chosen = [item.members for item in promising(proposals)]
-        little = gap < THRESHOLDS.little * chance  # what differs does so in single places
+        little = gap < THRESHOLDS.little * chance  # the difference is then in single places
         near = little or not proposals or proposals[0].expected > enough
         if near:
             chosen = [*chosen[:2], *self._elsewhere(start.model, rays, number)]
@@ -163,13 +163,13 @@ class Selector:
             chosen += self._nearest()
             chosen += settings_as_members(self._library) if gap > THRESHOLDS.huge * chance else []
         best = self._fitted(start, chosen, f"round {number + 1}: candidates")
-        if best is None and not near:  # the library promised more than it kept
+        if best is None and not near:  # simulations did not confirm the prediction of the library
             chosen = self._elsewhere(start.model, rays, number)
             best = self._fitted(start, chosen, f"round {number + 1}: places")
         return best
 
     def _fitted(self, start: Tested, chosen: Sequence[Members], title: str) -> Tested | None:
-        """The best of some sets of effects on top of a model; None if none is worth its price."""
+        """Return the best set of effects on top of a model; None if none is worth its price."""
         tried = self._tried(start.model, list(dict.fromkeys(chosen)), title)
         best = self._refined(tried, THRESHOLDS.candidates_fitted, start.model.cost)
         if best is None:
@@ -177,16 +177,17 @@ class Selector:
         gain = start.model.cost - best.cost
         if gain > self._fitter.price:
             return self.test(best)
-        # All statistics together may hardly notice what is plain along an effect's own direction.
+        # An effect may be clear along its own direction although the total distance hardly changes.
         if start.residual.p < self._alpha / THRESHOLDS.plain and gain > -self._fitter.price:
             tested = self.test(best)
             return tested if tested.residual.p > self._alpha else None
         return None
 
     def _nearest(self) -> list[Members]:
-        """Return the single strengths of the library that come nearest, simulated, not along rays.
+        """Return the simulated single effects of the library that come nearest to the data.
 
-        What effects do may come in steps, as whole vehicles cross the start of green or a detector.
+        Effects may act in steps, when whole vehicles cross the start of green or a detector. Linear
+        prediction between strengths misses them.
         """
         strengths = [((item, level),) for item in self._library for level in item.levels]
         found: list[tuple[float, int]] = []
@@ -200,11 +201,11 @@ class Selector:
         return [strengths[place] for _, place in sorted(found)[: THRESHOLDS.nearest]]
 
     def _elsewhere(self, model: Fitted, rays: Sequence[Direction], number: int) -> list[Members]:
-        """Propose effects at places and in windows, judged by lanes and minutes too."""
+        """Propose effects at places and in windows; lanes and bins of time are compared as well."""
         present = {item.key for item in self._library}
         found = self._proposer.hypotheses(model.reference, model.distance, self._periods)
         local = [item for item in found if item.key not in present]
-        known = [] if number else list(self._places)  # worked out upon the scenario as it is
+        known = [] if number else list(self._places)  # simulated on the scenario as it is
         places = {ray.hypothesis.key for ray in known}
         added = self._bank(model, [h for h in local if h.key not in places], number, "places")
         added += known
@@ -218,7 +219,7 @@ class Selector:
             if hypothesis.key in places:
                 best.setdefault(hypothesis.name, item.members)
         here = list(best.values())[: THRESHOLDS.kinds_of_places]
-        # What the counts say may be nearer than what a straight ray makes of it.
+        # The strength estimated from counts may be nearer than the strength along a ray.
         here += [((h, h.levels[0]),) for ((h, _),) in here if h.levels[0]]
         return [*(item.members for item in promising(proposals)), *here]
 
@@ -227,7 +228,7 @@ class Selector:
         return Whitener(model.reference, data, THRESHOLDS.foresight, base, blocks)
 
     def _library_rays(self, model: Fitted, number: int) -> tuple[Direction, ...]:
-        """Return rays of the library on top of a model; those of the scenario as it is are kept."""
+        """Return rays of the library on top of a model; rays of the first round are kept."""
         if number:
             return tuple(self._bank(model, self._library, number))
         self._rays = self._rays or tuple(self._bank(model, self._library, 0))
@@ -236,7 +237,7 @@ class Selector:
     def _bank(
         self, model: Fitted, hypotheses: Sequence[Hypothesis], number: int, what: str = "library"
     ) -> list[Direction]:
-        """Simulate hypotheses on top of a model."""
+        """Simulate hypotheses on top of a model, and return the changes of the statistics."""
         present = {hypothesis.key: values for hypothesis, values in model.members}
         jobs: list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...] | None]] = []
         for hypothesis in dict.fromkeys(hypotheses):
@@ -258,7 +259,7 @@ class Selector:
             try:
                 difference, variance = self._fitter.difference(model, members, days)
             except (SimulatorError, OptionError, ScenarioError) as error:
-                # it cannot be there: the lane is too short to park on, say
+                # the effect is impossible there, for example because the lane is too short to park
                 if what == "library":
                     self._reporter.say(f"note: {hypothesis.name} left out: {error}")
                 continue
@@ -280,7 +281,13 @@ class Selector:
         return found
 
     def _refined(self, models: Sequence[Fitted], count: int, gap: float) -> Fitted | None:
-        """The best of several models once the most promising and the best simple are fitted."""
+        """Fit the most promising models and the best single effect; return the best of them.
+
+        Args:
+            models: Simulated models.
+            count: Number of models to fit.
+            gap: Cost of the model before.
+        """
         ranked = sorted(models, key=cost_of)
         simple = [model for model in ranked[count:] if len(model.members) == 1]
         ranked = ranked[:count] + simple[:1]
@@ -294,7 +301,7 @@ class Selector:
         return best
 
     def _kept(self, model: Fitted) -> Fitted:
-        """Remember the best of every set of effects."""
+        """Keep the best model of every set of effects; return the given model."""
         key = str(sorted(str(hypothesis.key) for hypothesis, _ in model.members))
         if key not in self._seen or model.cost < self._seen[key].cost:
             self._seen[key] = model
@@ -313,20 +320,20 @@ def pruned(
     alpha: float,
     reporter: Reporter | None = None,
 ) -> Tested:
-    """Drop effects that do not matter, or that the others can do without.
+    """Drop effects that do not matter, or that the explanation does not need.
 
-    Of two sets that leave no more than chance, the smaller one is the explanation. Costs are
-    compared over the same days, and enough of them: with more the same model costs less, and what
-    a few cost is luck where queues are long.
+    If two sets of effects leave only chance, the smaller set is the explanation. Costs are compared
+    with equal numbers of days, since more days lower the cost of the same model. Few days would
+    leave the comparison to chance where queues are long.
 
     Args:
-        best: The set to begin with.
-        base: The scenario as it is, which is left if every effect is fitted to nothing.
-        fitter: Simulates and fits.
-        kept: Remembers what was fitted.
-        test: Tests what a model leaves.
+        best: The tested set to start from.
+        base: The scenario as it is; the result if every effect is fitted to nothing.
+        fitter: Simulator and fitter of models.
+        kept: Function that keeps a fitted model for the list of rivals.
+        test: Function that tests a model.
         alpha: Level of the tests.
-        reporter: Shows progress.
+        reporter: Display of progress; None for no display.
     """
     reporter = reporter or Silent()
 
@@ -350,7 +357,7 @@ def pruned(
             least = min(doubtful, key=cost_of)
         tested = test(least)
         enough = tested.residual.p > alpha
-        # What may not be there is not named, either, where nothing suffices.
+        # If no set suffices anyway, an effect that may be absent is not named either.
         vain = least in doubtful and best.residual.p <= alpha
         if least.cost > best.model.cost and not enough and not vain:
             break
@@ -362,7 +369,7 @@ def pruned(
 
 
 def _doubtful(tested: Tested) -> list[int]:
-    """Places of the effects whose intervals hold the nominal value: they may not be there."""
+    """Return indices of effects whose intervals hold the nominal values: they may be absent."""
     found: list[int] = []
     first = 0
     for place, (hypothesis, values) in enumerate(tested.model.members):

@@ -1,4 +1,4 @@
-"""Signal timing that differs from the scenario's: read off the log, no statistics needed."""
+"""Signal timing that differs from the scenario, read off the signal log without statistics."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ugat_marl.effects import Effect, effect_from
 from ugat_marl.scenarios import GREEN, Network, Scenario, SignalLog
 
 IN_THE_LOG = ("yellow_time", "all_red_time")
-"""Effects that the log of the signals tells by itself; a replay has them without knowing."""
+"""Effects that are read off the signal log. A replay of the log contains them already."""
 _AMBER = frozenset("yY")
 
 
 def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> tuple[Effect, ...]:
-    """Read yellow and all-red times off the log, where the scenario's control has others.
+    """Return effects for yellow and all-red times of the log that differ from the scenario's.
 
-    A log of the network's own programme is compared with that programme instead.
+    Logs with only states of the network's own programme are left out.
     """
     yellow: Counter[float] = Counter()
     red: Counter[float] = Counter()
@@ -47,9 +47,9 @@ def _own(log: SignalLog, programme: tuple[tuple[float, str], ...]) -> bool:
 
 
 def _clearances(log: SignalLog) -> list[tuple[str, float]]:
-    """Return durations of yellow, and of the time from its end to the next start of a green.
+    """Return durations in s of yellow (``y``), and from its end to the next green (``r``).
 
-    Other links may be green all the while; red-yellow is not yellow.
+    Other links may be green at the same time. Red-yellow does not count as yellow.
     """
     found: list[tuple[str, float]] = []
     began = ended = math.nan

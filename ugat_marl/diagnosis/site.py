@@ -1,4 +1,4 @@
-"""The measured part of a network: lanes, their signals and their detectors, in a fixed order."""
+"""Measured part of a network: lanes with their signals and detectors, in a fixed order."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class SiteLane:
     """A lane in front of a traffic light.
 
     Attributes:
-        id: SUMO id.
-        edge: Its edge.
-        intersection: Index of its intersection in the site.
-        links: Letters of the signal state that concern it.
-        speed_mps: Speed limit.
-        detectors: Kind to the ids of the detectors on it.
-        following: Edges it leads to.
+        id: SUMO id of the lane.
+        edge: SUMO id of its edge.
+        intersection: Index of its intersection in `Site.intersections`.
+        links: Indices of its letters in the signal state.
+        speed_mps: Speed limit, m/s.
+        detectors: Ids of the detectors on it, by kind.
+        following: Ids of the edges that it leads to.
     """
 
     id: str
@@ -52,11 +52,11 @@ class Greens:
     """The greens of one lane in one period; all arrays ``(greens,)``, times in s.
 
     Attributes:
-        start_s: Green begins.
-        end_s: Green ends and yellow begins.
-        red_s: Red begins.
-        next_s: The next green begins, or the period ends.
-        protected: Whether the green gives right of way.
+        start_s: Begin of green.
+        end_s: End of green and begin of yellow.
+        red_s: Begin of red.
+        next_s: Begin of the next green, or end of the period.
+        protected: True if the green gives right of way.
     """
 
     start_s: NDArray[np.float64]
@@ -73,9 +73,9 @@ class Site:
     Attributes:
         intersections: SUMO ids of the traffic lights.
         lanes: Incoming lanes.
-        exits: Outgoing lanes with an exit detector: (intersection, lane, detectors).
+        exits: Outgoing lanes with an exit detector: index of the intersection, lane, detectors.
         detectors: All detectors.
-        owner: Detector to its traffic light.
+        owner: SUMO id of the traffic light, by detector.
     """
 
     intersections: tuple[str, ...]
@@ -129,14 +129,14 @@ class Site:
 
     @functools.cached_property
     def places(self) -> tuple[tuple[int, str, str], ...]:
-        """Index of the traffic light, edge and lane of every place: incoming lanes, then exits."""
+        """Index of the intersection, edge and lane of every place: incoming lanes, then exits."""
         incoming = [(lane.intersection, lane.edge, lane.id) for lane in self.lanes]
         outgoing = [(owner, edge_of(name), name) for owner, name, _ in self.exits]
         return (*incoming, *outgoing)
 
     @functools.cached_property
     def counted(self) -> Mapping[str, tuple[str, int]]:
-        """Detector to the feature and the place it counts for; the first one of a kind there."""
+        """Feature and place by detector, for the first detector of each kind on a lane."""
         rows: dict[str, tuple[str, int]] = {}
         for index, lane in enumerate(self.lanes):
             for kind, names in lane.detectors.items():
@@ -146,7 +146,7 @@ class Site:
         return rows
 
     def greens(self, period: Period) -> tuple[Greens, ...]:
-        """Return the greens of every lane; only whole ones."""
+        """Return the greens of every lane that begin and end inside the period."""
         found: list[Greens] = []
         for lane in self.lanes:
             log = period.signals.get(self.intersections[lane.intersection], ())
@@ -163,7 +163,7 @@ def _following(item: Intersection, lane: str) -> frozenset[str]:
 
 
 def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
-    """Merge what the links of a lane show into its greens."""
+    """Return the greens of a lane from the letters of its links in the signal log."""
     seen: dict[str, str] = {}
     changes: list[tuple[float, str]] = []
     for time, state in log:

@@ -1,4 +1,4 @@
-"""Verdict: one of five, in a sentence, with what would decide between rivals."""
+"""Verdict of a diagnosis: one of five, with a sentence and the next useful measurement."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect, known_effects
 
 NOUNS = {"swapped": "swapped detectors", "stuck": "a stuck detector"}
-"""Effects whose names are no nouns, in a sentence."""
+"""Nouns for effects whose names are no nouns, for sentences."""
 
 
 def conclude(
@@ -40,10 +40,10 @@ def conclude(
     """Draw the conclusion of a search.
 
     Args:
-        located: The scenario as it is.
-        selection: The result of the search.
-        selector: Tests rivals.
-        verification: The held-out periods.
+        located: Comparison of the scenario as it is with the data.
+        selection: Result of the search.
+        selector: The search, which also tests rivals.
+        verification: Tests on the held-out periods.
         alpha: Level of the tests.
         site: Lanes and detectors.
     """
@@ -86,8 +86,8 @@ def unchallenged(
     """Conclude that the scenario as it is could have made the data.
 
     Args:
-        located: The scenario as it is.
-        ruled_out: Effects the data cannot show.
+        located: Comparison of the scenario as it is with the data.
+        ruled_out: Names of effects that the data cannot show.
         timing: Effects that are read off the signal log.
     """
     blind = f"; {len(ruled_out)} effects could not be examined" if ruled_out else ""
@@ -102,7 +102,7 @@ def unchallenged(
 
 
 def unverified(located: Located, selected: Selected) -> tuple[Verified, Conclusion]:
-    """Conclude what can be said when the budget ended before the model was verified."""
+    """Conclude if the budget ended before the model was verified."""
     residual = located.base.residual
     members = selected.best.model.members
     nearest = f" The nearest so far is {describe_members(members)}." if members else ""
@@ -115,7 +115,7 @@ def unverified(located: Located, selected: Selected) -> tuple[Verified, Conclusi
 
 
 def _sufficient(selection: Selected, selector: Selector, alpha: float, site: Site) -> Conclusion:
-    """Conclude where a set of effects leaves no more than chance."""
+    """Conclude if the selected set of effects leaves no more than chance."""
     best = selection.best
     names = describe_members(best.model.members)
     if ends := _at_an_end(best.model.members):
@@ -144,7 +144,7 @@ def _sufficient(selection: Selected, selector: Selector, alpha: float, site: Sit
 
 
 def _unexplained(selection: Selected) -> str:
-    """Say that nothing was found; only a search that came to its end says it of the library."""
+    """Return the sentence that no effect explains the data; it depends on the end of the search."""
     if selection.complete:
         return "Simulation and measurement disagree, and no effect of the library explains it"
     return (
@@ -154,13 +154,16 @@ def _unexplained(selection: Selected) -> str:
 
 
 def combined(one: float, other: float) -> float:
-    """Return the chance of two independent tests as a whole (Fisher 1932)."""
+    """Return the p value of two independent tests (Fisher 1932).
+
+    -2 ln(p q) has a chi-square distribution with 4 degrees of freedom.
+    """
     product = max(one * other, 1e-300)
     return float(stats.chi2.sf(-2.0 * math.log(product), df=4))
 
 
 def _rivals(selection: Selected, selector: Selector, alpha: float) -> tuple[Fitted, ...]:
-    """Find other sets of effects that leave no more than chance and are hardly farther away."""
+    """Find other sets of effects that leave no more than chance at nearly the same cost."""
     best = selection.best.model
     names = _kinds(best.members)
     found: list[Fitted] = []
@@ -179,7 +182,7 @@ def _rivals(selection: Selected, selector: Selector, alpha: float) -> tuple[Fitt
 
 
 def _at_an_end(members: Members) -> str:
-    """Values at an end of their range that is a bound of plausibility, not of the definition."""
+    """Describe values at an end of their plausible range; natural limits such as 0 do not count."""
     found: list[str] = []
     for hypothesis, values in members:
         ranges = known_effects()[hypothesis.name].ranges
@@ -195,7 +198,10 @@ def _kinds(members: Members) -> set[str]:
 
 
 def _look_at(selection: Selected) -> str | None:
-    """The regime in which most is left; as long as more time may explain it, no measurement."""
+    """Suggest a measurement where most is left; None if the search ended early.
+
+    A longer search may still explain the data then.
+    """
     if not selection.complete:
         return None
     z = selection.best.model.distance.z["network"][0]
@@ -205,7 +211,7 @@ def _look_at(selection: Selected) -> str | None:
 
 
 def _separating(best: Fitted, rival: Fitted) -> str:
-    """Name the statistic in which two models differ most, and the periods that would decide."""
+    """Name the statistic in which two models differ most, and the number of periods to decide."""
     block, other = best.reference.blocks["network"], rival.reference.blocks["network"]
     difference = (block.mean - other.mean)[0]
     deviation = np.sqrt(block.variance[0])
@@ -218,7 +224,7 @@ def _separating(best: Fitted, rival: Fitted) -> str:
 
 
 def describe_members(members: Members) -> str:
-    """Describe effects: name, place, window, values."""
+    """Describe effects by name, place, window and values."""
     return listed([describe_effect(hypothesis, values) for hypothesis, values in members])
 
 
@@ -243,7 +249,10 @@ def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
 def place_and_window(
     hypothesis: Hypothesis,
 ) -> tuple[str | None, tuple[float, float] | None]:
-    """Return the texts of an effect joined, and its window."""
+    """Return the place of an effect and its window in s; None for what it does not have.
+
+    The place joins all fixed texts by ``>``.
+    """
     fixed = dict(hypothesis.fixed)
     texts = [value for value in fixed.values() if isinstance(value, str)]
     begin, end = (fixed.get(key) for key in WINDOW)
@@ -254,7 +263,13 @@ def place_and_window(
 def effect_record(
     hypothesis: Hypothesis, values: tuple[float, ...], errors: tuple[float, ...] | None = None
 ) -> EffectRecord:
-    """Write an effect, with 95 % intervals of its numbers if their errors are known."""
+    """Return the record of an effect, with 95 % intervals of its values if errors are given.
+
+    Args:
+        hypothesis: The effect with its fixed fields.
+        values: Values of its free fields.
+        errors: Standard errors of these values.
+    """
     place, window = place_and_window(hypothesis)
     ranges = known_effects()[hypothesis.name].ranges
     parameters: dict[str, Parameter] = {}
@@ -321,11 +336,11 @@ STATISTICS = {
     "kept_to_exit": "vehicles at exit per vehicle at stop",
     "occupied": "occupied time of advance detector",
 }
-"""What the statistics are, in words; those in time have " in time" behind their names."""
+"""Descriptions of the statistics; names of statistics in bins of time end with " in time"."""
 
 
 def statistic(name: str) -> str:
-    """Return a statistic in words; its own name where none are known."""
+    """Return the description of a statistic; its name if there is no description."""
     base = name.removesuffix(" in time")
     return STATISTICS.get(base, base) + (" in some stretch of time" if base != name else "")
 
@@ -338,7 +353,7 @@ def clock(seconds: float) -> str:
 
 
 def amount(field: str, value: float, unit: str) -> str:
-    """Return a number of an effect as it follows the effect's name: `` of 1.4 s``, `` × 0.8``."""
+    """Return a value as text behind the name of an effect: `` of 1.4 s``, `` × 0.8``."""
     if field == "factor":
         return f" × {value:.3g}"
     if field == "share":

@@ -1,4 +1,4 @@
-"""The scenario as it is and the model selected, on periods that were not fitted."""
+"""Verification of the scenario as it is and the selected model on held-out periods."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def verify_model(study: Study, base: Tested, best: Tested) -> Verified:
 
 
 def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
-    """Put both models side by side."""
+    """Make the tables that compare both models."""
     return Tables(
         statistics_table(study, base, best),
         lanes_table(study, base, best),
@@ -104,10 +104,10 @@ def _rms(z: Array) -> float:
 
 
 def courtesy(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
-    """Compute what traffic engineers are used to see: GEH, FHWA's criteria, discharge headway.
+    """Compute the usual criteria of traffic engineers: GEH, those of FHWA, saturation headway.
 
-    None of them decides anything here. GEH and headways are those of the held-out days; what
-    FHWA asks for is how much days differ, which takes all that were measured.
+    They do not affect the verdict. GEH and headway use the held-out days. The criteria of FHWA use
+    all measured days, since they need the variation between days.
     """
     data, every = added(study.heldout), study.all_days
 
@@ -140,7 +140,7 @@ def _headway(days: Sequence[Tally]) -> float | None:
 def travel_times(study: Study, best: Tested) -> TravelTimes:
     """Return the mean simulated travel time of the measured days, before and after.
 
-    Detectors do not know travel times, so the measured one has no place here.
+    Detectors do not measure travel times, so there is no measured value to compare with.
     """
     numbers = study.engine.first(min(study.effort.test, study.effort.base))
 
