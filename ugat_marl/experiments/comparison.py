@@ -148,7 +148,7 @@ class Comparison:
         return min(names, key=lambda name: float(self.values(name, target, "att_s").mean()))
 
     def regret_s(self, setting: str, target: str) -> Floats:
-        """Return the ATT above that of the best setting there, in s, one per training seed."""
+        """Return the ATT minus that of the best setting there, in s, one per training seed."""
         best = self.values(self.best(target), target, "att_s")
         return self.values(setting, target, "att_s") - best
 

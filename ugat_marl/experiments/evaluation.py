@@ -241,7 +241,7 @@ class TrainedPolicy:
 
 
 def rule_factory(spec: str) -> PolicyFactory:
-    """Return a factory for a controller such as ``"largest-queue:30"``; check the spelling now."""
+    """Return a factory for a controller such as ``"largest-queue:30"``, and check its spelling."""
     parse_spec(spec)
     return RuleFactory(spec)
 

@@ -69,7 +69,7 @@ def _above_first(found: Evaluation, policy: str, domain: str) -> NDArray[np.floa
 
 
 def _above_best(found: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
-    """Return the hidden cost above that of the best controller there, seed by seed, in %."""
+    """Return 100 · (cost / cost of the best controller there - 1), seed by seed, in %."""
     best = min(found.policies, key=lambda name: float(found.values(name, domain, "cost").mean()))
     least = found.values(best, domain, "cost")
     return 100.0 * (found.values(policy, domain, "cost") / np.maximum(least, 1e-9) - 1.0)

@@ -188,7 +188,7 @@ def file_name(name: str) -> str:
 
 
 def file_names(names: Iterable[str]) -> list[str]:
-    """Return names of files for policies, all different: repeated names end in -2, -3, ...."""
+    """Return names of files for policies, all different: repeated names end in -2, -3 and so on."""
     found: list[str] = []
     for name in names:
         own = [file_name(name), *(f"{file_name(name)}-{k}" for k in range(2, len(found) + 2))]

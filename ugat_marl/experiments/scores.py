@@ -107,7 +107,7 @@ class Evaluation:
         return list(dict.fromkeys(name for scores in played for name in scores.hidden))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything, for JSON: the summary and every episode."""
+        """Return the summary and every episode, as values for JSON."""
         summary: list[dict[str, Any]] = []
         for policy in self.policies:
             for domain in self.domains:

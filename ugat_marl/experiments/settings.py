@@ -62,8 +62,9 @@ class LearnerSpec:
             device: Device for the updates of "dqn"; baselines stay on the CPU.
 
         Raises:
-            UnknownNameError: No such setting.
-            OptionError: A value is impossible, the library is not installed, or no such device.
+            UnknownNameError: A setting does not exist.
+            OptionError: A value is impossible, the library is not installed, or the device does
+                not exist.
         """
         return learner_factory(self.name, self.settings, self.dqn, device)
 

@@ -53,7 +53,10 @@ class PairedTest:
 
     @classmethod
     def of(cls, one: Floats, other: Floats) -> PairedTest:
-        """Compare two settings, ``(n,)`` each, in the same order of seeds."""
+        """Compare two settings, ``(n,)`` each, in the same order of seeds.
+
+        t = |mean| · √n / s of the differences, with n - 1 degrees of freedom.
+        """
         differences = one - other
         count, better = differences.size, int((differences < 0).sum())
         p = math.nan

@@ -181,7 +181,7 @@ def settings_of(name: str, budget: int) -> list[str]:
 
 
 def _fields(settings: int) -> list[int]:
-    """Return the number that takes part in each rung: half of those before, down to two."""
+    """Return the number of settings in each rung: half of the rung before, down to two."""
     fields = [settings]
     while fields[-1] > 2:
         fields.append(math.ceil(fields[-1] / 2))
