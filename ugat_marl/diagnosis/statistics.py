@@ -323,7 +323,7 @@ def _controlled(
 
 @functools.cache
 def _grain(width: int) -> Array:
-    """Return the least standard deviation of one observation, by feature or bin of time."""
+    """Return the least standard deviation of a sum over a day, by feature or bin of time."""
     if width != len(FEATURES):
         return np.full(width, THRESHOLDS.grain)
     return np.array(
