@@ -1,9 +1,13 @@
 """Environments: PettingZoo's `ParallelEnv` with one agent per signalised intersection.
 
-`TrafficEnv` simulates a scenario. `observations` and `rewards` define what agents see and are paid.
-Effects on controllers change both, and what becomes of an action: through `sensors`, `objectives`
-and `actuators`. `wrappers` change what a learner sees, `vector` steps many environments at once in
-worker processes, `adapters` fit other libraries.
+- `traffic_env`, `options`: `TrafficEnv` simulates a scenario; `EnvOptions` are its options.
+- `observations`, `rewards`, `actions`: observation vectors, rewards, and checks of actions.
+- `sensors`, `actuators`, `objectives`: effects on the counts and commands of controllers, and on
+  the cost of an episode.
+- `wrappers`: other observations and equal spaces for learners; `agents` makes padded arrays.
+- `vector`: many environments in worker processes, stepped together.
+- `adapters`: environments in the form of other libraries.
+- `rendering`: pictures of the network.
 """
 
 import lazy_loader

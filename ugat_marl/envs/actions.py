@@ -1,4 +1,4 @@
-"""Checks of the actions of agents, before anything happens."""
+"""Checks of the actions of agents before a step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def checked_phases(
     """Return the green phase requested by each agent, in their order.
 
     Raises:
-        ActionError: An action is missing, of an unknown agent, or outside its space.
+        ActionError: An action is missing, is of an unknown agent, or is outside its space.
     """
     _refuse_unknown("actions", actions, agents)
     requested: list[int] = []
@@ -36,10 +36,10 @@ def checked_phases(
 
 
 def checked_delays(seconds: Mapping[str, float], agents: Sequence[str]) -> dict[str, float]:
-    """Delays of the greens of some agents, in s.
+    """Return the delays of the greens of some agents, in s.
 
     Raises:
-        ActionError: Of an unknown agent, negative or not finite.
+        ActionError: A delay is of an unknown agent, negative or not finite.
     """
     _refuse_unknown("delays", seconds, agents)
     for agent, delay in seconds.items():

@@ -1,4 +1,4 @@
-"""Commands on their way to the lights, through the actuators of a scenario's effects.
+"""Path of commands to the lights, through the actuators of a scenario's effects.
 
 An environment has `Actuators` only if its scenario lists effects on commands.
 """
@@ -47,7 +47,7 @@ class Actuators:
         """Return the actuators of a scenario with these effects; None if there are none.
 
         Raises:
-            ScenarioError: An order of phases that an intersection's phases do not allow.
+            ScenarioError: The phases of an intersection do not allow the order of phases.
         """
         latest = {effect.name: effect for effect in effects}  # the last of a name counts
         made = (e.actuator(network, timing, decision_interval_s) for e in latest.values())
@@ -55,15 +55,15 @@ class Actuators:
         return cls(chain, network, timing, decision_interval_s) if chain else None
 
     def reset(self, seed: int) -> None:
-        """Begin the episode of this seed, which decides what is drawn at random."""
+        """Begin an episode; `seed` decides all random draws."""
         for actuator in self._chain:
             actuator.reset(seed)
 
     def obey(self, commands: Sequence[int], states: Sequence[SignalState]) -> list[int]:
-        """Return the phases the signal machines are asked for in the next decision interval.
+        """Return the phases that signal machines are asked for in the next decision interval.
 
         Args:
-            commands: Phase asked for at each intersection, at this decision.
+            commands: Phase that the agent of each intersection chose at this decision.
             states: State of each signal machine.
         """
         arrived: Sequence[int | None] = list(commands)
@@ -75,10 +75,10 @@ class Actuators:
         ]
 
     def masks(self, states: Sequence[SignalState]) -> list[NDArray[np.int8]]:
-        """Return the commands that would be obeyed if given now, ``(phases,)`` per intersection.
+        """Return masks of commands that would be obeyed if given now, ``(phases,)`` per light.
 
-        A command that is under way for some time meets another state than the present one: the one
-        to which those ahead of it lead, if none of them is lost.
+        A delayed command arrives in a later state of the light. This state follows from the
+        commands ahead of it, if none of them is lost.
         """
         ahead = [commands for actuator in self._chain for commands in actuator.under_way]
         masks: list[NDArray[np.int8]] = []
@@ -92,7 +92,10 @@ class Actuators:
         return masks
 
     def _obeyed(self, place: int, command: int | None, state: SignalState) -> int:
-        """Return the phase a light is asked for; a command that is not obeyed changes nothing."""
+        """Return the phase a light is asked for.
+
+        A command that is not obeyed keeps the phase; if that must end, the next phase follows.
+        """
         mask = self._mask(place, state)
         if command is not None and mask[command]:
             return command

@@ -21,7 +21,7 @@ class AgentSet:
     """The agents of an environment, in a fixed order, with the sizes of their spaces.
 
     Attributes:
-        names: The agents.
+        names: Names of the agents.
         observation_sizes: Length of each agent's observation vector.
         action_counts: Number of actions of each agent.
     """
@@ -32,10 +32,10 @@ class AgentSet:
 
     @classmethod
     def of(cls, env: AnyParallelEnv) -> AgentSet:
-        """The agents of any parallel environment with Box vectors and Discrete actions.
+        """Return the agents of a parallel environment with Box vectors and Discrete actions.
 
         Raises:
-            OptionError: No agents, or a space of another kind.
+            OptionError: The environment has no agents, or a space of another kind.
         """
         names = tuple(env.possible_agents)
         if not names:
@@ -48,20 +48,20 @@ class AgentSet:
 
     @property
     def widest_observation(self) -> int:
-        """Length to which observations are padded."""
+        """Length of padded observations."""
         return max(self.observation_sizes)
 
     @property
     def most_actions(self) -> int:
-        """Number to which actions are padded."""
+        """Number of padded actions."""
         return max(self.action_counts)
 
     def stack(self, observations: Observations) -> NDArray[np.float32]:
-        """Observations as one array ``(agents, widest_observation)``, padded with zeros.
+        """Return observations as one array ``(agents, widest_observation)``, padded with zeros.
 
         Raises:
-            OptionError: An agent is missing, unknown, or its vector has another length or holds
-                what is not a number.
+            OptionError: An agent is missing or unknown, or its vector has another length or holds
+                NaN or infinity.
         """
         if len(observations) != len(self.names):
             raise OptionError(
@@ -85,7 +85,7 @@ class AgentSet:
         return stacked
 
     def masks(self, infos: Infos) -> Mask:
-        """Allowed actions ``(agents, most_actions)``; an info without a mask allows all.
+        """Return allowed actions ``(agents, most_actions)``; an info without a mask allows all.
 
         Raises:
             ActionError: An agent's mask allows nothing, or has the wrong length.
@@ -105,16 +105,16 @@ class AgentSet:
         return allowed
 
     def actions(self, chosen: NDArray[np.int64]) -> dict[str, int]:
-        """The row of action indices as a dictionary."""
+        """Return action indices ``(agents,)`` as a dictionary by agent."""
         return dict(zip(self.names, chosen.tolist(), strict=True))
 
     def values(self, by_agent: Mapping[str, Any]) -> NDArray[np.float32]:
-        """One number per agent as a vector ``(agents,)``."""
+        """Return one number per agent as a vector ``(agents,)``."""
         return np.array([by_agent[name] for name in self.names], dtype=np.float32)
 
 
 def groups_of(agents: AgentSet) -> dict[str, str]:
-    """Agent to its group: all agents ``<group>_<n>`` if they are alike, or the agent itself."""
+    """Return the group of each agent ``<group>_<n>``, or its own name if the group is not alike."""
     sizes = zip(agents.observation_sizes, agents.action_counts, strict=True)
     kinds: dict[str, set[tuple[int, int]]] = {}
     for agent, kind in zip(agents.names, sizes, strict=True):

@@ -1,4 +1,4 @@
-"""Hidden objectives: emissions, fairness, safety and persons, which no training sees."""
+"""Hidden objectives: emissions, fairness, safety and persons. No training uses them."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ OBJECTIVE_MEASURES: dict[str, str] = {
     "hard_brakings": "hard brakings [1/1000 veh]",
     "collisions": "collisions [1/1000 veh]",
 }
-"""Measures of a domain with an objective beside `ugat_marl.data.MEASURES`, with their
-headings."""
+"""Measures and their headings, of domains with an objective, beside `ugat_marl.data.MEASURES`."""
 
 PERSONS: dict[str, float] = {
     "bus": 25.0,
@@ -37,21 +36,21 @@ PERSONS: dict[str, float] = {
     "moped": 1.0,
     "bicycle": 1.0,
 }
-"""Persons assumed in a vehicle of a class."""
+"""Number of persons assumed in a vehicle of each class."""
 
 PERSONS_IN_A_CAR = 1.5
-"""Persons assumed in any other vehicle."""
+"""Number of persons assumed in any other vehicle."""
 
 
 class Objectives:
     """Measures of an episode that are hidden from training, and their cost.
 
     Args:
-        cost: Cost of the measures.
-        scenario: Its vehicle types decide how many persons travel.
+        cost: Function from measures to their cost.
+        scenario: Scenario whose vehicle types decide the numbers of persons.
 
     Attributes:
-        persons: Vehicle type to the persons in each vehicle, "" for all other types.
+        persons: Vehicle type to the number of persons in a vehicle; "" for all other types.
     """
 
     def __init__(self, cost: Cost, scenario: Scenario) -> None:
@@ -75,8 +74,8 @@ class Objectives:
         """Return the scores with the hidden measures and their cost.
 
         Args:
-            scores: Of an episode.
-            trips: Of its vehicles, emissions and persons included.
+            scores: Scores of an episode.
+            trips: Trips of its vehicles, with emissions and persons.
         """
         hidden = hidden_measures(trips)
         cost = self._cost({"queue": scores.queue, "delay": scores.delay, **hidden})
@@ -86,11 +85,11 @@ class Objectives:
 def hidden_measures(trips: Trips) -> dict[str, float]:
     """Return the measures of `OBJECTIVE_MEASURES`, without the cost.
 
-    CO2 is the mean over vehicles that entered, of what each emitted until it arrived or the episode
-    ended (SUMO's emission model HBEFA, by the emission class of the vehicle's type). The Gini
-    coefficient and the 95 % quantile are over the delays of all vehicles due. Person delay is the
-    mean delay weighted with the persons in each vehicle. Hard brakings and collisions are counted
-    by SUMO and given per 1000 vehicles that entered.
+    - CO2: mean emission in g per vehicle that entered, until it arrived or the episode ended
+      (SUMO's emission model HBEFA, by the emission class of the vehicle's type).
+    - Gini coefficient and 95 % quantile: over the delays of all vehicles due.
+    - Person delay: mean delay, weighted with the persons in each vehicle.
+    - Hard brakings and collisions: counted by SUMO, per 1000 vehicles that entered.
     """
     entered = max(int(trips.entered.sum()), 1)
     persons, delays = trips.persons, trips.delay_s
@@ -106,7 +105,10 @@ def hidden_measures(trips: Trips) -> dict[str, float]:
 
 
 def gini(values: NDArray[np.float64]) -> float:
-    """Return the Gini coefficient of values >= 0: 0 if all are equal, near 1 if one has it all."""
+    """Return the Gini coefficient of values >= 0: 0 if all are equal, near 1 if one has it all.
+
+    sum_i (2 i - n - 1) x_i / (n sum_i x_i),    x sorted, i = 1, ..., n
+    """
     total = _sum(values)
     if total <= 0:
         return 0.0
@@ -115,5 +117,5 @@ def gini(values: NDArray[np.float64]) -> float:
 
 
 def _sum(values: NDArray[np.float64]) -> float:
-    """Return the exact sum; numpy's own depends on where in memory the values lie."""
+    """Return the exact sum; numpy's sum depends on the memory layout."""
     return math.fsum(values.tolist())

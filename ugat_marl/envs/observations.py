@@ -1,7 +1,7 @@
 """Observations: from a snapshot to one vector per intersection, with its space.
 
-Every vector is ``features | own phase one-hot | context``: what the intersection measures, what it
-shows, and, if asked for, the same of its neighbours.
+Every vector is ``features | own phase one-hot | context``. Features are measured at the
+intersection. The context holds features and phases of neighbours; it is empty by default.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ugat_marl.simulation import Snapshot
 ObservationName = Literal["count", "queue", "pressure", "waiting", "density", "movements"]
 
 COUNT_SCALE = 40.0
-"""Vehicles that make a count 1: what fits on a lane of 300 m."""
+"""Number of vehicles for a count of 1; so many fit on a lane of 300 m."""
 
 WAITING_SCALE_S = 100.0
 """Mean waiting time per storage place that makes `waiting` 1."""
@@ -35,7 +35,8 @@ UNITS: dict[str, str] = {
     "movements": "halting per incoming, vehicles per incoming, vehicles per outgoing lane; "
     "each / lane capacity",
 }  # fmt: skip
-"""What one feature of each observation is. All are clipped to [0, 1] (pressure: [-1, 1])."""
+"""Meaning and unit of one feature of each observation. All are clipped to [0, 1] (pressure: [-1,
+1])."""
 
 
 class Observer:
@@ -44,15 +45,15 @@ class Observer:
     Args:
         network: The network.
         name: One of `ObservationName`; ``"count"`` is the observation of the UGAT paper.
-        neighbours: How many roads away intersections are whose features and phase are included.
+        neighbours: Distance in roads up to which features and phases of others are included.
 
     Attributes:
         layouts: Sizes of the parts of each intersection's vector, in the network's order.
         spaces: A float32 `Box` for each intersection; one object for equal ones.
-        groups: Group to the positions of its intersections. One group has the same lanes and
-            phases, and so the same spaces under every observation: the names of agents do not
-            depend on what is observed.
-        agents: ``<group>_<n>`` for each intersection.
+        groups: Group to the positions of its intersections. Intersections of a group have equal
+            numbers of lanes and phases, so their spaces are equal under every observation, and
+            the names of agents do not depend on the observation.
+        agents: Name ``<group>_<n>`` of each intersection.
     """
 
     def __init__(self, network: Network, name: str = "count", neighbours: int = 0) -> None:
@@ -97,11 +98,11 @@ class Observer:
         return self.name == "waiting"
 
     def observe(self, snapshot: Snapshot, phases: Sequence[int]) -> list[NDArray[np.float32]]:
-        """The vectors of all intersections.
+        """Return the vectors of all intersections.
 
         Args:
-            snapshot: What was measured.
-            phases: Green phase each intersection shows or clears towards.
+            snapshot: Measured lanes.
+            phases: Phase of each intersection that is green or about to be.
 
         Returns:
             For each intersection float32 ``(layout.size,)``, parts of one fresh array.
@@ -113,10 +114,10 @@ class Observer:
         return [seen[part] for part in self._parts]
 
     def _place(self) -> None:
-        """Lay out ``features | phases`` of all intersections in one row, and who sees what of it.
+        """Compute the places of all numbers in one row, and the places that each agent sees.
 
-        Every number of a decision is then written by three assignments, however many intersections
-        there are.
+        The row holds ``features | phases`` of all intersections. `observe` then needs three
+        assignments for any number of intersections.
         """
         features = [layout.features for layout in self.layouts]
         widths = [f + phases for f, phases in zip(features, self._phases, strict=True)]
@@ -167,14 +168,17 @@ class Observer:
 
 
 def joint_space(spaces: Sequence[Box]) -> Box:
-    """The space of vectors one after the other."""
+    """Return the space of concatenated vectors."""
     low = np.concatenate([space.low for space in spaces])
     high = np.concatenate([space.high for space in spaces])
     return Box(low, high, dtype=np.float32)
 
 
 def _gather(network: Network, name: str) -> tuple[NDArray[np.int64], list[int]]:
-    """Positions in (halting | vehicles) for `movements`, and the number of features of each."""
+    """Return the positions of all features, and the number of features of each intersection.
+
+    For `movements` they are positions in (halting | vehicles), otherwise indices of lanes.
+    """
     lanes = network.lane_table()
     count = len(lanes.ids)
     parts: list[NDArray[np.int64]] = []
@@ -191,7 +195,7 @@ def _gather(network: Network, name: str) -> tuple[NDArray[np.int64], list[int]]:
 
 
 def _downstream_matrix(network: Network) -> NDArray[np.float64]:
-    """Rows average, for each incoming lane, the lanes its links lead to."""
+    """Return a matrix whose rows average, for each incoming lane, the lanes its links lead to."""
     lanes = network.lane_table()
     rows: list[NDArray[np.float64]] = []
     for item in network.intersections:
@@ -204,7 +208,7 @@ def _downstream_matrix(network: Network) -> NDArray[np.float64]:
 
 
 def _within(network: Network, hops: int) -> list[list[int]]:
-    """For each intersection the others at most `hops` roads away, nearest first."""
+    """Return, for each intersection, the others at most `hops` roads away, nearest first."""
     position = {item.id: index for index, item in enumerate(network.intersections)}
     near = within_hops({item.id: item.neighbours for item in network.intersections}, hops)
     return [[position[name] for name in others] for others in near.values()]

@@ -16,16 +16,16 @@ class EnvOptions:
     """Options of an environment.
 
     Attributes:
-        observation: What an agent sees; see `ugat_marl.envs.observations.UNITS`.
+        observation: Name of the observation; see `ugat_marl.envs.observations.UNITS`.
         reward: ``"queue"``, ``"pressure"``, ``"waiting"`` or a function of two `IntersectionView`.
-        neighbours: How many roads away intersections are whose features and phase are seen too.
+        neighbours: Distance in roads up to which agents see features and phases of others.
         signals: ``"actions"``, or ``"programme"``: SUMO runs the network's own signal programme
             and actions are ignored.
         duration_s: Length of an episode in s; None for the scenario's own.
-        simulator: ``"process"`` (any number at once, reproducible to the bit), ``"spawn"`` (the
-            same without forking), or ``"inprocess"`` (one per process, a little faster).
-        crossings: Whether it is also measured when vehicles cross the stop lines, which roll-outs
-            then record; lanes are looked at every second, which takes time.
+        simulator: ``"process"`` (any number at once, exactly repeatable), ``"spawn"`` (the same
+            without forking), or ``"inprocess"`` (one per process, a little faster).
+        crossings: True to measure when vehicles cross the stop lines, for roll-outs to record. It
+            is slower, because lanes are read every second.
         render_mode: None, ``"rgb_array"`` (a picture from `render`) or ``"human"`` (sumo-gui).
     """
 
@@ -54,10 +54,10 @@ class EnvOptions:
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> EnvOptions:
-        """Options from keywords.
+        """Return options from keywords.
 
         Raises:
-            UnknownNameError: No option of this name, or no such value.
+            UnknownNameError: An option or a value does not exist.
         """
         known = [item.name for item in fields(cls)]
         for name in options:

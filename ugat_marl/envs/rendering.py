@@ -1,6 +1,6 @@
-"""A picture of the network with its vehicles and signals, as pixels.
+"""Picture of the network with its vehicles and signals, as pixels.
 
-Roads, names and the legend are drawn once; a frame puts signals and vehicles on a copy of them.
+Roads, names and the legend are drawn once. Each frame draws signals and vehicles on a copy.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from ugat_marl.scenarios import Network
 from ugat_marl.simulation import VehiclePicture
 
 SIZE_PX = 1000
-"""Longer side of a picture, if nothing else is asked for."""
+"""Longer side of a picture by default, in pixels."""
 _LEAST_PX = 220  # of the shorter side
 _LEGEND_PX = 34
 _DPI = 100
 _POINTS = 72 / _DPI  # of type, in a pixel
 _LANE_M, _VEHICLE_M = 3.2, 1.9
-_LEAST_VEHICLE_PX = 2.4, 4.5  # width and length, so that it is seen on a large network
+_LEAST_VEHICLE_PX = 2.4, 4.5  # width and length; smaller ones are invisible on a large network
 _NAMED = 100
 
 _SPEEDS = ("#8c0d25", "#d6482f", "#f0a73c", "#56a0c8", "#14508c")
-"""From standing to the fastest limit of the network; told apart by the colour-blind."""
+"""Colours from standing to the highest speed limit; the colour-blind can tell them apart."""
 _SIGNALS = {"G": "#008f68", "g": "#4fc3a1", "y": "#f0b000", "Y": "#f0b000", "u": "#f0b000"}
 _RED, _OFF = "#d1301f", "#888888"
 
@@ -34,16 +34,16 @@ Floats = NDArray[np.float64]
 
 
 class Picture:
-    """Draws one network again and again.
+    """Draws frames of one network.
 
-    A green signal is a line that leads into the junction, a red or yellow one a bar across the
-    lane, so that colour is not the only difference.
+    A green signal is a line into the junction; a red or yellow one is a bar across the lane. So
+    colour is not the only difference.
 
     Args:
-        network: What to draw.
-        names: What to write beside intersections: a name to the id of a traffic light, such as
-            `TrafficEnv.intersection_of`; nothing by default.
-        size_px: Longer side of the picture.
+        network: The network.
+        names: Name to the id of a traffic light, to write beside intersections, such as
+            `TrafficEnv.intersection_of`; no names by default.
+        size_px: Longer side of the picture, in pixels.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Picture:
         self._canvas.draw()
         self._empty = self._canvas.copy_from_bbox(figure.bbox)
         self._heads = _Heads(network, self._view)
-        # Arrays are drawn fastest, which matplotlib's types do not know.
+        # Arrays are fastest, but matplotlib's type stubs do not allow them.
         self._lines: Any = LineCollection([], linewidths=max(3.2, self._view.scale) * _POINTS)
         self._lines.set_capstyle("butt")
         self._bodies: Any = PolyCollection([], edgecolors="none")
@@ -78,7 +78,7 @@ class Picture:
         self._draw_signals({})
 
     def draw(self, vehicles: VehiclePicture, states: Mapping[str, str]) -> None:
-        """Put vehicles and signal states into the picture."""
+        """Draw vehicles and signal states (traffic light to SUMO's state letters)."""
         self._canvas.restore_region(self._empty)
         self._draw_signals(states)
         if len(vehicles.length_m):
@@ -88,7 +88,7 @@ class Picture:
             self._axes.draw_artist(self._bodies)
 
     def pixels(self) -> NDArray[np.uint8]:
-        """The picture, uint8 ``(height, width, 3)``."""
+        """Return the picture, uint8 ``(height, width, 3)``."""
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _draw_signals(self, states: Mapping[str, str]) -> None:
@@ -98,7 +98,7 @@ class Picture:
         self._axes.draw_artist(self._lines)
 
     def _outlines(self, vehicles: VehiclePicture) -> Floats:
-        """Rectangles, ``(vehicles, 4, 2)`` in pixels."""
+        """Return the rectangles of vehicles, ``(vehicles, 4, 2)`` in pixels."""
         front = self._view.pixels(vehicles.position)
         angle = np.deg2rad(vehicles.angle_deg)
         along = np.stack([np.sin(angle), np.cos(angle)], axis=1)
@@ -136,7 +136,7 @@ class Picture:
         points = self._view.pixels(np.array([centre for _, centre in known]))
         apart = _least_distance(points)
         size = min(13.0, apart / 6)
-        if size < 6:  # unreadable, and all over the roads
+        if size < 6:  # too small to read
             return
         halo = [withStroke(linewidth=3 * _POINTS, foreground="white")]
         away = max(7.0, 10 * self._view.scale)
@@ -160,7 +160,7 @@ class Picture:
 
 
 class _View:
-    """Metres of a network to pixels of a picture; y goes up, as in the network."""
+    """Map from metres of a network to pixels of a picture; y goes up in both."""
 
     def __init__(self, low: Floats, scale: float, offset: Floats, size: tuple[int, int]) -> None:
         self.scale = scale
@@ -173,7 +173,7 @@ class _View:
         low, high = points.min(axis=0) - 15, points.max(axis=0) + 15
         extent = high - low
         scale = float(min(size_px / extent[0], (size_px - _LEGEND_PX) / extent[1]))
-        # Even sides: encoders of video want them.
+        # Video encoders need even sides.
         sides = [2 * round(float(side) / 2) for side in extent * scale + (0, _LEGEND_PX)]
         longest = sides.index(max(sides))
         sides[longest] = 2 * round(size_px / 2)
@@ -209,7 +209,7 @@ class _Heads:
         self._across, self._along = np.array(across), np.array(along)
 
     def shown(self, states: Mapping[str, str]) -> tuple[Floats, list[str]]:
-        """Lines, ``(links, 2, 2)``, and their colours; grey where nothing is known."""
+        """Return lines, ``(links, 2, 2)``, and their colours; grey for unknown states."""
         letters = [states.get(tls, "")[index : index + 1] for tls, index in self._keys]
         green = np.array([letter in ("G", "g") for letter in letters])
         lines = np.where(green[:, None, None], self._along, self._across)
@@ -219,7 +219,7 @@ class _Heads:
 def _head(
     shape: tuple[tuple[float, float], ...], view: _View, number: int, count: int
 ) -> tuple[Floats, Floats]:
-    """Bar across the end of a lane and line into the junction, for one of its links; pixels."""
+    """Return the bar across a lane's end and the line into the junction of a link, in pixels."""
     before, end = view.pixels(np.array(shape[-2:]))
     way = (end - before) / max(float(np.linalg.norm(end - before)), 1e-9)
     right = np.array([way[1], -way[0]])
@@ -237,7 +237,7 @@ def _least_distance(points: Floats) -> float:
 
 
 def _ramp(colours: tuple[str, ...]) -> Floats:
-    """256 colours between the given ones, RGBA ``(256, 4)``."""
+    """Return 256 colours between the given ones, RGBA ``(256, 4)``."""
     from matplotlib.colors import to_rgba
 
     stops = np.array([to_rgba(colour) for colour in colours])

@@ -21,12 +21,12 @@ class IntersectionView:
     """Part of a snapshot that belongs to one intersection, lanes in its own order.
 
     Attributes:
-        time_s: Time on the scenario's clock.
-        vehicles: Vehicles per incoming lane.
-        halting: Halting vehicles per incoming lane.
-        mean_speed_mps: Mean speed per incoming lane.
-        waiting_s: Waiting time per incoming lane.
-        outgoing_vehicles: Vehicles per outgoing lane.
+        time_s: Time on the scenario's clock, in s.
+        vehicles: Number of vehicles per incoming lane.
+        halting: Number of halting vehicles per incoming lane.
+        mean_speed_mps: Mean speed per incoming lane, in m/s.
+        waiting_s: Summed waiting time per incoming lane, in s.
+        outgoing_vehicles: Number of vehicles per outgoing lane.
     """
 
     time_s: float
@@ -38,7 +38,7 @@ class IntersectionView:
 
 
 RewardFunction = Callable[[IntersectionView, IntersectionView], float]
-"""Maps the view before and after a decision interval to a reward."""
+"""Function from the views before and after a decision interval to a reward."""
 
 
 class Rewarder:
@@ -46,10 +46,10 @@ class Rewarder:
 
     Args:
         network: The network.
-        reward: ``"queue"`` (minus the halting vehicles on incoming lanes; the UGAT paper's),
-            ``"pressure"`` (minus the absolute difference of vehicles on incoming and outgoing
-            lanes; Wei et al. 2019, PressLight), ``"waiting"`` (decrease of the summed waiting time,
-            in s), or a function of two `IntersectionView`.
+        reward: Name of the reward, or a function of two `IntersectionView`. ``"queue"``: minus the
+            number of halting vehicles on incoming lanes (UGAT paper). ``"pressure"``: minus the
+            absolute difference of the numbers of vehicles on incoming and outgoing lanes (Wei et
+            al. 2019, PressLight). ``"waiting"``: decrease of the summed waiting time, in s.
     """
 
     def __init__(self, network: Network, reward: str | RewardFunction = "queue") -> None:
@@ -70,7 +70,7 @@ class Rewarder:
         return self._reward == "waiting" or callable(self._reward)
 
     def rewards(self, before: Snapshot, after: Snapshot) -> list[float]:
-        """The rewards of all intersections, in the network's order."""
+        """Return the rewards of all intersections, in the network's order."""
         if self._reward == "queue":
             return (-self._sum_in(after.halting)).tolist()
         if self._reward == "pressure":

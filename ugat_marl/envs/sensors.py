@@ -1,7 +1,7 @@
-"""Measured counts on their way to the controllers, through the sensors of a scenario's effects.
+"""Path of measured counts to the controllers, through the sensors of a scenario's effects.
 
 An environment has `Sensors` only if its scenario lists effects on observations. Rewards and scores
-go by what was measured itself.
+use the measured counts.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class Sensors:
         chain: Sensors of the effects.
 
     Attributes:
-        chain: The same in the order in which they act.
-        zone_m: Length of the detection zones in m; 0 where whole lanes are seen.
+        chain: Sensors in the order in which they act.
+        zone_m: Length of the detection zones in m; 0 for whole lanes.
     """
 
     def __init__(self, chain: Sequence[Sensor]) -> None:
@@ -35,26 +35,27 @@ class Sensors:
     def of(
         cls, effects: Sequence[Effect], network: Network, decision_interval_s: float
     ) -> Sensors | None:
-        """Return the sensors of a scenario with these effects; None if everything is seen."""
+        """Return the sensors of a scenario with these effects; None if there are none."""
         latest = {effect.name: effect for effect in effects}  # the last of a name counts
         made = (effect.sensor(network, decision_interval_s) for effect in latest.values())
         chain = [sensor for sensor in made if sensor is not None]
         return cls(chain) if chain else None
 
     def reset(self, seed: int) -> None:
-        """Begin the episode of this seed, which decides what is drawn at random."""
+        """Begin an episode; `seed` decides all random draws."""
         for sensor in self.chain:
             sensor.reset(seed)
 
     def see(self, snapshot: Snapshot) -> Snapshot:
-        """Return what controllers see at the decision at which `snapshot` was measured.
+        """Return the snapshot that controllers see at this decision.
 
         Args:
-            snapshot: Of the reset first, and then of every decision in turn.
+            snapshot: Measured snapshot; first that of the reset, then that of each decision in
+                turn.
 
         Returns:
-            A snapshot of the same time whose vehicles, halting vehicles and waiting times are those
-            that arrive, none before the first ones do.
+            A snapshot of the same time with the vehicles, halting vehicles and waiting times that
+            arrive at the controllers; they are 0 until the first ones arrive.
         """
         measured = snapshot.waiting_s
         waiting_s = measured if len(measured) else np.zeros_like(snapshot.vehicles)

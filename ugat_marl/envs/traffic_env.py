@@ -39,23 +39,22 @@ from ugat_marl.simulation import Simulator, Snapshot, launch_of, simulator_of
 class TrafficEnv(ParallelEnv[str, Any, Any]):
     """Traffic signals of a road network, one agent per intersection.
 
-    An action is the green phase of the next decision interval; yellow, all-red and minimum green
-    are kept whatever is asked for. Episodes end by truncation, for all agents at once. SUMO is not
-    started before `reset`.
+    An action is the green phase of the next decision interval. Yellow, all-red and minimum green
+    are always kept. Episodes end by truncation, for all agents at once. `reset` starts SUMO.
 
     Args:
-        scenario: The simulation.
-        domain: The world the environment is in: ``"sim"``, ``"V1"``..``"V4"``, effects, ....
-        options: See `EnvOptions`.
+        scenario: Road network, demand and signals.
+        domain: Domain of the simulation: ``"sim"``, ``"V1"``..``"V4"``, effects, ....
+        options: Options of the environment.
 
     Attributes:
         scenario: The scenario in its domain.
         domain: Name of the domain.
-        network: Static facts.
+        network: Lanes and intersections of the road network.
         layouts: Agent to the parts of its observation.
         intersection_of: Agent to SUMO's id of its traffic light.
         agent_groups: Group to its agents; agents of one group have the same spaces.
-        np_random: Draws the seeds of episodes; SuperSuit's frame_skip draws from it too.
+        np_random: Generator of the seeds of episodes; SuperSuit's frame_skip uses it, too.
     """
 
     observation_spaces: dict[str, Box]
@@ -113,22 +112,22 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     @property
     def env_options(self) -> dict[str, Any]:
-        """Options that a policy needs elsewhere for the same observations."""
+        """Options with which another environment gives the same observations."""
         return {"observation": self.options.observation, "neighbours": self.options.neighbours}
 
     @property
     def snapshot(self) -> Snapshot:
-        """Measured lanes after the last decision, or the reset."""
+        """Measured lanes after the last decision interval, or after the reset."""
         return self._snapshot
 
     @property
     def seen(self) -> Snapshot:
-        """The `snapshot` as controllers see it, behind the sensors of effects."""
+        """The `snapshot` after the sensors of effects, as controllers see it."""
         return self._seen
 
     @property
     def phases(self) -> list[int]:
-        """Green phase each intersection shows or clears towards, in the order of the agents."""
+        """Phase of each intersection that is green or about to be, in the order of the agents."""
         return [state.phase for state in self._states]
 
     # --- episode ------------------------------------------------------------------------------
@@ -139,7 +138,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """Start an episode in a fresh simulation.
 
         Args:
-            seed: Fixes the simulation to the bit; without it the seed is drawn from the one before.
+            seed: Seed that makes the simulation exactly repeatable; without it, the next seed is
+                drawn from `np_random`.
             options: Not used.
         """
         if seed is not None and seed < 0:
@@ -175,13 +175,13 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """Show the chosen phases for one decision interval.
 
         Args:
-            actions: A green phase for every agent; forbidden by its mask, it is not shown.
+            actions: A green phase for every agent; a phase that its mask forbids is not shown.
 
         Returns:
             Observations, rewards, terminations, truncations and infos of all agents.
 
         Raises:
-            ActionError: An action is missing, unknown or out of range; nothing has happened.
+            ActionError: An action is missing, unknown or out of range; nothing was simulated.
             EpisodeError: The episode has not begun or is over.
             SimulatorError: SUMO failed.
         """
@@ -212,16 +212,16 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         return result
 
     def delay_greens(self, seconds: Mapping[str, float]) -> None:
-        """Hold back the greens that begin in the next step; greens that end are not touched.
+        """Delay the greens that begin in the next step; ends of greens do not change.
 
-        Observations and infos are blind to it, as they are to a late green of the scenario.
+        Observations and infos do not show these delays, nor a late green of the scenario.
 
         Args:
-            seconds: Agent to how long its links stay red beyond the usual, in s. Greens begin at
-                whole simulation steps; what is left over is added to the link's next green.
+            seconds: Agent to the additional red of its links, in s. Greens begin at whole
+                simulation steps; the remainder is added to the delay of the link's next green.
 
         Raises:
-            ActionError: Of an unknown agent, negative or not finite.
+            ActionError: A delay is of an unknown agent, negative or not finite.
             EpisodeError: The episode has not begun or is over.
         """
         if not self.agents:
@@ -231,13 +231,13 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._delays.ask(lights)
 
     def state(self) -> NDArray[np.float32]:
-        """All observations, one after the other; also after the last step."""
+        """Return all observations, one after the other; also after the last step."""
         if not hasattr(self, "_states"):
             raise EpisodeError("state() has no meaning before the first reset()")
         return np.concatenate(self._observer.observe(self._seen, self.phases))
 
     def scores(self) -> Scores:
-        """The measures of the episode that has ended.
+        """Return the measures of the episode that has ended.
 
         Raises:
             EpisodeError: No episode has ended since the last reset.
@@ -250,9 +250,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         return self._scores
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The network with its vehicles and signals, uint8 ``(height, width, 3)``.
+        """Return a picture of the network with vehicles and signals, uint8 ``(height, width, 3)``.
 
-        None with render mode "human": there SUMO draws its own window.
+        Return None in render mode "human", in which SUMO draws its own window, and without one.
         """
         if self.render_mode != "rgb_array":
             return None
@@ -263,7 +263,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         return self._picture.pixels()
 
     def close(self) -> None:
-        """End the simulation and its process and remove its files; may be called again."""
+        """End the simulation and its process and remove its files; a second call does nothing."""
         simulator, self._simulator = self._simulator, None
         self.agents = []
         if simulator is not None:
@@ -277,7 +277,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     # --- parts --------------------------------------------------------------------------------
 
     def _name_agents(self) -> None:
-        """Name the agents as their observer does; the same group means the same spaces."""
+        """Set names and spaces of the agents; agents of one group have the same spaces."""
         observer, items = self._observer, self.network.intersections
         agents = self.possible_agents = list(observer.agents)
         self.agent_groups = {
@@ -376,7 +376,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 def parallel_env(
     scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any
 ) -> TrafficEnv:
-    """The environment as a PettingZoo `ParallelEnv`.
+    """Make an environment as a PettingZoo `ParallelEnv`.
 
     Args:
         scenario: Id of a shipped scenario, a scenario directory, a ``.sumocfg``, ``resco:<map>``,
@@ -393,7 +393,7 @@ def parallel_env(
 
 
 def env(scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any) -> Any:
-    """The environment as a PettingZoo `AECEnv`; arguments as for `parallel_env`."""
+    """Make an environment as a PettingZoo `AECEnv`; the arguments are those of `parallel_env`."""
     from pettingzoo.utils import parallel_to_aec
 
     return parallel_to_aec(parallel_env(scenario, domain, **options))

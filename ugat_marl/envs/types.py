@@ -22,10 +22,10 @@ AnyParallelEnv = ParallelEnv[str, Any, Any]
 
 
 ResetResult = tuple[dict[str, Any], dict[str, dict[str, Any]]]
-"""What an environment's `reset` returns: observations and infos, by agent."""
+"""Result of an environment's `reset`: observations and infos, by agent."""
 
 
 StepResult = tuple[
     dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
 ]
-"""What its `step` returns: observations, rewards, terminations, truncations and infos."""
+"""Result of `step`: observations, rewards, terminations, truncations and infos, by agent."""

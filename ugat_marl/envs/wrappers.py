@@ -1,9 +1,9 @@
-"""Wrappers for learners that need equal spaces, or more in an observation than one agent sees.
+"""Wrappers for learners that need equal spaces or larger observations.
 
 They take any `ParallelEnv` whose agents observe one-dimensional boxes, act in `Discrete(n)` and
-live to the end of the episode, and stack in any order; `masked_observation` comes last. Rewards,
-ends, infos (but for `pad`, which lengthens ``action_mask``) and `state()` are those of the
-environment within.
+live to the end of the episode. They can be stacked in any order; `masked_observation` comes last.
+Rewards, ends, infos and `state()` stay those of the wrapped environment; only `pad` lengthens
+``action_mask`` in the infos.
 """
 
 from __future__ import annotations
@@ -28,14 +28,13 @@ Infos = dict[str, dict[str, Any]]
 def pad(env: AnyParallelEnv) -> Wrapper:
     """Give all agents equal spaces: zeros behind short observations, further actions.
 
-    All observe one and the same `Box`, of the length of the longest observation, and act in
-    `Discrete` of the size of the largest. ``infos[agent]["action_mask"]`` is 0 for the actions an
-    agent does not have; where the environment gives no mask, there is one now. An action space's
-    `sample()` draws among the agent's own actions.
+    All agents share one `Box` of the length of the longest observation, and act in a `Discrete` of
+    the size of the largest. ``infos[agent]["action_mask"]`` is 0 for actions that an agent does not
+    have; it is added if the environment gives no mask. `sample()` of an action space draws among
+    the agent's own actions.
 
     Raises:
-        ActionError: From `step`, for an action the agent does not have; nothing has happened, and
-            nothing is chosen in its place.
+        ActionError: `step` got an action that the agent does not have; nothing was simulated.
     """
     return _Pad(env)
 
@@ -43,17 +42,16 @@ def pad(env: AnyParallelEnv) -> Wrapper:
 def agent_indicator(env: AnyParallelEnv) -> Wrapper:
     """Append to each observation a one-hot of its agent, in the order of `possible_agents`.
 
-    It is 0 or 1 and its bounds are 0 and 1, whatever the bounds of the observation.
+    The bounds of the one-hot are 0 and 1, for observations with any bounds.
     """
     return _AgentIndicator(env)
 
 
 def shared_observation(env: AnyParallelEnv) -> Wrapper:
-    """Append to each observation those of all agents, its own again included.
+    """Append the observations of all agents, its own included, to each observation.
 
-    The appended part is the same for all agents, in the order of `possible_agents`. It is made of
-    the observations of the environment within, padded or stacked if that is; `state()` stays
-    as it was.
+    The appended part is the same for all agents, in the order of `possible_agents`. It contains the
+    observations of the wrapped environment. `state()` does not change.
     """
     return _SharedObservation(env)
 
@@ -68,9 +66,9 @@ def frame_stack(env: AnyParallelEnv, k: int) -> Wrapper:
 
 
 def masked_observation(env: AnyParallelEnv) -> Wrapper:
-    """Observations as ``{"observations": vector, "action_mask": int8 (actions,)}``, as RLlib wants.
+    """Give observations as ``{"observations": vector, "action_mask": int8 (actions,)}``.
 
-    The mask is that of the infos, which keep theirs; all ones where they have none.
+    RLlib needs this form. The mask is a copy of that of the infos, or all ones without one.
     """
     return _MaskedObservation(env)
 
@@ -78,18 +76,18 @@ def masked_observation(env: AnyParallelEnv) -> Wrapper:
 def appended_mask(env: AnyParallelEnv) -> Wrapper:
     """Append to each observation the agent's action mask, for learners without another way.
 
-    Whoever reads it gives the actions with a 0 no probability, or a value below all others. It is
-    all ones where the infos have no mask.
+    The learner must not choose actions whose mask is 0. The mask is all ones if the infos have
+    none.
     """
     return _AppendedMask(env)
 
 
 class Wrapper(BaseParallelWrapper[str, Any, Any]):
-    """Base of the wrappers: spaces of its own, all else of the environment within.
+    """Base of the wrappers, with its own spaces; everything else is the wrapped environment's.
 
     Attributes:
         observation_spaces: Agent to its space, the same object as `observation_space` returns.
-        action_spaces: The same for actions.
+        action_spaces: Agent to its space, the same object as `action_space` returns.
     """
 
     observation_spaces: dict[str, Any]
@@ -103,9 +101,9 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
 
     @property
     def unwrapped(self) -> Wrapper:
-        """The wrapper itself: skrl and EPyMARL read the spaces there and would find those within.
+        """The wrapper itself, because skrl and EPyMARL read the spaces of `unwrapped`.
 
-        It has every public attribute of the environments within; `base` is the innermost.
+        It has every public attribute of the wrapped environments; `base` is the innermost one.
         """
         return self
 
@@ -126,17 +124,17 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
-        """Start an episode of the environment within."""
+        """Start an episode of the wrapped environment."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._begin()
         told = self._told(infos)
         return self._seen(observations, told), told
 
     def step(self, actions: dict[str, Any]) -> StepResult:
-        """Pass actions on, and observations back.
+        """Step the wrapped environment and convert its observations and infos.
 
         Raises:
-            ActionError: As the environment within, and `pad`.
+            ActionError: The wrapped environment or `pad` refuses an action.
         """
         self._check(actions)
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
@@ -144,7 +142,7 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
         return self._seen(observations, told), rewards, terminations, truncations, told
 
     def _begin(self) -> None:
-        """Forget the episode before."""
+        """Forget the previous episode."""
 
     def _check(self, actions: Mapping[str, Any]) -> None:
         """Refuse actions before anything happens."""
@@ -159,13 +157,13 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
 
 
 class PaddedDiscrete(spaces.Discrete):
-    """`Discrete(n)` of whose actions only the first `own` exist; `sample()` draws among these.
+    """`Discrete(n)` whose first `own` actions exist; `sample()` draws among these.
 
-    Equal to any other `Discrete(n)`, and contains all of it, so that agents can share a network.
+    It equals any other `Discrete(n)` and contains all its actions, so agents can share a network.
 
     Args:
-        n: Actions, with the padding.
-        own: Actions that exist.
+        n: Number of actions, with the padding.
+        own: Number of actions that exist.
     """
 
     def __init__(self, n: int, own: int) -> None:
@@ -173,7 +171,7 @@ class PaddedDiscrete(spaces.Discrete):
         self.own = own
 
     def sample(self, mask: Any = None, probability: Any = None) -> np.int64:
-        """A random action; among those that exist unless `mask` or `probability` say otherwise."""
+        """Draw an action by `mask` or `probability`, or by default among those that exist."""
         if probability is not None:
             return super().sample(mask, probability=probability)
         if mask is None:
@@ -193,7 +191,7 @@ class _Pad(Wrapper):
         self.observation_spaces = dict.fromkeys(self.observation_spaces, common)
 
     def _check(self, actions: Mapping[str, Any]) -> None:
-        if self.env.agents:  # after the end it is for the environment to say something
+        if self.env.agents:  # after the end the environment itself reports the error
             try:
                 checked_phases(actions, self.env.agents, self._own)
             except ActionError as error:
@@ -262,7 +260,7 @@ class _FrameStack(Wrapper):
         self.observation_spaces = _each(self.observation_spaces, self._stacked_box)
 
     def _stacked_box(self, box: spaces.Box) -> spaces.Box:
-        """The newest frame is in the box; those before may be zeros as well."""
+        """Return the box of k frames; all but the newest may also be zeros."""
         zeros = spaces.Box(np.minimum(box.low, 0), np.maximum(box.high, 0), dtype=_dtype(box))
         return _joined([*[zeros] * (self._k - 1), box])
 
@@ -341,7 +339,7 @@ def _discrete(env: AnyParallelEnv, agent: str) -> spaces.Discrete:
 
 
 def _longer(vector: NDArray[Any], width: int) -> NDArray[Any]:
-    """A copy with zeros behind it; `numpy.pad` takes several times as long."""
+    """Return a copy with zeros behind it; `numpy.pad` takes several times as long."""
     longer = np.zeros(width, dtype=vector.dtype)
     longer[: vector.size] = vector
     return longer
@@ -357,19 +355,19 @@ def _dtype(box: spaces.Box) -> Any:
 
 
 def _joined(boxes: list[spaces.Box]) -> spaces.Box:
-    """The box of vectors written one behind the other, in the first one's type."""
+    """Return the box of concatenated vectors, with the dtype of the first box."""
     low, high = ([getattr(box, side) for box in boxes] for side in ("low", "high"))
     return spaces.Box(np.concatenate(low), np.concatenate(high), dtype=_dtype(boxes[0]))
 
 
 def _each(boxes: Mapping[str, spaces.Box], change: Any) -> dict[str, spaces.Box]:
-    """Return each agent's changed box; agents that shared one still do."""
+    """Return each agent's changed box; agents that shared a box still share one."""
     changed = {id(box): change(box) for box in boxes.values()}
     return {agent: changed[id(box)] for agent, box in boxes.items()}
 
 
 def common_box(boxes: list[spaces.Box]) -> spaces.Box:
-    """Return a box for all, of the longest length, that holds zeros behind shorter vectors."""
+    """Return a box that contains the vectors of all boxes, padded with zeros to one length."""
     width = max(box.shape[0] for box in boxes)
     low, high = (
         np.array([_longer(getattr(box, side), width) for box in boxes]) for side in ("low", "high")
