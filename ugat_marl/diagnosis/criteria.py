@@ -82,7 +82,7 @@ def fhwa(measured: Sequence[Tally], simulated: Sequence[Tally], together: int) -
         return None
     days, model = days[:, used], model[used]
     chosen = representative(days)
-    error = model - days[chosen]
+    error = model - days[chosen]  # (detectors, intervals)
     sigma = np.maximum(days.std(axis=0, ddof=1), 1e-9)
     others = np.delete(days, chosen, axis=0)
     bound = np.abs(others - days[chosen]).mean(axis=(0, 2)) + 1e-9

@@ -93,6 +93,7 @@ VERSION = 4
 """Version of features and replays; tallies cached under another version are not used."""
 
 _KEPT_DAYS = 40
+"""Largest number of simulated days that are kept in memory with their passages."""
 
 Job = TypeVar("Job")
 Done = TypeVar("Done")

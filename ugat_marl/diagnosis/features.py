@@ -73,12 +73,14 @@ FEATURES: tuple[tuple[str, str, str], ...] = (
 """Name, regime and unit of every feature."""
 
 INDEX = {name: index for index, (name, _, _) in enumerate(FEATURES)}
+"""Index of a feature in `FEATURES`, by name."""
 SPEED_FEATURES = frozenset(
     {
         "speed1", "speed2", "speed3", "speed4-5", "speed6-8", "free_speed", "free_speed_spread",
         "free_fast", "red_speed", "red_slow", "vehicle_length", "long_vehicles",
     }
 )  # fmt: skip
+"""Features that need measured speeds."""
 EVENT_FEATURES = frozenset(
     {
         "gap_short", "gap_long", "platoon_short", "platoon_middle", "free_fast", "red_slow",
@@ -87,8 +89,11 @@ EVENT_FEATURES = frozenset(
 )  # fmt: skip
 """Features that count events, some of which are very rare."""
 COUNT_FEATURES = ("count_advance", "count_stop", "count_exit")
+"""Features that count vehicles."""
 PLATOON_FEATURES = ("platoon_gap", "platoon_short", "platoon_middle", "platoon_time")
+"""Features of moving platoons at the advance detectors."""
 BIN_FEATURES = (*COUNT_FEATURES, "occupied")
+"""Quantities that are kept in bins of time: counts in vehicles, occupied time in s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +235,7 @@ def _merged(period: Period, names: Sequence[str]) -> Passages:
 
 def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     """Add gaps, speeds and times over the detector of vehicles queued at the start of green."""
-    order = np.argsort(stop.off_s, kind="stable")
+    order = np.argsort(stop.off_s, kind="stable")  # crossings in time, by the vehicle's rear
     stop = stop.at(order[np.isfinite(stop.off_s[order])])
     cycles = float(len(greens.start_s))
     counter.ratio("queued", 0.0, cycles)
@@ -248,16 +253,19 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     start = greens.start_s[cycle]
     came = np.where(np.isfinite(stop.on_s), stop.on_s, -np.inf)
     queue = came[first] < start
+    # the gap of the first queued vehicle runs from the start of green
     before = np.where(number == 0, start, np.roll(crossed, 1))
     gap = crossed - before
     broken = np.cumsum(
         gap > np.where(number == 0, THRESHOLDS.first_gap_s, THRESHOLDS.queue_break_s)
     )
+    # vehicles before the first long gap of their green
     alive = queue & (broken - broken[first] + (gap[first] > THRESHOLDS.first_gap_s) == 0)
     protected = alive & greens.protected[cycle]
     counter.add("gap_permitted", gap[alive & ~greens.protected[cycle] & (number >= 1)])
     lost = gap[protected & (number == 0)]
     counter.add("lost", lost)
+    # trend = mean of lost * t, with t from -1 at the begin of the period to 1 at its end
     middle = 0.5 * (counter.period.begin_s + counter.period.end_s)
     half = 0.5 * (counter.period.end_s - counter.period.begin_s)
     counter.add("lost_trend", lost * (start[protected & (number == 0)] - middle) / half)
@@ -361,6 +369,7 @@ def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
         np.concatenate(([period.begin_s], np.sort(on), np.sort(off), [period.end_s])), kind="stable"
     )
     times, present = times[order], np.minimum(np.cumsum(steps[order]), 1.0)
+    # occupied seconds from the begin of the period up to each time
     filled = np.append(0.0, np.cumsum(np.diff(times) * present[:-1]))
 
     def occupied(when: Array) -> Array:

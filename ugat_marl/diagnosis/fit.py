@@ -394,14 +394,17 @@ def uncertainty(
         difference, _ = shift(fitter.pools, [item], days)
         influences.append(inverse @ (jacobian @ whitener(difference)))
     spread = np.atleast_2d(np.cov(np.stack(influences).T))
+    # measured periods and simulated days both vary
     covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies))
     grids = np.array([h.step for h, values in model.members for _ in values])
+    # rounding to a grid of step s has the variance s^2 / 12
     covariance[:free, :free] += np.diag(grids**2 / 12.0)
     unseen = np.flatnonzero(~jacobian[:free].any(axis=1))
     covariance[unseen, unseen] += [changes[index][1] ** 2 for index in unseen]
     extra: dict[str, Array] = {}
     for name, block in model.reference.blocks.items():
         slopes = np.stack([change[name] / delta for change, delta in changes])
+        # variance of a statistic = d' C d, with d its derivatives by the values
         extra[name] = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes) + 0.0 * block.mean
         extra[name] = np.nan_to_num(extra[name])
     errors = np.sqrt(np.diag(covariance)[:free])

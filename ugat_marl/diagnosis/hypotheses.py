@@ -13,6 +13,7 @@ from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
 
 WINDOW = ("begin_s", "end_s")
+"""Names of the fields of an effect's window."""
 ORDER = (
     "local_speed", "demand_level", "demand_surge", "demand_timing", "turning", "lane_closure",
     "parking",

@@ -16,6 +16,7 @@ from ugat_marl.diagnosis.statistics import Array, Distance, Reference
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 SHOWN = 40
+"""Largest number of disagreements that are reported."""
 _REGIME_OF_BINS = ("volume", "volume", "volume", "storage")
 
 

@@ -29,7 +29,9 @@ _FLOW = (
     "gap_long", "occupied_in_green", "gap9+", "free_speed", "queue_over", "platoon_gap",
     "count_advance", "count_stop",
 )  # fmt: skip
+"""Features that parked vehicles on a lane change."""
 _AVOIDED = ("count_advance", "count_stop")
+"""Features that show that drivers avoid a lane."""
 
 
 class Proposer:
@@ -628,6 +630,7 @@ def most_unusual(
     best: tuple[float, int, int, float] | None = None
     for length in range(shortest, max(int(THRESHOLDS.longest_stretch * minutes), shortest) + 1):
         inside = [row[length:] - row[:-length] for row in sums]
+        # z = (measured - rest * expected) / noise in the stretch, rest = their ratio outside
         rest = (sums[0][-1] - inside[0]) / np.maximum(sums[1][-1] - inside[1], 1e-9)
         excess = inside[0] - rest * inside[1]
         share = inside[1] / np.maximum(sums[1][-1] - inside[1], 1e-9)
@@ -781,5 +784,5 @@ def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None
 
 
 def _towards(sign: float, strengths: Examined) -> tuple[tuple[float, ...], ...]:
-    """Return the positive levels with the given sign, in their order."""
+    """Return the positive levels times the sign, in their order."""
     return tuple((sign * level,) for level in strengths.levels if level > 0)

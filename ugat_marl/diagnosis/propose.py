@@ -156,6 +156,7 @@ def _least_squares(
         )
     except np.linalg.LinAlgError:
         return None
+    # a negative strength helps only if the effect has an opposite
     size = np.where(both, np.abs(found), found)
     if (size < THRESHOLDS.least_strength).any():
         return None

@@ -68,6 +68,7 @@ from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import launch_of, loops_document, one_line, read_loops, read_trips
 
 _DAYS = 64
+"""Largest number of days of vehicles that are kept in memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +120,7 @@ class Replay:
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[functools.partial[Replay], tuple[Any, ...]]:
-        """Send it to other processes without the days it remembers."""
+        """Pickle the arguments only, without the days in memory."""
         return functools.partial(Replay, answering=self.answering), self._given
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:

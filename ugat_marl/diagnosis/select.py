@@ -151,7 +151,7 @@ class Selector:
         rays = between(self._library_rays(start.model, number))
         whitener = self._whitener(start.model, WIDE)
         gap = float(whitener.measured @ whitener.measured)
-        chance = float(len(whitener.measured))
+        chance = float(len(whitener.measured))  # expected squared length if only noise is left
         enough = chance + THRESHOLDS.look_elsewhere * max(gap - chance, 0.0)
         proposals = propose(rays, whitener, self._fitter.price)
         chosen = [item.members for item in promising(proposals)]

@@ -286,7 +286,7 @@ class Study:
         )
 
     def selector(self, base: Tested, reporter: Reporter) -> Selector:
-        """Make the search for effects."""
+        """Make the search for sets of effects."""
         return Selector(
             self.fitter(base),
             self.proposer,
@@ -329,6 +329,7 @@ def _tallies(
 # --- measured edges without demand ----------------------------------------------------------------
 
 _NAMED = 6
+"""Largest number of edges that a message names."""
 
 
 def unreached(

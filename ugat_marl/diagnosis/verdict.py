@@ -229,7 +229,7 @@ def describe_members(members: Members) -> str:
 
 
 def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
-    """Describe one effect."""
+    """Describe one effect by name, place, window and values."""
     place, window = place_and_window(hypothesis)
     ranges = known_effects()[hypothesis.name].ranges
     text = NOUNS.get(hypothesis.name, hypothesis.name.replace("_", " "))

@@ -27,7 +27,11 @@ from ugat_marl.effects import Effect
 
 
 def verify_model(study: Study, base: Tested, best: Tested) -> Verified:
-    """Test both models on the held-out periods."""
+    """Test both models on the held-out periods.
+
+    With e the excess of the distance over its expected value, at least 0:
+    shrink = 1 - e_after / e_before.
+    """
     count = len(study.heldout)
 
     def null(model: Tested) -> Null:
