@@ -26,7 +26,7 @@ from ugat_marl.scenarios import Network
 class PolicyGap:
     """Measure by how much a diagnosis shrinks the gap of policies to the real domain.
 
-    The policies are played in sim, in the corrected scenario and in the real domain.
+    Play the policies in sim, in the corrected scenario and in the real domain.
 
     The travel times are printed, and added to DIR/diagnosis.json and report.html.
 
