@@ -16,7 +16,7 @@ content of ``diagnosis.json``.
     propose        sets of effects, from simulated changes of the statistics
     places         effects at places, in windows and of detectors
     fit            values of a set of effects, and their errors
-    residual       the test of what a model leaves
+    residual       the test of the difference that a model leaves
     select         the search, round by round
     verify         both models on held-out periods, side by side
     criteria       GEH and the criteria of FHWA

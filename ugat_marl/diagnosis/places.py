@@ -29,7 +29,7 @@ _FLOW = (
     "gap_long", "occupied_in_green", "gap9+", "free_speed", "queue_over", "platoon_gap",
     "count_advance", "count_stop",
 )  # fmt: skip
-"""Features that parked vehicles on a lane change."""
+"""Features that change if a vehicle stands on a lane."""
 _AVOIDED = ("count_advance", "count_stop")
 """Features that show that drivers avoid a lane."""
 

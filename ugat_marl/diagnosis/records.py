@@ -145,7 +145,7 @@ class Disagreement:
         size: Measured minus simulated, in `unit`.
         unit: Unit of the statistic.
         z: `size` in standard deviations.
-        p: Chance of a difference this large under the model.
+        p: Chance of a difference this large under the model, two-sided.
     """
 
     tls: str | None

@@ -249,7 +249,7 @@ def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
 def place_and_window(
     hypothesis: Hypothesis,
 ) -> tuple[str | None, tuple[float, float] | None]:
-    """Return the place of an effect and its window in s; None for what it does not have.
+    """Return the place of an effect and its window in s; None if it has none.
 
     The place joins all fixed texts by ``>``.
     """
