@@ -1,19 +1,18 @@
-"""Digests of behaviour, to be held to the bit while the package is rearranged.
+"""Digests of behaviour, which must stay equal to the bit while the package is rearranged.
 
     python -m studies.held write studies/held.json                 # plays every part twice
     python -m studies.held check studies/held.json                 # one line per part
     python -m studies.held check FILE --only episodes/single-v1 train/phase
 
 Parts play episodes in process, in worker processes and in vectors, visit every named domain, and
-let the command line train, record and diagnose. Nothing of the package is used but its public names
-and its command line, so that modules may move and names may change.
+train, record and diagnose by the command line. They use only public names and the command line, so
+that modules may move.
 
-A part is *values*, a table of label to list of numbers and short texts, and *names*, what is said
-beside them. The digest of a part is the SHA-256 over its values in an order of their own, without
-labels and names: where only these have changed, `check` says so and goes on. Wall times, paths,
-versions and dates are no values. Each part runs in an interpreter of its own, on one thread, and
-without those instructions of a processor in which mathematical libraries differ most; the numbers
-still belong to the versions in `made_with`.
+A part has *values* (label to a list of numbers and short texts) and *names* (further texts). The
+digest of a part is the SHA-256 over its sorted values, without labels and names. If only labels or
+names have changed, `check` reports it and continues. Wall times, paths, versions and dates are no
+values. Each part runs in its own interpreter, on one thread, without the processor instructions in
+which mathematical libraries differ most. The numbers still belong to the versions in `made_with`.
 """
 
 from __future__ import annotations
@@ -55,9 +54,9 @@ ENVIRONMENT = {
 }
 PACKAGES = ("eclipse-sumo", "gymnasium", "numpy", "pettingzoo", "polars", "torch")
 EPISODES = ("single-v1", "mixed-v1", "resco:cologne1")
-"""Scenarios of which whole episodes are played."""
+"""Scenarios whose whole episodes are played."""
 IN_A_VECTOR_S = 900.0
-"""Length of an episode in a vector."""
+"""Seconds of an episode in a vector."""
 SEED = 11
 MEASURES = ("att_s", "throughput", "queue", "delay", "reward", "delay_s", "due", "departed")
 
@@ -83,7 +82,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "crossings": {"crossings": True},
     "spawn": {"simulator": "spawn"},
 }
-"""Options of an environment beside the usual ones."""
+"""Options of an environment that differ from the defaults."""
 
 RULES = """
 fixed-time:30 webster actuated:40 delay-actuated sotl largest-queue:20 longest-waiting
@@ -101,14 +100,14 @@ emergency_deceleration min_gap imperfection reaction_step desired_speed speed_sp
 red_running gap_acceptance lane_discipline heavy_share driver_model demand_surge demand_timing
 turning lane_closure parking local_speed clock_drift stuck dropout swapped
 """
-"""Effects that are left out of a diagnosis, which would take minutes with them."""
+"""Effects that a diagnosis leaves out; with them it would take minutes."""
 
 WORDS = frozenset({"sentence", "findings", "next_measurement", "ruled_out", "untried", "left_out"})
-"""Keys of a diagnosis under which there are words."""
+"""Keys of a diagnosis whose values are sentences."""
 OF_THE_RUN = frozenset(
     {"hashes", "versions", "budget_s", "policy_gap", "schema", "scenario", "corrected"}
 )
-"""Keys of a diagnosis that say how it was made."""
+"""Keys of a diagnosis about the run, not about its result."""
 
 
 class NotInstalled(Exception):
@@ -119,10 +118,10 @@ class NotInstalled(Exception):
 
 
 class Watched:
-    """Record of an episode: bytes into digests, sums into lists.
+    """Record of an episode: digests of all bytes, and lists of sums.
 
     Args:
-        label: What its values are called.
+        label: Label of its values.
     """
 
     def __init__(self, label: str) -> None:
@@ -139,7 +138,7 @@ class Watched:
             self._sums[what].append(math.fsum(float(x) for a in arrays for x in np.ravel(a)))
 
     def score(self, scores: Any) -> None:
-        """Keep the measures of the episode that has ended."""
+        """Keep the measures of the finished episode."""
         self._scores = dataclasses.asdict(scores)
 
     def values(self) -> Values:
@@ -153,7 +152,7 @@ class Watched:
 
 
 def canonical(value: Any) -> Any:
-    """Return a value as JSON that differs wherever a bit does."""
+    """Return a value as JSON; two values that differ in a bit give different JSON."""
     if isinstance(value, Mapping):
         return {str(key): canonical(value[key]) for key in sorted(value, key=str)}
     if isinstance(value, np.ndarray):
@@ -170,7 +169,7 @@ def canonical(value: Any) -> Any:
 
 
 def flat_numbers(value: Any) -> Iterator[Any]:
-    """Yield the numbers of nested tables, in the order in which they stand."""
+    """Yield the numbers of nested tables, in their order."""
     if isinstance(value, Mapping):
         for item in value.values():
             yield from flat_numbers(item)
@@ -185,13 +184,13 @@ def drawn(mask: NDArray[Any], rng: np.random.Generator) -> int:
 
 
 def play(label: str, env: Any, seed: int = SEED, *, late: bool = False) -> Values:
-    """Return what a whole episode shows under random allowed actions.
+    """Play a whole episode with random allowed actions and return its values.
 
     Args:
-        label: What it is called.
-        env: A parallel environment; it is closed.
-        seed: Of the episode and of the actions.
-        late: Whether greens are held back by random times.
+        label: Label of the values.
+        env: A parallel environment; it is closed at the end.
+        seed: Seed of the episode and of the actions.
+        late: True to delay greens by random times.
     """
     rng, watched = np.random.default_rng(seed), Watched(label)
     watched.see("spaces", [[a, str(env.observation_space(a))] for a in env.possible_agents])
@@ -215,7 +214,7 @@ def play(label: str, env: Any, seed: int = SEED, *, late: bool = False) -> Value
 
 
 def take_turns(label: str, env: Any) -> Values:
-    """Return what an episode of an AEC environment shows."""
+    """Play an episode of an AEC environment and return its values."""
     rng, watched = np.random.default_rng(SEED), Watched(label)
     env.reset(seed=SEED)
     for agent in env.agent_iter():
@@ -230,7 +229,7 @@ def take_turns(label: str, env: Any) -> Values:
 
 
 def step_together(scenario: str) -> Values:
-    """Return what two environments in a vector show: an episode, and the beginning of the next."""
+    """Play two environments in a vector: an episode, and the beginning of the next."""
     domains, found = ["sim", "V4"], {}
     with ugat_marl.vector_env(scenario, 2, domains, duration_s=IN_A_VECTOR_S) as env:
         batch = env.reset(seed=SEED)
@@ -258,7 +257,7 @@ def step_together(scenario: str) -> Values:
 
 
 def episodes(scenario: str) -> tuple[Values, Values]:
-    """Return a scenario's episodes in a process of their own."""
+    """Return the values of a scenario's episodes in a worker process."""
     found = play("V4", ugat_marl.parallel_env(scenario, "V4"), SEED + 1)
     found |= play("sim", ugat_marl.parallel_env(scenario))
     if scenario == "single-v1":
@@ -267,17 +266,17 @@ def episodes(scenario: str) -> tuple[Values, Values]:
 
 
 def episodes_in_process(scenario: str) -> tuple[Values, Values]:
-    """Return a scenario's episode in this process."""
+    """Return the values of a scenario's episode in this process."""
     return play("sim", ugat_marl.parallel_env(scenario, simulator="inprocess")), {}
 
 
 def episodes_in_a_vector(scenario: str) -> tuple[Values, Values]:
-    """Return a scenario's episodes in a vector of two."""
+    """Return the values of a scenario's episodes in a vector of two."""
     return step_together(scenario), {}
 
 
 def domains() -> tuple[Values, Values]:
-    """Return short episodes in many domains, and the hashes of their scenarios."""
+    """Return the values of short episodes in many domains, and the hashes of their scenarios."""
     found: Values = {}
     for domain in DOMAINS.split():
         duration_s = 700.0 if domain in BEGINNING_LATE else 200.0
@@ -286,7 +285,7 @@ def domains() -> tuple[Values, Values]:
 
 
 def variants() -> tuple[Values, Values]:
-    """Return short episodes under other options, and with greens held back."""
+    """Return the values of short episodes with other options, and with delayed greens."""
     found: Values = {}
     for name, options in VARIANTS.items():
         found |= play(name, ugat_marl.parallel_env("mixed-v1", duration_s=300.0, **options))
@@ -295,7 +294,7 @@ def variants() -> tuple[Values, Values]:
 
 
 def scenarios() -> tuple[Values, Values]:
-    """Return what scenarios hold, by their own hash."""
+    """Return id, hash and number of decisions of the scenarios."""
     names = ("single-v1", "grid2x2-v1", "grid4x4-v1", "arterial1x5-v1", "mixed-v1")
     loaded = {name: ugat_marl.load_scenario(name) for name in names}
     return {name: [one.id, one.hash, one.decisions] for name, one in loaded.items()}, {}
@@ -308,7 +307,7 @@ def command(*arguments: str | Path) -> None:
     """Run ``ugat-marl`` with the arguments.
 
     Raises:
-        RuntimeError: It failed; the end of what it said is in the message.
+        RuntimeError: The command failed; the message quotes the end of its output.
     """
     line = [sys.executable, "-m", "ugat_marl", *map(str, arguments)]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
@@ -317,7 +316,7 @@ def command(*arguments: str | Path) -> None:
 
 
 def table_of(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a ``.parquet`` or ``.csv``."""
+    """Return the rows of a ``.parquet`` or ``.csv`` file."""
     import polars as pl
 
     read = pl.read_parquet if path.suffix == ".parquet" else pl.read_csv
@@ -325,7 +324,7 @@ def table_of(path: Path) -> list[dict[str, Any]]:
 
 
 def training(grounding: str, *more: str) -> tuple[Values, Values]:
-    """Return scores per policy, domain and seed, and all that was logged on the way."""
+    """Train; return scores per policy, domain and seed, and all logged numbers."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         command(
@@ -361,7 +360,7 @@ def measured_values(folder: Path, label: str) -> Values:
 
 
 def recorded_rules() -> tuple[Values, Values]:
-    """Return what is measured under each rule."""
+    """Record measured data under each rule and return their values."""
     found: Values = {}
     for rule in RULES.split():
         with tempfile.TemporaryDirectory() as folder:
@@ -373,9 +372,9 @@ def recorded_rules() -> tuple[Values, Values]:
 
 
 def diagnosis(domain: str) -> tuple[Values, Values]:
-    """Return measured data of a domain, and everything a diagnosis finds in them.
+    """Return measured data of a domain, and the result of a diagnosis of them.
 
-    The budget is a day, so that none is ever used up.
+    The budget is a day, so that time never ends the diagnosis.
     """
     with tempfile.TemporaryDirectory() as folder:
         data, out = Path(folder) / "measured", Path(folder) / "found"
@@ -398,7 +397,7 @@ def diagnosis(domain: str) -> tuple[Values, Values]:
 
 
 def leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the leaves of nested JSON with their paths; ``[]`` stands for each entry of a list."""
+    """Yield the leaves of nested JSON with their paths; ``[]`` means each entry of a list."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield from leaves(f"{path}.{key}", item)
@@ -413,7 +412,7 @@ def leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def needing(scenario: str, part: Callable[[str], tuple[Values, Values]]) -> tuple[Values, Values]:
-    """Return a part of a scenario, if its network is there."""
+    """Return a part of a scenario, if its network is installed."""
     if scenario.startswith("resco:") and importlib.util.find_spec("sumo_rl") is None:
         raise NotInstalled(f"{scenario}: the networks of sumo-rl are not installed")
     return part(scenario)
@@ -438,11 +437,11 @@ def parts() -> dict[str, Callable[[], tuple[Values, Values]]]:
 
 
 def played(name: str) -> dict[str, Any]:
-    """Return a part as another interpreter plays it: its digest, values and names.
+    """Play a part in another interpreter; return its digest, values and names.
 
     Raises:
-        NotInstalled: It needs what is not there.
-        RuntimeError: It failed.
+        NotInstalled: The part needs something that is not installed.
+        RuntimeError: The part failed.
     """
     done = subprocess.run(
         [sys.executable, "-m", "studies.held", "play", name],
@@ -460,7 +459,7 @@ def played(name: str) -> dict[str, Any]:
 
 
 def plain(values: Values) -> Values:
-    """Return values as JSON can hold them: numbers that are none as texts."""
+    """Return values that JSON can hold: numbers that are not finite become texts."""
     return {
         label: [str(x) if isinstance(x, float) and not math.isfinite(x) else x for x in found]
         for label, found in values.items()
@@ -468,7 +467,7 @@ def plain(values: Values) -> Values:
 
 
 def digest_of(values: Values) -> str:
-    """Return the SHA-256 of the values, whatever their labels and the order of these."""
+    """Return the SHA-256 of the values; labels and their order do not count."""
     lines = sorted(json.dumps(found) for found in values.values())
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
@@ -489,7 +488,7 @@ def answer(name: str) -> int:
 
 
 def write(path: Path, chosen: Sequence[str]) -> int:
-    """Play every part twice and write down those that are equal; 1 if some are not."""
+    """Play every part twice and write the parts that are equal; return 1 if some differ."""
     held: dict[str, Any] = {}
     if path.exists():
         held = json.loads(path.read_text(encoding="utf-8"))["parts"]
@@ -533,7 +532,7 @@ def save(path: Path, held: Mapping[str, Any]) -> None:
 
 
 def check(path: Path, chosen: Sequence[str]) -> int:
-    """Play the parts again and print one line for each; 1 if one is different."""
+    """Play the parts again and print one line for each; return 1 if one differs."""
     held = json.loads(path.read_text(encoding="utf-8"))["parts"]
     different = 0
     for name in chosen:
@@ -560,13 +559,13 @@ def check(path: Path, chosen: Sequence[str]) -> int:
 
 
 def moved(before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
-    """Return whether the same labels have exchanged their values."""
+    """Return true if the same labels have exchanged their values."""
     was, now = before["values"], after["values"]
     return was.keys() == now.keys() and was != now
 
 
 def difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
-    """Return the first difference of two parts in words, that of a number if there is one."""
+    """Return the first difference of two parts in words; a difference of numbers comes first."""
     for kind in ("values", "names"):
         was, now = before[kind], after[kind]
         for label in [key for key in was if key in now]:
@@ -586,10 +585,10 @@ def say(verdict: str, name: str, text: str) -> None:
 
 
 def selected(wanted: Iterable[str], names: Iterable[str]) -> list[str]:
-    """Return the names that begin with one of those wanted; all if none is.
+    """Return the names that begin with one of the wanted ones; all if none is wanted.
 
     Raises:
-        SystemExit: Nothing begins so.
+        SystemExit: No name begins with a wanted one.
     """
     wanted, names = list(wanted), list(names)
     for begin in wanted:

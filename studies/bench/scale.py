@@ -29,8 +29,8 @@ class Figure:
     Attributes:
         name: Name of the measured number.
         value: Measured value.
-        reach: Value that it must reach; None without a target.
-        aim: Value that would be better still.
+        reach: Value that it must reach; nan for none.
+        aim: Value that would be better still; nan for none.
         at_least: True if the value must be at least `reach`; false if at most.
     """
 

@@ -1,4 +1,4 @@
-"""Measured program of ``bench scale``: one of `WORK`, told what in ``request["work"]``."""
+"""Measured program of ``bench scale``; ``request["work"]`` names a function of `WORK`."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from ugat_marl.seeding import numpy_generator
 
 Request = Mapping[str, Any]
 _HELD = 3
-"""Decisions for which the actions of the measured episodes hold a green, so that traffic flows."""
+"""Decisions for which `cycle` holds each green, so that traffic flows."""
 
 
 def cycle(masks: NDArray[np.int8], decision: int) -> NDArray[np.int64]:
-    """Choose green after green, each held for the same time, among those the mask allows."""
+    """Choose the allowed greens in turn, each for `_HELD` decisions."""
     counts = masks.sum(axis=-1)
     wanted = np.full(masks.shape[:-1], decision // _HELD) % np.maximum(counts, 1)
     order = np.cumsum(masks, axis=-1) - 1
@@ -37,7 +37,7 @@ def cycle(masks: NDArray[np.int8], decision: int) -> NDArray[np.int64]:
 
 
 def steps(request: Request) -> dict[str, Any]:
-    """Decisions of `n` simulations together, after some that are not measured."""
+    """Measure decisions of `n` simulations together, after some that are not measured."""
     with vector_env(request["scenario"], request["n"], duration_s=request["duration_s"]) as env:
         batch = env.reset(request["seed"])
         for decision in range(request["settled"]):
@@ -63,7 +63,7 @@ def steps(request: Request) -> dict[str, Any]:
 
 
 def _by_halves(env: VectorEnv, batch: Batch, first: int, last: int) -> None:
-    """Step two halves in turn: one decides while the other one is simulated."""
+    """Step two halves in turn: one half decides while the other is simulated."""
     halves = env.halves()
     masks = [batch.masks[: halves[0].n], batch.masks[halves[0].n :]]
     for half, own in zip(halves, masks, strict=True):
@@ -76,7 +76,7 @@ def _by_halves(env: VectorEnv, batch: Batch, first: int, last: int) -> None:
 
 
 def split(request: Request) -> dict[str, Any]:
-    """Seconds of CPU that the same decisions take in SUMO, and in all else, in one process."""
+    """Measure the CPU time per agent and step in SUMO and in the rest, in one process."""
     env = parallel_env(request["scenario"], duration_s=request["duration_s"], simulator="inprocess")
     _, infos = env.reset(seed=request["seed"])
     simulator: Any = env._simulator
@@ -106,7 +106,7 @@ def split(request: Request) -> dict[str, Any]:
     total = time.process_time() - began
     vehicles = env.snapshot.vehicles.sum()
     env.close()
-    sumo = inside["advance"] - inside["_snapshot"]  # reading its lanes is not simulating
+    sumo = inside["advance"] - inside["_snapshot"]  # reading the lanes is not part of SUMO's step
     agents, steps = len(env.possible_agents), request["decisions"]
     return {
         "sumo_ms": 1e3 * sumo / (agents * steps),
@@ -116,7 +116,7 @@ def split(request: Request) -> dict[str, Any]:
 
 
 def grounded(request: Request) -> dict[str, Any]:
-    """Time an episode, plain or with models whose answers are not used: the same traffic."""
+    """Time an episode without or with models; their answers are not used: the same traffic."""
     from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform, TimedTransform
 
     inner = parallel_env(request["scenario"], duration_s=request["duration_s"])
@@ -127,9 +127,9 @@ def grounded(request: Request) -> dict[str, Any]:
         kind: Any = kinds[request["grounding"]]
         transform = kind(inner.layouts, request["seed"], gate=never)
         for model in (transform.forward, transform.inverse):
-            model.fitted.fill_(True)  # what they answer is not used
+            model.fitted.fill_(True)  # unfitted models would refuse; their answers are not used
         env = GroundedEnv(inner, transform)
-    env.reset(seed=request["seed"])  # the warm parent is started
+    env.reset(seed=request["seed"])  # the first reset also starts the warm parent
     _, infos = env.reset(seed=request["seed"])
     began = time.perf_counter()
     decision = 0
@@ -150,7 +150,7 @@ def grounded(request: Request) -> dict[str, Any]:
 
 
 def leaks(request: Request) -> dict[str, Any]:
-    """Open, reset, step and close environments, again and again."""
+    """Open, reset, step and close environments many times; measure memory and files."""
     seen: list[dict[str, float]] = []
     resets = 0
     for turn in range(request["turns"]):
@@ -254,7 +254,7 @@ def learner(request: Request) -> dict[str, Any]:
 
     env = parallel_env(request["scenario"], duration_s=request["duration_s"], simulator="inprocess")
     learning = learner_factory(request["learner"])(env, request["seed"])
-    learning.learn(env, 1, seed=request["seed"])  # imports, and all that is done once
+    learning.learn(env, 1, seed=request["seed"])  # imports and other work that is done once
     with CpuShares({name: folder_of(name) for name in ("libsumo", "torch")}) as shares:
         learning.learn(env, request["episodes"], seed=request["seed"])
     env.close()
@@ -262,7 +262,7 @@ def learner(request: Request) -> dict[str, Any]:
 
 
 def _cpu_s(env: VectorEnv) -> float:
-    """Seconds of CPU the simulations have used; nan where the system does not say."""
+    """Return CPU seconds of the simulations; nan if the system does not tell them."""
     total = 0.0
     for remote in env._environments:
         stat = Path(f"/proc/{remote._worker._pid if remote._worker else 0}/stat")
@@ -279,7 +279,7 @@ def _memory_mib() -> float:
     for pid, resident in family(processes(), os.getpid()).items():
         try:
             text = Path(f"/proc/{pid}/smaps_rollup").read_text()
-        except OSError:  # another system, or it has ended meanwhile
+        except OSError:  # no Linux, or the process has ended meanwhile
             total += resident
         else:
             total += int(text.partition("\nPss:")[2].split()[0]) / 1024
@@ -287,7 +287,11 @@ def _memory_mib() -> float:
 
 
 def _vehicles(counts: NDArray[np.float32]) -> float:
-    """Vehicles on incoming lanes; `counts` are 40ths of them, and each agent's phase, a one."""
+    """Return the vehicles on incoming lanes.
+
+    The observation `count` holds vehicles / 40 for each lane, and a one-hot of the phase, whose sum
+    is 1 per agent.
+    """
     return 40.0 * (float(counts.sum()) - counts.shape[0] * counts.shape[1])
 
 
@@ -299,22 +303,21 @@ def _kill(env: VectorEnv, number: int) -> None:
 
 
 INTERVAL_S = 0.001
-"""CPU time from one sample of `CpuShares` to the next."""
+"""CPU seconds between two samples of `CpuShares`."""
 
 
 class CpuShares:
-    """Seconds of CPU of the main thread, by the package of the innermost Python function.
+    """CPU seconds of the main thread, by the package of the innermost Python function.
 
-    A timer of the process's own time interrupts it; what has been used since the last sample is
-    charged to the function that is on top then. A long call into C is interrupted when it returns,
-    and charged whole to the function that made it: a package's compiled code counts as its own
-    where one of its Python functions calls it, and as the caller's where it is called directly.
+    A timer of CPU time interrupts the process. The time since the last sample is charged to the
+    Python function that runs at this moment. A long call into compiled code is interrupted when it
+    returns, and its whole time is charged to the Python function that called it.
 
     Args:
-        packages: Name of a share to the folder of the package it is of; the rest is "rest".
+        packages: Name of a share to the folder of its package; all other code is "rest".
 
     Attributes:
-        seconds: Of each share, so far.
+        seconds: CPU seconds of each share so far.
     """
 
     def __init__(self, packages: Mapping[str, Path]) -> None:

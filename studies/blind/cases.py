@@ -1,7 +1,7 @@
-"""Files of a blind test: a plan the diagnosis may read, and labels it may not.
+"""Files of a blind test: a plan that the diagnosis may read, and labels that it may not.
 
-A folder of a blind test holds ``plan.json``, one folder per case with its measured data and, in
-time, its diagnosis, and ``labels/<case>.json``, opened by the grading alone.
+A folder of a blind test holds ``plan.json``, one folder per case with its measured data and later
+its diagnosis, and ``labels/<case>.json``, which only the grading and the test of visibility read.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ DIAGNOSIS, RUN = "diagnosis.json", "run.json"
 SCHEMA = "ugat-marl/blind/1"
 
 WINDOW = ("begin_s", "end_s")
-"""Fields of effects that tell when, and not how much."""
+"""Fields of effects that give a time, not a strength."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Hidden:
 
     Attributes:
         name: Name of the effect.
-        place: Its text fields, joined by ``>``; None if it has none.
-        window: Begin and end, s; None if it is always there.
-        parameters: Its other numbers.
-        nominal: The value of each of them without the effect, where there is one.
+        place: Text fields of the effect, joined by ``>``; None if it has none.
+        window: Begin and end, s; None for an effect without a window.
+        parameters: Other numbers of the effect.
+        nominal: Values of these numbers without the effect, if there are such values.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Hidden:
 
     @classmethod
     def of(cls, effect: Effect, nominal: Mapping[str, float] | None = None) -> Hidden:
-        """Write an effect of the library as a diagnosis would."""
+        """Return an effect of the library in the form of a diagnosis."""
         record = effect.record()
         texts = [str(record[key]) for key in effect.texts]
         window = None
@@ -78,17 +78,17 @@ class Label:
         case: Id of the case.
         scenario: Name of its scenario.
         group: ``none``, ``single``, ``pair``, ``setting`` or ``outside``.
-        hidden: What is hidden, in a word: an effect, two joined by ``+``, ``V3``, ``bus_stops``.
-        strength: ``small``, ``medium`` or ``large``, where that means something.
-        effects: The hidden effects that a diagnosis can name; for the group ``outside`` there is
-            none that explains the data.
-        leave_out: Effects the diagnosis may not use.
+        hidden: Name of the hidden effects: an effect, two joined by ``+``, ``V3``, ``bus_stops``.
+        strength: ``small``, ``medium`` or ``large``, for groups that have a strength.
+        effects: Hidden effects that a diagnosis can name. In the group ``outside`` none explains
+            the data.
+        leave_out: Effects that the diagnosis may not use.
         lights: Traffic lights that agents control.
         begin_s: Start of the periods.
         end_s: End of the periods.
         periods: Number of periods.
-        speeds: Whether speeds were measured.
-        policy: Who controlled the signals.
+        speeds: True if speeds were measured.
+        policy: Controller of the signals.
         seed: Seed of the measured data.
         measured: Hash of the measured data.
     """
@@ -124,9 +124,9 @@ class Case:
     """Facts about a case that the diagnosis may know.
 
     Attributes:
-        case: Its id, which says nothing.
-        scenario: Name of the scenario that is to be corrected.
-        leave_out: Effects the diagnosis has to do without.
+        case: Id of the case; it tells nothing about the hidden effects.
+        scenario: Name of the scenario to diagnose.
+        leave_out: Effects that the diagnosis may not use.
     """
 
     case: str
@@ -135,16 +135,16 @@ class Case:
 
 
 def write_plan(directory: Path, cases: tuple[Case, ...]) -> None:
-    """Write what the diagnosis may know."""
+    """Write the plan."""
     content = {"schema": SCHEMA, "cases": [asdict(case) for case in cases]}
     write_whole(directory / PLAN, json.dumps(content, indent=1) + "\n")
 
 
 def read_plan(directory: Path) -> tuple[Case, ...]:
-    """Read what the diagnosis may know.
+    """Read the plan.
 
     Raises:
-        BlindTestError: There is no plan, or it is not one.
+        BlindTestError: The plan is missing or damaged.
     """
     raw = read_json(directory / PLAN)
     try:
@@ -163,8 +163,8 @@ def chosen(directory: Path, only: Sequence[str]) -> tuple[Case, ...]:
     """Return the cases with these ids; all cases without any.
 
     Raises:
-        BlindTestError: Not a blind test.
-        UnknownNameError: No such case.
+        BlindTestError: The directory holds no blind test.
+        UnknownNameError: There is no such case.
     """
     cases = read_plan(directory)
     known = [case.case for case in cases]
@@ -180,16 +180,16 @@ def label_path(directory: Path, case: str) -> Path:
 
 
 def write_label(directory: Path, label: Label) -> None:
-    """Seal the truth about a case."""
+    """Write the label of a case."""
     text = json.dumps(asdict(label), indent=1, allow_nan=False)
     write_whole(label_path(directory, label.case), text + "\n")
 
 
 def read_label(directory: Path, case: str) -> Label:
-    """Open the truth about a case.
+    """Read the label of a case.
 
     Raises:
-        BlindTestError: It is missing or damaged.
+        BlindTestError: The label is missing or damaged.
     """
     path = label_path(directory, case)
     try:
@@ -202,7 +202,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read the object in a JSON file.
 
     Raises:
-        BlindTestError: Missing, cut short, or not an object.
+        BlindTestError: The file is missing, cut short, or holds no object.
     """
     try:
         found: Any = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""``python -m studies.blind``: hide effects, diagnose the data, open the labels, sum up."""
+"""``python -m studies.blind``: hide effects, diagnose the data, grade and sum up."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ugat_marl.scenarios import Network
 
 @dataclass(frozen=True)
 class BlindGenerate:
-    """Hide effects in scenarios, measures them, and seals what was hidden.
+    """Hide effects in scenarios, record measured data, and write the labels.
 
     Then follow blind run, blind grade and blind table (docs/explanation/blind-tests.md).
 
@@ -38,15 +38,15 @@ class BlindGenerate:
         python -m studies.blind generate --scenario single-v1 --classes none --out nulls
 
     Attributes:
-        scenario: Scenarios the cases are spread over.
-        out: Directory of the blind test; one that is there is gone on with.
-        classes: What is hidden: none, single, pair, setting, outside, and names of effects.
+        scenario: Scenarios of the cases.
+        out: Directory of the blind test; an existing one is continued.
+        classes: Classes to hide: none, single, pair, setting, outside, and names of effects.
         strengths: Strengths of single effects: small, medium, large.
         cases: Number of cases.
         seed: Root of all seeds.
         periods: Days per case.
-        speeds: Whether the detectors measure speeds.
-        pressure_share: Share of the cases under max-pressure control, not fixed-time.
+        speeds: Measure speeds at the detectors.
+        pressure_share: Share of the cases under max-pressure instead of fixed-time control.
         duration_s: Length of a day in s.
     """
 
@@ -62,7 +62,7 @@ class BlindGenerate:
     duration_s: LengthS = None
 
     def run(self, console: Console) -> int:
-        """Generates."""
+        """Generate the cases."""
         blueprint = Blueprint(
             self.scenario,
             self.classes,
@@ -82,7 +82,7 @@ class BlindGenerate:
 
 @dataclass(frozen=True)
 class BlindRun:
-    """Diagnose the cases that have no diagnosis yet; the labels stay closed.
+    """Diagnose the cases that have no diagnosis yet, without reading labels.
 
     Examples:
         python -m studies.blind run blind --budget-s 600
@@ -91,7 +91,7 @@ class BlindRun:
         directory: Directory of a blind test.
         jobs: Cases at a time.
         budget_s: Time for each diagnosis, s.
-        alpha: Chance of finding something where there is nothing.
+        alpha: Chance of naming an effect if there is none.
         seed: Seed of the diagnoses.
         only: Names of the cases to diagnose.
     """
@@ -138,9 +138,9 @@ class BlindRun:
 
 @dataclass(frozen=True)
 class BlindVisible:
-    """Judge single effects by a test that knows them: would it see them?
+    """Test single effects: are they visible to a test that knows them?
 
-    Opens the labels of diagnosed cases, and of no others. Grade them again then.
+    The test reads the labels of diagnosed cases only. Grade the cases again after it.
 
     Examples:
         python -m studies.blind visible blind
@@ -148,7 +148,7 @@ class BlindVisible:
     Attributes:
         directory: Directory of a blind test.
         seed: Seed of the diagnoses, whose simulated days are used again.
-        only: Names of the cases to judge.
+        only: Names of the cases to test.
     """
 
     directory: Annotated[Positional[Path], arg(metavar="DIR")]
@@ -158,7 +158,7 @@ class BlindVisible:
     ] = ()
 
     def run(self, console: Console) -> int:
-        """Judge."""
+        """Test and print."""
         found = judge_visibility(
             self.directory, only=self.only, seed=self.seed, reporter=Bars(console)
         )
@@ -170,7 +170,7 @@ class BlindVisible:
 
 @dataclass(frozen=True)
 class BlindGrade:
-    """Open the labels of the cases that have been diagnosed, and writes grades.json.
+    """Compare diagnosed cases with their labels, and write grades.json.
 
     Examples:
         python -m studies.blind grade blind
@@ -182,7 +182,7 @@ class BlindGrade:
     directory: Annotated[Positional[Path], arg(metavar="DIR")]
 
     def run(self, console: Console) -> int:
-        """Grade."""
+        """Grade and print."""
         grades = grade_cases(self.directory)
         for item in grades:
             wrong = ", confident and wrong" if item.confident_wrong else ""
@@ -201,7 +201,7 @@ class BlindTable:
         python -m studies.blind table blind nulls --out table.md
 
     Attributes:
-        directories: Directories of blind tests that have been graded.
+        directories: Directories of graded blind tests.
         out: File for the table: Markdown, or JSON if its name ends in .json.
     """
 
@@ -213,7 +213,7 @@ class BlindTable:
     ] = None
 
     def run(self, console: Console) -> int:
-        """Print, and writes."""
+        """Print and write."""
         if not self.directories:
             raise OptionError("give at least one blind test")
         if self.out is not None:

@@ -1,4 +1,4 @@
-"""Make blind cases: draws what is hidden, measures it, and seals the label."""
+"""Make blind cases: draw hidden effects, record measured data, write the label."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 
 FIXED_TIMES = ("fixed-time:20", "fixed-time:30", "fixed-time:40")
 PRESSURES = ("max-pressure:10", "max-pressure:20")
-"""The signals of the hidden world: fixed-time control, and at times one that reacts to traffic."""
+"""Controllers that react to traffic; the other cases have fixed-time control."""
 
 
 LEAST = 20
-"""Detections of a day that have to come, go or move by more than a tenth of a second."""
+"""Least number of a day's detections that an effect must add, remove or move by over 0.1 s."""
 
 
 @dataclass(frozen=True)
 class Blueprint:
-    """Settings that decide a blind test, together with the scenarios' files.
+    """Settings of a blind test.
 
     Attributes:
-        scenarios: Names of scenarios, as `load` takes them.
+        scenarios: Names of scenarios, as for `load_scenario`.
         classes: Groups (none, single, pair, setting, outside) and names of effects.
         strengths: Strengths of single effects.
         cases: Number of cases.
         seed: Root of all seeds.
         periods: Days per case.
-        speeds: Whether speeds are measured.
+        speeds: True if speeds are measured.
         pressure_share: Share of the cases under max-pressure instead of fixed-time control.
         duration_s: Length of a day; None for the scenario's own.
     """
@@ -91,19 +91,19 @@ class _Planned:
 
 
 def generate(directory: Path, blueprint: Blueprint, reporter: Reporter | None = None) -> int:
-    """Write the cases of a blind test that are not there yet.
+    """Write the missing cases of a blind test.
 
     Args:
-        directory: New, or one of the same blueprint, which is gone on with.
-        blueprint: What decides the test.
-        reporter: Shows progress.
+        directory: A new directory, or one of the same blueprint, which is continued.
+        blueprint: Settings of the test.
+        reporter: Reporter of the progress.
 
     Returns:
-        How many cases were made.
+        Number of cases that were made.
 
     Raises:
-        BlindTestError: The directory holds another blind test, or no scenario has a place for what
-            is to be hidden.
+        BlindTestError: The directory holds another blind test, or no scenario has a place for an
+            effect.
     """
     reporter = reporter or Silent()
     scenarios = {name: _loaded(name, blueprint) for name in blueprint.scenarios}
@@ -137,7 +137,7 @@ def _plan(
     busy: dict[str, Busy],
     reporter: Reporter,
 ) -> list[_Planned]:
-    """Draw all cases; case by case, so that a longer test begins like a shorter one."""
+    """Draw all cases one by one, so that a longer test begins like a shorter one."""
     generator = numpy_generator(blueprint.seed, "blind", "deck")
     tasks = draw_tasks(blueprint.classes, blueprint.strengths, blueprint.cases, generator)
     spare = _spare(tasks)
@@ -151,7 +151,7 @@ def _plan(
 
 
 def _spare(tasks: Sequence[Task]) -> dict[str, list[Task]]:
-    """Group the tasks, as substitutes for one that no scenario has a place for."""
+    """Group the tasks; another task replaces one for which no scenario has a place."""
     found: dict[str, list[Task]] = {}
     for task in tasks:
         found.setdefault(task.group, []).append(task)
@@ -175,7 +175,7 @@ def _planned(
             sample = draw_sample(attempt, scenarios[name], busy[name], generator)
             if sample is not None:
                 policies = FIXED_TIMES
-                # In V4 max-pressure locks some networks up, and a standstill says nothing.
+                # In V4 max-pressure blocks some networks, and a standstill tells nothing.
                 if generator.random() < blueprint.pressure_share and sample.group != "setting":
                     policies = PRESSURES
                 policy = policies[int(generator.integers(len(policies)))]
@@ -191,7 +191,7 @@ def _planned(
 
 
 def _begin(directory: Path, blueprint: Blueprint, cases: tuple[Case, ...]) -> None:
-    """Write the plan, and beside the labels what they were drawn from."""
+    """Write the plan, and the blueprint beside the labels."""
     sealed = directory / LABELS / "blueprint.json"
     text = json.dumps(asdict(blueprint), indent=1) + "\n"
     if (directory / PLAN).exists() and (
@@ -210,7 +210,7 @@ def _begin(directory: Path, blueprint: Blueprint, cases: tuple[Case, ...]) -> No
 
 
 def _make(directory: Path, blueprint: Blueprint, item: _Planned, scenario: Scenario) -> None:
-    """Measure one case, and seals its label last, which marks it as made."""
+    """Measure one case and write its label; the label comes last and marks the case as made."""
     measured = record(
         scenario,
         item.sample.effects,
@@ -255,8 +255,8 @@ class Consequences:
     def has(self, scenario: Scenario, sample: Sample, policy: str) -> bool:
         """Return true if each effect changes the measured data; faults of detectors always do.
 
-        A setting is judged as a whole: beside drivers who brake as usual an emergency braking is
-        never seen, and V1 to V4 have one all the same.
+        A setting is judged as a whole, because V1 to V4 contain an emergency braking, which alone
+        is never seen with drivers who brake as usual.
         """
         alone = [(effect,) for effect in sample.effects if not effect.on_detectors]
         for effects in [sample.effects] if sample.group == "setting" else alone:
@@ -274,7 +274,7 @@ class Consequences:
 
 
 def differing(one: Period, two: Period) -> int:
-    """Detections of one period that the other does not have, both ways, to a tenth of a second."""
+    """Return the number of detections that only one of two periods has, to a tenth of a second."""
     return sum(((_seen(one) - _seen(two)) + (_seen(two) - _seen(one))).values())
 
 

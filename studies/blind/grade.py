@@ -1,4 +1,4 @@
-"""Grade of diagnosed cases against their labels, by docs/explanation/blind-tests.md."""
+"""Grades of diagnosed cases against their labels (docs/explanation/blind-tests.md)."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ Verdict = Literal[
 Outcome = Literal["right", "missed", "wrong", "abstained", "failed"]
 
 SEEN = 3.2
-"""Standard deviations: a level of 5 % shared by the 32 effects of the library, on two sides."""
+"""Standard deviations of a visible effect: a two-sided level of 5 % shared by 32 effects."""
 
 NAMING: frozenset[Verdict] = frozenset({"explained", "partially_explained"})
 """Verdicts that name the effects."""
 
 OPTIONAL = frozenset({"emergency_deceleration"})
-"""Hidden effects that need not be named: nobody who drives as usual shows them."""
+"""Hidden effects that need not be named, because usual driving does not show them."""
 
 WEAK_STARTUP_S = 0.5
 """Below this, a start-up delay beside other effects need not be named (V3 has 0.25 s)."""
 
 WHOLE = 0.95
-"""A window over this share of the period is no window."""
+"""Share of the period from which on a window counts as the whole period."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class Estimate:
 
     Attributes:
         effect: Name of the effect.
-        parameter: Its field.
-        true: The hidden value.
-        value: The value found.
-        relative: Distance of the two over the hidden value; None if that is 0.
-        of_effect: Distance of the two over the distance of the hidden from the nominal value.
-        inside: Whether the interval holds the hidden value; None without an interval.
+        parameter: Field of the effect.
+        true: Hidden value.
+        value: Value that the diagnosis found.
+        relative: ``|value - true| / |true|``; None if the hidden value is 0.
+        of_effect: ``|value - true| / |true - nominal|``; None without a different nominal value.
+        inside: True if the interval holds the hidden value; None without an interval.
     """
 
     effect: str
@@ -76,27 +76,28 @@ class Grade:
 
     Attributes:
         case: Id of the case.
-        scenario: Its scenario.
-        group: Group of what was hidden.
-        hidden: What was hidden.
-        strength: Its strength.
+        scenario: Name of the scenario.
+        group: Group of the hidden effects.
+        hidden: Name of the hidden effects.
+        strength: Strength of the hidden effects.
         periods: Number of periods.
-        speeds: Whether speeds were measured.
+        speeds: True if speeds were measured.
         lights: Number of traffic lights.
-        verdict: What the diagnosis says.
-        named: Effects it names.
-        outcome: What that is worth.
-        among: Whether the right names are among those it cannot tell apart.
-        found: Share of the hidden effects that it names.
-        confident_wrong: Whether it calls explained what it gets wrong, in name or in place.
-        place_right: Whether all places are right; None where there is none, or the name is wrong.
-        window_iou: Overlap of the windows over their union; None likewise.
+        verdict: Verdict of the diagnosis.
+        named: Effects that the diagnosis names.
+        outcome: Judgement of the diagnosis: right, wrong, missed, abstained or failed.
+        among: True if the right names are among alternatives that the diagnosis cannot tell apart.
+        found: Share of the hidden effects that the diagnosis names.
+        confident_wrong: True if the verdict is "explained" but a name or place is wrong.
+        place_right: True if all places are right; None without places, or if a name is wrong.
+        window_iou: Intersection of the windows over their union; None without windows, or if a name
+            is wrong.
         estimates: Parameters of effects named at the right place.
-        shrink: Share of the held-out gap that is gone.
-        policy_shrink: Share of the policy gap that is gone.
-        wall_s: Time the diagnosis took.
-        visible: Whether a test that knows the effect sees it, or the log of the signals shows it;
-            None where that was not judged.
+        shrink: Share of the held-out gap that the diagnosis removes.
+        policy_shrink: Share of the policy gap that the diagnosis removes.
+        wall_s: Wall seconds of the diagnosis.
+        visible: True if a test that knows the effect sees it, or the log of the signals shows it;
+            None if this was not tested.
     """
 
     case: str
@@ -131,12 +132,12 @@ class Grade:
 
 
 def grade_cases(directory: Path) -> tuple[Grade, ...]:
-    """Grade every case whose diagnosis is there, or whose diagnosis failed, and writes them.
+    """Grade every case with a finished or failed diagnosis, and write the grades.
 
-    The labels of other cases stay closed.
+    The labels of other cases are not read.
 
     Raises:
-        BlindTestError: Not a blind test, or a diagnosis that is none.
+        BlindTestError: The directory holds no blind test, or a diagnosis is damaged.
     """
     grades: list[Grade] = []
     judged = read_json(directory / VISIBLE) if (directory / VISIBLE).exists() else {}
@@ -168,7 +169,7 @@ def read_grades(directory: Path) -> tuple[Grade, ...]:
     """Read the grades of a blind test.
 
     Raises:
-        BlindTestError: It is missing or damaged.
+        BlindTestError: The file is missing or damaged.
     """
     path = directory / GRADES
     try:
@@ -183,12 +184,12 @@ def grade(label: Label, diagnosis: Mapping[str, Any], wall_s: float | None = Non
     """Compare a diagnosis with the truth.
 
     Args:
-        label: The truth.
-        diagnosis: The content of a ``diagnosis.json``.
-        wall_s: Time it took.
+        label: Truth about the case.
+        diagnosis: Content of its ``diagnosis.json``.
+        wall_s: Wall seconds of the diagnosis.
 
     Raises:
-        ValueError: The verdict is none of those there are.
+        ValueError: The verdict is unknown.
     """
     verdict = diagnosis["verdict"]
     if verdict not in get_args(Verdict):
@@ -199,7 +200,7 @@ def grade(label: Label, diagnosis: Mapping[str, Any], wall_s: float | None = Non
     others = [
         canonical(map(found_effect, other["effects"]), label)
         for other in diagnosis.get("alternatives") or ()
-        if verdict == "not_identifiable"  # elsewhere they are what was tried, not what is named
+        if verdict == "not_identifiable"  # with other verdicts these were tried, not named
     ]
     sets = [{item.name for item in effects} for effects in (named, *others)]
     required, allowed = required_and_allowed(label, truth)
@@ -265,7 +266,7 @@ def _where(
     named: Sequence[Hidden],
     truth: Sequence[Hidden],
 ) -> tuple[bool | None, float | None]:
-    """Judge the places (all right, no other named), and return the overlap of the windows."""
+    """Return whether all places are right and no other is named, and the overlap of windows."""
     windows = [
         _overlap(item.window, other.window)
         for item, same in matched
@@ -279,7 +280,7 @@ def _where(
 
 
 def _overlap(one: tuple[float, float] | None, two: tuple[float, float] | None) -> float:
-    """Intersection over union of two windows."""
+    """Return the intersection over union of two windows."""
     if one is None or two is None:
         return 0.0
     inside = max(min(one[1], two[1]) - max(one[0], two[0]), 0.0)
@@ -324,10 +325,10 @@ def _estimates(
 
 
 def _policy_shrink(gap: Any) -> float | None:
-    """Share of the policy gap that is gone, of a trained policy if there is one.
+    """Return the share of the policy gap that the diagnosis removes, ``1 - |after| / |before|``.
 
-    Reads ``{policy: {"before": Δ, "after": Δ}}``; a name that holds ``.pt`` or ``trained`` is the
-    trained policy, and without one the mean over all policies is taken.
+    The gap has the form ``{policy: {"before": Δ, "after": Δ}}``. The mean is over trained policies
+    (names with ``.pt`` or ``trained``); without any, over all policies.
     """
     if not isinstance(gap, Mapping):
         return None
@@ -354,7 +355,7 @@ def _number(value: Any) -> float | None:
 def required_and_allowed(
     label: Label, truth: Sequence[Hidden]
 ) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the names a diagnosis must give, and those it may give."""
+    """Return the names that a diagnosis must give, and those that it may give."""
     allowed = frozenset(item.name for item in truth)
     if label.group == "outside":
         return frozenset(), allowed
@@ -370,14 +371,14 @@ def required_and_allowed(
 
 
 def canonical(effects: Iterable[Hidden], label: Label) -> list[Hidden]:
-    """Effects in one spelling, so that two descriptions of the same thing are equal."""
+    """Return effects in one spelling, so that descriptions of the same effect are equal."""
     found = [canonical_effect(item, label) for item in effects]
     kept: list[Hidden] = []
     for item in found:
         kind = KINDS.get(item.name)
         if kind is not None and kind.where == "light" and len(label.lights) > 1:
             same = [x for x in found if x.name == item.name]
-            if {x.place for x in same} == set(label.lights):  # at all lights means everywhere
+            if {x.place for x in same} == set(label.lights):  # all lights are everywhere
                 keys = item.parameters
                 mean = {k: sum(x.parameters[k] for x in same) / len(same) for k in keys}
                 item = replace(item, place=EVERYWHERE, parameters=mean)
@@ -387,7 +388,7 @@ def canonical(effects: Iterable[Hidden], label: Label) -> list[Hidden]:
 
 
 def canonical_effect(item: Hidden, label: Label) -> Hidden:
-    """One effect in its one spelling."""
+    """Return an effect in the spelling of `canonical`."""
     name, place, window, parameters = item.name, item.place, item.window, dict(item.parameters)
     if name == "demand_surge" and window is not None and _covers(window, label):
         name, window = "demand_level", None
@@ -410,7 +411,7 @@ def _covers(window: tuple[float, float], label: Label) -> bool:
 
 
 def found_effect(raw: Mapping[str, Any]) -> Hidden:
-    """An effect of a diagnosis, values without their intervals."""
+    """Return an effect of a diagnosis, with values but without intervals."""
     values = {
         key: float(item["value"]) if isinstance(item, Mapping) else float(item)
         for key, item in (raw.get("parameters") or {}).items()
@@ -419,10 +420,10 @@ def found_effect(raw: Mapping[str, Any]) -> Hidden:
 
 
 def match(item: Hidden, others: Sequence[Hidden]) -> Hidden | None:
-    """The effect of the same name at the same place."""
+    """Return the effect of the same name at the same place."""
     return next((x for x in others if (x.name, x.place) == (item.name, item.place)), None)
 
 
 def same_name(name: str, others: Sequence[Hidden]) -> Hidden | None:
-    """The effect of the same name, wherever it is."""
+    """Return the first effect of this name, at any place."""
     return next((x for x in others if x.name == name), None)

@@ -13,12 +13,15 @@ from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Document, Network, Scenario
 
 STOP_BEFORE_LINE_M = 30.0
-"""Where buses stop and cars turn off: between the advance and the stop detectors."""
+"""Metres before the stop line at which buses stop and cars turn off.
+
+The place is between the advance and the stop detectors.
+"""
 
 
 @dataclass(frozen=True)
 class BusStops(Effect):
-    """Buses on the most usual way over an edge stop there in their lane, every so many minutes."""
+    """Buses that stop on an edge in their lane at regular times, on its most usual route."""
 
     name: ClassVar[str] = "bus_stops"
     ranges: ClassVar[dict[str, Parameter]] = {
@@ -34,7 +37,7 @@ class BusStops(Effect):
         """Add a bus type and its buses.
 
         Raises:
-            BlindTestError: Nobody drives over the edge and on.
+            BlindTestError: No vehicle drives over the edge and on.
         """
         way = _usual_way(scenario, self.edge)
         lane = _lane_towards(scenario, self.edge, way[way.index(self.edge) + 1])
@@ -63,7 +66,7 @@ class BusStops(Effect):
 
 @dataclass(frozen=True)
 class Driveway(Effect):
-    """This share of the vehicles on an edge turn off into a driveway before the stop line."""
+    """A driveway before the stop line into which a share of the vehicles on an edge turns off."""
 
     name: ClassVar[str] = "driveway"
     ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
@@ -94,7 +97,7 @@ class Driveway(Effect):
 
 
 def _usual_way(scenario: Scenario, edge: str) -> tuple[str, ...]:
-    """The route most vehicles over the edge take, if they go on from there."""
+    """Return the most frequent route over the edge among routes that continue after it."""
     ways: Counter[tuple[str, ...]] = Counter()
     for document in scenario.routes:
         for item in document.parse().iter("vehicle"):
@@ -108,7 +111,7 @@ def _usual_way(scenario: Scenario, edge: str) -> tuple[str, ...]:
 
 
 def _lane_towards(scenario: Scenario, edge: str, other: str) -> str:
-    """The rightmost lane of an edge from which another edge can be reached."""
+    """Return the rightmost lane of an edge that leads to another edge."""
     network = Network.read(scenario)
     links = [link for item in network.intersections for link in item.links]
     found = [

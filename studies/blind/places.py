@@ -13,13 +13,13 @@ from ugat_marl.scenarios import Detector, Network, Scenario
 from ugat_marl.seeding import derive_seed
 
 TURN_PER_HOUR = 60.0
-"""A turn to which vehicles are diverted is already taken by so many."""
+"""Least vehicles per hour on a turn to which others are diverted."""
 BUSY_PER_HOUR = 120.0
-"""What an origin, a detector or a lane needs to count as busy."""
+"""Least vehicles per hour of a busy origin, detector or lane."""
 YIELDING_PER_HOUR = 200.0
-"""A turn that shows how drivers yield: fewer find their gap, or the green that protects them."""
+"""Least vehicles per hour on a turn that shows how drivers yield."""
 LONG_M = 50.0
-"""A lane to close or to park on is at least so long."""
+"""Least length in metres of a lane to close or to park on."""
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,15 @@ class Busy:
 
     Attributes:
         lights: Traffic lights that agents control.
-        origins: Edges where vehicles start, and how many per hour tell of them (`telling`).
+        origins: Edges where vehicles start, and the vehicles per hour of `telling`.
         turns: ``(from, to)`` edges of turns at traffic lights.
         closable: Lanes before a traffic light with a lane beside them.
         lanes: Lanes before a traffic light.
         edges: Edges before a traffic light.
         detectors: Detectors.
         pairs: Detectors of one kind on neighbouring lanes that count differently.
-        permitted: Whether drivers have to yield on some green, and enough of them do.
-        several_lanes: Whether an approach has more than one lane.
+        permitted: True if enough drivers have to yield on a green.
+        several_lanes: True if an approach has more than one lane.
     """
 
     lights: tuple[str, ...]
@@ -52,11 +52,11 @@ class Busy:
 
 
 def busy_places(scenario: Scenario, seed: int) -> Busy:
-    """Count the demand, and plays one day to see which lanes it takes.
+    """Count the demand, and play one day to count the vehicles on each lane.
 
     Args:
-        scenario: The simulation.
-        seed: Root of the seed of that day.
+        scenario: Scenario of the simulation.
+        seed: Root of the seed of this day.
     """
     network = Network.read(scenario)
     rates, detectors = _detected(scenario, seed)
@@ -102,14 +102,15 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
 
 
 def telling(routes: Routes, origin: str, counted: Collection[str]) -> float:
-    """Vehicles per hour that would tell as much of an origin if they were counted alone.
+    """Return the effective vehicles per hour by which detectors measure an origin.
 
-    A share of `own` vehicles among `all` is told with the error of all: as by ``own**2 / all``
-    alone. The edge that tells most counts.
+    A detector counts `own` vehicles of the origin among `all`. The noise is that of all vehicles,
+    so the count is as precise as ``own**2 / all`` vehicles counted alone. Return the largest value
+    over the edges.
 
     Args:
-        routes: Of the scenario.
-        origin: Where vehicles start.
+        routes: Routes of the scenario.
+        origin: Edge where vehicles start.
         counted: Edges with detectors.
     """
     told = (
@@ -121,7 +122,7 @@ def telling(routes: Routes, origin: str, counted: Collection[str]) -> float:
 
 
 def _yielding(network: Network) -> set[tuple[str, str]]:
-    """Edges of the turns that have to yield on some green."""
+    """Return the edges of the turns that have to yield on some green."""
     return {
         (network.lanes[link.from_lane].edge, network.lanes[link.to_lane].edge)
         for item in network.intersections
@@ -131,7 +132,7 @@ def _yielding(network: Network) -> set[tuple[str, str]]:
 
 
 def _detected(scenario: Scenario, seed: int) -> tuple[dict[str, float], tuple[Detector, ...]]:
-    """Vehicles per hour at every detector on one ordinary day."""
+    """Return the vehicles per hour at every detector on a day without effects."""
     day = record(
         scenario,
         "sim",

@@ -1,4 +1,4 @@
-"""Diagnose the cases of a blind test, without opening their labels."""
+"""Diagnose the cases of a blind test without reading their labels."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ def run_cases(
     """Diagnose the cases that have no diagnosis yet; one that fails does not stop the others.
 
     Args:
-        directory: A blind test.
-        diagnose: Makes one diagnosis.
-        only: Cases; none for all.
-        jobs: Cases at a time, each in a process of its own if there are several.
-        command: The command line that runs one case, its id to be added.
-        reporter: Shows progress.
+        directory: Directory of a blind test.
+        diagnose: Function that makes one diagnosis.
+        only: Ids of cases; empty for all.
+        jobs: Cases at a time; several run in their own processes.
+        command: Command line that runs one case; the id is appended.
+        reporter: Reporter of the progress.
 
     Returns:
-        How many were diagnosed, and how many failed.
+        Number of diagnosed cases, and number of failed ones.
 
     Raises:
-        BlindTestError: Not a blind test, or a case that has not been measured.
-        UnknownNameError: No such case.
+        BlindTestError: The directory holds no blind test, or a case has not been measured.
+        UnknownNameError: There is no such case.
     """
     left = [
         case for case in chosen(directory, only) if not (directory / case.case / DIAGNOSIS).exists()
@@ -74,7 +74,7 @@ def run_cases(
 
 
 def _one(directory: Path, case: Case, diagnose: Diagnose) -> bool:
-    """Diagnose a case here; notes how long it took, or why it failed."""
+    """Diagnose a case in this process; write the wall time, or the reason of a failure."""
     folder = directory / case.case
     start = time.monotonic()
     error = None
@@ -89,15 +89,15 @@ def _one(directory: Path, case: Case, diagnose: Diagnose) -> bool:
 
 
 def _apart(directory: Path, case: Case, command: Sequence[str]) -> bool:
-    """Diagnose a case in a process of its own."""
+    """Diagnose a case in another process."""
     folder = directory / case.case
     start = time.monotonic()
     (folder / RUN).unlink(missing_ok=True)
     call = [sys.executable, "-m", "studies.blind", *command, "--only", case.case]
-    # the module path of this process, which found the checkout
+    # the module path of this process, by which the checkout is found
     variables = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run(call, capture_output=True, text=True, env=variables, check=False)
-    if not (folder / RUN).exists():  # it did not even get so far as to say why
+    if not (folder / RUN).exists():  # the process ended before it could write why
         said = " ".join(done.stderr.split())[-500:]
         _note(folder, time.monotonic() - start, f"exit code {done.returncode}: {said}")
     return read_json(folder / RUN).get("error") is None

@@ -1,4 +1,4 @@
-"""Draw what is hidden in a case: class, strength, place and time."""
+"""Draw the hidden effects of a case: class, strength, place and time."""
 
 from __future__ import annotations
 
@@ -23,17 +23,19 @@ GROUPS: Mapping[str, float] = {
 """The groups of classes, and their usual shares of the cases."""
 
 EFFECT_SHARE = 0.05
-"""Share of an effect that is asked for by name, beside groups."""
+"""Share of the cases for an effect that is requested by name beside groups."""
 
 DECOYS = 0.3
-"""Share of the other cases in which an effect that is not hidden is left out of the library too, so
-that leaving out says nothing."""
+"""Share of the other cases in which an effect that is not hidden is left out of the library.
+
+So the list of left-out effects does not reveal the hidden one.
+"""
 
 MARGIN_S = 600.0
-"""Nothing with a window begins or ends closer to the ends of a period."""
+"""Least seconds between a window and the ends of a period."""
 
 ALSO_OUT: Mapping[str, tuple[str, ...]] = {"demand_level": ("demand_surge",)}
-"""What else says the same as an effect, and is left out with it."""
+"""Effects that are left out together with an effect, because they mean the same."""
 
 OUTSIDE = (
     "bus_stops", "driveway", "double_parking", "reaction_step", *MODELS,
@@ -44,7 +46,7 @@ _OWN = OUTSIDE[: 4 + len(MODELS)]
 
 @dataclass(frozen=True)
 class Task:
-    """Request for one case before the draw: group, member of the group, strength."""
+    """Request for one case: group, member of the group, strength."""
 
     group: str
     member: str = ""
@@ -56,11 +58,11 @@ class Sample:
     """Hidden effects of one case.
 
     Attributes:
-        group: The group.
-        hidden: What it is, in a word.
-        strength: How strong it is.
-        effects: What is applied.
-        leave_out: Effects the diagnosis may not use.
+        group: Group of the case.
+        hidden: Name of the hidden effects.
+        strength: Strength of the hidden effects.
+        effects: Effects that are applied to the scenario.
+        leave_out: Effects that the diagnosis may not use.
     """
 
     group: str
@@ -76,10 +78,10 @@ def draw_tasks(
     cases: int,
     generator: np.random.Generator,
 ) -> list[Task]:
-    """One task per case: shares as asked for, each class as often as any other of its group.
+    """Draw one task per case, with equal numbers for all members of a group.
 
     Raises:
-        UnknownNameError: No such class or strength.
+        UnknownNameError: There is no such class or strength.
     """
     for name in classes:
         if name not in GROUPS and name not in KINDS:
@@ -90,7 +92,7 @@ def draw_tasks(
     weights = np.array([GROUPS.get(name, EFFECT_SHARE) for name in classes])
     exact = cases * weights / weights.sum()
     counts = np.floor(exact).astype(int)
-    # Those without anything hidden are rounded up: fewer than asked for would flatter the result.
+    # Cases without effects are rounded up, because too few of them would flatter the result.
     first = np.array([name != "none" for name in classes])
     rest = np.lexsort((counts - exact, first))[: cases - counts.sum()]
     counts[rest] += 1
@@ -98,7 +100,7 @@ def draw_tasks(
     for name, count in zip(classes, counts.tolist(), strict=True):
         members = _members(name, strengths)
         order = [members[i] for i in generator.permutation(len(members))]
-        if name == "outside":  # half of them what no library has, half what this one is denied
+        if name == "outside":  # half are effects of no library, half are left out of this one
             own = [task for task in order if task.member in _OWN]
             denied = [task for task in order if task.member not in _OWN]
             order = [task for pair in zip(cycle(own), denied, strict=False) for task in pair]
@@ -107,7 +109,7 @@ def draw_tasks(
 
 
 def _members(name: str, strengths: Sequence[str]) -> list[Task]:
-    """All tasks of a group, or of an effect."""
+    """Return all tasks of a group, or of an effect."""
     if name == "setting":
         return [Task(name, setting) for setting in SETTINGS]
     if name == "outside":
@@ -202,7 +204,7 @@ def _window(
 
 
 def _pair(scenario: Scenario, busy: Busy, generator: np.random.Generator) -> Sample | None:
-    """Draw two effects of two families, neither of them small."""
+    """Draw two effects of different families, both medium or large."""
     names = [x for x in KINDS if x in known_effects() and x not in IN_THE_LOG]
     for _ in range(100):
         one, two = (names[i] for i in generator.choice(len(names), 2, replace=False))

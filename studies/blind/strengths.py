@@ -1,7 +1,8 @@
 """Strengths of hidden effects: small, medium and large, effect by effect.
 
-Small is half and large twice the distance of the medium strength from the value without the effect.
-What is told by counts alone is at medium strength at least so large that it can be told from them.
+The distance from the value without the effect is half as large for small and twice as large for
+large as for medium. An effect that only counts can show is, at medium strength, large enough to be
+seen in the counts.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from ugat_marl.scenarios import Scenario
 
 Strength = Literal["small", "medium", "large"]
 COUNTED = 6.0
-"""A medium change of counts is at least so many standard errors of what is counted."""
+"""Least size of a medium change of counts, in standard errors of the count."""
 COUNTED_HOURS = 3.0
-"""Hours that are counted: the fitted ones of five periods of an hour."""
+"""Hours of counting: the fitted periods of five periods of one hour."""
 STRENGTHS: tuple[Strength, ...] = ("small", "medium", "large")
 SCALE: Mapping[str, float] = {"small": 0.5, "medium": 1.0, "large": 2.0}
 
@@ -25,7 +26,7 @@ Family = Literal["vehicles", "signals", "demand", "road", "detectors"]
 Where = Literal[
     "everywhere", "light", "origin", "turn", "closable", "lane", "edge", "detector", "pair", "model"
 ]
-"""What has to be drawn to say where an effect is."""
+"""Kind of place that is drawn for an effect."""
 
 
 @dataclass(frozen=True)
@@ -33,17 +34,17 @@ class Kind:
     """Form in which an effect of the library is hidden.
 
     Attributes:
-        family: Pairs are made of two families.
-        where: What its place is.
-        parameter: The field that has a strength; "" if its window or nothing has.
+        family: Family of the effect; a pair has effects of two families.
+        where: Kind of its place.
+        parameter: Field that has a strength; "" if only the window or nothing has one.
         nominal: Value of the field without the effect.
-        medium: Its medium strength.
+        medium: Value of the field at medium strength.
         least: Smallest value drawn.
         greatest: Greatest value drawn.
-        either: Whether it may lie as far on the other side of the nominal value.
-        window_s: Length of its window at medium strength; 0 if it has none.
-        fixed: Fields that are always the same.
-        strengths: The strengths that differ.
+        either: True if the value may also lie on the other side of the nominal value.
+        window_s: Seconds of its window at medium strength; 0 for no window.
+        fixed: Fields with fixed values.
+        strengths: Strengths that differ from each other.
     """
 
     family: Family
@@ -61,12 +62,12 @@ class Kind:
     def value(
         self, strength: str, other_side: bool = False, per_hour: float | None = None
     ) -> float:
-        """The value of the field at a strength.
+        """Return the value of the field at a strength.
 
         Args:
-            strength: Which.
-            other_side: On the other side of the nominal value, if there is one.
-            per_hour: Vehicles an hour that tell it, if it is a share of them.
+            strength: Strength: small, medium or large.
+            other_side: True for a value on the other side of the nominal one, if allowed.
+            per_hour: Vehicles per hour that show the effect, if its field is a share of them.
         """
         distance = self.medium - self.nominal
         if per_hour is not None:
@@ -76,7 +77,7 @@ class Kind:
         return round(min(max(value, self.least), self.greatest), 4)
 
     def window(self, strength: str) -> float:
-        """Length of the window, s: the strength of an effect that has no other."""
+        """Return the seconds of the window; they are the strength if no field has one."""
         return self.window_s if self.parameter else self.window_s * SCALE[strength]
 
 
@@ -118,12 +119,14 @@ KINDS: Mapping[str, Kind] = {
     "dropout": Kind("detectors", "detector", window_s=900.0),
     "swapped": Kind("detectors", "pair", strengths=("medium",)),
 }
-"""Every effect of the library but `emergency_deceleration`, which nobody who drives as usual shows:
-it decides only what happens in an emergency."""
+"""Every effect of the library but `emergency_deceleration`.
+
+That effect acts only in an emergency, so usual driving does not show it.
+"""
 
 
 def nominal_of(name: str, scenario: Scenario) -> dict[str, float]:
-    """The value of an effect's field without the effect, in a scenario."""
+    """Return the value of an effect's field without the effect, in a scenario."""
     kind = KINDS.get(name)
     if kind is None or not kind.parameter:
         return {}

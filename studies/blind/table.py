@@ -1,4 +1,4 @@
-"""Sum up grades: one row per measure with its interval, and what was taken for what."""
+"""Sum up grades: one row per measure with its interval, and the confusions of effects."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from studies.blind.grade import Grade
 from ugat_marl.files import write_whole
 
 TRIO = frozenset({"acceleration", "startup_delay", "headway"})
-"""Effects that all make queues discharge slowly, and are taken for each other."""
+"""Effects that all make queues discharge slowly, so that a diagnosis confuses them."""
 
 MANY = 5
-"""Periods that the goals of the first row are meant for."""
+"""Number of periods for the goal of the first row."""
 
 AIMS = {
     "single effect, medium or large, named (5 periods, speeds)": "98 %",
@@ -39,7 +39,7 @@ AIMS = {
     "wall time, one intersection (median)": "240 s",
     "wall time, several intersections (median)": "900 s",
 }
-"""What would be better still than the goal, by measure."""
+"""Measure to a value that would be better still than the goal."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,15 @@ class Row:
     """One measure.
 
     Attributes:
-        measure: What is measured.
-        n: Cases (or parameters) it is measured on.
-        count: How many of them; None for a measure that is not a share.
+        measure: Name of the measure.
+        n: Number of cases (or parameters).
+        count: Number of successes among them; None for a measure that is not a share.
         value: The share or the median; None without cases.
         low: Lower end of the 95 % Wilson interval of a share, or the lower quartile.
-        high: Upper end, or the upper quartile.
-        unit: ``""`` for shares and ratios, else the unit.
+        high: Upper end of this interval, or the upper quartile.
+        unit: Unit of the value; ``""`` for shares and ratios.
         ship: The goal, in words.
-        met: Whether `value` meets it; None without cases or without a goal.
+        met: True if `value` meets the goal; None without cases or without a goal.
     """
 
     measure: str
@@ -152,7 +152,7 @@ def confusion(grades: Iterable[Grade]) -> dict[str, Counter[str]]:
 
 
 def markdown(grades: Sequence[Grade]) -> str:
-    """The table and the confusions as Markdown."""
+    """Return the table and the confusions as Markdown."""
     lines = [
         "| measure | n | result | 95 % interval, or quartiles | goal | met | aim |",
         "|---|---|---|---|---|---|---|",
@@ -174,7 +174,7 @@ def markdown(grades: Sequence[Grade]) -> str:
 
 
 def write_table(grades: Sequence[Grade], path: Path) -> None:
-    """Write the table as Markdown, or as JSON where the name ends so."""
+    """Write the table as Markdown, or as JSON if the name ends in ``.json``."""
     if path.suffix != ".json":
         write_whole(path, markdown(grades))
         return
@@ -230,7 +230,7 @@ def _share(
 
 
 def _coverage(inside: Sequence[bool | None]) -> Row:
-    """Return the share of 95 % intervals that hold the value; too few and all are both missed."""
+    """Return the share of 95 % intervals that hold the value; the goal has two sides."""
     known = [x for x in inside if x is not None]
     n, count = len(known), sum(known)
     share = count / n if n else None

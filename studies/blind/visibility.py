@@ -1,8 +1,9 @@
-"""Visibility of hidden effects, by a test that is told the effect.
+"""Visibility of hidden effects to a test that knows them.
 
-A diagnosis has to find the effect, its place and its strength. This test knows them, and asks only
-by how many standard deviations of noise they move what the fitted periods show: what it cannot see
-no diagnosis can name. It opens labels, and so it only judges cases that have been diagnosed.
+A diagnosis has to find the effect, its place and its strength. This test knows them. It measures by
+how many standard deviations of noise they move the data of the fitted periods. No diagnosis can
+name an effect that this test cannot see. The test reads labels, so it only takes cases that have
+been diagnosed.
 """
 
 from __future__ import annotations
@@ -33,26 +34,26 @@ from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Network
 
 DAYS = 24
-"""Simulated with the effect; the same ones without it."""
+"""Number of days that are simulated with the effect, and again without it."""
 
 
 def judge_visibility(
     directory: Path, *, only: Sequence[str] = (), seed: int = 0, reporter: Reporter | None = None
 ) -> dict[str, float | None]:
-    """Judge every diagnosed case with a single effect, and writes what it finds.
+    """Test every diagnosed case with a single effect, and write the result.
 
     Args:
-        directory: A blind test.
-        only: Cases; none for all.
+        directory: Directory of a blind test.
+        only: Ids of cases; empty for all.
         seed: Seed of the diagnoses, whose simulated days are used again.
-        reporter: Shows progress.
+        reporter: Reporter of the progress.
 
     Returns:
-        By case: standard deviations, or None where the log of the signals shows the effect.
+        Case to standard deviations, or to None if the log of the signals shows the effect.
 
     Raises:
-        BlindTestError: Not a blind test, or a damaged label.
-        UnknownNameError: No such case.
+        BlindTestError: The directory holds no blind test, or a label is damaged.
+        UnknownNameError: There is no such case.
     """
     path = directory / VISIBLE
     found: dict[str, float | None] = read_json(path) if path.exists() else {}
@@ -79,7 +80,7 @@ def judge_visibility(
 
 
 def effect_of(hidden: Hidden) -> Effect:
-    """Make the effect from the form in which it is named."""
+    """Make an effect of the library from the form of a diagnosis."""
     texts = known_effects()[hidden.name].texts
     values: dict[str, float | str] = dict(hidden.parameters)
     values |= dict(zip(texts, (hidden.place or "").split(">"), strict=True)) if texts else {}
@@ -89,13 +90,13 @@ def effect_of(hidden: Hidden) -> Effect:
 
 
 def deviations_of(study: Study, effects: Sequence[Effect]) -> float:
-    """By how many standard deviations effects move what the fitted periods show.
+    """Return by how many standard deviations effects move the data of the fitted periods.
 
-    Days with and without them are simulated with the same vehicles.
+    Days with and without the effects are simulated with the same vehicles.
 
     Args:
         study: Scenario, data and simulated days.
-        effects: The hidden ones, strength and all.
+        effects: Hidden effects with their true values.
     """
     base = study.base(Silent()).model
     with_them = [day.tally for day in study.engine.replicates(effects, study.engine.first(DAYS))]
@@ -106,17 +107,18 @@ def deviations_of(study: Study, effects: Sequence[Effect]) -> float:
 def separation(
     reference: Reference, data: Sequence[Tally], after: Sequence[Tally], before: Sequence[Tally]
 ) -> float:
-    """The distance of two models in noise, as the best linear test between them sees it.
+    """Return the distance of two models in standard deviations of noise.
 
-    It is the Mahalanobis distance of their means, for the block of statistics that shows them best.
-    Its square is estimated by the product of the difference in every other day with that in the
-    days between, which has no bias: what is chance in one is not in the other.
+    It is the Mahalanobis distance of their means, ``sqrt(d' C^-1 d)`` with the noise C, as seen by
+    the best linear test, for the block of statistics that separates them best. The square is
+    estimated by ``d_1' C^-1 d_2`` with the differences d_1 and d_2 of alternate days. This estimate
+    has no bias, because the noise of the two halves is independent.
 
     Args:
-        reference: Whose noise.
-        data: Periods, which decide what is seen and how precisely.
+        reference: Reference that gives the noise.
+        data: Periods of measured data, which decide the statistics and their precision.
         after: Days of one model.
-        before: The same days of the other.
+        before: The same days of the other model.
 
     Returns:
         Standard deviations; 0 where chance turns the estimate of the square negative.
