@@ -127,7 +127,7 @@ def grounded(request: Request) -> dict[str, Any]:
         kind: Any = kinds[request["grounding"]]
         transform = kind(inner.layouts, request["seed"], gate=never)
         for model in (transform.forward, transform.inverse):
-            model.fitted.fill_(True)  # unfitted models would refuse; their answers are not used
+            model.fitted.fill_(True)  # unfitted models are not asked; the answers are not used
         env = GroundedEnv(inner, transform)
     env.reset(seed=request["seed"])  # the first reset also starts the warm parent
     _, infos = env.reset(seed=request["seed"])

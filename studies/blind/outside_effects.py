@@ -21,7 +21,7 @@ The place is between the advance and the stop detectors.
 
 @dataclass(frozen=True)
 class BusStops(Effect):
-    """Buses that stop on an edge in their lane at regular times, on its most usual route."""
+    """Buses on the most usual route over an edge that stop there in their lane."""
 
     name: ClassVar[str] = "bus_stops"
     ranges: ClassVar[dict[str, Parameter]] = {
@@ -66,7 +66,7 @@ class BusStops(Effect):
 
 @dataclass(frozen=True)
 class Driveway(Effect):
-    """A driveway before the stop line into which a share of the vehicles on an edge turns off."""
+    """Driveway before a stop line into which a share of the vehicles turns off."""
 
     name: ClassVar[str] = "driveway"
     ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}

@@ -16,7 +16,9 @@ from ugat_marl.policies import NetworkPolicy, export_policy
 
 @dataclass(frozen=True)
 class Export:
-    """Write a trained policy as TorchScript, ONNX or matrices; see docs/how-to/export.md.
+    """Write a trained policy as TorchScript, ONNX or matrices.
+
+    The files are described in docs/how-to/export.md.
 
     Examples:
         ugat-marl export runs/demo/policies/ugat.pt --out ugat.onnx --scenario grid2x2-v1

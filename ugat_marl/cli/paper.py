@@ -97,7 +97,9 @@ class Main(_Paper):
 
 @dataclass(frozen=True)
 class Ablation(_Paper):
-    """UGAT without its parts: static α, no gate, no uncertainty, no grounding (Table 3).
+    """Compare UGAT with and without its parts (paper, Table 3).
+
+    The variants have a static α, no gate, no uncertainty or no grounding.
 
     Examples:
         ugat-marl paper ablation

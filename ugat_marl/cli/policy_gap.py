@@ -24,7 +24,7 @@ from ugat_marl.scenarios import Network
 
 @dataclass(frozen=True)
 class PolicyGap:
-    """Measure by how much a diagnosis shrinks the gap of policies to the real domain.
+    """Measure how much a diagnosis shrinks the gap of policies to the real domain.
 
     Play the policies in sim, in the corrected scenario and in the real domain.
 
