@@ -1,7 +1,9 @@
-"""Importers: road networks and demand from anywhere, made into scenario directories.
+"""Importers: scenario directories from other road networks and demand.
 
-- `making`: a scenario directory from a source of roads and one of vehicles.
-- Roads: `plan` (grids, arterials), `osm` with `osm_crossings`, `sumo_files`, `cityflow`.
-- Vehicles: `turning_shares`, `counts`, `sumo_files`, `cityflow`.
-- `streets`: where cars may drive; `long_files`: files read piece by piece.
+- `making`: a scenario directory from a source of roads and a source of vehicles.
+- Sources of roads: `plan` (grids, arterials), `osm` with `osm_crossings`, `sumo_files`,
+  `cityflow` with `cityflow_roadnet`.
+- Sources of vehicles: `turning_shares`, `counts`, `sumo_files`, `cityflow`.
+- `streets`: the roads for cars in a network.
+- `long_files`: files read piece by piece.
 """

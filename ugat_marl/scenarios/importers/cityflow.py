@@ -1,8 +1,8 @@
 """CityFlow's two files as a SUMO network with vehicles.
 
-Geometry, lanes, light phases, routes, departures, sizes and speeds are CityFlow's. CityFlow counts
-lanes from the middle of the road, SUMO from the kerb. Both draw lanes to the right of the road's
-line and stop vehicles at a distance from the centre, which is kept.
+Geometry, lanes, light phases, routes, departures, sizes and speeds are those of CityFlow. CityFlow
+counts lanes from the middle of the road, SUMO from the kerb. In both, lanes lie to the right of the
+road's line. Stop lines keep their distance from the centre.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ def from_cityflow(
     """Return a source of the roads and vehicles in a ``roadnet.json`` and its ``flow.json``.
 
     Args:
-        roadnet: The roads.
-        flow: The vehicles.
-        duration_s: Length of an episode; None for whole ten minutes that hold all departures, at
-            least an hour.
-        own_vehicles: Whether the vehicles are wanted.
-        exact: Whether headways are CityFlow's too, and nothing is left to chance.
+        roadnet: File with the roads.
+        flow: File with the vehicles.
+        duration_s: Length of an episode. None for all departures, rounded up to ten minutes, and at
+            least one hour.
+        own_vehicles: True to import the vehicles.
+        exact: True for CityFlow's headways and driving without randomness.
     """
 
     def roads(folder: Path, reporter: Reporter) -> RoadFiles:
@@ -82,7 +82,7 @@ def write_network(net: Roadnet, out: Path) -> list[str]:
     """Make the SUMO network.
 
     Args:
-        net: The roads.
+        net: Roads and intersections.
         out: The ``.net.xml`` to write.
 
     Returns:
@@ -113,7 +113,7 @@ def write_network(net: Roadnet, out: Path) -> list[str]:
 
 
 def has_light(crossing: Crossing) -> bool:
-    """Return True for an intersection with a traffic light: two phases that differ."""
+    """Return True for an intersection with a traffic light: it has two different phases."""
     return not crossing.virtual and len({frozenset(links) for _, links in crossing.phases}) > 1
 
 
@@ -131,7 +131,7 @@ def _nodes(net: Roadnet) -> ET.Element:
             attributes["tl"] = crossing.id
         if not crossing.virtual and (shape := _stop_lines(crossing, net)):
             attributes["shape"] = shape
-        # No road is the main one: straight on goes before turns, as in CityFlow.
+        # No road is the main one: straight on has priority over turns, as in CityFlow.
         ET.SubElement(root, "node", attributes, type=kind, rightOfWay="edgePriority")
     return root
 
@@ -159,7 +159,7 @@ def _connections(net: Roadnet) -> ET.Element:
     leads = {link.start for crossing in net.crossings.values() for link in crossing.links}
     for road in net.roads.values():
         if road.id not in leads and not net.crossings[road.end].virtual:
-            ET.SubElement(root, "connection", {"from": road.id})  # nothing leads on
+            ET.SubElement(root, "connection", {"from": road.id})  # forbids guessed connections
     for crossing in net.crossings.values():
         for _, attributes in _ways(crossing, net):
             ET.SubElement(root, "connection", attributes)
@@ -167,7 +167,7 @@ def _connections(net: Roadnet) -> ET.Element:
 
 
 def _lights(net: Roadnet) -> ET.Element:
-    """Map letters to ways; states follow later, once the conflicts are known."""
+    """Return lights with one letter per way. `_set_programmes` writes the states later."""
     root = ET.Element("tlLogics")
     for crossing in filter(has_light, net.crossings.values()):
         ways = list(_ways(crossing, net))
@@ -181,7 +181,7 @@ def _lights(net: Roadnet) -> ET.Element:
 
 
 def _ways(crossing: Crossing, net: Roadnet) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield every way across with the number of its road link, in the order of the file."""
+    """Yield every way across an intersection, with its road link's number, in file order."""
     for number, link in enumerate(crossing.links):
         before, behind = net.roads[link.start], net.roads[link.end]
         for a, b in link.lanes:
@@ -197,7 +197,7 @@ def _ways(crossing: Crossing, net: Roadnet) -> Iterator[tuple[int, dict[str, str
 
 
 def _stop_lines(crossing: Crossing, net: Roadnet) -> str:
-    """Return a polygon through the ends of all stop lines; empty if roads begin at the centre."""
+    """Return a polygon through the ends of all stop lines; empty if there are none."""
     if crossing.width_m <= 0:
         return ""
     corners: list[Point] = []
@@ -214,7 +214,7 @@ def _stop_lines(crossing: Crossing, net: Roadnet) -> str:
 def _corners(
     road: Road, points: tuple[Point, ...], distance_m: float, *, backwards: bool
 ) -> list[Point]:
-    """Return the ends of the line across a road at a distance from the intersection's centre."""
+    """Return both ends of the line across a road at a distance from the intersection's centre."""
     left = distance_m
     for (ax, ay), (bx, by) in pairwise(points):
         length = math.hypot(bx - ax, by - ay)
@@ -237,7 +237,10 @@ def _shape(points: tuple[Point, ...] | list[Point]) -> str:
 
 
 def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
-    """Write the light phases into the network, now that it is known who has to wait for whom."""
+    """Write the light phases into the network and return notes.
+
+    The network must be built first, because ``g`` or ``G`` depends on its right of way.
+    """
     links = links_of(root)
     rules = RightOfWay(foes_of(root), yields_of(root))
     without: list[str] = []
@@ -275,8 +278,8 @@ def _split(
 ) -> tuple[list[tuple[float, frozenset[int]]], float, frozenset[int]]:
     """Return the green phases, the seconds between two of them, and the links always green.
 
-    CityFlow's files hold the time between two greens as a phase of its own, usually the first, in
-    which only those may go who may always go.
+    CityFlow's files have a separate phase for the time between two greens, usually the first phase.
+    In it only links that are always green may go.
     """
     phases = [(seconds, frozenset(links)) for seconds, links in crossing.phases if seconds > 0]
     greens = [
@@ -314,8 +317,8 @@ class Flows:
     """Vehicles that were written.
 
     Attributes:
-        vehicles: How many.
-        last_s: When the last one departs.
+        vehicles: Number of vehicles.
+        last_s: Departure of the last vehicle.
     """
 
     vehicles: int
@@ -333,20 +336,21 @@ def write_routes(
 ) -> Flows:
     """Turn a ``flow.json`` into a route file.
 
-    Vehicles keep their size, gap, accelerations and speed. How they follow each other is SUMO's
-    unless `exact` is set: the headway of 1 s and the chance in driving that its models are tuned
-    for, as in the SUMO forms that CityFlow's data sets come with.
+    Vehicles keep their size, gap, accelerations and speed. Without `exact` they follow each other
+    as in SUMO's defaults, with a headway of 1 s and some randomness. The SUMO versions of
+    CityFlow's data sets do the same.
 
     Args:
-        path: The flows.
-        net: The roads they use.
+        path: File with the flows.
+        net: Roads and intersections that they use.
         out: The file to write.
-        duration_s: End of the episode, for flows without an end; None for an hour.
-        reporter: Shows progress in a long file.
-        exact: Whether headways are CityFlow's too, and nothing is left to chance.
+        duration_s: End of the episode, s, for flows without an end; None for one hour.
+        reporter: Shows progress if the file is long.
+        exact: True for CityFlow's headways and driving without randomness.
 
     Raises:
-        ScenarioError: Not a list of flows, or one that cannot be driven; with the line.
+        ScenarioError: The file is not a list of flows, or a flow is impossible; the message names
+            the line.
     """
     routes = _Routes(net)
     types: dict[str, dict[str, str]] = {}
@@ -363,13 +367,13 @@ def write_routes(
             raise ScenarioError(f"{where}: more than {MOST_VEHICLES} vehicles")
     if not drives:
         raise ScenarioError(f"{path}: no vehicle in it")
-    drives.sort(key=lambda drive: drive.depart_s)  # stable: as in the file within a second
+    drives.sort(key=lambda drive: drive.depart_s)  # stable: equal times keep the file's order
     write_drives(out, drives, types.values())
     return Flows(len(drives), drives[-1].depart_s)
 
 
 def _departures(flow: Mapping[str, Any], end_s: float, where: str) -> Iterator[float]:
-    """Yield a flow's departures, ``startTime`` to ``endTime`` inclusive; -1 is the end."""
+    """Yield a flow's departures in s, ``startTime`` to ``endTime`` (-1 is the episode's end)."""
     start, end, interval = (
         _number(flow, key, where, least=least)
         for key, least in (("startTime", 0.0), ("endTime", -1.0), ("interval", 0.0))
@@ -388,7 +392,7 @@ def _departures(flow: Mapping[str, Any], end_s: float, where: str) -> Iterator[f
 
 
 def _vehicle_type(raw: Any, name: str, where: str, *, exact: bool) -> dict[str, str]:
-    """Attributes of a SUMO vehicle type for CityFlow's vehicle."""
+    """Return the attributes of a SUMO vehicle type for a vehicle of CityFlow."""
     if not isinstance(raw, dict):
         raise ScenarioError(f"{where}: 'vehicle' is missing or not an object in braces")
     value = {key: _number(raw, key, where, least=0.0) for key in _VEHICLE}
@@ -408,7 +412,8 @@ def _vehicle_type(raw: Any, name: str, where: str, *, exact: bool) -> dict[str, 
     if exact:
         kind |= {
             "emergencyDecel": f"{max(value['maxNegAcc'], value['usualNegAcc']):g}",
-            # CityFlow's gap to the bumper ahead is headway times speed; Krauss adds minGap to it.
+            # CityFlow: gap = headway * v. SUMO's Krauss model: gap = tau * v + minGap.
+            # Both are equal at maxSpeed with tau = headway - minGap / maxSpeed.
             "tau": f"{max(value['headwayTime'] - value['minGap'] / value['maxSpeed'], 0.1):.3g}",
             "sigma": "0",
             "speedFactor": "1",
@@ -427,14 +432,14 @@ def _number(raw: Mapping[str, Any], key: str, where: str, *, least: float) -> fl
 
 
 class _Routes:
-    """Routes from anchor to anchor, on the shortest way where anchors do not touch."""
+    """Routes through anchor roads; the shortest way joins two anchors that do not touch."""
 
     def __init__(self, net: Roadnet) -> None:
         self._net = net
         self._known: dict[tuple[str, ...], tuple[str, ...]] = {}
 
     def through(self, raw: Any, where: str) -> tuple[str, ...]:
-        """Return the whole route."""
+        """Return the whole route through a list of anchors."""
         if not isinstance(raw, list) or not raw or not all(isinstance(name, str) for name in raw):
             raise ScenarioError(f"{where}: 'route' is missing or not a list of roads")
         anchors = tuple(raw)
@@ -462,7 +467,7 @@ class _Routes:
         return {name: _length(road.points) for name, road in self._net.roads.items()}
 
     def _between(self, start: str, goal: str, where: str) -> list[str]:
-        """Return the roads after `start` up to and with `goal` (Dijkstra)."""
+        """Return the roads after `start`, up to and including `goal` (Dijkstra)."""
         best = {start: 0.0}
         came: dict[str, str] = {}
         heap = [(0.0, start)]

@@ -16,14 +16,14 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Road:
-    """A carriageway; lane 0 is the one at the middle of the road.
+    """A carriageway; lane 0 is the lane at the middle of the road.
 
     Attributes:
-        id: Its name.
-        points: Its left border, from one intersection's centre to the other's, m.
+        id: Name of the road.
+        points: Left border, from one intersection's centre to the other's, m.
         lanes: Width (m) and speed limit (m/s) of every lane.
-        start: Intersection it begins at.
-        end: Intersection it ends at.
+        start: Intersection at its start.
+        end: Intersection at its end.
     """
 
     id: str
@@ -35,12 +35,12 @@ class Road:
 
 @dataclass(frozen=True)
 class RoadLink:
-    """A movement: from a road to another over some lanes.
+    """A movement: from one road to another over some lanes.
 
     Attributes:
-        start: Road it comes from.
-        end: Road it leads to.
-        lanes: Lane of the first and of the second road, for each way across.
+        start: Road before the intersection.
+        end: Road after the intersection.
+        lanes: For each way across, the lane on the first and the lane on the second road.
     """
 
     start: str
@@ -53,12 +53,12 @@ class Crossing:
     """An intersection.
 
     Attributes:
-        id: Its name.
-        point: Its centre, m.
+        id: Name of the intersection.
+        point: Centre, m.
         width_m: Distance of the stop lines from the centre.
-        virtual: Whether it is an end of the network.
-        links: Its movements.
-        phases: Seconds of every light phase, and the movements that may go then.
+        virtual: True for an end of the network.
+        links: Movements.
+        phases: Seconds of every light phase, and the indices of the movements that may go.
     """
 
     id: str
@@ -81,7 +81,8 @@ def read_roadnet(path: Path) -> Roadnet:
     """Read and check a ``roadnet.json``.
 
     Raises:
-        ScenarioError: Not one, or something in it names what does not exist; with the line.
+        ScenarioError: The file is no road network, or it refers to something that does not exist;
+            the message names the line if it can.
     """
     raw, text = read_json(path)
     reader = _Reader(path, text)
@@ -137,7 +138,7 @@ def _check_links(crossing: Crossing, net: Roadnet, reader: _Reader) -> None:
 
 
 class _Reader:
-    """Reader of a parsed file; a missing value, or one of another type, is an error."""
+    """Reader of a parsed file. A missing value, or a value of another type, is an error."""
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path

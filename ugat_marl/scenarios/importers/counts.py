@@ -34,10 +34,10 @@ from ugat_marl.scenarios.programs import run_program, sumo_program, tool
 from ugat_marl.seeding import numpy_generator
 
 _CANDIDATES_VPH = 400.0
-"""Random drives from each entry among which the counts are met."""
+"""Random candidate routes drawn at each entry; routeSampler chooses among them."""
 _GOOD_GEH = 5.0
 _MOST_ROWS = 1_000_000
-"""As many as a thousand roads have in ten days of quarters of an hour."""
+"""Most rows of a table: about a thousand roads, ten days, intervals of 15 minutes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +45,11 @@ class Row:
     """One line of a table of demand.
 
     Attributes:
-        roads: The road counted; or two: a turn from one to the other, or origin and destination.
-        count: Vehicles.
-        begin_s: Start of the time they belong to.
-        end_s: Its end.
-        line: Its line in the file.
+        roads: One road for a count, or two roads: a turn, or origin and destination.
+        count: Number of vehicles.
+        begin_s: Start of the interval of the count.
+        end_s: End of the interval of the count.
+        line: Line in the file.
     """
 
     roads: tuple[str, ...]
@@ -62,19 +62,19 @@ class Row:
 def read_rows(
     path: Path, begin_s: float, end_s: float, reporter: Reporter, *, pairs: bool
 ) -> list[Row]:
-    """Read a CSV file with the columns ``count`` and ``edge``, or ``from`` and ``to``.
+    """Read a CSV file with the column ``count`` and either ``edge`` or ``from`` and ``to``.
 
-    The columns ``begin_s`` and ``end_s`` may be added; without them a row is for the whole episode.
+    The columns ``begin_s`` and ``end_s`` are optional. Without them a row covers the whole episode.
 
     Args:
         path: The file.
-        begin_s: Start of the episode.
-        end_s: Its end.
-        reporter: Shows progress in a long file.
-        pairs: Whether every row has to have ``from`` and ``to``.
+        begin_s: Start of the episode, s.
+        end_s: End of the episode, s.
+        reporter: Shows progress if the file is long.
+        pairs: True to require the columns ``from`` and ``to``.
 
     Raises:
-        ScenarioError: A column is missing, or a value is none; names file and line.
+        ScenarioError: A column is missing or a value is impossible; the message names the line.
     """
     texts = lines(path, reporter)
     first = next(texts, "")
@@ -137,9 +137,16 @@ def _number(text: str | None, key: str, where: str) -> float:
 
 
 def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
-    """Return a source of vehicles that meet counts, by SUMO's routeSampler.
+    """Return a source of vehicles that meet counts, with SUMO's routeSampler.
 
-    It chooses among random drives through the network; every counted road has to lie on one.
+    routeSampler chooses among random routes through the network. Every counted road must lie on one
+    of them.
+
+    Args:
+        path: CSV file with the counts.
+        begin_s: Start of the episode, s.
+        length_s: Length of the episode, s.
+        seed: Seed of the random routes and of routeSampler.
     """
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
@@ -190,7 +197,7 @@ def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -
 
 
 def _counts_for_sumo(rows: Sequence[Row], work: Path) -> list[str]:
-    """Write the counts as routeSampler reads them and return its options."""
+    """Write the counts in routeSampler's format and return its options."""
     turns = any(len(row.roads) > 1 for row in rows)
     by_time: dict[tuple[float, float], list[Row]] = defaultdict(list)
     for row in rows:
@@ -221,7 +228,10 @@ def _sampled(path: Path) -> Iterator[Drive]:
 
 
 def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
-    """Say in one sentence how many counts are met, by the GEH of traffic engineering."""
+    """Return a sentence with the number of counts that are met.
+
+    A count C is met by M vehicles per hour if GEH = sqrt(2 (M - C)^2 / (M + C)) is below 5.
+    """
     good = 0
     passed = _passages(drives)
     for row in rows:
@@ -235,7 +245,7 @@ def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
 
 
 def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
-    """Map roads, and turns between two, to the departures of the vehicles there, in order."""
+    """Map each road, and each turn between two roads, to the sorted departures of its vehicles."""
     found: dict[tuple[str, ...], list[float]] = defaultdict(list)
     for drive in sorted(drives, key=lambda drive: drive.depart_s):
         for passed in chain(zip(drive.route, strict=True), pairwise(drive.route)):
@@ -244,7 +254,14 @@ def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
 
 
 def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
-    """Return a source of vehicles from origins to destinations, on the fastest free routes."""
+    """Return a source of vehicles from origins to destinations, on the fastest routes when empty.
+
+    Args:
+        path: CSV file with origins, destinations and counts.
+        begin_s: Start of the episode, s.
+        length_s: Length of the episode, s.
+        seed: Seed of the departures and of duarouter.
+    """
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=True)

@@ -1,4 +1,4 @@
-"""Long files read piece by piece, with progress, and errors that name the line."""
+"""Long files, read piece by piece with progress; errors name the line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ugat_marl.files import Tag, chunks_of, read_bytes, scan_xml
 from ugat_marl.progress import Reporter
 
 _MOST = 32 << 20
-"""Most characters of a single object; more mean a file that is broken in the middle."""
+"""Most characters of one object or line. A longer one means that the file is damaged."""
 _BEFORE, _BETWEEN = re.compile(r"[ \t\r\n]*"), re.compile(r"[ \t\r\n,]*")
 
 Pieces = Iterable[bytes]
@@ -30,10 +30,10 @@ def scan(path: Path, reporter: Reporter) -> Iterator[Tag]:
 
 
 def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], int]]:
-    """Yield the objects of a JSON file that holds one list of them, each with its line.
+    """Yield the objects in the list of a JSON file, each with its line.
 
     Raises:
-        ScenarioError: Not JSON, or not a list of objects.
+        ScenarioError: The file is not JSON, or not a list of objects.
     """
     decoder = json.JSONDecoder()
     text, at, line, opened = "", 0, 1, False
@@ -74,7 +74,7 @@ def lines(path: Path, reporter: Reporter) -> Iterator[str]:
     """Yield the lines of a text file of any length, with their ends.
 
     Raises:
-        ScenarioError: Not UTF-8, or a line no table has.
+        ScenarioError: The file is not UTF-8, or has a line too long for a table.
     """
     rest, count = "", 0
     for text in _texts(chunks_of(path, reporter), path):
@@ -94,7 +94,7 @@ def read_json(path: Path) -> tuple[Any, str]:
     """Return the content of a JSON file, and its text.
 
     Raises:
-        ScenarioError: Not JSON.
+        ScenarioError: The file is not JSON.
     """
     try:
         text = read_bytes(path).decode()
@@ -111,7 +111,7 @@ def read_json(path: Path) -> tuple[Any, str]:
 
 
 def _strange(where: str, error: Exception) -> ScenarioError:
-    """Return the error for JSON on which Python's reader gives up."""
+    """Return the error for JSON that exceeds the limits of Python's reader."""
     what = "nested too deeply" if isinstance(error, RecursionError) else "a number is far too long"
     return ScenarioError(f"{where}: {what}; no file of CityFlow's is like that")
 

@@ -1,4 +1,4 @@
-"""A scenario directory from a source of roads and one of vehicles, checked before it is there."""
+"""A scenario directory from sources of roads and vehicles, checked before it appears."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class RoadFiles:
     """Files that a source of roads has put into the folder.
 
     Attributes:
-        description: One line.
-        origin: Where it comes from, for the README: sentences in Markdown.
-        network: Its network; a name in the folder, or the absolute path of a file left in place.
-        routes: Its route files, likewise; empty if the source has no vehicles.
-        additional: Its additional files, likewise.
-        settings: Further values of its ``scenario.toml``.
-        derive: Whether the phases of each light are derived as its lanes allow.
+        description: Description in one line.
+        origin: Origin of the files for the README, as sentences in Markdown.
+        network: Name of the network file in the folder, or absolute path of a file outside.
+        routes: Route files, named likewise; empty if the source has no vehicles.
+        additional: Additional files, named likewise.
+        settings: Further values of ``scenario.toml``.
+        derive: True to choose the source of phases for each light (`phases.suited`).
         notes: Notes for the README and the user.
-        copied: Files in the folder that are copies, to where they come from.
+        copied: Copy in the folder to its original file.
     """
 
     description: str
@@ -51,7 +51,7 @@ class RoadFiles:
 
 
 RoadSource = Callable[[Path, Reporter], RoadFiles]
-"""Puts a network into a folder."""
+"""Function that puts a network into a folder."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class VehicleFiles:
     """Files that a source of vehicles has put into the folder.
 
     Attributes:
-        routes: Its route files: names in the folder, or absolute paths of files left in place.
+        routes: Names of route files in the folder, or absolute paths of files outside.
         notes: Notes for the user.
-        copied: Files in the folder that are copies, to where they come from.
+        copied: Copy in the folder to its original file.
     """
 
     routes: tuple[str, ...]
@@ -70,7 +70,7 @@ class VehicleFiles:
 
 
 VehicleSource = Callable[[Path, Path, Reporter], VehicleFiles]
-"""Puts route files for the network (the second path) into a folder."""
+"""Function that puts route files into a folder (first path) for a network (second path)."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,9 @@ class Made:
     """A scenario that was made.
 
     Attributes:
-        scenario: As it lies in its directory.
+        scenario: The scenario, read from its directory.
         network: Its network.
-        demand: Its demand.
+        demand: Counts of its vehicles.
         notes: Notes for the user.
     """
 
@@ -103,17 +103,17 @@ def make_scenario(
     """Make a scenario directory, whole or not at all.
 
     Args:
-        target: The directory.
-        roads: Where the roads come from.
-        vehicles: Where the vehicles come from; None if the roads come with vehicles.
-        settings: Values for ``scenario.toml`` that go before those of the source.
-        command: The command that makes it again, for the README.
-        force: Whether a scenario of this name is replaced.
+        target: The directory to make.
+        roads: Source of the roads.
+        vehicles: Source of the vehicles; None if the source of roads brings vehicles.
+        settings: Values for ``scenario.toml``; they override those of the source.
+        command: Command that makes the scenario again, for the README.
+        force: True to replace an existing scenario.
         reporter: Shows progress.
 
     Raises:
-        OutputError: It exists, or cannot be written.
-        ScenarioError: The result is no sound scenario.
+        OutputError: The directory exists, or cannot be written.
+        ScenarioError: The result is not a valid scenario.
     """
     with new_folder(target, force=force) as folder:
         draft = roads(folder, reporter)
@@ -159,7 +159,7 @@ def _write_settings(
 
 @contextlib.contextmanager
 def _errors_about(copied: Mapping[str, Path], folder: Path) -> Iterator[None]:
-    """Make errors name the user's files, not copies that are gone when the error is read."""
+    """Make errors name the user's files instead of the copies, which are removed on errors."""
     try:
         yield
     except ScenarioError as error:
@@ -205,8 +205,8 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
     """Yield an empty folder beside `target` that becomes `target` if the block ends normally.
 
     Args:
-        target: The directory to be.
-        force: Whether a scenario that is there already may be replaced. Anything else never is.
+        target: The directory to make.
+        force: True to replace an existing scenario. Other files are never replaced.
 
     Raises:
         OutputError: `target` exists, cannot be written, or has the name of a shipped scenario.
@@ -227,7 +227,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
             require_free(target, force=force)  # it may have appeared meanwhile
             _put(made, target, folder / "before")
     except ScenarioError as error:
-        # Files are checked where they are made; errors name the place where they belong.
+        # Files are checked in the temporary folder, but errors should name the final one.
         if str(made) not in str(error):
             raise
         raise ScenarioError(str(error).replace(str(made), str(target))) from None
@@ -242,7 +242,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _stopped_in_order() -> Iterator[None]:
-    """Turn SIGTERM into an exception, so that a killed program leaves nothing behind."""
+    """Turn SIGTERM into an exception, so that a terminated program removes its folder."""
 
     def stop(number: int, _: object) -> None:
         raise SystemExit(128 + number)
@@ -270,7 +270,7 @@ def _put(made: Path, target: Path, before: Path) -> None:
 
 
 def require_free(target: Path, *, force: bool) -> None:
-    """Refuse a place that holds something.
+    """Refuse a target that exists or has an impossible name.
 
     Raises:
         OutputError: As for `new_folder`.
@@ -283,7 +283,7 @@ def require_free(target: Path, *, force: bool) -> None:
         )
     try:
         occupied = target.is_symlink() or (target.exists() and not target.is_dir())
-    except OSError as error:  # a name that is too long, say
+    except OSError as error:  # such as a name that is too long
         raise OutputError(
             f"{target!s:.80}: cannot be written ({error.strerror}); give another place"
         ) from None

@@ -1,7 +1,7 @@
-"""Streets from an OpenStreetMap extract the user has; nothing is downloaded.
+"""Streets from an OpenStreetMap extract of the user; nothing is downloaded.
 
-netconvert does the work, with the options that give signals a controller can use: junctions that
-are mapped as several nodes become one, signals mapped before a junction belong to it, and lights
+netconvert converts the extract, with options for signals that a controller can use. Junctions
+mapped as several nodes become one. Signals mapped before a junction belong to the junction. Lights
 close to each other share one controller.
 """
 
@@ -48,7 +48,7 @@ _OPTIONS = (
 
 
 _KINDS = frozenset({"highway", "railway"})
-"""Keys of the ways that SUMO's table of OpenStreetMap's types knows."""
+"""Keys of ways that SUMO's type map for OpenStreetMap contains."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class _Extract:
     """Facts about an extract that its conversion needs.
 
     Attributes:
-        roads: Ways for cars.
-        signals: Nodes with a traffic light.
-        walks: Those of them that are a crossing for people on foot, by their ids.
-        crossings: Longitude and latitude of crossings that may have a light.
-        unlit: Crossings without one.
-        nodes: Nodes of roads and railways.
+        roads: Number of ways for cars.
+        signals: Number of nodes with a traffic light.
+        walks: Ids of nodes that are a traffic light at a crossing for people on foot.
+        crossings: Longitude and latitude of crossings that may have a light, degrees.
+        unlit: Number of crossings without a light.
+        nodes: Ids of the nodes of roads and railways.
     """
 
     roads: int
@@ -76,11 +76,11 @@ def from_osm(path: Path, *, guess: bool) -> RoadSource:
     """Return a source of the streets of an extract.
 
     Args:
-        path: ``.osm``, ``.osm.gz`` or ``.pbf``.
-        guess: Whether netconvert may put lights at large junctions that have none in the extract.
+        path: The extract: ``.osm``, ``.osm.gz`` or ``.pbf``.
+        guess: True if netconvert may add lights at large junctions without a light in the extract.
 
     Raises:
-        OptionError: Another kind of file, by its name.
+        OptionError: The name of the file has another ending.
     """
     if not path.name.lower().endswith(_ENDINGS):
         raise OptionError(f"--osm {str(path)!r}: give a file that ends in {', '.join(_ENDINGS)}")
@@ -161,8 +161,8 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
         arguments.append("--sidewalks.guess.from-permissions")
     made = work / "made.net.xml"
     netconvert(arguments, made)
-    # Lights left on plain roads, far from their junction, separate no conflicting streams. Lights
-    # at crossings stop the traffic for people on foot and stay.
+    # Lights on plain roads, far from their junction, separate no conflicting streams and are
+    # removed. Lights at crossings stay: they stop traffic for people on foot.
     if idle := _idle_lights(made, extract.walks):
         netconvert([*arguments, "--tls.unset", ",".join(idle)], made)
     if extract.crossings:
@@ -188,7 +188,7 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
 
 
 def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
-    """Add crossings at lights, and programmes that have green for them."""
+    """Add crossings at lights, and rebuild programmes with green for them."""
     root = parse_xml(read_bytes(made), str(made))
     if not (content := crossings_for(root, extract.crossings)):
         return
@@ -200,7 +200,7 @@ def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
 
 
 def _idle_lights(network: Path, walks: Iterable[str]) -> list[str]:
-    """Return the junctions of lights without conflicting streams, crossings excepted."""
+    """Return the junctions of lights without conflicting streams, except those in `walks`."""
     root = parse_xml(read_bytes(network), str(network))
     foes = foes_of(root)
     kept = set(walks)
@@ -219,8 +219,8 @@ class Item(NamedTuple):
     """A node, way or relation.
 
     Attributes:
-        start: Its own tag.
-        inside: What it holds: ``tag``, ``nd`` and ``member`` elements.
+        start: Opening tag of the item.
+        inside: Its ``tag``, ``nd`` and ``member`` elements.
     """
 
     start: Tag
@@ -234,7 +234,7 @@ class Item(NamedTuple):
 
     @property
     def way_nodes(self) -> list[str]:
-        """Nodes, if it is a road or railway."""
+        """Ids of its nodes if it is a road or railway, else empty."""
         if self.start.name != "way" or not _KINDS & self.tags.keys():
             return []
         return [tag.attributes.get("ref", "") for tag in self.inside if tag.name == "nd"]
@@ -249,9 +249,8 @@ def unpack(path: Path, out: Path, reporter: Reporter) -> None:
         reporter: Shows progress.
 
     Raises:
-        ScenarioError: pyosmium is not installed, or the file is missing, cut short, damaged or
-            compressed in another way than zlib.
-        OutputError: No room for the result.
+        ScenarioError: pyosmium is not installed, or the file is missing or damaged.
+        OutputError: There is no room for the result.
     """
     try:
         osmium: Any = importlib.import_module("osmium")
@@ -270,7 +269,7 @@ def unpack(path: Path, out: Path, reporter: Reporter) -> None:
         raise ScenarioError(f"{path}: no such file") from None
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
-    except RuntimeError as error:  # all that libosmium raises
+    except RuntimeError as error:  # libosmium raises no other exception
         raise ScenarioError(
             f"{path}: not an OpenStreetMap .pbf, or damaged ({error}); copy it again, or convert "
             f"it with: osmium cat {path.name} -o extract.osm.gz"
@@ -282,11 +281,11 @@ def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
 
     Args:
         source: The extract as XML, packed or not.
-        path: What to call it in errors.
+        path: Name of the extract in errors.
         reporter: Shows progress.
 
     Raises:
-        ScenarioError: As for `scan`, or another kind of XML.
+        ScenarioError: As for `scan`, or the file is not an OpenStreetMap extract.
     """
     item: Item | None = None
     try:
@@ -311,18 +310,20 @@ def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
 def write_roads(
     source: Path, path: Path, nodes: Collection[str], out: Path, reporter: Reporter
 ) -> None:
-    """Write roads and railways; netconvert would hold all else, mostly buildings, in memory.
+    """Write the roads, railways and relations of an extract.
+
+    netconvert would keep all other items, mostly buildings, in memory.
 
     Args:
         source: The extract as XML, packed or not.
-        path: What to call it in errors.
-        nodes: The nodes of its roads and railways, see `Item.way_nodes`.
+        path: Name of the extract in errors.
+        nodes: Ids of the nodes of its roads and railways, see `Item.way_nodes`.
         out: The file to write.
         reporter: Shows progress.
 
     Raises:
-        OutputError: No room for it.
-        ScenarioError: A node of a road is nowhere on earth.
+        OutputError: There is no room for the file.
+        ScenarioError: A node of a road has no valid coordinates.
     """
     with scratch(), out.open("w", encoding="utf-8") as file:
         file.write("<?xml version='1.0' encoding='UTF-8'?>\n<osm version=\"0.6\">\n")
@@ -346,7 +347,7 @@ def place_of(node: Tag, path: Path) -> tuple[float, float]:
     """Return longitude and latitude of a node, degrees.
 
     Raises:
-        ScenarioError: It has none; names the line.
+        ScenarioError: The node has no valid coordinates; the message names the line.
     """
     try:
         longitude, latitude = (float(node.attributes[key]) for key in ("lon", "lat"))

@@ -1,7 +1,7 @@
-"""Crossings at lights of an OpenStreetMap extract, on the roads netconvert made of it.
+"""Crossings at lights of an OpenStreetMap extract, for a network made by netconvert.
 
 Crossings are nodes of the roads they cross. netconvert leaves them out unless footways are mapped
-without a gap, so they are found here by their place and handed to it as a list.
+without gaps. This file finds them by their coordinates and lists them for netconvert.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ugat_marl.files import xml_bytes
 _NEAR_M = 8.0
 """Greatest distance of a crossing from the road it crosses."""
 _REACH_M = 40.0
-"""Greatest distance along the road from the junction whose light it has."""
+"""Greatest distance along the road between a crossing and the junction of its light."""
 _BESIDE_M = 2.0
-"""Roads farther apart at a crossing are carriageways, each with a node of its own."""
+"""Roads that are farther apart at a crossing are separate carriageways with separate nodes."""
 _SAME_ARM_DEG = 25.0
 _WITHOUT_LIGHT = frozenset({"uncontrolled", "zebra", "unmarked", "marked", "no"})
 
@@ -31,7 +31,12 @@ Point = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Arm:
-    """Roads that leave or reach a junction in one direction."""
+    """Roads that leave or reach a junction in one direction.
+
+    Attributes:
+        bearing_deg: Direction away from the junction, anticlockwise from east.
+        roads: Name and first metres of each road, seen from the junction.
+    """
 
     bearing_deg: float
     roads: list[tuple[str, Point]]
@@ -41,7 +46,7 @@ def has_light(tags: Mapping[str, str]) -> bool:
     """Return True for a node that is a crossing and may belong to a traffic light.
 
     Args:
-        tags: Of the node.
+        tags: Tags of the node.
     """
     highway, kind = tags.get("highway"), tags.get("crossing")
     if kind == "traffic_signals" or tags.get("crossing:signals") == "yes":
@@ -80,7 +85,7 @@ def crossings_for(root: ET.Element, places: Iterable[tuple[float, float]]) -> by
 def _crossed(
     place: Point, arms: Mapping[str, Sequence[_Arm]]
 ) -> tuple[str, tuple[str, ...]] | None:
-    """Return the junction and the roads of the arm that a crossing is on."""
+    """Return the junction of a crossing and the roads that it crosses, or None."""
     best_m, best = math.inf, None
     for junction, around in arms.items():
         for arm in around:
@@ -88,7 +93,7 @@ def _crossed(
                 continue
             apart = [_distance_m(place, line) for _, line in arm.roads]
             nearest = min(apart)
-            # Two junctions may share a road: the nearer one has the crossing.
+            # Two junctions may share a road: the small extra term prefers the nearer junction.
             far_m = nearest + 0.05 * min(
                 float(np.linalg.norm(line[0] - place)) for _, line in arm.roads
             )
@@ -129,7 +134,7 @@ def _arms_at_lights(root: ET.Element) -> dict[str, list[_Arm]]:
 
 
 def _join(arms: list[_Arm], name: str, line: Point) -> None:
-    """Add a road, drawn from its junction outwards, to the arm of its direction."""
+    """Add a road to the arm of its direction; its line starts at the junction."""
     away = line[-1] - line[0]
     bearing = math.degrees(math.atan2(away[1], away[0]))
     for arm in arms:
@@ -145,7 +150,7 @@ def _line(shape: str) -> Point | None:
 
 
 def _first_metres(line: Point) -> Point:
-    """Return the beginning of a line, `_REACH_M` long."""
+    """Return the first `_REACH_M` metres of a line."""
     kept = [line[0]]
     left = _REACH_M
     for a, b in zip(line, line[1:], strict=False):
@@ -166,7 +171,7 @@ def _distance_m(place: Point, line: Point) -> float:
 
 
 def _projection(root: ET.Element) -> Callable[[float, float], Point] | None:
-    """Return the projection from degrees to a network's metres if that is UTM, else None."""
+    """Return the function from degrees to a network's metres if it uses UTM, else None."""
     place = root.find("location")
     words = (place.get("projParameter", "") if place is not None else "").split()
     zone = next((word.removeprefix("+zone=") for word in words if word.startswith("+zone=")), "")
@@ -183,14 +188,19 @@ def _projection(root: ET.Element) -> Callable[[float, float], Point] | None:
 
 
 def utm(longitude: float, latitude: float, zone: int) -> tuple[float, float]:
-    """Return easting and northing, m, north of the equator (Krüger's series, WGS84, to 1 mm).
+    """Return easting and northing in m, north of the equator, exact to 1 mm.
+
+    Krüger's series on WGS84, with xi' and eta' the coordinates of the transverse sphere:
+
+        easting  = 500 km + 0.9996 A (eta' + sum_j alpha_j cos(2 j xi') sinh(2 j eta'))
+        northing = 0.9996 A (xi' + sum_j alpha_j sin(2 j xi') cosh(2 j eta'))
 
     Args:
         longitude: Degrees.
         latitude: Degrees.
-        zone: 1 to 60.
+        zone: UTM zone, 1 to 60.
     """
-    n = 1 / (2 / 0.0033528106647474805 - 1)  # of the flattening of WGS84
+    n = 1 / (2 / 0.0033528106647474805 - 1)  # third flattening n = f / (2 - f) of WGS84
     radius = 6378137.0 / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
     alpha = (
         n / 2 - 2 / 3 * n**2 + 5 / 16 * n**3,

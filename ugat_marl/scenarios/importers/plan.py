@@ -1,8 +1,8 @@
-"""A road network described in a few lines, and the SUMO network made from it.
+"""A road network as a short plan, and the SUMO network made from it.
 
-The `source.toml` of a shipped scenario names either a grid or single junctions and roads. The lanes
-of an approach are listed from the kerb to the middle of the road, each with the turns it serves at
-the junction ahead: ``["sr", "l"]`` is a lane for straight on and right beside a lane for left.
+The `source.toml` of a shipped scenario holds either a grid or single junctions and roads. The lanes
+of an approach are listed from the kerb to the middle of the road, each with its turns at the next
+junction. ``["sr", "l"]`` means a lane for straight on and right, and a lane for left.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ugat_marl.scenarios.programs import netconvert
 
 TURNS = {"l": "left", "s": "straight", "r": "right"}
 STRAIGHT_WITHIN_DEG = 45.0
-"""A road counts as straight on if it leaves within this angle of the approach."""
+"""Largest angle between an approach and a road ahead that counts as straight on."""
 
 
 SIDE_STREET = ("sr", "l")
@@ -39,7 +39,7 @@ MOST = 2500
 
 @dataclass(frozen=True)
 class Node:
-    """A signalised junction, or a place where the network ends."""
+    """A signalised junction, or an end of the network; coordinates are in metres."""
 
     id: str
     x: float
@@ -49,7 +49,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Road:
-    """Carriageway; `lanes` holds the turns of each lane, kerb first."""
+    """Carriageway between two nodes; `lanes` holds the turns of each lane, kerb first."""
 
     start: str
     end: str
@@ -63,13 +63,13 @@ class Road:
 
 @dataclass(frozen=True)
 class Plan:
-    """Nodes and roads, from which the network and its demand are made."""
+    """Nodes and roads by id, from which the network is made."""
 
     nodes: dict[str, Node]
     roads: dict[str, Road]
 
     def heading_deg(self, road: Road) -> float:
-        """Direction of travel, anticlockwise from east."""
+        """Return the direction of travel in degrees, anticlockwise from east."""
         start, end = self.nodes[road.start], self.nodes[road.end]
         return math.degrees(math.atan2(end.y - start.y, end.x - start.x))
 
@@ -87,12 +87,12 @@ class Plan:
         return found
 
     def connections(self, approach: Road) -> list[tuple[int, Road, int]]:
-        """(lane, road entered, lane entered) for every lane and turn of `approach`.
+        """Return (lane, road entered, lane entered) for every lane and turn of `approach`.
 
-        Right turns enter the lane at the kerb, left turns the one in the middle. Through lanes
-        keep their order and the innermost may enter all lanes that are left: so through traffic
-        needs the whole road, a left turn from another side conflicts with it, and a junction of
-        four arms has the usual eight conflict-free phases.
+        Right turns enter the lane at the kerb, left turns the lane at the middle. Through lanes
+        keep their order, and the innermost one may enter all remaining lanes. Through traffic
+        therefore conflicts with left turns from other sides, and a junction with four arms has the
+        usual eight conflict-free phases.
         """
         exits = self.exits(approach)
         through = [lane for lane, turns in enumerate(approach.lanes) if "s" in turns]
@@ -143,12 +143,12 @@ def grid(
     """Return a grid: junctions A1 (south-west), B1, ..., A2, ...; ends west1, east1, southA, ...
 
     Args:
-        columns: Junctions from west to east.
-        rows: Junctions from south to north.
-        spacing_m: Between neighbours.
+        columns: Number of junctions from west to east.
+        rows: Number of junctions from south to north.
+        spacing_m: Distance between neighbouring junctions.
         entry_m: Length of the roads into the network.
         east_west: Lanes of the roads along the rows, kerb first, each with its turns.
-        north_south: Those of the roads along the columns.
+        north_south: Lanes of the roads along the columns, kerb first, each with its turns.
     """
     letters = [_column(number) for number in range(columns)]
     nodes: dict[str, Node] = {}
@@ -207,14 +207,14 @@ def plain_xml(plan: Plan, speed_mps: float) -> dict[str, bytes]:
 
 
 def build_network(documents: Mapping[str, bytes], options: Mapping[str, Any]) -> bytes:
-    """Return the .net.xml that netconvert makes, without its comment of date and paths.
+    """Return the ``.net.xml`` that netconvert makes, without its comment with date and paths.
 
     Args:
-        documents: From `plain_xml`.
-        options: Further options of netconvert without the leading dashes.
+        documents: The documents of `plain_xml`.
+        options: Further options of netconvert, without the leading dashes.
 
     Raises:
-        ScenarioError: netconvert refused or warned; holds its words.
+        ScenarioError: netconvert refused or warned; the message quotes it.
     """
     with tempfile.TemporaryDirectory() as folder:
         arguments: list[str] = []
@@ -238,12 +238,12 @@ def rectangle(text: str, spacing_m: float, speed_mps: float) -> RoadSource:
     """Return a source of a grid of roads.
 
     Args:
-        text: ``RxC``, rows and columns.
-        spacing_m: Between intersections, and of the roads into the network.
+        text: Rows and columns, as in ``4x5``.
+        spacing_m: Distance between intersections, and length of the roads into the network.
         speed_mps: Speed limit.
 
     Raises:
-        OptionError: Not a size, or an impossible one.
+        OptionError: The text is no size, or a value is out of range.
     """
     match = re.fullmatch(r"(\d{1,4})[x×X](\d{1,4})", text.strip())
     rows, columns = (int(match[1]), int(match[2])) if match else (0, 0)
@@ -261,12 +261,12 @@ def arterial(count: int, spacing_m: float, speed_mps: float) -> RoadSource:
     """Return a source of a main road from west to east with side streets.
 
     Args:
-        count: Intersections.
-        spacing_m: Between them, and of the roads into the network.
+        count: Number of intersections.
+        spacing_m: Distance between intersections, and length of the roads into the network.
         speed_mps: Speed limit.
 
     Raises:
-        OptionError: An impossible size.
+        OptionError: A value is out of range.
     """
     if not 1 <= count <= MOST:
         raise OptionError(f"--arterial {count}: give 1 to {MOST} intersections")

@@ -1,4 +1,4 @@
-"""Roads for cars: entries, exits, and the roads ahead of every road of a network."""
+"""Roads for cars in a network: entries, exits, and the roads ahead of every road."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 TURNS = {"L": "l", "R": "r", "T": "t"}
-"""SUMO's letters for partial turns, as the turns they resemble."""
+"""SUMO's letters for partial turns and U-turns, to the letters used here."""
 
 
 @dataclass(frozen=True)
 class Streets:
-    """The roads for cars.
+    """The roads for cars (SUMO's edges).
 
     Attributes:
-        start: Junction at the beginning of every road (SUMO's edges).
-        end: Junction at its end.
-        ahead: Roads ahead of every road by turn: ``s``, ``l``, ``r`` or ``t`` (back).
-        entries: Roads that no other road leads to, but perhaps their own opposite direction.
-        exits: Roads that lead to no other.
+        start: Road to the junction at its start.
+        end: Road to the junction at its end.
+        ahead: Road to the roads ahead, by turn: ``s``, ``l``, ``r`` or ``t`` (back).
+        entries: Roads into the network: no road leads to them except their opposite direction.
+        exits: Roads out of the network: they lead to no road except their opposite direction.
     """
 
     start: Mapping[str, str]

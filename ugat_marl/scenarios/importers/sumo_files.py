@@ -1,4 +1,4 @@
-"""Networks and configurations of SUMO, copied or used where they lie."""
+"""Networks, configurations and route files of SUMO, copied or linked."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
     """Return a source of roads, and perhaps vehicles, from SUMO's own files.
 
     Args:
-        path: A ``.sumocfg`` or a ``.net.xml``, packed or not.
-        link: Whether files stay where they are and are named by their absolute paths.
-        own_vehicles: Whether the vehicles of a configuration are wanted.
+        path: A ``.sumocfg`` or a ``.net.xml``; the network may be packed (``.gz``).
+        link: True to use the files by their absolute paths instead of copying them.
+        own_vehicles: True to use the vehicles of a configuration.
 
     Raises:
-        OptionError: Neither a configuration nor a network, by its name.
+        OptionError: By its name, the file is neither a configuration nor a network.
     """
     configuration = path.name.endswith(_CONFIGURATIONS)
     if not configuration and not path.name.removesuffix(".gz").endswith(".xml"):
@@ -112,12 +112,12 @@ def _put(document: Document, folder: Path, link: bool) -> str:
     if document.path is not None and document.home is None:
         return _placed(document.path, folder, link)
     _require_new(folder / document.name)
-    document.write(folder / document.name)  # without the files it would write
+    document.write(folder / document.name)  # edited: its outputs are discarded
     return document.name
 
 
 def _placed(path: Path, folder: Path, link: bool) -> str:
-    """Copy the file, unless it is linked; return the name by which the scenario finds it."""
+    """Copy the file unless it is linked; return its name or path for ``scenario.toml``."""
     if link:
         return str(path.resolve())
     _require_new(folder / path.name)
@@ -133,7 +133,7 @@ def _require_new(path: Path) -> None:
 
 
 def _leads(network: Path) -> dict[str, set[str]]:
-    """Return the edges that every edge of a network leads to."""
+    """Return, for each edge of a network, the edges it leads to."""
     root = parse_xml(read_bytes(network), str(network))
     found: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
     for item in root.iter("connection"):
@@ -142,7 +142,7 @@ def _leads(network: Path) -> dict[str, set[str]]:
 
 
 def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
-    """Refuse edges that do not exist, by the file the user has, not the copy to be."""
+    """Refuse edges that do not exist; the error names the user's file, not a copy."""
     used = edges_used(tag)
     if leads and not leads.keys() >= set(used):  # a network without roads has its own message
         edge = next(edge for edge in used if edge not in leads)
@@ -153,7 +153,7 @@ def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
 
 
 def _require_connected(tag: Tag, leads: Mapping[str, set[str]], path: Path, network: Path) -> None:
-    """Refuse a route that jumps."""
+    """Refuse a route with two edges in a row that no connection joins."""
     for a, b in pairwise(tag.attributes.get("edges", "").split()):
         if a in leads and b in leads and b not in leads[a]:
             raise ScenarioError(
@@ -168,7 +168,7 @@ def _require_root(path: Path, tags: Sequence[str], what: str, reporter: Reporter
 
 
 def _rooted(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> Iterator[Tag]:
-    """Yield all elements of a file; refuse another root than `tags`."""
+    """Yield all elements of a file; refuse a root that is not in `tags`."""
     for number, tag in enumerate(scan(path, reporter)):
         if not number and tag.name not in tags:
             raise ScenarioError(

@@ -1,8 +1,7 @@
-"""Demand from turning shares: vehicles that enter by chance and turn by chance.
+"""Demand from turning shares: random arrivals and random turns.
 
-Arrivals at each entry are a Poisson process. A vehicle walks from junction to junction with the
-shares of the turns it finds there until it leaves the network; a walk that would pass a junction
-twice is drawn again.
+Arrivals at each entry are a Poisson process. At each junction a vehicle draws its turn from the
+shares, until it leaves the network. A route that would pass a junction twice is drawn again.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ CAR = {
     "decel": "4.5", "emergencyDecel": "9.0", "startupDelay": "0.0", "sigma": "0.5", "tau": "1.0",
     "maxSpeed": "55.55", "speedFactor": "normc(1,0.1,0.2,2)",
 }  # fmt: skip
-"""SUMO's passenger car, spelled out."""
+"""Attributes of SUMO's default passenger car, written out."""
 
 MOST_VEHICLES = 5_000_000
 """Most vehicles of a scenario."""
 _TRIES = 200
-"""Walks that may end in a circle before a vehicle is left out."""
+"""Number of routes drawn for a vehicle before it is left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +39,11 @@ class Drive:
     """One vehicle.
 
     Attributes:
-        id: Its name.
-        depart_s: When it enters.
-        route: Its roads.
-        type: Its vehicle type, or empty for SUMO's default.
-        speed: How fast it enters: m/s, or ``max``.
+        id: Name of the vehicle.
+        depart_s: Time of its departure.
+        route: Roads of its route.
+        type: Vehicle type, or empty for SUMO's default.
+        speed: Speed at departure: m/s, or ``max``.
     """
 
     id: str
@@ -60,19 +59,20 @@ def walked(
     """Draw vehicles at every entry of a network.
 
     Args:
-        streets: Where.
-        vph: Vehicles an hour at each entry.
-        shares: Of left turns, straight on and right turns; where one of them is not possible,
-            the others keep their proportion.
-        length_s: For how long vehicles enter.
+        streets: Roads of the network.
+        vph: Vehicles per hour at each entry.
+        shares: Shares of left turns, straight on and right turns. If a turn is not possible, the
+            others keep their proportion.
+        length_s: Time in which vehicles enter.
         seed: Seed of all draws.
 
     Returns:
-        The vehicles in the order of their departures.
+        The vehicles, sorted by departure.
 
     Raises:
-        OptionError: Shares or a rate that are none.
-        ScenarioError: No road leads into the network, or no way through it out again.
+        OptionError: The shares or the rate are impossible.
+        ScenarioError: No road leads into the network, no vehicle enters, or no route to an exit was
+            found.
     """
     if not (math.isfinite(vph) and 0 < vph <= 1e5):
         raise OptionError(f"--vph {vph:g} is not a number of vehicles an hour; give 1 to 100000")
@@ -116,7 +116,7 @@ def walked(
 def _walk(
     streets: Streets, entry: str, shares: Mapping[str, float], random: np.random.Generator
 ) -> tuple[str, ...]:
-    """Draw roads from an entry to an exit, no junction twice; empty if none was found."""
+    """Draw a route from an entry to an exit that passes no junction twice; empty if none."""
     for _ in range(_TRIES):
         road, route, passed = entry, [entry], {streets.start[entry]}
         while road not in streets.exits and streets.end[road] not in passed:
@@ -137,7 +137,7 @@ def _walk(
 def poisson_arrivals(
     random: np.random.Generator, rate_per_s: float, length_s: float
 ) -> list[float]:
-    """Draw Poisson arrivals in [0, length_s)."""
+    """Draw the times of Poisson arrivals in [0, length_s), s."""
     found: list[float] = []
     moment = 0.0
     while rate_per_s > 0:
@@ -149,7 +149,7 @@ def poisson_arrivals(
 
 
 def weighted_choice(shares: Mapping[str, float], random: np.random.Generator) -> str:
-    """Draw a key of `shares`, with probability proportional to its value."""
+    """Draw a key of `shares` with probability proportional to its value."""
     mark = float(random.random()) * sum(shares.values())
     for name, share in shares.items():
         mark -= share
@@ -161,12 +161,12 @@ def weighted_choice(shares: Mapping[str, float], random: np.random.Generator) ->
 def write_drives(
     path: Path, drives: Iterable[Drive], types: Iterable[Mapping[str, str]] = (CAR,)
 ) -> None:
-    """Write the vehicles as a route file, one after the other.
+    """Write vehicles as a route file.
 
     Args:
         path: The file.
-        drives: In the order of their departures.
-        types: Attributes of the vehicle types they name.
+        drives: The vehicles, sorted by departure.
+        types: Attributes of their vehicle types.
     """
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(f"{line}\n" for line in _route_file(drives, types))
@@ -194,7 +194,7 @@ def _attributes(values: Mapping[str, str]) -> str:
 def from_turns(
     vph: float, shares: tuple[float, float, float], begin_s: float, length_s: float, seed: int
 ) -> VehicleSource:
-    """Return a source of vehicles by turning shares, as `walked` draws them, from `begin_s` on."""
+    """Return a source of vehicles that `walked` draws by turning shares, from `begin_s` on."""
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         del reporter
