@@ -116,7 +116,7 @@ def split(request: Request) -> dict[str, Any]:
 
 
 def grounded(request: Request) -> dict[str, Any]:
-    """Time an episode without or with models; their answers are not used: the same traffic."""
+    """Time an episode without or with models; their answers are not used, so traffic is equal."""
     from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform, TimedTransform
 
     inner = parallel_env(request["scenario"], duration_s=request["duration_s"])
@@ -127,7 +127,7 @@ def grounded(request: Request) -> dict[str, Any]:
         kind: Any = kinds[request["grounding"]]
         transform = kind(inner.layouts, request["seed"], gate=never)
         for model in (transform.forward, transform.inverse):
-            model.fitted.fill_(True)  # unfitted models are not asked; the answers are not used
+            model.fitted.fill_(True)  # unfitted models raise an error; the answers are not used
         env = GroundedEnv(inner, transform)
     env.reset(seed=request["seed"])  # the first reset also starts the warm parent
     _, infos = env.reset(seed=request["seed"])

@@ -100,12 +100,12 @@ class StrengthBench:
 
     @property
     def spec(self) -> LearnerSpec:
-        """The learner."""
+        """Name and settings of the learner."""
         return LearnerSpec(self.learner, self.learner_settings, self.dqn)
 
     @property
     def plan(self) -> list[Job]:
-        """The job of the rule, then a training for each seed."""
+        """Jobs: one for the rule, then a training for each seed."""
         rules = () if self.rule is None else (self.rule,)
         return [
             self._job(Setting(RULE, "rule", rules=rules), None),

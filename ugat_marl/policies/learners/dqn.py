@@ -129,7 +129,7 @@ class Acting:
         return self._network
 
     def forget(self) -> None:
-        """Copy the weights at the next call, whatever the number of updates."""
+        """Copy the weights at the next call, also without a new update."""
         self._updates = -1
 
 

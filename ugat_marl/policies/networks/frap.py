@@ -19,9 +19,9 @@ class FRAP(nn.Module):
     serves all intersections, as in MPLight (Chen et al. 2020, AAAI). The demand of a movement is
     computed from its traffic and its share of green. The demand d_p of a phase p is the sum over
     its movements. With ``z_pq = ReLU(W [d_p, d_q] + b)``, Q of p is the mean over the other phases
-    q of ``w_pq . z_pq``, plus one constant. The weights w_pq are one of two learned rows: one for
-    pairs of phases that share a movement, one for the others. So Q does not depend on the numbering
-    of phases or movements, and no weight belongs to a single intersection.
+    q of ``w_pq . z_pq``, plus a learned constant. The weights w_pq are one of two learned rows: one
+    for pairs of phases that share a movement, one for the others. So Q does not depend on the
+    numbering of phases or movements, and no weight belongs to a single intersection.
 
     Three things differ from the paper. Scores are averaged, not summed, so that intersections with
     two and with eight phases have values of one size. A movement counts by the share of its links
