@@ -1,9 +1,9 @@
-"""Imports high-resolution logs of signal controllers (ATSPM) as measured data.
+"""Import of high-resolution logs of signal controllers (ATSPM) as measured data.
 
-The events are those of the "Indiana Traffic Signal Hi Resolution Data Logger Enumerations" (Purdue
-University, https://docs.lib.purdue.edu/jtrpdata/4/), as UDOT's ATSPM lists them in
-``Atspm/Data/Enums/IndianaEnumerations.cs`` (github.com/utahudot/udot-atspm) and ODOT's package
-`atspm` uses them in ``src/atspm/queries/timeline.sql`` (github.com/ShawnStrasser/atspm).
+The event codes are those of the "Indiana Traffic Signal Hi Resolution Data Logger Enumerations"
+(Purdue University, https://docs.lib.purdue.edu/jtrpdata/4/). UDOT's ATSPM lists them in
+``Atspm/Data/Enums/IndianaEnumerations.cs`` (github.com/utahudot/udot-atspm). ODOT's package `atspm`
+uses them in ``src/atspm/queries/timeline.sql`` (github.com/ShawnStrasser/atspm).
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from ugat_marl.scenarios import Network, Period, Scenario, SignalLog, deciding_l
 GREEN, YELLOW, RED = "G", "y", "r"
 
 PHASE_EVENTS = {1: GREEN, 8: YELLOW, 9: RED, 10: RED, 11: RED, 12: RED}
-"""Begin green, begin yellow, end yellow, begin and end red clearance, phase inactive. The red
-clearance is logged only where it is served, so the end of yellow counts as red."""
+"""Begin green, begin yellow, end yellow, begin and end red clearance, phase inactive. A red
+clearance is logged only if it is served, so the end of yellow counts as red."""
 OVERLAP_EVENTS = {61: GREEN, 62: GREEN, 63: YELLOW, 64: RED, 65: RED, 66: RED}
 """Begin green, begin trailing green, begin yellow, begin red clearance, off, dark."""
 ARROW_EVENTS = {32: GREEN, 33: RED}
-"""A flashing yellow arrow, on which one may turn but yields, begins and ends."""
+"""Begin and end of a flashing yellow arrow. Vehicles may turn on it but must yield."""
 BEFORE = {
     1: RED,
     8: GREEN,
@@ -57,13 +57,13 @@ BEFORE = {
     32: RED,
     33: GREEN,
 }
-"""State shown before an event, where that is certain."""
+"""Colour shown before an event, if it is certain."""
 DETECTOR_OFF, DETECTOR_ON = 81, 82
-"""Parameter: detector channel. Stamped after the controller's own delay and extension."""
+"""The parameter is the detector channel. Times include the controller's delay and extension."""
 DETECTOR_FAULTS = (84, 85, 86, 87, 88)
 CLOCK_UPDATED = 181
 
-# Names of the columns: of ODOT's atspm package, and of UDOT's Controller_Event_Log.
+# Column names of ODOT's package atspm and of UDOT's Controller_Event_Log.
 _NAMES = {
     "timestamp": "time",
     "deviceid": "device",
@@ -83,7 +83,7 @@ _FORMATS = (
 )
 
 LOOK_BACK_S = 3600.0
-"""Events within this time before a period give the signal state at its begin."""
+"""Time before a period from which events are read, to know the signal state at its begin."""
 
 Source = tuple[str, int]
 """``("phase", 2)``, ``("overlap", 1)`` or ``("arrow", 5)``."""
@@ -112,16 +112,16 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
     """Read a controllers' log as measured data.
 
     Args:
-        events: CSV or Parquet with TimeStamp, DeviceId, EventId and Parameter.
-        mapping: TOML that maps devices to traffic lights, phases and overlaps to links, channels
-            to detectors, and local time to the scenario's clock
+        events: CSV or Parquet file with TimeStamp, DeviceId, EventId and Parameter.
+        mapping: TOML file that maps devices to traffic lights, phases and overlaps to links,
+            channels to detectors, and local time to the scenario's clock
             (``docs/reference/measured-data.md``).
-        scenario: The scenario whose clock is meant.
-        network: Its network.
+        scenario: Scenario with the clock of the data.
+        network: Network of the scenario.
 
     Raises:
-        MeasuredDataError: The log or the mapping cannot be read, contradict each other or do not
-            fit the network.
+        MeasuredDataError: The log or the mapping cannot be read, they contradict each other, or
+            they do not fit the network.
     """
     events, mapping = Path(events), Path(mapping)
     found: list[Finding] = []
@@ -209,7 +209,7 @@ def _numbered(frame: pl.DataFrame) -> pl.DataFrame:
 def _in_periods(
     path: Path, log: pl.DataFrame, spans: Sequence[Span], periods: Sequence[Period]
 ) -> pl.DataFrame:
-    """Return the events of each period and of the time before, with ``period_id``, ``time_s``."""
+    """Return the events in and shortly before each period, with ``period_id`` and ``time_s``."""
     parts: list[pl.DataFrame] = []
     for span, period in zip(spans, periods, strict=True):
         time = (pl.col("time") - pl.lit(span.zero)).dt.total_microseconds() / 1e6
@@ -228,7 +228,7 @@ def _in_periods(
 
 
 def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, found: list[Finding]) -> None:
-    """Add findings that the log itself reports: clocks that were set, detectors that failed."""
+    """Add findings on faults that the log reports: clocks that were set, and broken detectors."""
     updates = rows.filter(pl.col("event") == CLOCK_UPDATED)
     if updates.height:
         names = ", ".join(map(repr, updates["device"].unique().sort().to_list()[:6]))
@@ -327,7 +327,7 @@ def _signals(
 def _links(
     device: Device, width: int, programme: Sequence[tuple[float, str]]
 ) -> list[list[tuple[Source, str]]]:
-    """Return, per link, its sources and the letter it shows while a source is green."""
+    """Return, for each link, its sources and the letter it shows while the source is green."""
     follows: list[list[tuple[Source, str]]] = [[] for _ in range(width)]
     for kind, mapped in (("phase", device.phases), ("overlap", device.overlaps)):
         for number, links in mapped.items():
@@ -391,7 +391,7 @@ def _states(
             colours[event.source] = event.colour
             continue
         if event.source not in seen:
-            # The log may have a gap before the period: a colour that ends now was shown until now.
+            # The log may have a gap before the period. This event shows the colour until now.
             colours[event.source] = BEFORE.get(event.code, colours[event.source])
             seen.add(event.source)
         later.append(event)
@@ -419,16 +419,18 @@ def read_log(path: Path, time_zone: str, found: list[Finding]) -> pl.DataFrame:
     """Read the events of a log.
 
     Args:
-        path: CSV or Parquet with TimeStamp, DeviceId, EventId and Parameter, in any spelling.
-        time_zone: Where the street is; needed if the times carry a time zone.
-        found: Findings.
+        path: CSV or Parquet file with TimeStamp, DeviceId, EventId and Parameter, or other names
+            of these columns.
+        time_zone: Time zone of the street; required if the times have a time zone.
+        found: Findings; rows that are left out are added to them.
 
     Returns:
-        ``ROW``, ``time`` (local, microseconds), ``device`` (text), ``event``, ``parameter``, in
-        the order of the file; rows without event or parameter are left out.
+        Columns ``ROW``, ``time`` (local, microseconds), ``device`` (text), ``event`` and
+        ``parameter``, in the order of the file. Rows with empty cells are left out.
 
     Raises:
-        MeasuredDataError: Unreadable, a column missing, or times of an unknown form.
+        MeasuredDataError: The file is unreadable, a column is missing, or times have an unknown
+            form.
     """
     if path.suffix not in (".csv", ".parquet"):
         raise MeasuredDataError(f"{path}: a log is a .csv or a .parquet file")

@@ -1,4 +1,4 @@
-"""Mapping file: the meaning of the numbers in a controller's log on the network."""
+"""Mapping file: from the numbers in a controller's log to lights, links and lanes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Text = Annotated[str, Field(min_length=1)]
 
 
 def _name(value: Any) -> Any:
-    """Accept numbers as names: ``id = 1136``."""
+    """Turn whole numbers into names, as in ``id = 1136``."""
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
@@ -32,9 +32,11 @@ class Links(pydantic.BaseModel):
     """Links of a phase or overlap, by their index in the signal state.
 
     Attributes:
-        green: Green with the phase; protected where the network's programme has them so.
-        permissive: Green with the phase, but they yield.
-        flashing: They yield while the phase's arrow flashes yellow (events 32 and 33).
+        green: Links that are green with the phase. Their letter (``G`` or ``g``) comes from the
+            network's programme.
+        permissive: Links that are green with the phase but must yield (``g``).
+        flashing: Links that may go but must yield (``g``) while the phase's arrow flashes yellow
+            (events 32 and 33).
     """
 
     model_config = _STRICT
@@ -52,7 +54,7 @@ LinksOf = Annotated[Links, pydantic.BeforeValidator(_as_links)]
 
 
 class Channel(pydantic.BaseModel):
-    """Detector channel of a controller, and its place."""
+    """Detector channel of a controller, and its position on a lane."""
 
     model_config = _STRICT
 
@@ -63,7 +65,7 @@ class Channel(pydantic.BaseModel):
     kind: DetectorKind
     id: Name = ""
     latency_s: float = 0.0
-    """Delay of the detector's time stamps, s; subtracted from them."""
+    """Delay of the detector's time stamps, s; it is subtracted from them."""
 
 
 class Device(pydantic.BaseModel):
@@ -124,14 +126,15 @@ def read_mapping(
     """Read and check a mapping file.
 
     Args:
-        path: TOML.
-        widths: Letters in the state of each traffic light of the network.
-        driven: Its letters that vehicles obey; the others may be left out of the mapping, and are
-            red. All of them for a traffic light that is not listed.
+        path: The TOML file.
+        widths: Number of letters in the state of each traffic light of the network.
+        driven: Traffic light to the indices of its letters for vehicles, which must be mapped.
+            Other letters are red if they are not mapped. All letters of a traffic light that is not
+            listed must be mapped.
 
     Raises:
-        MeasuredDataError: Unreadable, keys missing or unknown, no periods, a traffic light the
-            network does not have or has twice, or links that are not mapped or do not exist.
+        MeasuredDataError: The file is unreadable, has missing or unknown keys, or has no periods.
+            Or a traffic light is unknown or mapped twice, or links are not mapped or unknown.
     """
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))

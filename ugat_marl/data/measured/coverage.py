@@ -26,19 +26,20 @@ from ugat_marl.scenarios import (
 SHORT_S = 300.0
 """Least length of a period with enough signal cycles."""
 SILENT_S = 1800.0
-"""A detector silent for longer, while others on its road count, is probably off."""
+"""A detector that is silent for longer, while others on its road count, is probably off."""
 ALL_SILENT_S = 600.0
-"""A recording in which all detectors are silent for longer was probably interrupted."""
+"""If all detectors are silent for longer, the recording was probably interrupted."""
 HOLE_S = 180.0
-"""The same for a busy recording: longer than a signal cycle."""
+"""The same limit for a busy recording; it is longer than a signal cycle."""
 BUSY = 20
-"""Passages of neighbours during a silence from which it is reported."""
+"""Least number of vehicles that counts as busy, such as at a neighbour during a silence."""
 EXPECTED = 10.0
-"""Vehicles expected during a silence from which it is reported."""
+"""Least number of vehicles expected during a silence for a report."""
 MOST_ON_RED = 0.6
-"""Share of vehicles that leave on red from which lanes, links or clocks must be mixed up."""
+"""Largest plausible share of vehicles that leave on red. Above it, lanes, links or clocks are
+probably wrong."""
 MANY_LENGTHS = 3
-"""Different lengths of one green, in whole s, from which a programme is not fixed."""
+"""Number of different lengths of one green, in whole s, from which a programme is not fixed."""
 NAMED = 6
 """Most names listed in one finding."""
 
@@ -65,7 +66,7 @@ NEEDS_SIGNALS = (
     "signal_clock",
     "clock_drift",
 )
-"""Effects that show relative to what the signals do."""
+"""Effects that are visible only relative to the signals."""
 NEEDS_STOP = (
     "startup_delay",
     "acceleration",
@@ -78,17 +79,17 @@ NEEDS_STOP = (
     "signal_clock",
     "clock_drift",
 )
-"""Effects that show in how a queue leaves the stop line."""
+"""Effects that are visible in the start of a queue at the stop line."""
 NEEDS_ADVANCE = ("deceleration", "emergency_deceleration", "min_gap")
-"""Effects that show in the approach to red and in how far queues reach."""
+"""Effects that are visible in the approach to red and in the length of queues."""
 NEEDS_YELLOW = ("yellow_running", "yellow_time")
 NEEDS_SPEEDS = ("speed_spread",)
 NEEDS_TWO_KINDS = ("undercount",)
-"""A detector that misses vehicles is one that sees fewer than the next along the road."""
+"""Effects that need two kinds of detectors: missed vehicles show in the next detector's count."""
 
 
 def coverage(measured: Measured, scenario: Scenario, network: Network) -> list[Finding]:
-    """Return findings on everything that is missing, most important first."""
+    """Return findings on all missing data, most important first."""
     return [
         *_of_periods(measured),
         *_of_signals(measured, scenario, network),
@@ -155,11 +156,11 @@ def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Ite
 
 
 def follows_traffic(periods: Sequence[Period], tls: str) -> bool:
-    """Return True if some green has many lengths, more than a fixed programme can give it."""
+    """Return True if a green has more different lengths than a fixed programme gives it."""
     lengths: dict[str, set[float]] = {}
     for period in periods:
         changes = period.signals.get(tls, ())
-        # The first and the last are cut by the ends of the period.
+        # The ends of the period cut the first and the last state short.
         for (begin_s, state), (end_s, _) in itertools.pairwise(changes[1:]):
             if set(state) & GREEN:
                 lengths.setdefault(state, set()).add(round(end_s - begin_s))
@@ -167,7 +168,7 @@ def follows_traffic(periods: Sequence[Period], tls: str) -> bool:
 
 
 def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
-    """Return True if a log has yellow, or no green that could end in it."""
+    """Return True if a log has yellow, or no green that could end in yellow."""
     shown = {state for period in periods for _, state in period.signals.get(tls, ())}
     letters = set("".join(shown))
     return bool(letters & YELLOW) or not letters & GREEN or len(shown) < 2
@@ -257,7 +258,10 @@ def _of_places(detectors: Sequence[Detector], network: Network) -> Iterator[Find
 
 
 def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
-    """Find lights whose vehicles leave the stop line on red: a wrong table or a wrong clock."""
+    """Yield a finding for each light whose vehicles mostly leave the stop line on red.
+
+    The cause is a wrong lane or link, or a wrong clock.
+    """
     stops: dict[str, list[str]] = {}
     for item in measured.detectors:
         if item.kind == "stop":
@@ -287,7 +291,14 @@ def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class _Silence:
-    """Time in which a detector does not change while a neighbour counts vehicles."""
+    """Time in which a detector reports no event while a neighbour counts vehicles.
+
+    Attributes:
+        period: Id of the period.
+        begin_s: Begin of the silence.
+        length_s: Length of the silence.
+        meanwhile: Number of vehicles at the busiest neighbour.
+    """
 
     period: str
     begin_s: float
@@ -331,7 +342,7 @@ def _of_silence(measured: Measured) -> Iterator[Finding]:
 
 
 def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> bool:
-    """Return True for a silence longer than a cycle, with as busy a time before and after it."""
+    """Return True for a silence longer than a cycle with busy times before and after it."""
     end_s = begin_s + length_s
     before = int(((times > begin_s - length_s) & (times <= begin_s)).sum()) // 2
     after = int(((times >= end_s) & (times < end_s + length_s)).sum()) // 2
@@ -354,11 +365,11 @@ def _silent(
     period: Period,
     usual: Mapping[str, float],
 ) -> Iterator[tuple[str, str, _Silence]]:
-    """Yield detectors that are silent while others of their road count."""
+    """Yield id, words for its state, and silence of detectors silent while their road is busy."""
     for item in group:
         begin, length = _longest_gap(times.get(item.id, np.empty(0)), period)
         if usual.get(item.id, 0.0) * length < EXPECTED:
-            continue  # a lane that hardly anybody uses
+            continue  # few vehicles use this lane
         if length <= min(SILENT_S, period.end_s - period.begin_s - 1e-6):
             continue
         others = [times[other.id] for other in group if other.id in times and other is not item]
@@ -377,12 +388,12 @@ def _times(period: Period, detector: str) -> NDArray[np.float64]:
 
 
 def _is_on(period: Period, detector: str, time_s: float) -> bool:
-    """Return True if a vehicle comes over the detector at this time."""
+    """Return True if a vehicle reaches the detector at this time."""
     return detector in period.passages and bool((period.passages[detector].on_s == time_s).any())
 
 
 def _longest_gap(times: NDArray[np.float64], period: Period) -> tuple[float, float]:
-    """Return begin and length of the longest time without an event."""
+    """Return begin and length of the longest time without an event, s."""
     marks = np.concatenate([[period.begin_s], np.sort(times), [period.end_s]])
     gaps = np.diff(marks)
     longest = int(gaps.argmax())
@@ -390,6 +401,6 @@ def _longest_gap(times: NDArray[np.float64], period: Period) -> tuple[float, flo
 
 
 def _list(what: str, names: Sequence[str]) -> str:
-    """Return a list as in ``2 detectors ('a', 'b')``."""
+    """Return names as a list, such as ``2 detectors ('a', 'b')``."""
     shown = ", ".join(map(repr, names[:NAMED])) + (" ..." if len(names) > NAMED else "")
     return f"{len(names)} {what}{'s' if len(names) != 1 else ''} ({shown})"

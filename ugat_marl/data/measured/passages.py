@@ -1,4 +1,4 @@
-"""Detections: rows of on and off become passages of vehicles."""
+"""Passages of vehicles from rows of on and off events."""
 
 from __future__ import annotations
 
@@ -16,24 +16,32 @@ from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import Detector, Passages, Period
 
 MOST_UNPAIRED = 0.5
-"""A detector with a larger share of events that have no partner is not used."""
+"""Largest share of events without a partner. A detector with more is not used."""
 FEW = 0.01
-"""Share of impossible values that is left out; a larger share means another unit."""
+"""Largest share of impossible values that is left out. A larger share means a wrong unit."""
 FASTEST_MPS = 70.0
-"""Faster vehicles on a street are errors of measurement (250 km/h)."""
+"""Largest plausible speed (250 km/h)."""
 LONGEST_M = 40.0
-"""Longer vehicles do not exist on streets."""
+"""Largest plausible length of a vehicle."""
 MOST_SHARED = 0.5
-"""Share of equal detections that two different days do not reach."""
+"""From this share of equal detections on, two periods hold the same recording."""
 
 IMPUTED_S = 2.0
-"""Two ons in a row at most this far apart are two vehicles: the first one's off is set to the
-second one's on. ODOT's `atspm` (queries of split failures) does the same."""
+"""Longest time between two ons in a row that count as two vehicles. The first one then gets its off
+at the second on. ODOT's `atspm` (queries of split failures) does the same."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Stream:
-    """Events in order of stream and time; all arrays ``(events,)``."""
+    """Events of detectors, sorted by stream and time; all arrays ``(events,)``.
+
+    Attributes:
+        key: Number of the stream: period times the number of detectors, plus detector.
+        time: Time, s.
+        is_on: True for on, False for off.
+        speed: Speed, m/s; NaN if not measured.
+        length: Length of the vehicle, m; NaN if not measured.
+    """
 
     key: NDArray[np.int64]
     time: NDArray[np.float64]
@@ -56,14 +64,14 @@ def passages_of(
         frame: Its rows, with `PERIOD`.
         periods: The periods.
         detectors: The detectors.
-        found: Findings; what was left out or filled in is added.
+        found: Findings; events that are left out or filled in are added to them.
 
     Returns:
-        One mapping per period, and the detectors that cannot be used.
+        For each period, detector to its passages; and the ids of detectors that cannot be used.
 
     Raises:
-        MeasuredDataError: Unknown events, no known detector, impossible speeds or lengths, a clock
-            set back, or the same detections in two periods.
+        MeasuredDataError: An event is unknown, no detector is known, speeds or lengths are
+            impossible, a clock was set back, or two periods share detections.
     """
     refuse(
         path,
@@ -122,7 +130,7 @@ def _known(
 def _plausible(
     path: Path, frame: pl.DataFrame, column: str, most: float, found: list[Finding]
 ) -> pl.Series:
-    """Return a column of speeds or lengths, NaN where missing or, rarely, impossible."""
+    """Return a column of speeds or lengths; missing and a few impossible values become NaN."""
     values = frame[column]
     refuse(
         path,
@@ -164,7 +172,7 @@ def _sorted(
         period, detector = divmod(stream // 2, len(names))
         return f"detector {names[detector]!r} in period {periods[period].id!r}"
 
-    # Ons and offs may have been exported one after the other.
+    # Ons and offs may have been exported separately, so each has its own stream here.
     refuse_set_back(path, key * 2 + is_on, time, frame[ROW].to_numpy(), name)
     order = in_order(path, key, time, found)
     order = order[untangled(key[order], time[order], is_on[order])]
@@ -256,7 +264,7 @@ def _split(
 
 
 def _refuse_copies(path: Path, stream: _Stream, periods: Sequence[Period], detectors: int) -> None:
-    """Refuse the same vehicles in two periods."""
+    """Refuse two periods with the same detections."""
     # One whole number per event: its time in ms, its detector, and whether it is an on.
     code = np.round(stream.time * 1000).astype(np.int64) * detectors + stream.key % detectors
     code = code * 2 + stream.is_on
@@ -296,19 +304,19 @@ def _share(some: NDArray[np.int64], many: NDArray[np.int64]) -> float:
 
 
 def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
-    """Return the passages as a file holds them: written and read again.
+    """Return the passages in the form of the files, as if they were written and read again.
 
-    Simulated detectors know more than those of a street, such as two vehicles on one zone at a
-    time. Measured and simulated passages are compared in this form.
+    Simulated detectors report more than detectors of a street, such as two vehicles on one zone at
+    the same time. Measured and simulated passages are compared in this form.
 
     Args:
-        passages: In any order.
+        passages: Passages in any order.
         begin_s: Begin of the period.
         end_s: End of the period.
 
     Returns:
-        Passages in order of time, to the millisecond, none of which overlap. ``on_s`` is NaN at
-        most in the first, ``off_s`` at most in the last.
+        Passages without overlap, sorted by time, in whole milliseconds. Only the first ``on_s`` and
+        the last ``off_s`` may be NaN.
     """
     on, off = np.round(passages.on_s, 3), np.round(passages.off_s, 3)
     on, off = np.where(on < begin_s, np.nan, on), np.where(off > end_s, np.nan, off)
@@ -319,7 +327,7 @@ def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
     order = order[~outside[order]]
     on, off = on[order], off[order]
     starts = on[np.isfinite(on)]
-    # An off without an on counts only where no passage can have come before it.
+    # An off without an on counts only as the first event of the period.
     stray = np.isnan(on) & (
         (np.arange(len(on)) > 0) | (off > (starts[0] if len(starts) else np.inf))
     )
@@ -327,7 +335,7 @@ def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
     following = np.append(on[1:], np.inf)
     off = np.where(following - on <= IMPUTED_S, np.fmin(off, following), np.minimum(off, following))
     lost = np.isnan(off) & np.isfinite(following)
-    # A detector reports two ons, or two offs, at one moment as one.
+    # Two ons, or two offs, at one moment are a single event in a log.
     twice = (following == on) | (np.append(np.nan, off[:-1]) == off)
     kept = ~lost & ~(off < on) & ~twice
     chosen = order[kept]
@@ -337,15 +345,16 @@ def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
 def untangled(
     key: NDArray[np.int64], time: NDArray[np.float64], is_on: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """Return an order of events in which an on and an off at the same moment alternate.
+    """Return an order of events in which ons and offs at the same moment alternate.
 
-    Logs of tenths of a second hold pulses shorter than that, and are often sorted by event: the off
-    of such a pulse then comes before its on. Ons and offs have to alternate.
+    Logs round times to tenths of a second, so on and off of a short pulse can have the same time.
+    Many logs are also sorted by event, so that the off comes before its on. Ons and offs must
+    alternate, and this decides which one comes first.
 
     Args:
-        key: Stream of each event ``(events,)``, sorted.
-        time: ``(events,)`` s, in order within each stream.
-        is_on: ``(events,)``.
+        key: Number of the stream of each event, ``(events,)``, sorted.
+        time: Time, s, ``(events,)``, sorted within each stream.
+        is_on: True for on, False for off, ``(events,)``.
     """
     order = np.arange(len(key))
     same = (key[1:] == key[:-1]) & (time[1:] == time[:-1]) & (is_on[1:] != is_on[:-1])
@@ -356,7 +365,7 @@ def untangled(
             continue
         if i > 0 and key[i - 1] == key[i]:
             swap = shown[i - 1] == shown[i]
-        else:  # nothing before it: the next event with a time of its own decides
+        else:  # the first events of a stream: the next event at a single time decides
             after = i + 2
             while after < len(same) and same[after] and key[after] == key[i]:
                 after += 2

@@ -1,4 +1,4 @@
-"""Reads a directory of measured data, checked against the network they were measured on."""
+"""Reader of a directory of measured data, which it checks against the network."""
 
 from __future__ import annotations
 
@@ -41,24 +41,24 @@ from ugat_marl.scenarios import (
 )
 
 TOLERANCE_M = 0.1
-"""Distance by which a zone may reach beyond its lane: networks give lengths to 1 cm."""
+"""Tolerance for a zone that reaches beyond its lane: networks round lengths to 1 cm."""
 
 SIGNAL_GAP_S = 600.0
-"""A traffic light that shows the same for longer was probably not recorded."""
+"""A log with one state for longer than this probably has a gap."""
 LATE_S = 120.0
-"""A log that begins later than this (about a cycle) in its period cannot be replayed."""
+"""A log may begin this much later than its period (about one signal cycle)."""
 
 
 def read_measured(directory: Path, scenario: Scenario, network: Network) -> Measured:
-    """Read measured data; the files are never written to.
+    """Read measured data; the files stay unchanged.
 
     Args:
-        directory: Holds the files described in ``docs/reference/measured-data.md``.
-        scenario: The scenario whose clock and demand the data are compared with.
-        network: Its network.
+        directory: Directory with the files of ``docs/reference/measured-data.md``.
+        scenario: Scenario with the clock and demand of the data.
+        network: Network of the scenario.
 
     Returns:
-        The data, with findings on what they lack and what was left out.
+        The data, with findings on missing data and on rows that were left out.
 
     Raises:
         MeasuredDataError: A file is missing, cannot be read, contradicts itself, or does not fit
@@ -176,7 +176,7 @@ def _counts(
     detectors: tuple[Detector, ...],
     alone: bool,
 ) -> pl.DataFrame:
-    """Return counts per detector and interval, all of known detectors and within periods."""
+    """Return counts per detector and interval; refuse unknown detectors and wrong intervals."""
     names = [detector.id for detector in detectors]
     refuse(
         path,
@@ -218,7 +218,7 @@ def _counts(
 
 
 def _refuse_empty(path: Path, what: str, periods: list[str]) -> None:
-    """Refuse periods of which a file holds nothing."""
+    """Refuse periods for which a file has no rows."""
     if periods:
         raise MeasuredDataError(
             f"{path}: no {what} in period {', '.join(map(repr, periods[:6]))}; was the file cut "
@@ -227,11 +227,12 @@ def _refuse_empty(path: Path, what: str, periods: list[str]) -> None:
 
 
 def periods_of(path: Path, frame: pl.DataFrame, scenario: Scenario) -> tuple[Period, ...]:
-    """Return the periods, still without signals and detections.
+    """Return the periods, without signals and detections.
 
     Raises:
-        MeasuredDataError: None, one twice, one that ends before it begins or that the scenario's
-            demand does not cover, or a split that is not ``fit`` or ``heldout``.
+        MeasuredDataError: There is no period, or no period to fit. Or a period occurs twice, ends
+            before it begins, lies outside the scenario, or has a split other than ``fit`` and
+            ``heldout``.
     """
     if frame.is_empty():
         raise MeasuredDataError(f"{path}: no periods; write one row per period of measurement")
@@ -309,8 +310,8 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
     """Return the detectors.
 
     Raises:
-        MeasuredDataError: None, one twice, on a lane the network does not have, reaching beyond
-            its lane, or of an unknown kind.
+        MeasuredDataError: There is no detector. Or a detector occurs twice, is on an unknown lane,
+            reaches beyond its lane, or has an unknown kind.
     """
     if frame.is_empty():
         raise MeasuredDataError(f"{path}: no detectors; write one row per detection zone")
@@ -367,12 +368,12 @@ def signals_of(
         path: The file.
         frame: Its rows, with `PERIOD`.
         periods: The periods.
-        widths: Letters in the state of each traffic light of the network.
-        found: Findings; logs that begin late, gaps and the like are added.
+        widths: Number of letters in the state of each traffic light of the network.
+        found: Findings; late logs, gaps and double states are added to them.
 
     Raises:
-        MeasuredDataError: An unknown traffic light, a state of another length than the network's
-            or with letters SUMO does not know, a clock set back, or a log that begins too late.
+        MeasuredDataError: A traffic light is unknown, a state has a wrong length or unknown
+            letters, a clock was set back, or a log begins too late.
     """
     _check_states(path, frame, widths)
     names = sorted(widths)
@@ -441,7 +442,7 @@ def _check_states(path: Path, frame: pl.DataFrame, widths: Mapping[str, int]) ->
 def _log(
     entries: list[tuple[float, str]], period: Period, where: str, found: list[Finding]
 ) -> SignalLog:
-    """Return one log that starts at the begin; of entries at the same time the last counts."""
+    """Return one log from the begin of the period; the last of equal times counts."""
     kept: list[tuple[float, str]] = []
     clashes = 0
     for entry in entries:
