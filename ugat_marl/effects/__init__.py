@@ -1,12 +1,14 @@
 """Effects: named physical values that turn a scenario into another scenario.
 
-The same value makes a "real" domain different from the simulation, is what a diagnosis names, and
-is what repairs a model. `base` holds what every effect can do, `table` all effects by name,
-`domains` named lists of effects, V1 to V4 of the UGAT paper among them. Effects on the simulation
-stand in `vehicles`, `fleet`, `demand`, `turning`, `roads`, `signals` and `engine`, effects on what
-detectors report in `detectors`, and effects on controllers in `sensors`, `actuators` and
-`objectives`, over the parts of `controllers`. `documents` and `places` serve them all: edits of
-SUMO's files, and the places of a network.
+Effects make the real domain different from the simulation. A diagnosis names effects, and a
+corrected scenario contains them.
+
+- `base`: base of all effects; `table`: all effects by name.
+- `domains`: named lists of effects, with V1 to V4 of the UGAT paper.
+- `vehicles`, `fleet`, `demand`, `turning`, `roads`, `signals`, `engine`: effects on the simulation.
+- `detectors`: effects on the reports of detectors.
+- `sensors`, `actuators`, `objectives`: effects on controllers, made of the parts in `controllers`.
+- `documents`, `places`: edits of SUMO's files, and the places of a network.
 """
 
 import lazy_loader

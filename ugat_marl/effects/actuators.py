@@ -1,7 +1,7 @@
-"""Effects on what becomes of a controller's commands: the action gap.
+"""Effects on the commands of controllers: the action gap.
 
-Each effect makes an `Actuator`. It changes which phase the signal machine is asked for; that
-machine keeps minimum green, yellow and all-red in any case.
+Each effect but `MinGreen` makes an `Actuator`, which changes the phase that the signal machine is
+asked for. The machine always keeps minimum green, yellow and all-red.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from ugat_marl.scenarios import Intersection, Network, Scenario, SignalState, Si
 from ugat_marl.seeding import numpy_generator
 
 PHASE_ORDERS = ("cyclic", "barrier-leading", "barrier-lagging", "barrier-both")
-"""Rules for which phase may follow which, see `successors`."""
+"""Rules for the order of phases, see `successors`."""
 
 _INSTANT_S = 1e-6
 
 
 @dataclass(frozen=True)
 class ExecutionDelay(ControllerEffect):
-    """Commands are carried out so late, in whole decisions; until then the light stays."""
+    """Commands take effect after so many s, rounded to decisions; until then the light stays."""
 
     name: ClassVar[str] = "execution_delay"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 600.0)}
@@ -38,7 +38,7 @@ class ExecutionDelay(ControllerEffect):
     def actuator(
         self, network: Network, timing: SignalTiming, decision_interval_s: float
     ) -> Actuator:
-        """Make a line on which commands are under way for some decisions."""
+        """Make an actuator that delays commands by whole decisions."""
         del timing
         nothing = (None,) * len(network.intersections)
         return _Late(nothing, round(self.seconds / decision_interval_s))
@@ -64,7 +64,7 @@ class _Late(Actuator):
 
 @dataclass(frozen=True)
 class LostCommands(ControllerEffect):
-    """A command to one light is lost with this chance; the light stays as it is."""
+    """A command to one light is lost with this chance; the light then stays."""
 
     name: ClassVar[str] = "lost_commands"
     ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
@@ -73,7 +73,7 @@ class LostCommands(ControllerEffect):
     def actuator(
         self, network: Network, timing: SignalTiming, decision_interval_s: float
     ) -> Actuator:
-        """Make a line on which commands are lost, light by light."""
+        """Make an actuator that loses commands, independently for each light."""
         del network, timing, decision_interval_s
         return _Lossy(self.share)
 
@@ -103,7 +103,7 @@ class PhaseOrder(ControllerEffect):
     def actuator(
         self, network: Network, timing: SignalTiming, decision_interval_s: float
     ) -> Actuator:
-        """Make lights that keep to the order.
+        """Make an actuator that forbids phases out of order.
 
         Raises:
             ScenarioError: The phases of an intersection have no barrier.
@@ -123,7 +123,7 @@ class _Ordered(Actuator):
 
 @dataclass(frozen=True)
 class MaxGreen(ControllerEffect):
-    """No green lasts longer, in whole decisions; the next phase allowed follows by itself."""
+    """No green lasts longer than so many s, in whole decisions; then the next phase follows."""
 
     name: ClassVar[str] = "max_green"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 10.0, 600.0)}
@@ -132,7 +132,7 @@ class MaxGreen(ControllerEffect):
     def actuator(
         self, network: Network, timing: SignalTiming, decision_interval_s: float
     ) -> Actuator:
-        """Make lights that end a green before it is too long."""
+        """Make an actuator that ends greens before they are too long."""
         del network
         return _Bounded(self.seconds, timing.clearance_s, decision_interval_s)
 
@@ -152,7 +152,7 @@ class _Bounded(Actuator):
 
 @dataclass(frozen=True)
 class MinGreen(Effect):
-    """Every green of the signals the agents control lasts at least so many s, in whole steps."""
+    """Greens of controlled signals last at least so many s, in whole simulation steps."""
 
     name: ClassVar[str] = "min_green"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 120.0)}
@@ -166,28 +166,28 @@ class MinGreen(Effect):
 
 
 ACTING: tuple[type[Effect], ...] = (ExecutionDelay, LostCommands, PhaseOrder, MaxGreen, MinGreen)
-"""Effects on what becomes of commands."""
+"""Effects on commands."""
 
 
 def successors(item: Intersection, rule: str = "") -> list[list[int]]:
-    """Return for each phase of an intersection the others that may follow it, by index.
+    """Return, for each phase of an intersection, the other phases that may follow it, by index.
 
-    Without a rule any may follow any. ``"cyclic"``: only the next one in the list of phases. The
-    other rules are those of NEMA controllers, whose barrier separates the phases of one street from
-    those of the streets that cross it. Two phases belong to one street if they serve the same
-    approach, right turns and permitted left turns apart, or if a chain of such phases joins them.
-    On a street any phase may follow any; from one street to another one allowed are
+    Without a rule, any phase may follow any other. With ``"cyclic"``, only the next one in the list
+    of phases follows. The other rules are those of NEMA controllers: a barrier separates the phases
+    of one street from those of the streets that cross it. Two phases belong to one street if they
+    serve a common approach, or if a chain of such phases joins them; right turns and permitted left
+    turns do not count. On one street, any phase may follow any other. Across the barrier:
 
-    - ``"barrier-leading"``: only into the phase of the left turns, if the other street has one;
-    - ``"barrier-lagging"``: only out of the phase of the through movements, if this one has one;
-    - ``"barrier-both"``: only out of the one into the other.
+    - ``"barrier-leading"``: only into the left-turn phase of the other street, if it has one;
+    - ``"barrier-lagging"``: only out of the through phase of this street, if it has one;
+    - ``"barrier-both"``: both rules hold.
 
     Args:
         item: The intersection.
         rule: One of `PHASE_ORDERS`, or "".
 
     Raises:
-        ScenarioError: All phases belong to one street, so that there is no barrier.
+        ScenarioError: All phases belong to one street, so there is no barrier.
     """
     count = len(item.phases)
     if rule == "cyclic":
@@ -219,7 +219,7 @@ def successors(item: Intersection, rule: str = "") -> list[list[int]]:
 
 
 class _Served(NamedTuple):
-    """Approaches a phase serves: by through movements, and by protected left turns."""
+    """Approaches that a phase serves with through movements, and with protected left turns."""
 
     through: frozenset[str]
     left: frozenset[str]
@@ -243,7 +243,10 @@ def _streets(item: Intersection) -> list[int]:
 
 
 def _first_phases(item: Intersection, streets: Sequence[int]) -> set[int]:
-    """Return the phases of most left turns and nothing else, or all of a street without any."""
+    """Return, of each street, the phases with the most left turns and no through movements.
+
+    A street without such a phase keeps all its phases.
+    """
     return _most(
         streets,
         [
@@ -254,7 +257,10 @@ def _first_phases(item: Intersection, streets: Sequence[int]) -> set[int]:
 
 
 def _last_phases(item: Intersection, streets: Sequence[int]) -> set[int]:
-    """Return the phases of most through movements and nothing else, or all of a street without."""
+    """Return, of each street, the phases with the most through movements and no left turns.
+
+    A street without such a phase keeps all its phases.
+    """
     return _most(
         streets,
         [

@@ -1,4 +1,4 @@
-"""Base of all effects, and the hash that decides which vehicles an effect meets."""
+"""Base of all effects, and the hash that chooses the vehicles of an effect."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Detector, Network, Period, Scenario, SignalTiming
 
 EVERYWHERE = "*"
-"""As a place: all of them."""
+"""Place of an effect that means all places."""
 
 TextKind = Literal["lane", "edge", "traffic light", "detector", "model", "phase order", "objective"]
 
@@ -28,7 +28,7 @@ Owner = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number an effect has.
+    """Number that is a parameter of an effect.
 
     Attributes:
         unit: SI unit, or "" for a pure number.
@@ -43,12 +43,12 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Text:
-    """A name an effect has: a place of the network, or a model.
+    """Name that is a parameter of an effect: a place of the network, or a model.
 
     Attributes:
-        kind: What is named.
-        everywhere: Whether ``"*"`` is allowed and means all of them.
-        allowed: The names there are, if the network does not decide it.
+        kind: Kind of the named thing.
+        everywhere: True if ``"*"`` is allowed; it means all of this kind.
+        allowed: All names of this kind; empty if the network decides them.
     """
 
     kind: TextKind
@@ -61,12 +61,12 @@ class Examined:
     """Strengths of an effect on a whole network that a diagnosis first simulates.
 
     Attributes:
-        levels: Values of its number.
-        nominal: Value that changes nothing; where vehicle types hold the number, theirs counts.
-        least: Distance from nominal below which the effect does not matter in practice.
+        levels: Values of the effect's number.
+        nominal: Value without an effect; if vehicle types have the number, theirs is nominal.
+        least: Smallest distance from nominal that matters in practice.
         both: True if values on the other side of nominal have the opposite effect.
-        step: The number is a multiple of it, if not 0.
-        extreme: Values that are simulated as well, and are no plausible world.
+        step: Step of the number, which is a multiple of it; 0 for none.
+        extreme: Further values to simulate, beyond plausible ones.
     """
 
     levels: tuple[float, ...]
@@ -81,22 +81,22 @@ class Examined:
 class Effect:
     """A physical effect; subclasses are frozen dataclasses whose fields are its parameters.
 
-    An effect does something at one of three places and leaves the others as they are: to the files
-    of a scenario (`apply`), to what detectors report (`observe`), or between a controller and its
-    street (`sensor`, `actuator`, `cost`).
+    An effect changes one of three things: the files of a scenario (`apply`), the reports of
+    detectors (`observe`), or the link between a controller and its street (`sensor`, `actuator`,
+    `cost`).
 
     Attributes:
         name: Name in files, on the command line and in verdicts.
         ranges: Unit and plausible range of each field that is a number.
-        texts: Kind of name that each other field holds.
-        attribute: Attribute of vehicle types that holds its number, or "".
-        examined: Strengths a diagnosis tries on a whole network; None if it tries none.
-        on_detectors: True if it changes what detectors report, and no traffic.
-        on_departures: True if it changes which vehicles depart or when, and not how they drive.
+        texts: Kind of name of each other field.
+        attribute: Attribute of vehicle types with the effect's number, or "".
+        examined: Strengths that a diagnosis tries on a whole network; None if it tries none.
+        on_detectors: True if it changes the reports of detectors, but no traffic.
+        on_departures: True if it changes only which vehicles depart, and when.
 
     Raises:
-        OptionError: A value is outside its plausible range, or a name cannot be one.
-        UnknownNameError: A model that does not exist.
+        OptionError: A value is outside its plausible range, or a name has impossible characters.
+        UnknownNameError: A name is not among the allowed ones.
     """
 
     name: ClassVar[str]
@@ -130,28 +130,28 @@ class Effect:
         return scenario
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Return what detectors would have reported instead.
+        """Return the period as detectors with this effect report it.
 
         Args:
-            period: What was measured; it does not change itself.
+            period: Measured passages; it does not change itself.
             detectors: All detectors.
             owner: Detector to its traffic light, see `owners`.
 
         Raises:
-            UnknownNameError: No such detector.
+            UnknownNameError: The detector does not exist.
         """
         del detectors, owner
         return period
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor | None:
-        """Make what changes the view of the controllers of a network; None if nothing does."""
+        """Make the sensor that changes the counts of controllers; None without such a change."""
         del network, decision_interval_s
         return None
 
     def actuator(
         self, network: Network, timing: SignalTiming, decision_interval_s: float
     ) -> Actuator | None:
-        """Make what changes the commands of the controllers of a network; None if nothing does.
+        """Make the actuator that changes commands of controllers; None without such a change.
 
         Raises:
             ScenarioError: The phases of an intersection do not allow it.
@@ -160,7 +160,7 @@ class Effect:
         return None
 
     def cost(self) -> Cost | None:
-        """Make the cost by which controllers are judged; None if it stays as it is."""
+        """Make the cost by which controllers are judged; None without a cost."""
         return None
 
     def record(self) -> dict[str, Any]:
@@ -207,10 +207,10 @@ class Effect:
 
 @dataclass(frozen=True)
 class ControllerEffect(Effect):
-    """An effect on what controllers see, do or are judged by; traffic and detectors stay the same.
+    """Base of effects on counts, commands and costs of controllers; traffic does not change.
 
-    No files change. The scenario goes on listing the effect in its own `effects`, where it is
-    hashed, written and read again, and the environment asks the effect for its part.
+    No files change. The scenario lists the effect in its `effects`, so it is hashed, written and
+    read with the scenario. The environment asks the effect for its sensor, actuator or cost.
     """
 
     def apply(self, scenario: Scenario) -> Scenario:
@@ -225,12 +225,12 @@ class ControllerEffect(Effect):
 def draw(salt: str, *names: str) -> float:
     """Return a number in [0, 1) that belongs to a vehicle, or to anything else with a name.
 
-    It takes the place of a random generator. A share of 0.2 is all vehicles with a number below
-    0.2: they are among those met at 0.3, and the order of vehicles does not matter.
+    It replaces a random generator. A share of 0.2 contains all vehicles with a number below 0.2, so
+    a share of 0.3 contains the same vehicles and more. The order of vehicles does not matter.
 
     Args:
         salt: Name of the decision; other decisions about the same vehicle are independent.
-        *names: Names of the vehicle, or of what else the decision is about.
+        *names: Name of the vehicle or other subject of the decision, in one or more parts.
     """
     digest = hashlib.blake2b("\0".join((salt, *names)).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") / 2.0**64

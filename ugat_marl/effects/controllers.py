@@ -1,9 +1,9 @@
-"""Parts between a controller and the street: what effects on controllers are made of.
+"""Parts of effects on controllers: sensors, actuators and costs.
 
-An effect makes a `Sensor` (what the controller sees), an `Actuator` (what becomes of its commands)
-or a `Cost` (what it is judged by). The environment chains those of all effects of its scenario.
-Sensors and actuators work on numpy arrays and draw from the seed of the episode, each from a stream
-of its own, so that an effect does the same whatever other effects are there.
+A `Sensor` changes the counts that a controller sees, an `Actuator` its commands; a `Cost` judges an
+episode. The environment chains the parts of all effects of its scenario. Each sensor and actuator
+draws from its own random stream, which follows from the seed of the episode. So an effect does not
+depend on the other effects.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from ugat_marl.scenarios import SignalState
 
 Cost = Callable[[Mapping[str, float]], float]
-"""Cost of an episode, from its measures by name."""
+"""Function from the measures of an episode, by name, to its cost."""
 
 Commands = Sequence[int | None]
 """Phase asked for at each intersection; None where no command arrives."""
 
 
 class Stage(IntEnum):
-    """Order in which sensors act, as it is on the street."""
+    """Order in which sensors act, the same as on a street."""
 
     ZONE = 1
     NOISE = 2
@@ -42,9 +42,10 @@ class Reading:
 
     Attributes:
         counts: Vehicles, halting vehicles and waiting times in s, ``(3, lanes)``.
-        near: The same in the detection zones before the stop lines, ``(3, lanes)``; empty unless a
-            sensor asks for a zone.
-        mean_left: As in `ugat_marl.simulation.Snapshot`, ``(lanes,)``; empty if not measured.
+        near: Counts in the detection zones before the stop lines, ``(3, lanes)``; empty if no
+            sensor has a zone.
+        mean_left: Field `mean_left` of `ugat_marl.simulation.Snapshot`, ``(lanes,)``; empty if not
+            measured.
     """
 
     counts: NDArray[np.float64]
@@ -57,7 +58,7 @@ class Sensor:
 
     Attributes:
         stage: Place in the chain of sensors.
-        zone_m: Length of the detection zones the simulator has to measure apart, in m; 0 for none.
+        zone_m: Length of the detection zones that the simulator has to measure, in m; 0 for none.
     """
 
     stage: Stage
@@ -67,15 +68,15 @@ class Sensor:
         """Begin the episode of this seed."""
 
     def read(self, reading: Reading) -> Reading:
-        """Return what is passed on; `reading` itself does not change."""
+        """Return the changed reading; `reading` itself does not change."""
         raise NotImplementedError
 
 
 class Actuator:
     """One step between the commands of a controller and its lights.
 
-    It may change when or whether commands arrive (`send`), and which phases a light may show next
-    (`restrict`). The signal machine keeps minimum green, yellow and all-red in any case.
+    It may delay or lose commands (`send`), and forbid phases (`restrict`). The signal machine
+    always keeps minimum green, yellow and all-red.
 
     Attributes:
         stage: Place in the chain of actuators: commands are late (0), and lost on arrival (1).
@@ -87,12 +88,12 @@ class Actuator:
         """Begin the episode of this seed."""
 
     def send(self, commands: Commands) -> Commands:
-        """Return the commands that arrive at this decision; `commands` are given at it."""
+        """Return the commands that arrive at this decision; `commands` are those given now."""
         return commands
 
     @property
     def under_way(self) -> Sequence[Commands]:
-        """Commands that have been given and not arrived, the oldest first."""
+        """Commands that were given but have not arrived, the oldest first."""
         return ()
 
     def restrict(self, mask: NDArray[np.int8], place: int, state: SignalState) -> None:

@@ -1,4 +1,4 @@
-"""Edits of a scenario's files, part by part, in those files alone that an effect may concern."""
+"""Edits of a scenario's files, part by part; files without a searched text are not parsed."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from ugat_marl.files import Draft, child_texts, scratch, xml_bytes
 from ugat_marl.scenarios import Document, Scenario, seconds_of
 
 DEFAULTS_FILE = "default-types.add.xml"
-"""The types SUMO defines itself, written down so that effects can change them."""
+"""File with SUMO's default vehicle types, so that effects can change them."""
 
 DEFAULT_TYPES = (
     "DEFAULT_VEHTYPE", "DEFAULT_TAXITYPE", "DEFAULT_BIKETYPE", "DEFAULT_RAILTYPE",
 )  # fmt: skip
-"""Types SUMO defines itself. Only the first is used without being named."""
+"""SUMO's default vehicle types. Vehicles without a type use the first one."""
 
 DEPARTING = frozenset({"vehicle", "trip", "flow"})
 BLOCKERS = ("closure.", "parking.")
-"""How the ids of vehicles begin that stand on the street and are no part of the demand."""
+"""Beginnings of the ids of vehicles that block a lane and are no part of the demand."""
 
 _SORTED = DEPARTING | {"person", "personFlow", "container", "containerFlow"}
 _OVERLAP = 256
-"""Bytes no text that is looked for is longer than."""
+"""Largest length of a searched text, in bytes."""
 _RUN = 16 << 20
-"""Characters of vehicles that are sorted in memory."""
+"""Number of characters to sort in memory at a time."""
 _AT_ONCE = 1000
 
 Root = ET.Element
 Change = Callable[[Root], bool]
-"""Edits some of a document's elements, below a root like its own, and says whether it did."""
+"""Function that edits a part of a document's elements, below their root; True if it did."""
 
 
 def windows(document: Document) -> Iterator[bytes]:
-    """Yield the bytes piece by piece, each with the end of the one before it."""
+    """Yield the bytes piece by piece, each with the end of the piece before it."""
     window = b""
     for piece in document.pieces():
         window = window[-_OVERLAP:] + piece
@@ -49,7 +49,7 @@ def windows(document: Document) -> Iterator[bytes]:
 
 
 def mentions(document: Document, *texts: str) -> bool:
-    """Return True if any of the texts occurs, or if only parsing could tell."""
+    """Return True if any of the texts occurs, or if the encoding prevents a search."""
     wanted = [text.encode() for text in texts]
     return any(
         window[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -65,11 +65,11 @@ def edit(
     """Apply `change` to every document that mentions one of `texts`.
 
     Args:
-        documents: What may be edited, however long.
-        change: Called with the elements below the root, a part of them at a time.
-        *texts: Documents without any of these are not even parsed.
-        in_order: Whether vehicles may depart at other times now, and have to be sorted: SUMO leaves
-            out those that stand behind a later one.
+        documents: Documents of any length.
+        change: Function called with parts of the elements, below their root.
+        *texts: Searched texts; documents without any of them are not parsed.
+        in_order: True to sort vehicles by departure after the change, because SUMO drops vehicles
+            that come after a later one.
     """
     return tuple(
         _edited(document, change, in_order) if mentions(document, *texts) else document
@@ -102,11 +102,11 @@ def edit_scenario(
     """Apply `change` to additional files and routes, as `edit` does.
 
     Args:
-        scenario: It does not change itself.
-        change: As for `edit`.
-        *texts: Documents without any of these are not even parsed.
-        applied: What to note as applied.
-        in_order: As for `edit`.
+        scenario: The scenario; it does not change itself.
+        change: Function that edits elements, as for `edit`.
+        *texts: Searched texts; documents without any of them are not parsed.
+        applied: Effect in text form, to add to `applied`.
+        in_order: True to sort vehicles by departure, as for `edit`.
     """
     return replace(
         scenario,
@@ -117,7 +117,7 @@ def edit_scenario(
 
 
 def with_default_types(scenario: Scenario) -> Scenario:
-    """Return the scenario with the default types in use declared, in its first additional file."""
+    """Return the scenario with a first additional file that declares the default types in use."""
     if scenario.additional and scenario.additional[0].name == DEFAULTS_FILE:
         return scenario
     declared: set[str] = set()
@@ -147,7 +147,7 @@ def is_demand(item: Root) -> bool:
 
 
 def depart_s(item: Root) -> float:
-    """Departure of a vehicle or trip, or begin of a flow; NaN if something else triggers it."""
+    """Return the departure of a vehicle or trip, or the begin of a flow, in s; NaN if triggered."""
     text = item.get("begin", "0") if item.tag.lower().endswith("flow") else item.get("depart", "")
     try:
         return seconds_of(text)
@@ -156,9 +156,9 @@ def depart_s(item: Root) -> float:
 
 
 def sort_departures(root: Root) -> None:
-    """Put definitions first and then everything that departs, in order of time.
+    """Sort the elements: definitions first, then everything that departs, by time.
 
-    One whose departure is triggered stays behind its predecessor.
+    An element with a triggered departure stays behind its predecessor.
     """
     root[:] = sorted(root, key=_clock())
 
@@ -179,7 +179,7 @@ def _clock() -> Callable[[Root], float]:
 
 
 class _Sorted:
-    """Texts in the order of their times, however many: in runs that are kept in files."""
+    """Texts sorted by time; files hold sorted runs if they do not fit into memory."""
 
     def __init__(self) -> None:
         self._run: list[tuple[float, int, str]] = []
@@ -187,7 +187,7 @@ class _Sorted:
         self._count = self._length = 0
 
     def add(self, rows: Iterable[tuple[float, str]]) -> None:
-        """Take times and texts; of those of one time, the first stays first."""
+        """Add times and texts; texts of equal time keep their order."""
         for time, text in rows:
             self._run.append((time, self._count, text))
             self._count += 1
@@ -206,5 +206,5 @@ class _Sorted:
 
 
 def seconds_text(value: float) -> str:
-    """Return a time as text for a file, to the millisecond, SUMO's own resolution."""
+    """Return a time in s as text for a file, rounded to 1 ms, the resolution of SUMO."""
     return f"{value:.3f}".rstrip("0").rstrip(".")

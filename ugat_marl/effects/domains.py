@@ -1,10 +1,10 @@
-"""Domains: lists of effects by name, V1 to V4 of the UGAT paper among them.
+"""Domains: named lists of effects, with V1 to V4 of the UGAT paper.
 
-Each named domain opens a gap between simulation and street.
+Each named domain makes a gap between the simulation and the real domain.
 
-The counterparts are settings of Sim2Signal (Al Rafi et al. 2026, arXiv:2609.01676), by the names of
-its repository, whose files of settings and tables of phases were read for the numbers here. That
-benchmark trains in CityFlow and plays the street in SUMO; here both sides are SUMO.
+The counterparts are settings of Sim2Signal (Al Rafi et al. 2026, arXiv:2609.01676), with the names
+of its repository. The numbers here come from its files of settings and tables of phases. That
+benchmark trains in CityFlow and simulates the real domain in SUMO; here both are SUMO.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Domain = str | Sequence[Effect]
 Gap = Literal["observation", "action", "transition", "reward"]
 
 GAPS: tuple[Gap, ...] = get_args(Gap)
-"""Where simulation and street may part: what is seen, done, what happens, what is wanted."""
+"""Kinds of gap: in what controllers see, in their commands, in the traffic, in the objective."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class NamedDomain:
     """A domain with a name, see `NAMED`.
 
     Attributes:
-        name: What it is called; small and capital letters are the same.
-        gap: Which gap it opens.
-        effects: Its effects, as in a domain: ``effect=value+effect=value``.
-        counterpart: The setting of Sim2Signal it corresponds to, or "".
-        note: What is different there, or what the numbers are based on.
+        name: Name of the domain; small and capital letters are the same.
+        gap: Kind of gap.
+        effects: Effects in text form: ``effect=value+effect=value``.
+        counterpart: Corresponding setting of Sim2Signal, or "".
+        note: Difference from the counterpart, or source of the numbers.
     """
 
     name: str
@@ -56,7 +56,7 @@ _ASSUMED = "assumed values"
 
 
 def _observation() -> list[NamedDomain]:
-    """Normal errors in vehicles, lanes that are silent for an episode, short detection zones."""
+    """Return domains with noise, dead detectors, short detection zones, late or lost counts."""
     found = [
         NamedDomain(f"noise-{n}", "observation", f"counting_error={n}", f"noise{n}")
         for n in (3, 5, 10, 20)
@@ -94,7 +94,7 @@ def _observation() -> list[NamedDomain]:
 
 
 def _action() -> list[NamedDomain]:
-    """Commands that arrive late or not at all, phases in a fixed order."""
+    """Return domains with late or lost commands, limits of greens, or an order of phases."""
     chained = "there every command also waits for the one before"
     found = [
         NamedDomain(f"delay-{s}", "action", f"execution_delay={s}", f"delay setting{n}", chained)
@@ -125,7 +125,7 @@ def _action() -> list[NamedDomain]:
 
 
 def _transition() -> list[NamedDomain]:
-    """Other vehicles, drivers, weather, demand and streets."""
+    """Return domains with other vehicles, drivers, weather, demand and streets."""
     paper = "Da et al. (2023), Real-world Configurations"
     settings = {
         "V1": (1.00, 2.50, 6.00, 0.50),
@@ -170,7 +170,7 @@ def _transition() -> list[NamedDomain]:
 
 
 def _reward() -> list[NamedDomain]:
-    """The same street, judged by what training does not see."""
+    """Return domains with an objective that training does not see."""
     theirs = {
         "efficiency": "efficiency_aligned",
         "emissions": "emission_heavy",
@@ -188,11 +188,11 @@ def _reward() -> list[NamedDomain]:
 NAMED: dict[str, NamedDomain] = {
     item.name: item for item in (*_observation(), *_action(), *_transition(), *_reward())
 }
-"""All of them, by name."""
+"""All named domains, by name."""
 
 
 TO_TRAIN_IN = frozenset({"meso"})
-"""Named domains that stand for a simulation, and for no street."""
+"""Named domains that are simulations for training, and no real domains."""
 
 ALIASES: dict[str, str] = {
     "light-loads": "V1",
@@ -207,8 +207,8 @@ def spelled_out(names: Sequence[str]) -> list[str]:
     """Return domains with ``"all"`` and names of gaps replaced by lists, each domain once.
 
     Args:
-        names: Domains; ``"all"`` is ``sim`` and every named one, the name of a gap all of its own,
-            but for those that are there `TO_TRAIN_IN`.
+        names: Domains. ``"all"`` means ``sim`` and every named domain; the name of a gap means its
+            domains. Both leave out those in `TO_TRAIN_IN`.
     """
     found: list[str] = []
     streets = [item for item in NAMED.values() if item.name not in TO_TRAIN_IN]
@@ -223,10 +223,10 @@ def spelled_out(names: Sequence[str]) -> list[str]:
 
 
 def parse_domain(domain: Domain) -> tuple[Effect, ...]:
-    """Return the effects that make `domain` out of a scenario; none for ``"sim"``.
+    """Return the effects of a domain; none for ``"sim"``.
 
     Raises:
-        UnknownNameError: No such setting or effect.
+        UnknownNameError: The domain or an effect does not exist.
         OptionError: An effect has an impossible value.
     """
     if not isinstance(domain, str):
@@ -259,12 +259,12 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
 
 
 def _names() -> dict[str, str]:
-    """Return the name of a domain by each of its names in lower case."""
+    """Return names and aliases in lower case, each with the name of its domain."""
     return {name.lower(): name for name in NAMED} | ALIASES
 
 
 def _parts(domain: str) -> list[str]:
-    """Split a domain at its plus signs, except those in the id of an edge or lane."""
+    """Split a domain at its plus signs, except in ids of edges and lanes."""
     parts: list[str] = []
     for part in domain.split("+"):
         name = parts[-1].partition("=")[0].strip().lower() if parts else ""
@@ -278,21 +278,21 @@ def _parts(domain: str) -> list[str]:
 
 
 def describe(domain: Domain) -> str:
-    """Return a short name for a domain, as tables show it."""
+    """Return the short name of a domain for tables."""
     if isinstance(domain, str):
         return _names().get(domain.strip().lower(), domain)
     return "+".join(map(str, domain)) or "sim"
 
 
 def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
-    """Return the scenario as it is in `domain`.
+    """Return the scenario with the effects of `domain`.
 
     Args:
-        scenario: What `load_scenario` returned.
-        domain: Effects, or the name of some, or the path of another scenario on the same network.
+        scenario: Scenario from `load_scenario`.
+        domain: Effects, a name of effects, or the path of another scenario on the same network.
 
     Raises:
-        UnknownNameError: No such setting or effect.
+        UnknownNameError: The domain or an effect does not exist.
         OptionError: An effect has an impossible value, or two of them exclude each other.
         ScenarioError: A scenario named as a domain cannot be read or has other roads.
     """
@@ -319,7 +319,7 @@ def _checked(scenario: Scenario) -> Scenario:
 
 
 def scenario_of(domain: Domain) -> Path | None:
-    """Return the other scenario that a domain names, or None; a file called V4 is none."""
+    """Return the path if a domain is a scenario directory or a ``.sumocfg``, else None."""
     if not isinstance(domain, str):
         return None
     path = Path(domain).expanduser()
@@ -327,7 +327,7 @@ def scenario_of(domain: Domain) -> Path | None:
 
 
 def _signals(scenario: Scenario) -> set[tuple[str, ...]]:
-    """Return the connection that each letter of each signal belongs to."""
+    """Return all connections with a signal: light, link index, edges and lanes."""
     keys = ("tl", "linkIndex", "from", "fromLane", "to", "toLane")
     return {
         tuple(item.get(key, "") for key in keys)

@@ -1,4 +1,4 @@
-"""Effects on the engine: queues in place of car following, blocked junctions, reach of counts."""
+"""Effects on the engine: mesoscopic queues, blocked junctions, and the reach of counts."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from ugat_marl.effects.base import Effect, Parameter
 from ugat_marl.scenarios import Scenario, validated
 
 HEADWAY_S = 1.4
-"""Net headway of queues that drive on, of drivers who keep 1 s: SUMO multiplies it with theirs.
+"""Net headway of moving queues in s, for drivers with `tau` = 1 s; SUMO multiplies it by `tau`.
 
-With 7.5 m per vehicle at the speed limit that is one every 2.30, 1.94 and 1.79 s at 8.3, 13.9 and
-19.4 m/s; of car following 2.48, 1.95 and 1.71 s were measured, straight on from one saturated lane.
+With 7.5 m per vehicle, the time between vehicles is 1.4 s + 7.5 m / speed: 2.30, 1.94 and 1.79 s at
+8.3, 13.9 and 19.4 m/s. Car following had 2.48, 1.95 and 1.71 s, measured straight on from one
+saturated lane.
 """
 
 
@@ -21,10 +22,11 @@ With 7.5 m per vehicle at the speed limit that is one every 2.30, 1.94 and 1.79 
 class QueueModel(Effect):
     """Vehicles wait in queues at the ends of segments of so many metres (SUMO's mesoscopic model).
 
-    Vehicles have no position within a segment and no acceleration; what they look at are signals,
-    and room in the next segment. Only the last segment of an edge has a queue for each way on; in
-    those before it whoever finds no room keeps all others back, so `--sim meso`, an engine to train
-    in, many times as fast, has segments as long as most roads. A diagnosis does not look for it.
+    Vehicles have no position within a segment and no acceleration. They react to signals and to the
+    room in the next segment. Only the last segment of an edge has one queue for each direction; in
+    the segments before, one vehicle without room stops all others. So the domain `meso`, a much
+    faster engine for training, has segments as long as most roads. A diagnosis does not look for
+    this effect.
     """
 
     name: ClassVar[str] = "queue_model"
@@ -32,15 +34,15 @@ class QueueModel(Effect):
     metres: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Set options of SUMO and the clearance, so that queues serve what car following serves.
+        """Set options of SUMO and the clearance, so that queues serve as many as car following.
 
-        A green of g s on a saturated lane serves (g - 0.9) / 1.95 vehicles in car following at
-        13.9 m/s, yellow and start included. SUMO's queues would serve as many in a green shorter by
-        `QUEUE_START_S`, and drive on in yellow: agents show red for yellow, and greens are late
-        (see `late_greens`). Its headways depend on how full segments are; here they are one,
-        `HEADWAY_S`, however long the queue and the segment. (The network's own programmes keep
-        their yellow, from which phases may be read. Not `meso-lane-queue`, with which SUMO 1.28
-        crashes on some networks.)
+        In car following at 13.9 m/s, a green of g s on a saturated lane serves (g - 0.9) / 1.95
+        vehicles, yellow and start included. SUMO's queues serve as many in a green that is shorter
+        by `QUEUE_START_S`, and they drive on in yellow. So agents show red instead of yellow, and
+        greens are late (see `late_greens`). SUMO's headways depend on the occupancy of segments;
+        here all are `HEADWAY_S`. The network's own programmes keep their yellow, because phases may
+        be read from them. The option `meso-lane-queue` is not used, because SUMO 1.28 crashes with
+        it on some networks.
         """
         options = {
             "mesosim": "true",
@@ -57,10 +59,10 @@ class QueueModel(Effect):
 class BlockerPatience(Effect):
     """A vehicle that has stood on a junction for so many seconds is no obstacle any more.
 
-    Vehicles that meet in the middle of a junction, slow ones that started late above all, can hold
-    each other up for ever: SUMO solves that by teleporting alone, which the suite switches off, and
-    whatever signals show, the network fills up to the end of the episode. On a street somebody
-    gives way (SUMO: ``--ignore-junction-blocker``). A diagnosis does not look for it.
+    Vehicles in the middle of a junction can block each other for ever, above all slow ones that
+    started late. SUMO solves this only by teleporting, which is switched off here, so the network
+    fills up. On a street somebody gives way (SUMO: ``--ignore-junction-blocker``). A diagnosis does
+    not look for this effect.
     """
 
     name: ClassVar[str] = "blocker_patience"
@@ -74,12 +76,12 @@ class BlockerPatience(Effect):
 
 @dataclass(frozen=True)
 class Reach(Effect):
-    """Vehicles are counted so far upstream of stop lines, where lanes at lights are shorter.
+    """Vehicles are counted up to so many metres upstream of stop lines, across short roads.
 
-    Networks made of maps are cut into short roads, and whoever stands on the road before the last
-    is seen by nobody; a policy learns that vehicles there cost nothing. With it observations and
-    rewards, and the measured queue, hold those on the lanes upstream, too, and those that wait
-    to enter the network there. A diagnosis does not look for it.
+    Networks from maps are cut into short roads. Without a reach, no agent sees vehicles before the
+    last road, and a policy learns that they cost nothing. With it, observations, rewards and the
+    measured queue include vehicles on the lanes upstream and those that wait to enter the network
+    there. A diagnosis does not look for this effect.
     """
 
     name: ClassVar[str] = "reach"

@@ -1,8 +1,7 @@
-"""Effects on what controllers are judged by: the reward gap.
+"""Effects on the objective of controllers: the reward gap.
 
-A domain with an objective has the same traffic and the same rewards. At the end of an episode its
-scores also hold the cost to the owner of the street and the measures it is made of, which no
-training ever sees.
+A domain with an objective has the same traffic and the same rewards. At the end of an episode, its
+scores also have a cost and the measures in it. No training uses them.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ OBJECTIVES: dict[str, dict[str, float]] = {
     "safety": {"queue": 0.5, "hard_brakings": 5.0, "collisions": 5.0},
     "person-delay": {"person_delay_s": 1.0},
 }
-"""Weights of measures by the name of the objective. Those of queue, emissions, fairness and safety
-are Sim2Signal's (Al Rafi et al. 2026)."""
+"""Weights of measures, by name of the objective. Those of queue, emissions, fairness and safety are
+from Sim2Signal (Al Rafi et al. 2026)."""
 
 NORMS: dict[str, float] = {
     "queue": 10.0,
@@ -33,20 +32,20 @@ NORMS: dict[str, float] = {
     "hard_brakings": 10.0,
     "collisions": 1.0,
 }
-"""Value of each measure that counts as 1 in a cost: round numbers of their size in the shipped
-scenarios."""
+"""Value of each measure that counts as 1 in a cost: round numbers of the size of the measure in the
+shipped scenarios."""
 
 
 @dataclass(frozen=True)
 class Objective(ControllerEffect):
-    """The street's owner wants something: emissions, fairness, safety or person delay count."""
+    """Controllers are judged by efficiency, emissions, fairness, safety or person delay."""
 
     name: ClassVar[str] = "objective"
     texts: ClassVar[dict[str, Text]] = {"wanted": Text("objective", allowed=tuple(OBJECTIVES))}
     wanted: str
 
     def cost(self) -> Cost:
-        """Return the weighted sum of measures, each divided by its norm."""
+        """Return the cost function: sum over measures of weight * measure / norm."""
         return self._weighted_sum  # a method, so that an environment can be pickled
 
     def _weighted_sum(self, measures: Mapping[str, float]) -> float:
@@ -55,4 +54,4 @@ class Objective(ControllerEffect):
 
 
 JUDGING: tuple[type[ControllerEffect], ...] = (Objective,)
-"""Effects on what controllers are judged by."""
+"""Effects on the objective of controllers."""

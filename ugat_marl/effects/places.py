@@ -1,4 +1,4 @@
-"""Places of a network that effects name: edges, lanes, traffic lights, and their connections."""
+"""Places of a network for effects: edges, lanes, traffic lights, and their connections."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ugat_marl.scenarios import Scenario
 
 @dataclass(frozen=True)
 class LanePlace:
-    """A lane: its edge, index, length and speed limit, and whether passenger cars may use it."""
+    """A lane: its edge, index, length in m, speed limit in m/s, and permission for cars."""
 
     edge: str
     index: int
@@ -33,7 +33,7 @@ class Places:
     Attributes:
         lanes: Lanes by id.
         edges: Edge to its lanes, from right to left.
-        following: Edge to the edges a car can go on to.
+        following: Edge to the edges that a car can reach next.
         lights: Ids of the traffic lights.
         ends: Lane to the traffic light it leads to.
         begins: Lane to the traffic light it comes from.
@@ -95,7 +95,7 @@ class Places:
 
 
 def places_of(scenario: Scenario) -> Places:
-    """The places of a scenario's network.
+    """Return the places of a scenario's network.
 
     Raises:
         ScenarioError: The network is not well-formed.

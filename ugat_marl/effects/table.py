@@ -70,7 +70,7 @@ EFFECTS: dict[str, type[Effect]] = {**_MEASURABLE, **_ON_CONTROLLERS, **_OTHERS}
 
 
 def known_effects() -> Mapping[str, type[Effect]]:
-    """Return the effects that measured data may show, by name: traffic, signals, detectors."""
+    """Return the effects that a diagnosis can find, by name: traffic, signals, detectors."""
     return dict(_MEASURABLE)
 
 
@@ -84,10 +84,10 @@ def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
 
     Args:
         record: ``{"name": ..., parameter: value, ...}``.
-        where: Where it stands, for errors.
+        where: Text for errors that names the place of the record.
 
     Raises:
-        UnknownNameError: No effect of this name, or no parameter of this name.
+        UnknownNameError: The effect or a parameter does not exist.
         OptionError: A parameter is missing or outside its range.
     """
     values = dict(record)
@@ -107,11 +107,11 @@ def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
 
 
 def effect_from_text(text: str) -> Effect:
-    """Return the effect ``name=value,value,...``, as `str` of an effect writes it.
+    """Return the effect of a text ``name=value,value,...``, the form that `str` of an effect gives.
 
     Raises:
-        UnknownNameError: No effect of this name.
-        OptionError: Too many or too few values, or an impossible one.
+        UnknownNameError: The effect does not exist.
+        OptionError: There are too many or too few values, or an impossible one.
     """
     name, _, values = (part.strip() for part in text.partition("="))
     name = name.lower()
@@ -142,9 +142,9 @@ def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
 
 
 def load_scenario(name: str | Path | Scenario) -> Scenario:
-    """Load a scenario and apply the effects its own file lists (see `read_scenario`).
+    """Load a scenario and apply the effects listed in its file (see `read_scenario`).
 
-    Those on controllers stay listed in its settings, for the environment to keep.
+    Effects on controllers stay listed in its settings, because the environment applies them.
     """
     scenario = name if isinstance(name, Scenario) else read_scenario(name)
     where = f" in scenario {scenario.id!r}"
@@ -156,7 +156,7 @@ def load_scenario(name: str | Path | Scenario) -> Scenario:
 def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:
     """Return the effects on detectors that were applied to a scenario.
 
-    They leave its files as they are, so that the code that measures it has to ask for them.
+    They do not change its files, so code that measures the scenario has to apply them.
     """
     names = (text.partition("=")[0] for text in scenario.applied)
     return tuple(
