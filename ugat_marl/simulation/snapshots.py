@@ -54,11 +54,11 @@ class Trips:
     """All vehicles due in an episode, finished or not, as SUMO reports them.
 
     Attributes:
-        travel_time_s: From the scheduled departure to the arrival, or to the end of the episode,
-            ``(vehicles,)``; waiting outside the network counts.
+        travel_time_s: Time from the scheduled departure to the arrival, or to the end of the
+            episode, ``(vehicles,)``. Waiting outside the network counts.
         delay_s: Time loss inside the network plus departure delay, ``(vehicles,)``.
-        finished: Whether the vehicle arrived, bool ``(vehicles,)``.
-        entered: Whether the vehicle got into the network, bool ``(vehicles,)``.
+        finished: True if the vehicle arrived, bool ``(vehicles,)``.
+        entered: True if the vehicle entered the network, bool ``(vehicles,)``.
         co2_g: CO2 emitted by the vehicle, g, ``(vehicles,)``. This array and the next two are empty
             unless the simulator was started with `persons`.
         persons: Persons in the vehicle, ``(vehicles,)``.
