@@ -1,1 +1,1 @@
-"""Environments in the form a library wants; each module imports one library."""
+"""Environments in the form of other libraries; each module imports one library."""

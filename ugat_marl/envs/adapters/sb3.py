@@ -1,13 +1,13 @@
 """Parallel environments as a `VecEnv` of Stable-Baselines3: one network for all agents.
 
     from stable_baselines3 import PPO
-    from ugat_marl.adapters.sb3 import AgentsVecEnv
-    from ugat_marl.wrappers import agent_indicator, pad
+    from ugat_marl.envs.adapters.sb3 import AgentsVecEnv
+    from ugat_marl.envs.wrappers import agent_indicator, pad
 
     env = AgentsVecEnv([agent_indicator(pad(ugat_marl.parallel_env("grid4x4-v1")))])
     PPO("MlpPolicy", env, seed=1).learn(100_000)
 
-In contrast to SuperSuit's it seeds, carries masks, closes, and says which ends are truncations.
+Unlike SuperSuit's version, it supports seeds and masks, can be closed, and marks truncations.
 """
 # pyright: reportMissingImports=false
 
@@ -28,22 +28,22 @@ Step = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[d
 
 
 class AgentsVecEnv(VecEnv):
-    """Each agent of each environment is an environment of its own, in the order of both.
+    """`VecEnv` with one row for each agent of each environment, in the order of both.
 
-    An episode that ends begins anew, as Stable-Baselines3 expects. What was seen at its end is in
-    the infos, as ``terminal_observation``, and with it ``TimeLimit.truncated``: there the library
-    goes on with the value of that observation. `action_masks` is what sb3-contrib's `MaskablePPO`
-    asks for.
+    After the end of an episode the next one begins at once, as Stable-Baselines3 expects. The infos
+    hold the last observation as ``terminal_observation``, and ``TimeLimit.truncated``; the library
+    then bootstraps with the value of this observation. sb3-contrib's `MaskablePPO` calls
+    `action_masks`.
 
     Args:
         envs: Environments whose agents all have the same spaces, and stay to the end of the
-            episode; `ugat_marl.envs.wrappers.pad` makes spaces the same.
-        masks_in_observation: Append its action mask to each observation, for policies that know no
-            other way to see it (`ugat_marl.envs.wrappers.appended_mask` does the same for one
-            environment).
+            episode; `ugat_marl.envs.wrappers.pad` makes spaces equal.
+        masks_in_observation: True to append the action mask to each observation, for policies
+            without another way to see it (`ugat_marl.envs.wrappers.appended_mask` does the same for
+            one environment).
 
     Raises:
-        OptionError: No agents, or unequal spaces.
+        OptionError: There are no agents, or their spaces are unequal.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class AgentsVecEnv(VecEnv):
         super().__init__(len(self.rows), box, actions)
 
     def reset(self) -> NDArray[np.float32]:
-        """Begin an episode in every environment, with the seeds that `seed` has left."""
+        """Begin an episode in every environment, with the seeds set by `seed`."""
         seen = [
             self._begin(k, self._seeds[int(self._starts[k])])  # its first agent's
             for k in range(len(self.envs))
@@ -75,7 +75,7 @@ class AgentsVecEnv(VecEnv):
         return np.concatenate(seen)
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Seed the next reset: ``seed + k`` for environment `k`, whatever its number of agents."""
+        """Set the seeds of the next reset: ``seed + k`` for environment `k`."""
         if seed is None:
             return super().seed(None)
         for k in range(len(self.envs)):
@@ -88,7 +88,7 @@ class AgentsVecEnv(VecEnv):
         self._chosen = np.asarray(actions).reshape(-1)
 
     def step_wait(self) -> Step:
-        """Step every environment once, and begin the next episode of those that are over."""
+        """Step every environment once, and begin the next episodes of ended ones."""
         seen, infos = list[NDArray[np.float32]](), list[dict[str, Any]]()
         rewards = np.zeros(len(self.rows), np.float32)
         over = np.zeros(len(self.rows), np.bool_)
@@ -114,16 +114,16 @@ class AgentsVecEnv(VecEnv):
         return np.concatenate(seen), rewards, over, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return the allowed actions, ``(agents, actions)``; all where the info has no mask."""
+        """Return the allowed actions, ``(agents, actions)``; all if the info has no mask."""
         return self._masks.copy()
 
     def close(self) -> None:
-        """Close every environment; may be called again."""
+        """Close every environment; a second call does nothing."""
         for env in self.envs:
             env.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute, for each agent that of its environment."""
+        """Return an attribute of the environment of each agent."""
         if attr_name == "action_masks":
             return [lambda row=row: self._masks[row] for row in self._picked(indices)]
         return [getattr(self.rows[row][0], attr_name) for row in self._picked(indices)]
@@ -138,7 +138,7 @@ class AgentsVecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method, once for each environment that these agents are in.
 
-        ``action_masks`` is one mask for each agent instead.
+        ``action_masks`` returns one mask for each agent instead.
         """
         if method_name == "action_masks":
             return [self._masks[row].copy() for row in self._picked(indices)]
@@ -146,11 +146,11 @@ class AgentsVecEnv(VecEnv):
         return [getattr(env, method_name)(*method_args, **method_kwargs) for env in environments]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Return False for every agent: none is inside one of Gymnasium's wrappers."""
+        """Return False for every agent, because Gymnasium's wrappers are not supported."""
         return [False for _ in self._picked(indices)]
 
     def get_images(self) -> Sequence[Any]:
-        """A picture of each environment."""
+        """Return a picture of each environment."""
         return [env.render() for env in self.envs]
 
     def _begin(self, k: int, seed: int | None) -> NDArray[np.float32]:

@@ -1,6 +1,6 @@
 """Simulations in worker processes as a `VecEnv` of Stable-Baselines3.
 
-from ugat_marl.adapters.sb3_vector import SimulationsVecEnv
+from ugat_marl.envs.adapters.sb3_vector import SimulationsVecEnv
 
 wraps = ["ugat_marl.envs.wrappers:pad", "ugat_marl.envs.wrappers:agent_indicator"]
 env = SimulationsVecEnv(ugat_marl.vector_env("grid4x4-v1", 4, wrap=wraps))
@@ -26,16 +26,16 @@ _ELSEWHERE = (
 
 
 class SimulationsVecEnv(AgentsVecEnv):
-    """Each agent of each simulation is an environment of its own; the simulations step together.
+    """`VecEnv` with one row for each agent of each simulation; the simulations step together.
 
     Args:
-        simulations: The environments; their agents have the same spaces
-            (``wrap="ugat_marl.envs.wrappers:pad"``), their episodes begin anew in the step that
-            ends them, which is the only convention Stable-Baselines3 knows.
-        masks_in_observation: As for `AgentsVecEnv`.
+        simulations: The environments. Their agents must have equal spaces
+            (``wrap="ugat_marl.envs.wrappers:pad"``), and their mode must be ``"same-step"``, the
+            only one that Stable-Baselines3 supports.
+        masks_in_observation: True to append masks to observations, as for `AgentsVecEnv`.
 
     Raises:
-        OptionError: Unequal spaces, or another convention.
+        OptionError: The spaces are unequal, or the vector has another mode.
     """
 
     def __init__(self, simulations: VectorEnv, *, masks_in_observation: bool = False) -> None:
@@ -49,7 +49,7 @@ class SimulationsVecEnv(AgentsVecEnv):
         )
 
     def reset(self) -> NDArray[np.float32]:
-        """Begin an episode in every simulation, with the seeds that `seed` has left."""
+        """Begin an episode in every simulation, with the seeds set by `seed`."""
         seeds = [self._seeds[int(start)] for start in self._starts[:-1]]
         given = [seed for seed in seeds if seed is not None]
         batch = self.simulations.reset(given if len(given) == len(seeds) else None)
@@ -63,7 +63,7 @@ class SimulationsVecEnv(AgentsVecEnv):
         self.simulations.step_async(np.asarray(actions).reshape(self.simulations.n, -1))
 
     def step_wait(self) -> Step:
-        """Wait for it."""
+        """Wait for the step of all simulations."""
         batch = self.simulations.step_wait()
         infos, agents = self._infos(batch), len(self.simulations.agents)
         for ended in batch.ended:
@@ -74,32 +74,32 @@ class SimulationsVecEnv(AgentsVecEnv):
         return self._seen(batch), rewards, np.repeat(batch.truncated, agents), infos
 
     def close(self) -> None:
-        """End the simulations; may be called again."""
+        """End the simulations; a second call does nothing."""
         self.simulations.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """``action_masks``, ``render_mode`` or ``metadata`` of each agent's environment.
+        """Return ``action_masks``, ``render_mode`` or ``metadata`` of each agent's environment.
 
         Raises:
-            AttributeError: Another one; the environments are in processes of their own.
+            AttributeError: The attribute is another one, which is in another process.
         """
         if attr_name not in ("action_masks", "render_mode", "metadata"):
             raise AttributeError(f"{attr_name}: {_ELSEWHERE}")
         return super().get_attr(attr_name, indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: the environments are in processes of their own."""
+        """Refuse, because the environments run in other processes."""
         raise OptionError(f"set_attr({attr_name!r}): {_ELSEWHERE}")
 
     def set_options(self, options: Any = None) -> None:
-        """Refuse: a reset of simulations takes seeds only."""
+        """Refuse options, because a reset of simulations takes seeds only."""
         if options:
             raise OptionError(f"set_options({options!r}): a reset of simulations takes seeds only")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """``action_masks``: one mask for each agent; others are refused."""
+        """Return one mask for each agent for ``action_masks``; other methods are refused."""
         if method_name != "action_masks":
             raise OptionError(f"env_method({method_name!r}): {_ELSEWHERE}")
         return super().env_method(method_name, indices=indices)

@@ -1,8 +1,8 @@
 """Memory that a user's process and its simulations share.
 
 The first axis is the environment, the second the agent, in the order of `possible_agents`. Unequal
-agents are padded at the end: zeros behind short observations, zeros in the masks of phases an agent
-does not have. The memory has no name, so that nothing is left of it however the processes end.
+agents are padded at the end: with zeros behind short observations, and zeros in masks for phases
+that an agent does not have. The memory has no name, so it vanishes with the processes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _ALIGNED = 64
-"""Bytes; no array begins in the middle of another one's cache line."""
+"""Alignment in bytes, so that no two arrays share a cache line."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Shape:
 
     Attributes:
         environments: Number of environments.
-        agents: Number of agents of each.
+        agents: Number of agents of each environment.
         width: Length of the longest observation.
-        actions: Number of phases of the agent with most of them.
+        actions: Largest number of phases of an agent.
     """
 
     environments: int
@@ -39,13 +39,13 @@ class Shape:
 
 @dataclass(frozen=True)
 class Arrays:
-    """Arrays that the two sides read and write.
+    """Arrays that the user's process and the workers read and write.
 
     Attributes:
         observations: float32 ``(environments, agents, width)``.
         masks: int8 ``(environments, agents, actions)``; 1 where a phase may be chosen.
         rewards: float64 ``(environments, agents)``.
-        actions: int64 ``(environments, agents)``; what the user asks for.
+        actions: int64 ``(environments, agents)``; the phases that the user asks for.
         executed: int64 ``(environments, agents)``; the phases that were shown.
     """
 
@@ -57,7 +57,7 @@ class Arrays:
 
     @classmethod
     def over(cls, descriptor: int, shape: Shape) -> Arrays:
-        """The arrays in an open file that `shared_memory` made; it may be closed afterwards."""
+        """Return the arrays in an open file of `shared_memory`; it may be closed afterwards."""
         memory = mmap.mmap(descriptor, _size(shape))
         arrays: dict[str, NDArray[Any]] = {}
         offset = 0
@@ -69,12 +69,12 @@ class Arrays:
         return cls(**arrays)
 
     def part(self, where: slice | int) -> Arrays:
-        """Some of the environments, or one without the first axis, in the same memory."""
+        """Return some environments, or one without the first axis, in the same memory."""
         return Arrays(*(getattr(self, field.name)[where] for field in fields(self)))
 
 
 def shared_memory(shape: Shape) -> int:
-    """The descriptor of an open file without a name, of the size the arrays need."""
+    """Return the descriptor of an open file without a name, of the size of the arrays."""
     if hasattr(os, "memfd_create"):
         descriptor = os.memfd_create("ugat_marl")
     else:
@@ -96,7 +96,7 @@ def _layout(shape: Shape) -> dict[str, tuple[type[np.generic], tuple[int, ...]]]
 
 
 def _room(dtype: type[np.generic], sizes: tuple[int, ...]) -> int:
-    """Bytes up to the next array."""
+    """Return the number of bytes up to the next array."""
     size = np.dtype(dtype).itemsize * int(np.prod(sizes))
     return -(-size // _ALIGNED) * _ALIGNED
 

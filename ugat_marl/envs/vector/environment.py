@@ -33,9 +33,13 @@ from ugat_marl.errors import ActionError, EpisodeError, OptionError, UgatMarlErr
 from ugat_marl.scenarios import Scenario
 
 Autoreset = Literal["same-step", "next-step", "disabled"]
-"""Gymnasium's modes. In ``"same-step"`` the step that ends an episode returns the first observation
-of the next one, and the last one in `Batch.ended`; in ``"next-step"`` the next episode begins with
-the step after, whose actions are ignored; in ``"disabled"`` the user calls `VectorEnv.reset`."""
+"""Gymnasium's modes for the end of an episode.
+
+- ``"same-step"``: the step that ends an episode returns the first observation of the next one; the
+  last one is in `Batch.ended`.
+- ``"next-step"``: the following step begins the next episode and ignores its actions.
+- ``"disabled"``: the user calls `VectorEnv.reset`.
+"""
 
 
 @dataclass(frozen=True)
@@ -43,11 +47,11 @@ class Ended:
     """An episode that has ended in a step.
 
     Attributes:
-        environment: Which environment's, counted within the object that was stepped.
-        episode: Its seed and domain.
-        observations: float32 ``(agents, width)``: the last ones.
-        masks: int8 ``(agents, actions)``: the last ones.
-        scores: Its measures; None if a wrapper hides them.
+        environment: Number of the environment in the stepped vector.
+        episode: Number, seed and domain of the episode.
+        observations: Last observations, float32 ``(agents, width)``.
+        masks: Last masks, int8 ``(agents, actions)``.
+        scores: Measures of the episode; None if a wrapper hides them.
     """
 
     environment: int
@@ -59,18 +63,18 @@ class Ended:
 
 @dataclass(frozen=True)
 class Batch:
-    """Result of a reset or step of all environments; the arrays are the caller's own.
+    """Result of a reset or step of all environments; its arrays are copies.
 
-    Agents are in the order of `VectorEnv.agents`, unequal ones padded at the end: observations with
-    zeros, and phases an agent does not have are 0 in its mask.
+    Agents are in the order of `VectorEnv.agents`. Observations are padded with zeros at the end;
+    masks are 0 for phases that an agent does not have.
 
     Attributes:
         observations: float32 ``(environments, agents, width)``.
         masks: int8 ``(environments, agents, actions)``; 1 where a phase may be chosen.
         rewards: float64 ``(environments, agents)``; 0 after a reset.
         executed: int64 ``(environments, agents)``; the phases that were shown.
-        truncated: bool ``(environments,)``; episodes end in no other way.
-        ended: One for each that is.
+        truncated: bool ``(environments,)``; true where an episode has ended.
+        ended: Ended episodes of this step.
     """
 
     observations: NDArray[np.float32]
@@ -82,24 +86,24 @@ class Batch:
 
 
 class VectorEnv:
-    """Environments in processes of their own, stepped together; see `vector_env`.
+    """Environments in their own processes, stepped together; see `vector_env`.
 
     Args:
         environments: The environments.
-        arrays: Their memory.
+        arrays: Their shared memory.
         plain: An environment with the same spaces, which is never started.
-        domains: The domain of an episode.
-        autoreset: What happens when one ends.
+        domains: Function that gives the domain of an episode.
+        autoreset: Mode for the end of an episode.
         shared: Their memory and host, closed with them; None for a half of another vector.
-        whole: The vector they are a half of, which is kept alive.
+        whole: Vector of which this is a half; it is kept alive.
 
     Attributes:
         n: Number of environments.
-        agents: The agents of each.
-        agent_set: Their names and sizes.
-        observation_spaces: Agent to its space, without padding.
-        action_spaces: The same for actions.
-        autoreset: What happens when an episode ends.
+        agents: Names of the agents of each environment.
+        agent_set: Names of the agents, and sizes of their spaces.
+        observation_spaces: Agent to its observation space, without padding.
+        action_spaces: Agent to its action space, without padding.
+        autoreset: Mode for the end of an episode.
         plain: An environment with the same spaces, which is never started.
     """
 
@@ -131,13 +135,13 @@ class VectorEnv:
 
     @property
     def episodes(self) -> tuple[Episode | None, ...]:
-        """The episode each environment is in; None before the first reset."""
+        """Current episode of each environment; None before the first reset."""
         return tuple(env.episode for env in self._environments)
 
     def halves(self) -> tuple[VectorEnv, VectorEnv]:
-        """Two vectors of these environments: one is stepped while the other one's answer is used.
+        """Return two vectors of these environments, to step one while the results of one are used.
 
-        Closing the whole closes both, closing a half ends its simulations only.
+        Closing the whole closes both. Closing a half ends only its simulations.
 
         Raises:
             OptionError: There is one environment only.
@@ -163,15 +167,15 @@ class VectorEnv:
     def reset(
         self, seed: int | Sequence[int] | None = None, where: ArrayLike | None = None
     ) -> Batch:
-        """Begin episodes; those under way are given up.
+        """Begin episodes; unfinished ones are dropped.
 
         Args:
-            seed: One for each environment; a single number stands for itself, the next one, .... A
-                later reset without a seed begins the next episodes, whose seeds follow from it.
+            seed: One seed for each environment, or one number k for seeds k, k + 1, .... A later
+                reset without a seed begins the next episodes; their seeds follow from the last.
             where: Numbers of the environments to reset, or a mask of them; all if None.
 
         Raises:
-            SimulatorError: SUMO refuses; its own words are in the message.
+            SimulatorError: SUMO failed; the message contains its output.
         """
         chosen = self._chosen(where)
         seeds = self._seeds(seed, chosen)
@@ -189,15 +193,16 @@ class VectorEnv:
             actions: Integers ``(environments, agents)``.
 
         Raises:
-            ActionError: Of another shape, or a phase the agent does not have; nothing has happened.
-            EpisodeError: There is no episode under way.
+            ActionError: The shape is wrong, or an agent does not have the phase; nothing was
+                simulated.
+            EpisodeError: An environment has no running episode.
             SimulatorError: SUMO failed. The other environments have made their step.
         """
         self.step_async(actions)
         return self.step_wait()
 
     def step_async(self, actions: ArrayLike) -> None:
-        """Begin a step, which `step_wait` ends; the caller may do other work in between."""
+        """Begin a step, which `step_wait` ends; the caller may work in between."""
         requested = self._checked(actions)
         idle = [env.over and not env.pending for env in self._environments]
         anew = self.autoreset == "next-step" and self._environments[0].episode is not None
@@ -215,7 +220,7 @@ class VectorEnv:
         """Wait for the step that `step_async` began.
 
         Raises:
-            EpisodeError: It has begun none.
+            EpisodeError: No step has begun.
         """
         if not self._stepped and not self._begun:
             raise EpisodeError("step_wait() without step_async()")
@@ -235,7 +240,7 @@ class VectorEnv:
         return self._batch(truncated, ended)
 
     def close(self) -> None:
-        """End all simulations and their processes and remove their files; may be called again."""
+        """End all simulations and processes and remove their files; a second call does nothing."""
         for env in self._environments:
             env.close()
         shared, self._shared = self._shared, None
@@ -318,7 +323,7 @@ class VectorEnv:
         self._answers(chosen)
 
     def _answers(self, chosen: list[int]) -> dict[int, Answer]:
-        """Return all answers; raise an error when all have arrived."""
+        """Return all answers; an error is raised after all have arrived."""
         answers: dict[int, Answer] = {}
         failed: list[UgatMarlError] = []
         for index in chosen:
@@ -364,26 +369,25 @@ def vector_env(
     wrap: Wraps = None,
     **options: Any,
 ) -> VectorEnv:
-    """Simulations in worker processes, stepped together, with their arrays in shared memory.
+    """Make simulations in worker processes, stepped together, with arrays in shared memory.
 
-    What an environment does depends on its seed, its domain and its actions alone: not on `n`, and
-    not on whether its process was killed meanwhile, which is replaced and taken to where it was.
+    An environment depends only on its seed, its domain and its actions, and not on `n`. A process
+    that dies is replaced; the new one repeats the actions of the episode.
 
     Args:
-        scenario: As for `ugat_marl.parallel_env`.
-        n: Number of environments; one simulation and one process each.
+        scenario: Scenario, as for `ugat_marl.parallel_env`.
+        n: Number of environments; each has one simulation in one process.
         domains: One domain for all; a list of `n`; or a function ``(environment, episode) ->
-            domain`` that is asked at each reset, such as `ugat_marl.envs.vector.spec.in_turn`
-            makes.
-        autoreset: What happens when an episode ends, see `Autoreset`.
-        wrap: A function that is put around each environment, one that can be imported, or
-            its ``"module:name"``, such as ``"ugat_marl.envs.wrappers:agent_indicator"``; or a list
-            of them.
-        **options: See `EnvOptions`; all but ``simulator`` and ``render_mode``.
+            domain`` that is called at each reset, such as one of
+            `ugat_marl.envs.vector.spec.in_turn`.
+        autoreset: Mode for the end of an episode, see `Autoreset`.
+        wrap: Wrapper of each environment: an importable function, its ``"module:name"``, such as
+            ``"ugat_marl.envs.wrappers:agent_indicator"``, or a list of them.
+        **options: Options of `EnvOptions`, except ``simulator`` and ``render_mode``.
 
     Raises:
-        UnknownNameError: No such scenario, domain, option or mode.
-        OptionError: An impossible number, or a function that a worker cannot import.
+        UnknownNameError: A scenario, domain, option or mode does not exist.
+        OptionError: A number is impossible, or a worker cannot import a function.
         ScenarioError: The scenario's files are missing or contradict each other.
     """
     count: Any = n

@@ -18,13 +18,13 @@ _MODES = {"same-step": "SAME_STEP", "next-step": "NEXT_STEP", "disabled": "DISAB
 
 
 class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
-    """One sub-environment for each intersection of each simulation: parameters are shared.
+    """One sub-environment for each intersection of each simulation, for shared parameters.
 
     Sub-environment ``i * agents + j`` is agent ``j`` of simulation ``i``. All have equal, padded
     spaces. Infos hold ``action_mask`` ``(num_envs, actions)`` and ``executed_action``
-    ``(num_envs,)``, and where episodes ended in a step that begins the next ones ``final_obs``
-    and ``final_info``, as Gymnasium's own do. An action that an intersection does not have is an
-    `ActionError`, never another action.
+    ``(num_envs,)``. In mode ``"same-step"``, the infos of ended episodes also hold ``final_obs``
+    and ``final_info``, as those of Gymnasium do. An action that an intersection does not have
+    raises an `ActionError`.
 
     Args:
         env: The simulations; closing this object closes them.
@@ -49,9 +49,9 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         """Begin episodes.
 
         Args:
-            seed: As for `VectorEnv.reset`: one for each simulation.
-            options: ``{"reset_mask": bool (num_envs,)}`` resets some simulations only; all
-                intersections of one, or none of them.
+            seed: One seed for each simulation, as for `VectorEnv.reset`.
+            options: ``{"reset_mask": bool (num_envs,)}`` resets some simulations only. The mask
+                must be equal for all intersections of a simulation.
         """
         mask = (options or {}).get("reset_mask")
         where = None if mask is None else self._simulations(np.asarray(mask))
@@ -72,7 +72,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         return self.step_wait()
 
     def step_async(self, actions: Any) -> None:
-        """Begin a step; `step_wait` ends it, and learning may go on meanwhile."""
+        """Begin a step, which `step_wait` ends; a learner may work in between."""
         requested = np.asarray(actions)
         if requested.shape != (self.num_envs,):
             raise ActionError(f"actions have shape {requested.shape}; allowed: ({self.num_envs},)")
@@ -113,7 +113,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         }
 
     def _final(self, batch: Batch, truncated: NDArray[np.bool_]) -> dict[str, Any]:
-        """Gymnasium's convention: an array of objects, None where no episode has ended."""
+        """Return final observations and infos in Gymnasium's form, None for running episodes."""
         observations = np.full(self.num_envs, None, dtype=object)
         masks = np.zeros((self.num_envs, self.env.agent_set.most_actions), dtype=np.int8)
         travel_time_s = np.zeros(self.num_envs)

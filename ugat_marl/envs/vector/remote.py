@@ -1,7 +1,7 @@
-"""Environments of a vector, as the user's process sees them: each in a process of its own.
+"""Environments of a vector in the user's process; each runs in its own worker process.
 
-An episode is its domain, its seed and its actions. A process that dies is therefore replaced by one
-that is given the three, and the user does not notice.
+Domain, seed and actions determine an episode. A process that dies is therefore replaced by one that
+repeats them, without a difference for the user.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from ugat_marl.simulation import ChannelClosed, Host, Worker
 SERVICE = "ugat_marl.envs.vector.worker:Episodes"
 
 DEATHS = 3
-"""Times a process may die at the same decision before the user is told."""
+"""Number of replaced processes at one decision after which an error is raised."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode, which `parallel_env` plays again: ``reset(seed=seed)`` in the domain.
+    """An episode; ``reset(seed=seed)`` of `parallel_env` in the domain repeats it.
 
     Attributes:
-        number: Number of episodes the environment has begun before, since it was given a seed.
-        seed: Of traffic and simulation.
+        number: Number of earlier episodes of the environment since it was given a seed.
+        seed: Seed of traffic and simulation.
         domain: Name of the domain.
     """
 
@@ -52,11 +52,11 @@ class Episode:
 
 @dataclass(frozen=True)
 class Answer:
-    """Answer of a process to a decision; the rest is in the arrays.
+    """Answer of a process to a decision; observations and rewards are in the arrays.
 
     Attributes:
         over: True if the episode has ended.
-        scores: Its measures, if so.
+        scores: Measures of an ended episode, else None.
         warnings: Texts of warnings.
     """
 
@@ -66,7 +66,7 @@ class Answer:
 
 
 def episode_seed(root: int, number: int) -> int:
-    """Return the seed of an environment's episode; the first one has the seed the user gave."""
+    """Return the seed of an environment's episode; the first one has the user's seed."""
     return root if number == 0 else derive_seed(root, "vector", number)
 
 
@@ -76,10 +76,10 @@ class Shared:
     Nothing is started or written before the first episode.
 
     Args:
-        scenario: The scenario of all of them.
-        options: Their options.
-        wraps: Their wrappers.
-        agents: Their agents.
+        scenario: Scenario of the environments.
+        options: Options of the environments.
+        wraps: Wrappers of the environments.
+        agents: Agents of each environment.
         n: Number of environments.
     """
 
@@ -124,7 +124,7 @@ class Shared:
         return self.host.start(order, (self._memory,))
 
     def close(self) -> None:
-        """Give everything up, once the processes of all episodes have ended."""
+        """Release host, memory and folder, after the processes of all episodes have ended."""
         self.host.tell({"forget": str(self._folder)})
         self.host.close()
         memory, self._memory = self._memory, -1
@@ -142,17 +142,17 @@ class Shared:
 
 
 class RemoteEnv:
-    """The episodes of one environment, each in a process of its own.
+    """Episodes of one environment, each in its own process.
 
     Args:
-        shared: The part it shares with the others.
-        index: Its number among them.
-        arrays: Its own part of the shared memory, without the first axis.
+        shared: Host, memory and folder of the vector.
+        index: Number of the environment.
+        arrays: Its part of the shared memory, without the first axis.
 
     Attributes:
-        episode: The episode it is in, or was in; None before the first.
-        over: True if there is none under way.
-        pending: True if an answer is awaited.
+        episode: Current or last episode; None before the first.
+        over: True if no episode is running.
+        pending: True while an answer is missing.
     """
 
     def __init__(self, shared: Shared, index: int, arrays: Arrays) -> None:
@@ -169,7 +169,7 @@ class RemoteEnv:
         self._worker: Worker | None = None
 
     def begin(self, seed: int | None, domain_of: DomainOf) -> None:
-        """Ask for an episode: the first one under a seed, or the next one under the last seed."""
+        """Ask for an episode: the first one of a new seed, or the next one of the last seed."""
         if seed is not None or self._root is None:
             self._root = seed if seed is not None else int(np.random.default_rng().integers(2**31))
             number = 0
@@ -187,16 +187,16 @@ class RemoteEnv:
         self._history.append(actions)
         self.arrays.actions[:] = actions
         self.pending = True
-        with contextlib.suppress(ChannelClosed):  # it is dead; `answer` will notice
+        with contextlib.suppress(ChannelClosed):  # `answer` replaces a dead process
             self._worker.ask("step")
 
     def answer(self) -> Answer:
         """Wait for the answer; a process that died is replaced.
 
         Raises:
-            SimulatorError: SUMO failed; its own words are in the message.
-            SimulatorCrashed: The processes die one after the other.
-            WorkerError: The reward or the wrapper raised something.
+            SimulatorError: SUMO failed; the message contains its output.
+            SimulatorCrashed: Several processes in a row died.
+            WorkerError: The reward or a wrapper raised an error.
         """
         while True:
             assert self._worker is not None
@@ -217,16 +217,16 @@ class RemoteEnv:
         return Answer(self.over, scores, tuple(reply["warnings"]))
 
     def close(self) -> None:
-        """End the episode and its process; may be called again."""
+        """End the episode and its process; a second call does nothing."""
         self.over, self.pending = True, False
         self._history = []
         self._end()
 
     def require_running(self) -> None:
-        """Refuse a decision without an episode, or while an answer is awaited.
+        """Refuse a decision without an episode, or while an answer is missing.
 
         Raises:
-            EpisodeError: It is so.
+            EpisodeError: No episode is running, or an answer is missing.
         """
         if self.pending:
             raise EpisodeError(
@@ -239,7 +239,7 @@ class RemoteEnv:
             )
 
     def _start(self) -> None:
-        """Start a process for the episode, which repeats the actions of the episode so far."""
+        """Start a process for the episode; it repeats the actions of the episode so far."""
         assert self.episode is not None
         self._end()
         shared = self._shared
@@ -276,6 +276,6 @@ class RemoteEnv:
 
 
 def _remove_tree(directory: Path, owner: int) -> None:
-    """Remove a folder; not in a forked child, however."""
+    """Remove a folder, but only in the process that made it; forked children must not."""
     if os.getpid() == owner:
         shutil.rmtree(directory, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Specification of the environments of a vector, in plain values that a process can be sent."""
+"""Specification of the environments of a vector, in plain values to send to a process."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import Scenario
 
 DomainOf = Callable[[int, int], Domain]
-"""The domain of an episode: ``(number of the environment, number of its episode) -> domain``."""
+"""Function ``(number of the environment, number of its episode) -> domain``."""
 
 Wrap = Callable[[Any], AnyParallelEnv] | str
-"""A function from environment to environment that can be imported, or its ``"module:name"``."""
+"""An importable function from environment to environment, or its ``"module:name"``."""
 
 Wraps = Wrap | Sequence[Wrap] | None
-"""One, some in the order in which they are put around the environment, or none."""
+"""One wrapper, a list of wrappers with the innermost first, or none."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Spec:
 
     Attributes:
         scenario: Folder of the scenario.
-        applied: The effects in it, some of which are in no file.
-        options: Options, see `EnvOptions`.
-        reward: ``"module:name"`` of the reward, if that is a function.
+        applied: Effects in the scenario; some of them are in no file.
+        options: Options of `EnvOptions`.
+        reward: ``"module:name"`` of a reward function; None for a named reward.
         wraps: ``"module:name"`` of each wrapper.
     """
 
@@ -52,7 +52,7 @@ class Spec:
 
     @classmethod
     def of(cls, scenario: Scenario, options: Mapping[str, Any], wraps: Wraps) -> Spec:
-        """The specification of an environment; its scenario is to be written somewhere."""
+        """Return the specification of an environment; its scenario still has to be written."""
         plain = dict(options)
         reward = plain.pop("reward") if callable(plain.get("reward")) else None
         return cls(
@@ -68,7 +68,7 @@ class Spec:
         return asdict(self)
 
     def environment(self, domain: Any) -> AnyParallelEnv:
-        """The environment in a domain as `sent` gives it, its simulator in this process."""
+        """Make the environment in a domain of `sent`, with the simulator in this process."""
         options = dict(self.options)
         if self.reward is not None:
             options["reward"] = imported(self.reward)
@@ -84,8 +84,8 @@ def checked_options(options: Mapping[str, Any]) -> None:
     """Refuse options that have no meaning in a vector.
 
     Raises:
-        UnknownNameError: No such option.
-        OptionError: One that says where to simulate, or asks for pictures.
+        UnknownNameError: An option does not exist.
+        OptionError: An option chooses the simulator or a render mode.
     """
     EnvOptions.of(options)
     for name in ("simulator", "render_mode"):
@@ -97,17 +97,17 @@ def checked_options(options: Mapping[str, Any]) -> None:
 
 
 def listed(wraps: Wraps) -> list[Wrap]:
-    """Wrappers as a list, the innermost first."""
+    """Return wrappers as a list, the innermost first."""
     if wraps is None:
         return []
     return [wraps] if isinstance(wraps, str) or callable(wraps) else list(wraps)
 
 
 def spelling(option: str, function: Callable[..., Any] | str) -> str:
-    """The ``"module:name"`` by which a worker imports a function.
+    """Return the ``"module:name"`` with which a worker imports a function.
 
     Raises:
-        OptionError: A worker would not find it.
+        OptionError: A worker cannot import the function.
     """
     if isinstance(function, str):
         imported(function)
@@ -123,10 +123,10 @@ def spelling(option: str, function: Callable[..., Any] | str) -> str:
 
 
 def imported(text: str) -> Any:
-    """The function ``"module:name"``.
+    """Return the function of a ``"module:name"``.
 
     Raises:
-        OptionError: There is none.
+        OptionError: The function does not exist.
     """
     module, _, name = text.partition(":")
     try:
@@ -142,7 +142,7 @@ def imported(text: str) -> Any:
 
 
 def sent(domain: Domain) -> Any:
-    """A domain as JSON holds it, to the last digit."""
+    """Return a domain in values for JSON, without loss of digits."""
     if not isinstance(domain, str):
         return [effect.record() for effect in parse_domain(domain)]
     path = scenario_of(domain)
@@ -150,23 +150,23 @@ def sent(domain: Domain) -> Any:
 
 
 def received(domain: Any) -> Domain:
-    """Return the domain that `sent` was given."""
+    """Return the domain from the values of `sent`."""
     return domain if isinstance(domain, str) else [effect_from(record) for record in domain]
 
 
 def domain_chooser(
     scenario: Scenario, domains: Domain | Sequence[Domain] | DomainOf, n: int
 ) -> DomainOf:
-    """The domain of each episode.
+    """Return the function that gives the domain of each episode.
 
     Args:
-        scenario: Where.
+        scenario: Scenario of the environments.
         domains: One domain, a list of `n`, or a function.
         n: Number of environments.
 
     Raises:
-        OptionError: A list of another length.
-        UnknownNameError: No such domain.
+        OptionError: The list has another length.
+        UnknownNameError: A domain does not exist.
     """
     if callable(domains):
         return domains
@@ -191,16 +191,16 @@ def domain_chooser(
 
 
 def in_turn(domains: Sequence[Domain]) -> DomainOf:
-    """Domain randomisation over a list: each environment goes through it, from another start.
+    """Return a domain randomisation in which each environment goes through a list.
 
-    Episode ``k`` of environment ``i`` is in domain ``(i + k) mod len(domains)``, however many
-    environments there are.
+    Episode ``k`` of environment ``i`` is in domain ``(i + k) mod len(domains)``, for any number of
+    environments.
 
     Args:
-        domains: At least one.
+        domains: List of at least one domain.
 
     Raises:
-        OptionError: None are given.
+        OptionError: The list is empty.
     """
     listed = list(domains)
     if not listed:
@@ -209,10 +209,10 @@ def in_turn(domains: Sequence[Domain]) -> DomainOf:
 
 
 def _is_domain(item: Any) -> bool:
-    """Return True if an entry of a list is a domain of its own, not an effect of one domain."""
+    """Return True if an entry of a list is a whole domain, and not one effect of a domain."""
     return isinstance(item, str | list | tuple)
 
 
 def agents_of(env: AnyParallelEnv) -> dict[str, list[Any]]:
-    """The agents of an environment with their sizes, for JSON."""
+    """Return the agents of an environment with their sizes, for JSON."""
     return {name: list(values) for name, values in asdict(AgentSet.of(env)).items()}

@@ -1,8 +1,8 @@
-"""The service of a vector of environments: what runs in the processes of its host.
+"""Service of a vector of environments, in the worker processes of its host.
 
-The warm parent makes an environment that is asked for a second time once and for all, and a process
-is forked for every episode. That process resets the environment, repeats the actions of an episode
-that is taken up again, and then plays decision by decision, with its arrays in shared memory.
+The host forks a process for every episode. That process resets the environment, repeats the actions
+of a resumed episode, and then simulates decision by decision, with arrays in shared memory. The
+host's parent process keeps each environment from its second use on, so forks need not make it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from ugat_marl.errors import EpisodeError, ScenarioError
 from ugat_marl.simulation import Message
 
 _KEPT = 64
-"""Environments the parent keeps; one is remade if so many others were asked for since."""
+"""Number of environments that the parent keeps; the least recently used one is dropped."""
 
 
 class Episodes:
@@ -45,9 +45,9 @@ class Episodes:
         self._ready: AnyParallelEnv | None = None
 
     def prepare(self, order: dict[str, Any]) -> None:
-        """Have the environment ready if it is asked for again.
+        """Make the environment in the parent at its second use.
 
-        The first time the worker makes it, since only a worker can report an error.
+        At the first use the worker makes it, because only a worker can report an error.
         """
         sys.path += [entry for entry in order["path"] if entry not in sys.path]
         folder = order["folder"]
@@ -58,7 +58,7 @@ class Episodes:
         elif self._kept[key][1] is None:
             with contextlib.suppress(Exception):
                 self._kept[key] = folder, Spec(**order["spec"]).environment(order["domain"])
-                gc.freeze()  # collecting garbage in a child would copy every page
+                gc.freeze()  # garbage collection in a child would copy every page
         self._kept.move_to_end(key)
         while len(self._kept) > _KEPT:
             self._kept.popitem(last=False)
@@ -67,14 +67,14 @@ class Episodes:
     def open(
         self, order: dict[str, Any], descriptors: Sequence[int]
     ) -> Callable[[Message], Message]:
-        """Return what answers for one episode."""
+        """Return the function that answers the messages of one episode."""
         tempfile.tempdir = order["directory"]
         Path(order["directory"]).mkdir(mode=0o700, exist_ok=True)
         (memory,) = descriptors
         return _EpisodeServer(memory, self._ready, order).answer
 
     def told(self, order: dict[str, Any]) -> None:
-        """Forget what belongs to a vector that is closed."""
+        """Forget the environments of a closed vector."""
         folder = order["forget"]
         self._folders.discard(folder)
         for key in [key for key, (own, _) in self._kept.items() if own == folder]:
@@ -91,12 +91,12 @@ class Episodes:
 
 
 class _EpisodeServer:
-    """Play one episode.
+    """Server of one episode.
 
     Args:
         memory: Descriptor of the shared memory.
-        env: The environment, if the parent has it ready.
-        order: Its specification and domain, if not.
+        env: The environment, if the parent has made it.
+        order: Specification and domain, to make the environment otherwise.
     """
 
     def __init__(self, memory: int, env: AnyParallelEnv | None, order: dict[str, Any]) -> None:
@@ -107,7 +107,7 @@ class _EpisodeServer:
         warnings.showwarning = self._note
 
     def answer(self, question: Message) -> Message:
-        """Begin the episode, or play a decision; errors are the user's to see."""
+        """Begin the episode, or simulate a decision; errors are sent to the user."""
         if question.header["what"] == "begin":
             self._begin(question)
         else:
@@ -154,7 +154,7 @@ class _EpisodeServer:
         ]
 
     def _scores(self) -> dict[str, float] | None:
-        """Return the measures of an episode that has ended, if the environment has such."""
+        """Return the measures of an ended episode; None if the environment has none."""
         base: Any = self._running.unwrapped
         if self._running.agents or not hasattr(base, "scores"):
             return None
