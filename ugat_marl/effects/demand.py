@@ -1,7 +1,7 @@
-"""Effects on how many vehicles depart, and when.
+"""Effects on the number of vehicles that depart, and on their times.
 
-They work on single vehicles, trips and flows alike. Which vehicles are left out, or get a twin, is
-decided by a hash of their ids: those kept at a level of 0.8 contain those kept at 0.6.
+They change single vehicles, trips and flows. A hash of their ids decides which vehicles are left
+out or get a twin, so vehicles kept at a level of 0.6 are also kept at 0.8.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from ugat_marl.effects.places import places_of
 from ugat_marl.scenarios import Scenario, seconds_of
 
 TAGS = ("<vehicle", "<trip", "<flow")
-"""A document without these has no demand."""
+"""Texts of demand; a document without any of them has no demand."""
 
 TWIN_S = 15.0
-"""A twin departs up to this much before or after its original."""
+"""Largest time between the departures of a twin and its original, in s."""
 
 _FACTOR = Parameter("", 0.0, 20.0)
 _TIME = Parameter("s", 0.0, 1e7)
@@ -40,7 +40,7 @@ _TWIN = re.compile(rb"(\++)(?:\d+|surge|after)[\"']")
 
 @dataclass
 class Routes:
-    """The routes that stand apart from the vehicles that take them.
+    """Routes that are defined apart from their vehicles.
 
     Attributes:
         edges: Route to its edges.
@@ -78,12 +78,12 @@ class Routes:
         return found
 
     def edges_of(self, item: ET.Element) -> tuple[str, ...]:
-        """The edges of a vehicle or flow; none if SUMO has yet to find its way."""
+        """Return the edges of a vehicle or flow; none if SUMO still has to find its way."""
         own = item.find("route")
         return _edges(own) if own is not None else self.edges.get(item.get("route", ""), ())
 
     def origin(self, item: ET.Element) -> str | None:
-        """The edge a vehicle, trip or flow starts on; None if only SUMO knows."""
+        """Return the first edge of a vehicle, trip or flow; None if only SUMO knows it."""
         own = item.find("route")
         if own is not None:
             return next(iter(_edges(own)), None)
@@ -96,7 +96,7 @@ def _edges(item: ET.Element) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class DemandLevel(Effect):
-    """So many times as many vehicles start on an edge, or everywhere (``"*"``)."""
+    """The number of vehicles that start on an edge (``"*"``: all) is multiplied by a factor."""
 
     name: ClassVar[str] = "demand_level"
     on_departures: ClassVar[bool] = True
@@ -117,7 +117,7 @@ class DemandLevel(Effect):
 
 @dataclass(frozen=True)
 class DemandSurge(Effect):
-    """So many times as many vehicles start on an edge (``"*"``: all) between two times."""
+    """Between two times, the number of vehicles that start on an edge is multiplied by a factor."""
 
     name: ClassVar[str] = "demand_surge"
     on_departures: ClassVar[bool] = True
@@ -139,9 +139,9 @@ class DemandSurge(Effect):
 
 @dataclass(frozen=True)
 class DemandTiming(Effect):
-    """Vehicles that start on an edge (``"*"``: everywhere) depart so much later, in s.
+    """Vehicles that start on an edge (``"*"``: all) depart so many s later.
 
-    Those that would depart before the scenario begins are left out.
+    Vehicles that would depart before the scenario begins are left out.
     """
 
     name: ClassVar[str] = "demand_timing"
@@ -191,13 +191,13 @@ def replace_departing(
     """Replace the vehicles, trips and flows that start on `edge`.
 
     Args:
-        scenario: It does not change itself.
-        effect: What is noted as applied.
-        edge: Where they start, or ``"*"``.
-        becomes: What stands for each of them afterwards.
+        scenario: The scenario; it does not change itself.
+        effect: Effect to add to `applied`.
+        edge: Edge on which they start, or ``"*"``.
+        becomes: Function from an element to the elements that replace it.
 
     Raises:
-        UnknownNameError: No such edge.
+        UnknownNameError: The edge does not exist.
     """
     routes = Routes()
     if edge != EVERYWHERE:
@@ -225,8 +225,8 @@ def scaled_flow(item: ET.Element, factor: float, end_s: float) -> ET.Element | N
 
     Args:
         item: A ``<flow>``.
-        factor: What its rate is multiplied by.
-        end_s: When it ends if it does not say so.
+        factor: Factor of its rate.
+        end_s: End of the flow, in s, if it has none itself.
     """
     if factor <= 0:
         return None
@@ -253,7 +253,7 @@ def scaled_flow(item: ET.Element, factor: float, end_s: float) -> ET.Element | N
         share = float(text) * factor
         if share <= 1:
             flow.set("probability", f"{share:.12g}")
-        else:  # more than one in a second can only be said as a rate
+        else:  # a probability per second cannot exceed 1, so use a rate
             del flow.attrib["probability"]
             flow.set("period", f"exp({share:.12g})")
     flow.attrib.setdefault("end", seconds_text(end_s))
@@ -313,7 +313,7 @@ def _scaled(
 
 
 def _mark(scenario: Scenario) -> str:
-    """Return a mark for the ids of twins that no id has yet: demand may grow more than once."""
+    """Return a mark for the ids of twins that no id has yet, because demand may grow twice."""
     documents = (*scenario.additional, *scenario.routes)
     found = (_TWIN.finditer(window) for document in documents for window in windows(document))
     return "+" * (1 + max((len(match[1]) for matches in found for match in matches), default=0))

@@ -1,4 +1,4 @@
-"""Effects on what detectors report, and not on the traffic: clocks, misses, broken detectors."""
+"""Effects on the reports of detectors, not on traffic: clocks, misses, broken detectors."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _CLOCK = Text("traffic light", everywhere=True)
 
 
 def _both_sides(*levels: float) -> tuple[float, ...]:
-    """Return levels of both signs: the effect of a clock is not in proportion to its error."""
+    """Return levels of both signs, because the effect of a clock is not linear in its error."""
     return (*(-level for level in reversed(levels)), *levels)
 
 
 def owners(scenario: Scenario, detectors: Sequence[Detector]) -> dict[str, str]:
-    """Return the traffic light of every detector: the one at the end of its lane, or behind it.
+    """Return the traffic light of every detector.
 
-    An exit detector belongs to the light it stands behind, any other to the light it leads to.
-    Detectors at no traffic light are left out.
+    An exit detector belongs to the light at the start of its lane, any other to the light at the
+    end; if there is none, to the light at the other end. Detectors at no light are left out.
     """
     places = places_of(scenario)
     found: dict[str, str] = {}
@@ -41,12 +41,12 @@ def owners(scenario: Scenario, detectors: Sequence[Detector]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class DetectorEffect(Effect):
-    """An effect on what detectors report; the simulation itself is not touched."""
+    """Base of effects on the reports of detectors; the simulation does not change."""
 
     on_detectors: ClassVar[bool] = True
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Note the effect; the scenario runs as before.
+        """Add the effect to `applied`; the files do not change.
 
         Raises:
             UnknownNameError: No such traffic light.
@@ -61,7 +61,7 @@ class DetectorEffect(Effect):
 
 @dataclass(frozen=True)
 class Undercount(DetectorEffect):
-    """A detector, or every one (``"*"``), misses this share of the vehicles."""
+    """A detector (``"*"``: all) misses this share of the vehicles."""
 
     name: ClassVar[str] = "undercount"
     ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
@@ -87,7 +87,7 @@ class Undercount(DetectorEffect):
 
 @dataclass(frozen=True)
 class SignalClock(DetectorEffect):
-    """Stamps of the detectors at a traffic light are ahead of its signals' clock, in s."""
+    """Times of the detectors at a traffic light are so many s ahead of the clock of its signals."""
 
     name: ClassVar[str] = "signal_clock"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -60.0, 60.0)}
@@ -97,7 +97,7 @@ class SignalClock(DetectorEffect):
     seconds: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Shift all stamps of the detectors."""
+        """Shift all times of the detectors."""
         del detectors
         shift = self.seconds
         return _edited(period, _at(self.place, period, owner), lambda _, p: _moved(p, shift, shift))
@@ -105,7 +105,7 @@ class SignalClock(DetectorEffect):
 
 @dataclass(frozen=True)
 class ClockDrift(DetectorEffect):
-    """The clock of the detectors at a traffic light gains so much, in s per hour of a period."""
+    """The clock of the detectors at a traffic light gains so many s per hour of a period."""
 
     name: ClassVar[str] = "clock_drift"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds_per_hour": Parameter("s/h", -60.0, 60.0)}
@@ -115,7 +115,7 @@ class ClockDrift(DetectorEffect):
     seconds_per_hour: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Shift stamps in proportion to the time since the period began."""
+        """Shift times in proportion to the time since the period began."""
         del detectors
         rate = self.seconds_per_hour / 3600.0
 
@@ -129,7 +129,7 @@ class ClockDrift(DetectorEffect):
 
 @dataclass(frozen=True)
 class Stuck(DetectorEffect):
-    """A detector is on all the time between two times, whatever passes."""
+    """A detector is always on between two times."""
 
     name: ClassVar[str] = "stuck"
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
@@ -139,7 +139,7 @@ class Stuck(DetectorEffect):
     end_s: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Replace all passages of that time by a long one without speed."""
+        """Replace all passages between the times by one long passage without speed."""
         del owner
         names = _named(self, self.detector, detectors)
         begin, end = max(self.begin_s, period.begin_s), min(self.end_s, period.end_s)
@@ -172,7 +172,7 @@ class Dropout(DetectorEffect):
     end_s: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Leave out all passages of that time."""
+        """Leave out all passages between the times."""
         del owner
 
         def silent(name: str, passages: Passages) -> Passages:

@@ -24,7 +24,7 @@ from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Scenario
 
 _LEAST, _GREATEST = 0.2, 2.0
-"""SUMO cuts speedFactor there unless a type says otherwise."""
+"""SUMO's default limits of speedFactor."""
 
 _HEAVY = "heavy."
 _NORMAL = re.compile(r"\s*norm(c?)\(([^)]*)\)\s*")
@@ -34,7 +34,7 @@ _CALM = frozenset({"truck", "trailer", "coach", "delivery", "taxi"})
 
 @dataclass(frozen=True)
 class Speeds:
-    """The distribution of speedFactor in a vehicle type: normal, cut at both ends."""
+    """Distribution of speedFactor in a vehicle type: normal, cut at both ends."""
 
     mean: float
     deviation: float
@@ -42,7 +42,7 @@ class Speeds:
     greatest: float = _GREATEST
 
     def write(self, item: ET.Element) -> None:
-        """Put the distribution into a type, in SUMO's words."""
+        """Write the distribution into a type in SUMO's form."""
         values = (self.mean, self.deviation, self.least, self.greatest)
         item.attrib.pop("speedDev", None)
         item.set("speedFactor", f"normc({','.join(f'{value:.8g}' for value in values)})")
@@ -79,7 +79,7 @@ def default_deviation(item: ET.Element, general: float | None) -> float:
 
 @dataclass(frozen=True)
 class DesiredSpeed(Effect):
-    """Desired speeds are so many times as high: speedFactor of all types and of each vehicle."""
+    """Desired speeds are multiplied by a factor: speedFactor of all types and vehicles."""
 
     name: ClassVar[str] = "desired_speed"
     ranges: ClassVar[dict[str, Parameter]] = {"factor": Parameter("", 0.2, 3.0)}
@@ -109,7 +109,7 @@ class SpeedSpread(Effect):
     def apply(self, scenario: Scenario) -> Scenario:
         """Set the deviation of all types; single vehicles move away from their type's mean.
 
-        A vehicle of a type without spread is given one by a hash of its id.
+        The speed of a vehicle whose type has no spread follows from a hash of its id.
         """
 
         def typed(old: Speeds) -> Speeds:
@@ -130,8 +130,8 @@ class SpeedSpread(Effect):
 class HeavyShare(Effect):
     """This share of the passenger cars are trucks, 12 m long and slow to speed up.
 
-    A truck is in all else like the car it takes the place of, so that effects applied before
-    hold for it too. Effects on acceleration and deceleration applied after it set those of trucks.
+    A truck keeps all other attributes of the car it replaces, so effects applied before also hold
+    for it. Later effects on acceleration and deceleration also set those of trucks.
     """
 
     name: ClassVar[str] = "heavy_share"
@@ -179,7 +179,7 @@ class HeavyShare(Effect):
 
 
 def _types(scenario: Scenario) -> tuple[dict[str, ET.Element], dict[str, list[str]]]:
-    """All vehicle types, and the names of the types in each distribution."""
+    """Return all vehicle types, and the names of the types in each distribution."""
     types: dict[str, ET.Element] = {}
     members: dict[str, list[str]] = {}
     for document in (*scenario.additional, *scenario.routes):
@@ -194,7 +194,7 @@ def _types(scenario: Scenario) -> tuple[dict[str, ET.Element], dict[str, list[st
 
 
 def _cars(scenario: Scenario) -> dict[str, ET.Element]:
-    """Types and distributions of passenger cars; a distribution with the first of its cars."""
+    """Return types and distributions of cars; a distribution is given with its first car type."""
     types, members = _types(scenario)
     found = {
         name: item
@@ -247,7 +247,7 @@ def _with_speeds(
 
 
 def _speeds(scenario: Scenario, general: float | None) -> dict[str, Speeds]:
-    """Type to its speeds, and distribution of types to the mean of theirs."""
+    """Return the speeds of each type, and the mean speeds of each distribution of types."""
     types, members = _types(scenario)
     found = {name: Speeds.of(item, general) for name, item in types.items()}
     for distribution, names in members.items():

@@ -1,7 +1,7 @@
 """Effects on roads: lanes closed or blocked for some time, other speeds along an edge.
 
-A closed lane is a vehicle that stands on it. It has a short type and a file of its own, so that
-departures stay in order; effects on the demand pass it over.
+A vehicle that stands on a lane closes it. It has a short vehicle type and its own file, to keep
+departures in order. Effects on the demand ignore it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ugat_marl.seeding import numpy_generator
 _LENGTH_M = 5.0
 _LAST_M = 60.0
 _PARKED = "parking."
-"""How the ids of vehicles that park begin."""
+"""Beginning of the ids of vehicles that park."""
 _TIME = Parameter("s", 0.0, 1e7)
 
 
@@ -57,7 +57,7 @@ class LaneClosure(Effect):
 class Incident(Effect):
     """A lane before a signal, chosen by a hash of the network's lanes, is closed between two times.
 
-    A diagnosis looks for the `LaneClosure` it is.
+    A diagnosis looks for a `LaneClosure` instead.
     """
 
     name: ClassVar[str] = "incident"
@@ -92,7 +92,7 @@ class Incident(Effect):
 
 @dataclass(frozen=True)
 class Parking(Effect):
-    """Vehicles stop near the end of a lane, so many in an hour, for `dwell_s` each."""
+    """`per_hour` vehicles stop near the end of a lane each hour, for `dwell_s` s each."""
 
     name: ClassVar[str] = "parking"
     ranges: ClassVar[dict[str, Parameter]] = {
@@ -121,7 +121,7 @@ class Parking(Effect):
 
 @dataclass(frozen=True)
 class LocalSpeed(Effect):
-    """Traffic on an edge is so many times as fast: its limit, by a sign that all obey."""
+    """The speed limit of an edge is multiplied by a factor, by a sign that all obey."""
 
     name: ClassVar[str] = "local_speed"
     ranges: ClassVar[dict[str, Parameter]] = {"factor": Parameter("", 0.1, 3.0)}
@@ -130,7 +130,7 @@ class LocalSpeed(Effect):
     factor: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Add a sign with a variable speed to the edge's lanes, or change the one there is.
+        """Add a variable speed sign to the edge's lanes, or change the existing one.
 
         Raises:
             UnknownNameError: No such edge.
@@ -160,9 +160,9 @@ class LocalSpeed(Effect):
 
 
 def parked_at_other_times(scenario: Scenario, seed: int) -> Scenario:
-    """Return the day with the vehicles of `Parking` at other times, shifted around the clock.
+    """Return the day with all `Parking` vehicles shifted by one random time, modulo the duration.
 
-    Nobody parks at the same second every day, and a model that says so expects a pattern in time.
+    Vehicles do not park at the same second every day; a fixed time would be a false pattern.
     """
     begin, duration = scenario.settings.begin_s, scenario.settings.duration_s
     shift = numpy_generator(seed).uniform(0, duration)
@@ -182,15 +182,15 @@ def _with_blockers(
 ) -> Scenario:
     """Add vehicles that appear in the middle of a lane's last 60 m, stand there and vanish.
 
-    Farther away traffic goes round them and is in order again before the signal. Where a queue
-    stands at that moment, the vehicle appears as soon as there is room for it.
+    Farther from the signal, traffic would pass them and be in order again before it. If a queue
+    stands there, the vehicle appears as soon as there is room for it.
 
     Args:
-        scenario: It does not change itself.
-        effect: What is noted as applied.
-        lane: Where they stop.
-        departs: When they appear, in s, in order.
-        stand: How long each of them stands, in the words of ``<stop>``.
+        scenario: The scenario; it does not change itself.
+        effect: Effect to add to `applied`.
+        lane: Lane on which they stop.
+        departs: Times at which they appear, in s, in order.
+        stand: Attributes of ``<stop>`` that decide how long each of them stands.
     """
     places = places_of(scenario)
     places.check(effect.name, "lane", lane, places.lanes)
@@ -233,5 +233,5 @@ def _with_blockers(
 
 
 def _file(stem: str) -> str:
-    """A name for the file of a blocked lane, whose id may hold what files cannot."""
+    """Return a file name for a blocked lane, without characters that files cannot have."""
     return re.sub(r"[^\w.~#-]", "_", stem) + ".rou.xml"

@@ -1,8 +1,7 @@
-"""Effects on what controllers see: the observation gap. Traffic, rewards and scores stay the same.
+"""Effects on the counts that controllers see: the observation gap.
 
-A *count* is what a lane's detector reports: vehicles and halting vehicles on the lane, and with
-them their waiting time. Each effect makes a `Sensor` that changes counts on their way to the
-controllers.
+Traffic, rewards and scores stay the same. The *counts* of a lane are its vehicles, its halting
+vehicles and their waiting time. Each effect makes a `Sensor` that changes the counts.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ def _stream(seed: int, effect: type[ControllerEffect]) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class CountingNoise(ControllerEffect):
-    """Every count is off by a normal error of this standard deviation, as a share of the count."""
+    """Every count has a normal error; its standard deviation is this share of the count."""
 
     name: ClassVar[str] = "counting_noise"
     ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
     share: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
-        """Make detectors whose relative error is drawn for each lane and decision."""
+        """Make a sensor that draws a relative error for each lane and decision."""
         del network, decision_interval_s
         return _Noise(self.share)
 
@@ -55,14 +54,14 @@ class _Noise(Sensor):
 
 @dataclass(frozen=True)
 class CountingError(ControllerEffect):
-    """Every count is off by a normal error of so many vehicles, also on an empty lane."""
+    """Every count has a normal error of so many vehicles, also on an empty lane."""
 
     name: ClassVar[str] = "counting_error"
     ranges: ClassVar[dict[str, Parameter]] = {"vehicles": Parameter("veh", 0.0, 100.0)}
     vehicles: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
-        """Make detectors whose absolute error is drawn for each lane and decision."""
+        """Make a sensor that draws an absolute error for each lane and decision."""
         del network, decision_interval_s
         return _Error(self.vehicles)
 
@@ -92,18 +91,18 @@ class DetectorFailure(ControllerEffect):
     share: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> DeadDetectors:
-        """Make detectors some of which are dead."""
+        """Make a sensor with dead detectors."""
         del decision_interval_s
         return DeadDetectors(self.share, len(network.lane_table().ids))
 
 
 class DeadDetectors(Sensor):
-    """Detectors some of which report 0 for a whole episode.
+    """Sensor in which some detectors report 0 for a whole episode.
 
-    The ones that are dead at a low share are among those that are dead at a higher one.
+    For one seed, detectors that are dead at a low share are also dead at a higher share.
 
     Args:
-        share: Chance of each lane.
+        share: Chance of a dead detector, for each lane.
         lanes: Number of lanes.
 
     Attributes:
@@ -123,7 +122,7 @@ class DeadDetectors(Sensor):
         self._alive = (~self.dead).astype(np.float64)
 
     def read(self, reading: Reading) -> Reading:
-        """Pass on the readings of the others."""
+        """Return the reading with zeros at dead detectors."""
         left = reading.mean_left
         return replace(
             reading,
@@ -141,7 +140,7 @@ class DetectionZone(ControllerEffect):
     metres: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
-        """Make zones at the stop lines; lanes without one are not seen."""
+        """Make a sensor with zones at the stop lines; lanes without a stop line report 0."""
         del decision_interval_s
         return _Zone(self.metres, network)
 
@@ -162,14 +161,14 @@ class _Zone(Sensor):
 
 @dataclass(frozen=True)
 class ObservationDelay(ControllerEffect):
-    """Counts arrive so late, in whole decisions; the phase shown is known at once."""
+    """Counts arrive after so many s, rounded to decisions; phases are known at once."""
 
     name: ClassVar[str] = "observation_delay"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 600.0)}
     seconds: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
-        """Make a line on which counts are under way for some decisions."""
+        """Make a sensor that delays counts by whole decisions."""
         del network
         return _Late(round(self.seconds / decision_interval_s))
 
@@ -193,14 +192,14 @@ class _Late(Sensor):
 
 @dataclass(frozen=True)
 class LostReadings(ControllerEffect):
-    """A lane's reading is lost with this chance at each decision; the last one is seen again."""
+    """A lane's counts are lost with this chance at each decision; the last ones are seen again."""
 
     name: ClassVar[str] = "lost_readings"
     ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
     share: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
-        """Make a line on which readings are lost, lane by lane."""
+        """Make a sensor that loses counts, independently for each lane."""
         del network, decision_interval_s
         return _Lossy(self.share)
 
@@ -231,7 +230,7 @@ class QuantisedCounts(ControllerEffect):
     vehicles: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
-        """Make detectors that count in steps; halves are rounded up."""
+        """Make a sensor that rounds counts to the step; halves are rounded up."""
         del network, decision_interval_s
         return _Steps(self.vehicles)
 
@@ -252,4 +251,4 @@ OBSERVING: tuple[type[ControllerEffect], ...] = (
     CountingNoise, CountingError, DetectorFailure, DetectionZone, ObservationDelay, LostReadings,
     QuantisedCounts,
 )  # fmt: skip
-"""Effects on what controllers see."""
+"""Effects on the counts that controllers see."""

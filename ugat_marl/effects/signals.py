@@ -14,15 +14,15 @@ from ugat_marl.scenarios import LateGreen as Held
 from ugat_marl.scenarios import Scenario, seconds_of, validated, with_late_green
 
 QUEUE_START_S = 2.0
-"""What the mesoscopic model lacks at the start of a green: its queues move at once, all of them."""
+"""Start-up time in s that the mesoscopic model lacks, because its queues move at once."""
 
 
 @dataclass(frozen=True)
 class LateGreen(Effect):
-    """Every link that turns green stays red for so long first: start-up lost time, in s.
+    """Every link that turns green stays red for so many s first: start-up lost time.
 
-    Controllers are blind to it: what they command and observe is the green. It is a setting of the
-    scenario, `late_green_s`, which the environment keeps in what it sends to SUMO.
+    Controllers do not see it: they command and observe the full green. The scenario has it as
+    `late_green_s`, and the environment applies it to the signals it sends to SUMO.
     """
 
     name: ClassVar[str] = "late_green"
@@ -59,7 +59,7 @@ class LateGreen(Effect):
 
 @dataclass(frozen=True)
 class YellowTime(Effect):
-    """The yellow of all signals the agents control lasts so many s, in whole steps."""
+    """The yellow of controlled signals lasts so many s, in whole simulation steps."""
 
     name: ClassVar[str] = "yellow_time"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 20.0)}
@@ -72,7 +72,7 @@ class YellowTime(Effect):
 
 @dataclass(frozen=True)
 class AllRedTime(Effect):
-    """The all-red of all signals the agents control lasts so many s, in whole steps."""
+    """The all-red of controlled signals lasts so many s, in whole simulation steps."""
 
     name: ClassVar[str] = "all_red_time"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 20.0)}
@@ -98,11 +98,11 @@ def late_greens(scenario: Scenario) -> dict[str, float]:
 def with_late_programmes(scenario: Scenario) -> Scenario:
     """Return the scenario with late green in SUMO's own programmes, for the simulator only.
 
-    Phases that agents choose from are read from the scenario as it was. A programme knows only
-    whole steps, and the same ones in each cycle: the late green is rounded to them.
+    The phases of agents are read from the unchanged scenario. A programme has whole simulation
+    steps, so the late green is rounded to them.
 
     Raises:
-        ScenarioError: A programme jumps between its phases, so that none of them can be split.
+        ScenarioError: A programme jumps between its phases, so they cannot be split.
     """
     late = late_greens(scenario)
     if not late:

@@ -27,8 +27,8 @@ _ENDS = ("arrivalLane", "arrivalPos", "arrivalEdge", "arrivalPosLat", "arrivalSp
 class Turning(Effect):
     """This share of the vehicles that leave an edge by another turn take `to_edge` instead.
 
-    From there they go on like vehicles that already do so; where nobody did, along the fastest way
-    out of the network. Trips are given the fastest way over empty streets first.
+    From there they take the ways of vehicles that already turn there, or the fastest way out of the
+    network if there are none. Trips first get the fastest way over empty streets.
     """
 
     name: ClassVar[str] = "turning"
@@ -122,7 +122,7 @@ class Turning(Effect):
 
 
 def _drawn(tails: Counter[Way], salt: str, name: str) -> Way:
-    """Return one of the further ways, drawn as often as vehicles took it."""
+    """Return one of the further ways, drawn by the number of vehicles on each."""
     ways = sorted(tails)
     bounds = list(accumulate(tails[way] for way in ways))
     return ways[bisect_right(bounds, draw(salt, "way", name) * bounds[-1])]

@@ -1,8 +1,7 @@
 """Effects on how vehicles move, written into every vehicle type of a scenario.
 
-A vehicle may name a type, draw one from a distribution, or name none; then SUMO uses a default
-type. All of these are reached. The attributes are written as XML, because `startupDelay` is
-silently ignored when it is set through TraCI.
+A vehicle may name a type, draw one from a distribution, or use SUMO's default type. The effects
+change all of these. They write XML, because TraCI silently ignores `startupDelay`.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ of 1 s, which PWagner2009 does not."""
 
 
 def driven_types(root: ET.Element) -> list[ET.Element]:
-    """All vehicle types of a document that drive on the road."""
+    """Return all vehicle types of a document that drive on the road."""
     return [item for item in root.iter("vType") if item.get("vClass") not in _NOT_DRIVEN]
 
 
@@ -64,7 +63,7 @@ class VehicleEffect(Effect):
         self._write(item, getattr(self, fields(self)[0].name), step_s)
 
     def _write(self, item: ET.Element, number: float, step_s: float) -> None:
-        """The same, of the effect's number."""
+        """Write the effect's number into one type, for this step length in s."""
         del step_s
         _set(item, self.attribute, number)
 
@@ -135,8 +134,8 @@ class StartupDelay(VehicleEffect):
 class Headway(VehicleEffect):
     """Time gap drivers keep to the vehicle in front, in s (SUMO's `tau`; default 1).
 
-    It is not set below the time between two decisions of a driver: a simulation step or the
-    `reaction_step`. SUMO's drivers would run red lights and into each other.
+    The smallest value is the time between two decisions of a driver: a simulation step or the
+    `reaction_step`. With less, SUMO's drivers run red lights and collide.
     """
 
     name: ClassVar[str] = "headway"
@@ -247,7 +246,7 @@ class LaneDiscipline(VehicleEffect):
 class DriverModel(Effect):
     """The car-following model of all vehicles (`carFollowModel`; SUMO's default is Krauss).
 
-    Parameters the other model does not know stay in the types, and SUMO passes over them.
+    Parameters that the new model does not have stay in the types; SUMO ignores them.
     """
 
     name: ClassVar[str] = "driver_model"
