@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import re
 import shlex
 import sys
 from pathlib import Path
@@ -15,6 +14,7 @@ import tyro
 from ugat_marl.__main__ import main
 from ugat_marl.cli import frame
 from ugat_marl.experiments import PaperConfig
+from ugat_marl.reporting.formats import commands_in
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
@@ -23,10 +23,8 @@ PROGRAMS = ("ugat-marl ", "python baselines/")
 
 def blocks(page: Path) -> list[str]:
     """The commands that stand in a page as blocks of their own."""
-    text = page.read_text(encoding="utf-8")
-    found = re.findall(r"^```sh\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
-    lines = (line for block in found for line in block.replace("\\\n", " ").splitlines())
-    return [line.strip() for line in lines if line.strip().startswith(PROGRAMS)]
+    commands = commands_in(page.read_text(encoding="utf-8"))
+    return [command for command in commands if command.startswith(PROGRAMS)]
 
 
 TABLES = [*sorted(RESULTS.glob("*/*/table.md")), *sorted(RESULTS.glob("baselines/*.md"))]

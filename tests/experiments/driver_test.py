@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from pydantic import TypeAdapter
 
+from tests.interrupts import KillAfter
 from ugat_marl.data import Scores, locked
 from ugat_marl.errors import MeasurementError, OptionError
 from ugat_marl.experiments import (
@@ -63,25 +62,6 @@ def after(base: Job, setting: Setting, episodes: int = 6) -> Job:
         every=0,
         start=f"{base.name}/{LEARNER}",
     )
-
-
-class KillAfter(Silent):
-    """Raises after some steps of one task."""
-
-    def __init__(self, name: str, steps: int) -> None:
-        self._name, self._left = name, steps
-
-    @contextlib.contextmanager
-    def task(self, name: str, total: int) -> Any:
-        with super().task(name, total) as advance:
-
-            def one(*args: Any, **note: Any) -> None:
-                advance(*args, **note)
-                self._left -= name == self._name
-                if not self._left:
-                    raise KeyboardInterrupt
-
-            yield one
 
 
 def test_it_is_judged_every_few_episodes_and_at_the_end() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 import torch
 
 import ugat_marl.experiments.transfers as transfer_module
+from tests.interrupts import KillAfter
 from ugat_marl.__main__ import main
 from ugat_marl.data import Metrics, TransitionLog
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
@@ -22,7 +22,6 @@ from ugat_marl.experiments.jobs import file_names
 from ugat_marl.experiments.randomised import RandomisedEnv
 from ugat_marl.grounding import FitConfig, RandomDelays, TimedConfig, UgatConfig
 from ugat_marl.policies import DQNConfig, NetworkPolicy
-from ugat_marl.progress import Silent
 
 SMALL = TransferConfig(
     scenario="single-v1",
@@ -77,25 +76,6 @@ def episodes(folder: Path, name: str) -> int:
 
 def jobs_of(folder: Path) -> list[Path]:
     return list((folder / "trainings").glob("*/job.json"))
-
-
-class KillIn(Silent):
-    """Raises after some episodes of one task."""
-
-    def __init__(self, name: str, after: int) -> None:
-        self._name, self._left = name, after
-
-    @contextlib.contextmanager
-    def task(self, name: str, total: int) -> Any:
-        with super().task(name, total) as advance:
-
-            def one(*args: Any, **note: Any) -> None:
-                advance(*args, **note)
-                self._left -= name == self._name
-                if not self._left:
-                    raise KeyboardInterrupt
-
-            yield one
 
 
 CONTROLS: dict[str, Any] = {
@@ -196,7 +176,7 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
     config = replace(SMALL, ugat=ugat, randomised=True)
     transfer(config, tmp_path / "unbroken")
     with pytest.raises(KeyboardInterrupt):
-        transfer(config, tmp_path / "run", reporter=KillIn("training: domain randomisation", 11))
+        transfer(config, tmp_path / "run", reporter=KillAfter("training: domain randomisation", 11))
     assert episodes(tmp_path / "run", "domain randomisation") == 10
     transfer(config, tmp_path / "run", resume=True)
     name = "domain-randomisation"
@@ -266,7 +246,7 @@ def test_a_run_with_noise_for_f_says_so_and_resumes(tmp_path: Path) -> None:
     transfer(config, tmp_path / "unbroken")
     assert numbers(tmp_path / "unbroken")[2, "forward/ratio"] > 1.2
     with pytest.raises(KeyboardInterrupt):
-        transfer(config, tmp_path / "run", reporter=KillIn("grounded, round 2", 2))
+        transfer(config, tmp_path / "run", reporter=KillAfter("grounded, round 2", 2))
     transfer(config, tmp_path / "run", resume=True)
     one, two = (pl.read_parquet(tmp_path / n / "metrics.parquet") for n in ("run", "unbroken"))
     assert one.equals(two)

@@ -1,0 +1,27 @@
+"""Reporters that interrupt the work they are told of, as a user does."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+from ugat_marl.progress import Silent
+
+
+class KillAfter(Silent):
+    """Raises after some steps of one task."""
+
+    def __init__(self, name: str, steps: int) -> None:
+        self._name, self._left = name, steps
+
+    @contextlib.contextmanager
+    def task(self, name: str, total: int) -> Any:
+        with super().task(name, total) as advance:
+
+            def one(*args: Any, **note: Any) -> None:
+                advance(*args, **note)
+                self._left -= name == self._name
+                if not self._left:
+                    raise KeyboardInterrupt
+
+            yield one
