@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import matplotlib.image
 import pytest
 from rich.console import Console
 
-from ugat_marl.diagnosis import statistic
+from ugat_marl.diagnosis import Diagnosis, statistic
 from ugat_marl.diagnosis.features import FEATURES
 from ugat_marl.diagnosis.verdict import STATISTICS
 from ugat_marl.effects import load_scenario
@@ -47,8 +48,13 @@ def disagreement(statistic: str, regime: str, z: float, lane: Any = None) -> dic
     }  # fmt: skip
 
 
-def record_of(verdict: str = "explained", *, complete: bool = True, **more: Any) -> dict[str, Any]:
-    """A record as `diagnose` makes it."""
+def diagnosis_of(verdict: str = "explained", *, complete: bool = True, **more: Any) -> Diagnosis:
+    """Make a diagnosis as `diagnose` does."""
+    return Diagnosis.from_json(content_of(verdict, complete=complete, **more))
+
+
+def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any) -> dict[str, Any]:
+    """Return the content of its file."""
     headway = effect("headway", None, None, seconds=parameter(1.4512, 1.4431, 1.4593))
     surge = effect("demand_surge", "S_C", [300.0, 900.0], factor=parameter(1.8, 1.7, 1.9, ""))
     same = verdict == "no_discrepancy"
@@ -80,7 +86,9 @@ def record_of(verdict: str = "explained", *, complete: bool = True, **more: Any)
             "floor": 180.0, "expected": 110.0, "shrink": None if same else 0.99964,
             "p_before": 0.4 if same else 1e-90, "p_after": 0.4 if same else 0.33,
         },
-        "evidence": {"p_fit": 0.4 if same else 1e-99},
+        "evidence": {"p_fit": 0.4 if same else 1e-99, "p_fit_after": 0.4},
+        "best": None if same else {"effects": [headway, surge], "distance": 118.2, "cost": 146.2},
+        "untried": [],
         "next_measurement": "speeds at the stop line" if verdict == "not_identifiable" else None,
         "statistics": [
             {
@@ -108,8 +116,7 @@ def record_of(verdict: str = "explained", *, complete: bool = True, **more: Any)
         "travel_time": {"before_s": 102.5, "after_s": 133.6},
     }  # fmt: skip
     if not complete:
-        for key in ("statistics", "lanes", "courtesy", "travel_time"):
-            del record[key]
+        record |= {"statistics": [], "lanes": [], "courtesy": None, "travel_time": None}
     return record | more
 
 
@@ -151,25 +158,26 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.texts).split())
 
 
-def printed(record: dict[str, Any]) -> str:
+def printed(diagnosis: Diagnosis) -> str:
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(diagnosis_summary(record))
+    console.print(diagnosis_summary(diagnosis))
     return console.export_text()
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_a_page_for_every_verdict(verdict: str, network: Network) -> None:
-    record = record_of(verdict)
-    text = diagnosis_page(record, network)
+    diagnosis = diagnosis_of(verdict)
+    text = diagnosis_page(diagnosis, network)
     page = Page(text)
-    for part in (f"A sentence for {verdict}.", words.MEANINGS[verdict], "GEH", "a" * 64):
+    for part in (f"A sentence for {verdict}.", words.MEANINGS[diagnosis.verdict], "GEH", "a" * 64):
         assert part in page.text
     assert "Partial" not in page.text
     assert ("No statistic speaks" in page.text) == (verdict == "no_discrepancy")
     maps = re.findall(r"_0: [\d.]+ standard deviations", page.text)
     assert len(maps) == len(LANES) * (1 if verdict == "no_discrepancy" else 2)
     assert ("does not see this gap" in page.text) == (verdict != "no_discrepancy")
-    if record["effects"]:
+    if diagnosis.effects:
+        assert "next set of effects is worse by 4 021" in page.text.replace("\u00a0", " ")
         assert "1.451 s (1.443 to 1.459)" in page.text
         assert "0:05:00 – 0:15:00" in page.text
         assert "99.96 %" in page.text
@@ -180,47 +188,49 @@ def test_a_page_for_every_verdict(verdict: str, network: Network) -> None:
 
 @pytest.mark.parametrize("verdict", ["unknown", "partially_explained"])
 def test_a_partial_result_says_so_first(verdict: str, network: Network) -> None:
-    record = record_of(verdict, complete=False)
-    page = Page(diagnosis_page(record, network))
+    diagnosis = diagnosis_of(verdict, complete=False)
+    page = Page(diagnosis_page(diagnosis, network))
     assert page.text.index("Partial result: the budget of 600 s") < page.text.index("A sentence")
     assert "Partial result" not in "".join(page.texts[:1])
-    lines = " ".join(printed(record).split())
+    lines = " ".join(printed(diagnosis).split())
     assert lines.startswith("Partial result: the budget of 600 s ended")
     assert "Not examined" not in lines
-    names = [f"effect_{number}" for number in range(words.UNTRIED + 2)]
-    lines = " ".join(printed({**record, "untried": names}).split())
+    names = tuple(f"effect_{number}" for number in range(words.UNTRIED + 2))
+    lines = " ".join(printed(replace(diagnosis, untried=names)).split())
     assert "Not examined yet: effect 0, effect 1, " in lines
     assert f", … ({words.UNTRIED + 2} in all)." in lines
     assert "The same command goes on" in lines
 
 
 def test_the_page_does_not_contradict_its_sentence(network: Network) -> None:
-    cut = diagnosis_page(record_of("partially_explained", complete=False), network)
+    cut = diagnosis_page(diagnosis_of("partially_explained", complete=False), network)
     assert not any(text in Page(cut).text for text in words.MEANINGS.values())
     # A value at its end, where what is left is no more than chance, is partially explained, too.
     assert "more than chance" not in words.MEANINGS["partially_explained"]
-    logged = record_of("explained")["effects"][:1]
-    found = Page(diagnosis_page(record_of("unknown", effects=logged), network)).text
+    logged = content_of("explained")["effects"][:1]
+    logged[0]["evidence"] = {"source": "signal log"}
+    found = Page(diagnosis_page(diagnosis_of("unknown", effects=logged), network)).text
+    assert "signal log" in found
     assert "No effect is named" not in found
     assert "stands in the log of the signals" in found
 
 
 def test_a_result_without_any_simulation_has_a_page(network: Network) -> None:
-    record = record_of("unknown", complete=False, heldout=None, where=[], alternatives=[])
-    record["evidence"] = {}
-    assert "Partial result" in Page(diagnosis_page(record, network)).text
-    assert "Partial result" in printed(record)
+    nothing: dict[str, Any] = {"where": [], "alternatives": [], "best": None, "evidence": None}
+    diagnosis = diagnosis_of("unknown", complete=False, heldout=None, **nothing)
+    assert "Partial result" in Page(diagnosis_page(diagnosis, network)).text
+    assert "Partial result" in printed(diagnosis)
 
 
 def test_the_page_needs_nothing_else_and_forbids_scripts(network: Network) -> None:
-    text = diagnosis_page(record_of(), network)
+    text = diagnosis_page(diagnosis_of(), network)
     # A picture refers to its own parts, by their ids; nothing else is referred to.
     assert not re.findall(r'https?:|src=|url\((?!#)|@import|<script|<link|href="(?!#)', text)
     assert "default-src 'none'" in text
 
 
 def test_lanes_are_coloured_by_class(network: Network) -> None:
-    text = diagnosis_page(record_of(), network)
+    text = diagnosis_page(diagnosis_of(), network)
     colours = re.findall(r"standard deviations</title><path [^>]*?stroke: var\(--(\w+)\)", text)
     assert colours == ["d0", "d3", "d4", "d4"] + ["d0"] * 4
 
@@ -236,17 +246,19 @@ def texts_in(value: Any) -> Iterator[Any]:
 
 
 def test_hostile_names_stay_text(network: Network) -> None:
-    harmless = record_of("not_identifiable", policy_gap=GAP)
-    record = next(texts_in(harmless)) | {"verdict": NASTY, "effects": harmless["effects"]}
-    record["effects"][0]["place"] = NASTY
-    record["versions"] = {NASTY: NASTY}
-    page = Page(diagnosis_page(record, network))
+    harmless = content_of("not_identifiable", policy_gap=GAP)
+    fixed = {name: harmless[name] for name in ("schema", "verdict", "effects")}
+    hostile = next(texts_in(harmless)) | fixed | {"versions": {NASTY: NASTY}}
+    diagnosis = Diagnosis.from_json(hostile)
+    effects = (replace(diagnosis.effects[0], place=NASTY), *diagnosis.effects[1:])
+    diagnosis = replace(diagnosis, effects=effects)
+    page = Page(diagnosis_page(diagnosis, network))
     assert NASTY in " ".join(page.texts)
-    plain = {tag for tag, _ in Page(diagnosis_page(harmless, network)).tags}
+    plain = {tag for tag, _ in Page(diagnosis_page(Diagnosis.from_json(harmless), network)).tags}
     assert {tag for tag, _ in page.tags} <= plain
     assert plain - {tag for tag, _ in page.tags} <= {"title"}  # of no lane that is known
     assert not [name for _, attrs in page.tags for name in attrs if name.startswith("on")]
-    assert printed(record)
+    assert printed(diagnosis)
 
 
 def test_nothing_of_what_a_lane_is_called_breaks_the_map(crossing: Any) -> None:
@@ -260,8 +272,8 @@ def test_nothing_of_what_a_lane_is_called_breaks_the_map(crossing: Any) -> None:
     routes.write_text(renamed(routes.read_text()))
     network = Network.read(load_scenario(directory))
     lane = html.unescape(name) + "_0"
-    record = record_of(lanes=[{"lane": lane, "tls": "C", "before": 9.0, "after": 1.0}])
-    page = Page(diagnosis_page(record, network))
+    diagnosis = diagnosis_of(lanes=[{"lane": lane, "tls": "C", "before": 9.0, "after": 1.0}])
+    page = Page(diagnosis_page(diagnosis, network))
     assert page.text.count(f"{lane}: 9 standard deviations") == 1
 
 
@@ -276,8 +288,8 @@ GAP = {
 
 
 def test_the_policy_gap_is_shown_where_it_was_measured(network: Network) -> None:
-    assert "Policy gap" not in Page(diagnosis_page(record_of(), network)).text
-    page = Page(diagnosis_page(record_of(policy_gap=GAP), network))
+    assert "Policy gap" not in Page(diagnosis_page(diagnosis_of(), network)).text
+    page = Page(diagnosis_page(diagnosis_of(policy_gap=GAP), network))
     for cell in ("max-pressure:20", "100 (98 to 102)", "148", "51", "94 %"):
         assert cell in page.text
 
@@ -285,22 +297,21 @@ def test_the_policy_gap_is_shown_where_it_was_measured(network: Network) -> None
 def test_a_page_tells_its_commands(network: Network, tmp_path: Path) -> None:
     commands = [f"ugat-marl diagnose '{NASTY}' --out found", "ugat-marl train ..."]
     page = tmp_path / "report.html"
-    write_diagnosis_page(record_of(sentence=NASTY), network, page, commands)
+    write_diagnosis_page(diagnosis_of(sentence=NASTY), network, page, commands)
     assert commands_on_page(page) == commands
     page.write_bytes(b"\xff no page")
     assert commands_on_page(page) == []
 
 
 def test_nothing_held_out_is_said(network: Network) -> None:
-    record = record_of(verified_on_fitted_periods=True)
-    assert "the numbers flatter" in Page(diagnosis_page(record, network)).text
-    assert "flatter" in printed(record)
+    diagnosis = diagnosis_of(verified_on_fitted_periods=True)
+    assert "the numbers flatter" in Page(diagnosis_page(diagnosis, network)).text
+    assert "flatter" in printed(diagnosis)
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_the_summary_fits_80_columns(verdict: str) -> None:
-    record = record_of(verdict)
-    text = printed(record)
+    text = printed(diagnosis_of(verdict))
     assert max(map(len, text.splitlines())) <= 80
     flat = " ".join(text.split())
     assert f"A sentence for {verdict}." in flat
@@ -313,10 +324,10 @@ def test_the_summary_fits_80_columns(verdict: str) -> None:
 
 
 def test_long_names_do_not_widen_the_summary() -> None:
-    record = record_of()
-    record["effects"][1]["place"] = "x" * 90
-    record["where"][0]["tls"] = "cluster_" * 12
-    assert max(map(len, printed(record).splitlines())) <= 80
+    content = content_of()
+    content["effects"][1]["place"] = "x" * 90
+    content["where"][0]["tls"] = "cluster_" * 12
+    assert max(map(len, printed(Diagnosis.from_json(content)).splitlines())) <= 80
 
 
 def test_every_statistic_has_words() -> None:
@@ -357,10 +368,12 @@ def browse(directory: Path, *options: str) -> str:
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
 @pytest.mark.parametrize("width", [360, 390, 700, 1280])
 def test_nothing_sticks_out_in_a_browser(width: int, network: Network, tmp_path: Path) -> None:
-    record = record_of(policy_gap=GAP)
-    record["effects"][1]["place"] = "cluster_1098574052_1098574061_" * 6
-    record["where"][0]["lane"] = "cluster_1098574052_1098574061_" * 4
-    text = diagnosis_page(record, network).replace("<details>", "<details open>")
+    content = content_of(policy_gap=GAP)
+    content["effects"][1]["place"] = "cluster_1098574052_1098574061_" * 6
+    content["where"][0]["lane"] = "cluster_1098574052_1098574061_" * 4
+    text = diagnosis_page(Diagnosis.from_json(content), network).replace(
+        "<details>", "<details open>"
+    )
     frame = tmp_path / "frame.html"
     frame.write_text(FRAME.format(width=width, page=html.escape(text, quote=True)))
     dom = browse(tmp_path, "--virtual-time-budget=3000", "--dump-dom", frame.as_uri())
@@ -375,7 +388,7 @@ def test_nothing_sticks_out_in_a_browser(width: int, network: Network, tmp_path:
 @pytest.mark.parametrize("dark", [False, True])
 def test_the_page_is_drawn_in_a_browser(dark: bool, network: Network, tmp_path: Path) -> None:
     page, picture = tmp_path / "report.html", tmp_path / "report.png"
-    write_diagnosis_page(record_of(), network, page)
+    write_diagnosis_page(diagnosis_of(), network, page)
     options = ["--blink-settings=preferredColorScheme=0"] if dark else []
     browse(tmp_path, *options, "--window-size=1280,1600", f"--screenshot={picture}", page.as_uri())
     pixels = matplotlib.image.imread(picture)

@@ -88,10 +88,9 @@ class Diagnose:
                 diagnosis = diagnose(scenario, measured, self.out, config, Bars(console))
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command goes on where it stopped") from None
-        record = diagnosis.to_json()
-        console.print(diagnosis_summary(record))
+        console.print(diagnosis_summary(diagnosis))
         if self.report:
-            write_diagnosis_page(record, network, self.out / REPORT, self._commands(diagnosis))
+            write_diagnosis_page(diagnosis, network, self.out / REPORT, self._commands(diagnosis))
         self._say_where(diagnosis, console)
         return 0
 

@@ -67,7 +67,7 @@ class PolicyGap:
         if self.first_seed < 0:
             raise OptionError("--first-seed must not be negative")
         scenario = load_scenario(self.scenario)
-        record, corrected = read_diagnosis(self.directory, scenario)
+        diagnosis, corrected = read_diagnosis(self.directory, scenario)
         require_writable(self.directory / FILE)
         if corrected.hash == scenario.hash:
             console.print("note: only detectors were at fault; the traffic was not corrected")
@@ -76,7 +76,7 @@ class PolicyGap:
             f"{name}.pt" if file else name
             for name, file in zip(names_of(self.policies), files, strict=True)
         ]
-        gap = policy_gap(
+        gaps = policy_gap(
             scenario,
             corrected,
             self.real,
@@ -86,11 +86,11 @@ class PolicyGap:
             duration_s=self.duration_s,
             workers=self.workers,
         )
-        record = write_policy_gap(self.directory, record, gap)
+        diagnosis = write_policy_gap(self.directory, diagnosis, gaps)
         page = self.directory / REPORT
         if page.is_file():  # diagnose --no-report writes no page
             commands = commands_on_page(page)
-            write_diagnosis_page(record, Network.read(scenario), page, commands)
+            write_diagnosis_page(diagnosis, Network.read(scenario), page, commands)
         title = f"{scenario.id}: average travel time in s, real: {describe(self.real)}"
-        console.print(policy_gap_table(title, gap, self.seeds))
+        console.print(policy_gap_table(title, gaps, self.seeds))
         return 0

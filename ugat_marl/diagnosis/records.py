@@ -15,7 +15,7 @@ plain values. The other records may hold simulated days and arrays, and are neve
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -283,6 +283,11 @@ class SearchGrounds:
     distance: float
     runner_up_is_worse_by: float | None
 
+    def in_words(self, number: Callable[[float], str]) -> str:
+        """Return the grounds as a phrase; `number` writes a number, "" without a runner-up."""
+        worse_by = self.runner_up_is_worse_by
+        return "" if worse_by is None else f"next set of effects is worse by {number(worse_by)}"
+
 
 @dataclass(frozen=True)
 class LogGrounds:
@@ -293,6 +298,11 @@ class LogGrounds:
     """
 
     source: str
+
+    def in_words(self, number: Callable[[float], str]) -> str:
+        """Return the grounds as a phrase; it has no number."""
+        del number
+        return self.source
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+from ugat_marl.diagnosis import CORRECTED, FILE, Diagnosis, PolicyGap, TravelTimeEstimate
 from ugat_marl.effects import Domain, describe, in_domain, load_scenario
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments.evaluation import evaluate
 from ugat_marl.experiments.scores import Estimate, Evaluation
-from ugat_marl.files import write_whole
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import PolicyFactory
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
-
-_FILE, _CORRECTED, _SCHEMA = "diagnosis.json", "corrected", "ugat-marl/diagnosis/"
 
 
 def policy_gap(
@@ -37,7 +34,7 @@ def policy_gap(
     *,
     duration_s: float | None = None,
     workers: Workers = None,
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, PolicyGap]:
     """Play policies in the simulation, the corrected scenario and the real domain.
 
     All three have the same seeds and the same demand, unless the correction changed the demand.
@@ -54,13 +51,11 @@ def policy_gap(
         workers: Simulations at a time; None for the number of cores; or an executor.
 
     Returns:
-        For each policy, with ATT in s:
+        For each policy the average travel times (ATT) with Student's 95 % intervals, and the gaps:
 
-        - ``sim``, ``corrected``, ``real``: ``mean`` of the ATT, and ``low`` and ``high`` of
-          Student's 95 % interval (None for one seed);
-        - ``before``: |ATT(real) - ATT(sim)| of the means;
-        - ``after``: |ATT(real) - ATT(corrected)| of the means;
-        - ``shrink``: 1 - after / before; None if the 95 % interval of ATT(real) - ATT(sim), paired
+        - `before`: |ATT(real) - ATT(sim)| of the means;
+        - `after`: |ATT(real) - ATT(corrected)| of the means;
+        - `shrink`: 1 - after / before; None if the 95 % interval of ATT(real) - ATT(sim), paired
           by seed, holds 0.
 
     Raises:
@@ -86,34 +81,30 @@ def policy_gap(
             reporter=reporter or Silent(),
             title=f"policies in {'the real world' if name == 'real' else name}",
         )
-    return {policy: _row(found, policy) for policy in policies}
+    return {policy: _gap(found, policy) for policy in policies}
 
 
-def _row(found: Mapping[str, Evaluation], policy: str) -> dict[str, Any]:
+def _gap(found: Mapping[str, Evaluation], policy: str) -> PolicyGap:
     values = {name: item.values(policy, "sim", "att_s") for name, item in found.items()}
     att = {name: Estimate.of(item) for name, item in values.items()}
     before = abs(att["real"].mean - att["sim"].mean)
     after = abs(att["real"].mean - att["corrected"].mean)
     paired = Estimate.of(values["real"] - values["sim"])
     unseen = before == 0 or paired.low <= 0 <= paired.high  # False for the nan of a single seed
-    return {
-        **{name: _as_dict(item) for name, item in att.items()},
-        "before": before,
-        "after": after,
-        "shrink": None if unseen else 1 - after / before,
-    }
+    times = {name: _travel_time(item) for name, item in att.items()}
+    shrink = None if unseen else 1 - after / before
+    return PolicyGap(times["sim"], times["corrected"], times["real"], before, after, shrink)
 
 
-def _as_dict(estimate: Estimate) -> dict[str, float | None]:
-    values = asdict(estimate)
-    return {name: _or_none(values[name]) for name in ("mean", "low", "high")}
+def _travel_time(estimate: Estimate) -> TravelTimeEstimate:
+    return TravelTimeEstimate(estimate.mean, _or_none(estimate.low), _or_none(estimate.high))
 
 
 def _or_none(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[dict[str, Any], Scenario]:
+def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[Diagnosis, Scenario]:
     """Read a diagnosis and the corrected scenario beside it.
 
     Args:
@@ -125,51 +116,36 @@ def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[dict[str, Any],
             corrected nothing.
         ScenarioError: The corrected scenario cannot be read.
     """
-    file = directory / _FILE
+    file = directory / FILE
     try:
-        record: Any = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        diagnosis = Diagnosis.read(directory)
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise OptionError(
             f"{file}: cannot be read ({error}); name the directory of a diagnosis, "
             "`ugat-marl diagnose SCENARIO MEASURED --out DIR`"
         ) from None
-    if not isinstance(record, dict) or not str(record.get("schema")).startswith(_SCHEMA):
-        raise OptionError(f"{file}: not a diagnosis; its schema is not {_SCHEMA}...")
-    hashes = record.get("hashes")
-    if not isinstance(hashes, dict) or hashes.get("scenario") != scenario.hash:
+    except ValueError:  # readable, but with other keys or types
+        raise OptionError(f"{file}: not a diagnosis of this version; diagnose again") from None
+    if diagnosis.hashes.get("scenario") != scenario.hash:
         raise OptionError(
             f"{file}: the diagnosis of another scenario or another version of it "
-            f"({record.get('scenario')!r}), not of {scenario.id!r} as it is now"
+            f"({diagnosis.scenario!r}), not of {scenario.id!r} as it is now"
         )
-    if record.get("corrected") is None:
+    if diagnosis.corrected is None:
         raise OptionError(
-            f"{file}: verdict {record.get('verdict')!r}: nothing was corrected, so there is "
+            f"{file}: verdict {diagnosis.verdict!r}: nothing was corrected, so there is "
             "nothing to compare"
         )
-    place = directory / _CORRECTED
+    place = directory / CORRECTED
     if not (place / "scenario.toml").is_file():
         raise ScenarioError(f"{place}: the corrected scenario is gone; diagnose again")
-    return record, load_scenario(place)
+    return diagnosis, load_scenario(place)
 
 
 def write_policy_gap(
-    directory: Path, record: Mapping[str, Any], gap: Mapping[str, Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Write a diagnosis with its policy gap, whole or not at all.
-
-    Numbers of the policy gap have nine significant digits.
-
-    Returns:
-        The content of the file.
-    """
-    content = {**record, "policy_gap": _rounded(gap)}
-    text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
-    write_whole(directory / _FILE, text + "\n")
-    return content
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        items: Mapping[Any, Any] = value
-        return {key: _rounded(item) for key, item in items.items()}
-    return float(f"{value:.9g}") if isinstance(value, float) else value
+    directory: Path, diagnosis: Diagnosis, gap: Mapping[str, PolicyGap]
+) -> Diagnosis:
+    """Write a diagnosis with its policy gap, whole or not at all; return it."""
+    measured = replace(diagnosis, policy_gap=dict(gap))
+    measured.write(directory)
+    return measured

@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from html import unescape
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.diagnosis import statistic
+from ugat_marl.diagnosis import (
+    CriteriaRow,
+    Diagnosis,
+    Disagreement,
+    EffectRecord,
+    HeldOut,
+    LaneRow,
+    NamedEffect,
+    StatisticRow,
+    TravelTimeEstimate,
+    Verdict,
+    statistic,
+)
 from ugat_marl.files import write_whole
 from ugat_marl.reporting import diagnosis_words as words
 from ugat_marl.reporting.charts import BAND, statistics_picture
-from ugat_marl.reporting.diagnosis_words import Record
 from ugat_marl.reporting.formats import chance, number, share, signed
 from ugat_marl.reporting.network_maps import disagreement_map
 from ugat_marl.reporting.page import Figure, Grid, Page, render
@@ -27,62 +38,66 @@ _LOUD, _QUIET = 16, 6
 _STRIPS = 8
 """Most strips in one picture; two pictures stand side by side."""
 _COMMANDS = re.compile(r"<h2>Run it again</h2>\s*<pre><code>(.*?)</code></pre>", re.DOTALL)
-_BADGES = {
+_BADGES: dict[Verdict, str] = {
     "no_discrepancy": "good", "explained": "good", "not_identifiable": "mixed",
     "partially_explained": "mixed", "unknown": "bad",
 }  # fmt: skip
-_CRITERIA = (
-    ("counts with GEH below 5 (usual: 85 %)", "geh_below_5", share),
-    ("largest GEH", "geh_largest", number),
-    ("FHWA I: 15 min within 1.96 σ of the typical day (95 %)", "within_2_sigma", share),
-    ("FHWA II: within 1 σ (two thirds)", "within_1_sigma", share),
-    ("FHWA III: detectors with bounded absolute error (all)", "absolute_error", share),
-    ("FHWA IV: with bounded systematic error (all)", "systematic_error", share),
+_CRITERIA: tuple[tuple[str, Callable[[CriteriaRow], str]], ...] = (
+    ("counts with GEH below 5 (usual: 85 %)", lambda row: share(row.geh_below_5)),
+    ("largest GEH", lambda row: number(row.geh_largest)),
+    (
+        "FHWA I: 15 min within 1.96 σ of the typical day (95 %)",
+        lambda row: share(row.within_2_sigma),
+    ),
+    ("FHWA II: within 1 σ (two thirds)", lambda row: share(row.within_1_sigma)),
+    (
+        "FHWA III: detectors with bounded absolute error (all)",
+        lambda row: share(row.absolute_error),
+    ),
+    ("FHWA IV: with bounded systematic error (all)", lambda row: share(row.systematic_error)),
 )
 
 
 def write_diagnosis_page(
-    record: Record, network: Network, path: Path, commands: Sequence[str] = ()
+    diagnosis: Diagnosis, network: Network, path: Path, commands: Sequence[str] = ()
 ) -> None:
     """Write the page of a diagnosis.
 
     Args:
-        record: Content of ``diagnosis.json``.
+        diagnosis: The diagnosis; `Diagnosis.read` reads it from ``diagnosis.json``.
         network: Network of the scenario, for the map.
         path: File to write.
         commands: Commands that repeat the diagnosis and go on from it, one line each.
     """
-    write_whole(path, diagnosis_page(record, network, commands))
+    write_whole(path, diagnosis_page(diagnosis, network, commands))
 
 
-def diagnosis_page(record: Record, network: Network, commands: Sequence[str] = ()) -> str:
+def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[str] = ()) -> str:
     """Return the page as text; see `write_diagnosis_page`."""
     page = Page()
-    verdict = str(record["verdict"])
-    name = words.VERDICTS.get(verdict, verdict)
-    heldout = record["heldout"]
+    verdict, heldout = words.VERDICTS[diagnosis.verdict], diagnosis.heldout
     return render(
         "diagnosis.html.j2",
-        title=f"Diagnosis of {record['scenario']}: {words.VERDICTS.get(verdict, '')}",
-        record={"next_measurement": None, "corrected": None, "findings": (), **record},
-        verdict=(_BADGES.get(verdict, ""), name),
-        partial=words.partial(record),
-        meaning=words.meaning(record),
-        effects=_effects(record),
-        judged="fitted" if record.get("verified_on_fitted_periods") else "held-out",
-        heldout=_heldout(heldout) if heldout is not None else None,
-        expected=number((heldout or {}).get("expected")),
-        maps=_maps(page, record, network),
+        title=f"Diagnosis of {diagnosis.scenario}: {verdict}",
+        diagnosis=diagnosis,
+        verdict=(_BADGES[diagnosis.verdict], verdict),
+        partial=words.partial(diagnosis),
+        meaning=words.meaning(diagnosis),
+        effects=_effects(diagnosis.effects),
+        judged="fitted" if diagnosis.verified_on_fitted_periods else "held-out",
+        heldout=None if heldout is None else _heldout(heldout),
+        expected=number(None if heldout is None else heldout.expected),
+        maps=_maps(page, diagnosis, network),
         map_key=[(f"d{place}", text) for place, (_, text) in enumerate(DISAGREEMENT)],
-        statistics=_statistics(page, record),
-        where=_where(record),
-        ranking=_ranking(record),
-        courtesy=_courtesy(record),
-        geh=words.geh_line(record),
-        policy_gap=_policy_gap(record),
-        data=_data(record),
-        commands=commands or _usual_commands(record),
-        provenance=_provenance(record),
+        statistics=_statistics(page, diagnosis),
+        where=_where(diagnosis),
+        ranking=_ranking(diagnosis),
+        courtesy=_courtesy(diagnosis),
+        geh=words.geh_line(diagnosis),
+        policy_gap=_policy_gap(diagnosis),
+        data=_data(diagnosis),
+        commands=commands or _usual_commands(diagnosis),
+        provenance=_provenance(diagnosis),
     )
 
 
@@ -98,82 +113,65 @@ def commands_on_page(path: Path) -> list[str]:
     return unescape(match[1]).splitlines() if match else []
 
 
-def _effects(record: Record) -> Grid | None:
+def _effects(effects: Sequence[NamedEffect]) -> Grid | None:
     """Return a table of the named effects with intervals; None without effects."""
     rows = [
         (
             words.effect_name(effect),
             words.place(effect),
-            words.window(effect.get("window")) or "always",
+            words.window(effect.window) or "always",
             words.values(effect),
-            _grounds(effect.get("evidence") or {}),
+            effect.evidence.in_words(number),
         )
-        for effect in record["effects"]
+        for effect in effects
     ]
     headings = ("effect", "where", "when", "value (95 % interval)", "grounds")
     return Grid(headings, rows) if rows else None
 
 
-def _grounds(evidence: Record) -> str:
-    if "source" in evidence:
-        return str(evidence["source"])
-    if evidence.get("runner_up_is_worse_by") is not None:
-        return f"next set of effects is worse by {number(evidence['runner_up_is_worse_by'])}"
-    return ""
-
-
-def _heldout(heldout: Record) -> list[tuple[str, str]]:
+def _heldout(heldout: HeldOut) -> list[tuple[str, str]]:
     """Return the numbers of the held-out periods with their labels."""
-    boxes = [(number(heldout["before"]), "distance before")]
-    after = heldout["shrink"] is not None
-    if after:
-        boxes.append((number(heldout["after"]), "distance after"))
-    boxes.append((number(heldout["floor"]), "noise floor"))
-    if after:
-        boxes.append((share(heldout["shrink"]), "of the gap is gone"))
-    boxes.append((chance(heldout["p_before"]), "p before"))
-    if after:
-        boxes.append((chance(heldout["p_after"]), "p after"))
+    boxes = [(number(heldout.before), "distance before")]
+    corrected = heldout.shrink is not None
+    if corrected:
+        boxes.append((number(heldout.after), "distance after"))
+    boxes.append((number(heldout.floor), "noise floor"))
+    if corrected:
+        boxes.append((share(heldout.shrink), "of the gap is gone"))
+    boxes.append((chance(heldout.p_before), "p before"))
+    if corrected:
+        boxes.append((chance(heldout.p_after), "p after"))
     return boxes
 
 
-def _changed(record: Record, table: str, before: str, after: str) -> bool:
-    """Return True if the values after the correction differ from those before."""
-    return any(row[before] != row[after] for row in record.get(table) or ())
-
-
-def _model(record: Record) -> str:
+def _model(diagnosis: Diagnosis) -> str:
     """Return the words for the corrected model."""
-    return "the effects named" if record["effects"] else "the best attempt, which is not named"
+    return "the effects named" if diagnosis.effects else "the best attempt, which is not named"
 
 
-def _maps(page: Page, record: Record, network: Network) -> list[Figure]:
-    lanes = record.get("lanes") or ()
-    models = [("before", "The scenario as it is")]
-    if _changed(record, "lanes", "before", "after"):
-        models.append(("after", f"With {_model(record)}"))
-    tls = {row["tls"] for row in lanes}
-    return page.figures(
-        *(
-            (
-                disagreement_map(
-                    f"map-{key}", title, network, {row["lane"]: row[key] for row in lanes}, tls
-                ),
-                "Point at a lane to read its disagreement.",
-            )
-            for key, title in models
-        )
-    )
+def _maps(page: Page, diagnosis: Diagnosis, network: Network) -> list[Figure]:
+    lanes = diagnosis.lanes
+    traffic_lights = {row.tls for row in lanes}
+
+    def drawn(name: str, title: str, size: Callable[[LaneRow], float]) -> tuple[Any, str]:
+        sizes = {row.lane: size(row) for row in lanes}
+        picture = disagreement_map(f"map-{name}", title, network, sizes, traffic_lights)
+        return picture, "Point at a lane to read its disagreement."
+
+    maps = [drawn("before", "The scenario as it is", lambda row: row.before)]
+    if any(row.before != row.after for row in lanes):
+        maps.append(drawn("after", f"With {_model(diagnosis)}", lambda row: row.after))
+    return page.figures(*maps)
 
 
-def _statistics(page: Page, record: Record) -> dict[str, Any] | None:
-    rows = record.get("statistics") or ()
+def _statistics(page: Page, diagnosis: Diagnosis) -> dict[str, Any] | None:
+    rows = diagnosis.statistics
     if not rows:
         return None
-    after = _changed(record, "statistics", "z_before", "z_after")
+    after = any(row.z_before != row.z_after for row in rows)
 
-    def size(row: Record) -> float:
-        return max(abs(row["z_before"]), abs(row["z_after"]))
+    def size(row: StatisticRow) -> float:
+        return max(abs(row.z_before), abs(row.z_after))
 
     ordered = sorted(rows, key=size, reverse=True)
     loud = sum(size(row) > BAND for row in ordered)
@@ -195,27 +193,27 @@ def _statistics(page: Page, record: Record) -> dict[str, Any] | None:
 
     return {
         "heading": "The statistics that speak" if loud else "No statistic speaks",
-        "model": _model(record) if after else "",
+        "model": _model(diagnosis) if after else "",
         "shown": pictures("statistics", strips[:first]),
         "rest": pictures("statistics-more", strips[first:]),
         "more": len(strips[first:]),
     }
 
 
-def _strip(row: Record, *, after: bool) -> tuple[str, str, float, float | None]:
+def _strip(row: StatisticRow, *, after: bool) -> tuple[str, str, float, float | None]:
     """Return the texts and deviations of a statistic."""
-    text = f"measured {number(row['measured'])}, simulated {number(row['before'])}"
+    text = f"measured {number(row.measured)}, simulated {number(row.before)}"
     if after:
-        text += f" → {number(row['after'])}"
-    text += f" ± {number(row['noise'], 2)}"
-    text += f" {row['unit']}" if row["unit"] else ""
-    remark = f"{row['regime']} · {text}"
-    return statistic(row["statistic"]), remark, row["z_before"], row["z_after"] if after else None
+        text += f" → {number(row.after)}"
+    text += f" ± {number(row.noise, 2)}"
+    text += f" {row.unit}" if row.unit else ""
+    remark = f"{row.regime} · {text}"
+    return statistic(row.statistic), remark, row.z_before, row.z_after if after else None
 
 
-def _where(record: Record) -> dict[str, Grid | None] | None:
+def _where(diagnosis: Diagnosis) -> dict[str, Grid | None] | None:
     """Return tables of the places where data and simulation disagree, before and after."""
-    where, left = record.get("where") or (), record.get("left") or ()
+    where, left = diagnosis.where, diagnosis.left
     if not where:
         return None
     return {
@@ -225,35 +223,32 @@ def _where(record: Record) -> dict[str, Grid | None] | None:
     }
 
 
-def _disagreements(items: Sequence[Record]) -> Grid:
+def _disagreements(items: Sequence[Disagreement]) -> Grid:
     rows = [
         (
             words.disagreement_place(item),
-            item["regime"],
-            statistic(item["statistic"]),
-            f"{signed(item['size'])} {item['unit']}".rstrip(),
-            signed(item["z"]),
-            words.window(item.get("window")),
+            item.regime,
+            statistic(item.statistic),
+            f"{signed(item.size)} {item.unit}".rstrip(),
+            signed(item.z),
+            words.window(item.window),
         )
         for item in items
     ]
     return Grid(("place", "regime", "statistic", "size", "z", "window"), rows, ("size", "z"))
 
 
-def _ranking(record: Record) -> list[dict[str, Any]]:
+def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return the simulated explanations, the chosen one first."""
-    items: list[tuple[str, Any, Any, bool]] = []
-    if record["effects"]:
-        grounds = (effect.get("evidence") or {} for effect in record["effects"])
-        best = record.get("best") or next((own for own in grounds if "distance" in own), {})
-        items.append((_set(record["effects"]), best.get("distance"), best.get("cost"), True))
-    items += [
-        (_set(item["effects"]), item["distance"], item["cost"], False)
-        for item in record.get("alternatives") or ()
-    ]
-    if not record.get("alternatives"):
+    if not diagnosis.alternatives:
         return []
-    most = max((float(item[1]) for item in items if item[1] is not None), default=1.0)
+    items: list[tuple[str, float | None, float | None, bool]] = []
+    if diagnosis.effects:
+        best = diagnosis.best
+        left, cost = (None, None) if best is None else (best.distance, best.cost)
+        items.append((_set(diagnosis.effects), left, cost, True))
+    items += [(_set(x.effects), x.distance, x.cost, False) for x in diagnosis.alternatives]
+    most = max((distance for _, distance, _, _ in items if distance is not None), default=1.0)
     return [
         {
             "effects": text,
@@ -266,100 +261,93 @@ def _ranking(record: Record) -> list[dict[str, Any]]:
     ]
 
 
-def _logarithm(distance: Any, most: float) -> float:
+def _logarithm(distance: float | None, most: float) -> float:
     """Return the length of a bar in per cent: 100 log(1 + distance) / log(1 + most)."""
     if distance is None:
         return 0.0
-    return 100 * math.log1p(max(float(distance), 0.0)) / math.log1p(max(most, 1.0))
+    return 100 * math.log1p(max(distance, 0.0)) / math.log1p(max(most, 1.0))
 
 
-def _set(effects: Sequence[Record]) -> str:
+def _set(effects: Sequence[EffectRecord]) -> str:
     return " + ".join(map(_in_words, effects))
 
 
-def _in_words(effect: Record) -> str:
+def _in_words(effect: EffectRecord) -> str:
     place = words.place(effect)
     text = words.effect_name(effect) + ("" if place == "everywhere" else f" at {place}")
-    text += f", {words.window(effect['window'])}" if effect.get("window") else ""
-    return f"{text} ({words.values(effect, intervals=False)})" if effect["parameters"] else text
+    text += f", {words.window(effect.window)}" if effect.window else ""
+    return f"{text} ({words.values(effect, intervals=False)})" if effect.parameters else text
 
 
-def _courtesy(record: Record) -> Grid | None:
+def _courtesy(diagnosis: Diagnosis) -> Grid | None:
     """Return the usual criteria of traffic engineering."""
-    tables = record.get("courtesy") or {}
-    if not tables:
+    criteria = diagnosis.courtesy
+    if criteria is None:
         return None
-    before, after = tables.get("before") or {}, tables.get("after") or {}
-    measured = tables.get("measured") or {}
-    rows = [(name, "", say(before.get(key)), say(after.get(key))) for name, key, say in _CRITERIA]
-    key = "saturation_headway_s"
-    headways = number(measured.get(key)), number(before.get(key)), number(after.get(key))
-    rows.append(("discharge headway, 4th vehicle on (s)", *headways))
-    if times := record.get("travel_time"):
-        both = number(times.get("before_s")), number(times.get("after_s"))
-        rows.append(("mean travel time (s)", "", *both))
+    before, after, measured = criteria.before, criteria.after, criteria.measured
+    rows = [(name, "", value(before), value(after)) for name, value in _CRITERIA]
+    street, sim, repaired = (number(x.saturation_headway_s) for x in (measured, before, after))
+    rows.append(("discharge headway, 4th vehicle on (s)", street, sim, repaired))
+    if (times := diagnosis.travel_time) is not None:
+        rows.append(("mean travel time (s)", "", number(times.before_s), number(times.after_s)))
     columns = ("measured", "before", "after")
     return Grid(("criterion", *columns), rows, columns)
 
 
-def _policy_gap(record: Record) -> Grid | None:
+def _policy_gap(diagnosis: Diagnosis) -> Grid | None:
     """Return travel times of policies in both simulations and in the real domain, if measured."""
-    gap = record.get("policy_gap")
-    if not isinstance(gap, Mapping) or not gap:
+    if not diagnosis.policy_gap:
         return None
     rows = [
         (
-            str(name),
-            *(_mean(item.get(world)) for world in ("sim", "corrected", "real")),
-            number(item.get("before")),
-            number(item.get("after")),
-            share(item.get("shrink")),
+            name,
+            *map(_mean, (gap.sim, gap.corrected, gap.real)),
+            number(gap.before),
+            number(gap.after),
+            share(gap.shrink),
         )
-        for name, item in gap.items()
+        for name, gap in diagnosis.policy_gap.items()
     ]
     headings = ("policy", "sim (s)", "corrected (s)", "real (s)", "before", "after", "shrink")
     return Grid(headings, rows, headings[4:])
 
 
-def _mean(item: Any) -> str:
+def _mean(estimate: TravelTimeEstimate) -> str:
     """Return a mean with its interval."""
-    if not isinstance(item, Mapping):
-        return "–"
-    if item.get("low") is None or item.get("high") is None:
-        return number(item.get("mean"))
-    return f"{number(item.get('mean'))} ({number(item['low'])} to {number(item['high'])})"
+    if estimate.low is None or estimate.high is None:
+        return number(estimate.mean)
+    return f"{number(estimate.mean)} ({number(estimate.low)} to {number(estimate.high)})"
 
 
-def _data(record: Record) -> list[tuple[str, str]]:
-    periods = record["periods"]
+def _data(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     return [
-        ("fitted periods", ", ".join(map(str, periods["fit"]))),
-        ("held-out periods", ", ".join(map(str, periods["heldout"])) or "none"),
-        ("the data cannot show", words.joined(record.get("ruled_out") or ()) or "all can be seen"),
-        ("left out on request", words.joined(record.get("left_out") or ()) or "nothing"),
+        ("fitted periods", ", ".join(diagnosis.periods.fit)),
+        ("held-out periods", ", ".join(diagnosis.periods.heldout) or "none"),
+        ("the data cannot show", words.joined(diagnosis.ruled_out) or "all can be seen"),
+        ("left out on request", words.joined(diagnosis.left_out) or "nothing"),
     ]
 
 
-def _provenance(record: Record) -> list[tuple[str, str]]:
+def _provenance(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     return [
-        ("schema", str(record["schema"])),
-        ("seed", str(record["seed"])),
-        ("level of the tests", number(record["alpha"])),
-        ("budget", f"{number(record['budget_s'])} s"),
-        *((f"version of {name}", str(text)) for name, text in record["versions"].items()),
-        *((f"SHA-256 of the {name}", str(text)) for name, text in record["hashes"].items()),
+        ("schema", diagnosis.schema),
+        ("seed", str(diagnosis.seed)),
+        ("level of the tests", number(diagnosis.alpha)),
+        ("budget", f"{number(diagnosis.budget_s)} s"),
+        *((f"version of {name}", str(text)) for name, text in diagnosis.versions.items()),
+        *((f"SHA-256 of the {name}", text) for name, text in diagnosis.hashes.items()),
     ]
 
 
-def _usual_commands(record: Record) -> list[str]:
+def _usual_commands(diagnosis: Diagnosis) -> list[str]:
     """Return the commands with words in capitals for the paths, which no record holds."""
-    options = f"--budget-s {record['budget_s']:g} --alpha {record['alpha']:g}"
-    options += f" --seed {record['seed']}"
-    if record.get("left_out"):
-        options += " --leave-out " + " ".join(map(str, record["left_out"]))
-    lines = [f"ugat-marl diagnose {record['scenario']} MEASURED --out DIR {options}"]
-    if record.get("corrected"):
+    options = f"--budget-s {diagnosis.budget_s:g} --alpha {diagnosis.alpha:g}"
+    options += f" --seed {diagnosis.seed}"
+    if diagnosis.left_out:
+        options += " --leave-out " + " ".join(diagnosis.left_out)
+    lines = [f"ugat-marl diagnose {diagnosis.scenario} MEASURED --out DIR {options}"]
+    if diagnosis.corrected:
         lines.append(
-            f"ugat-marl train {record['scenario']} --sim DIR/{record['corrected']} --real REAL"
+            f"ugat-marl train {diagnosis.scenario} --sim DIR/{diagnosis.corrected} --real REAL"
         )
     return lines

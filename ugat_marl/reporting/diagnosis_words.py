@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable
 
-from ugat_marl.diagnosis import clock
+from ugat_marl.diagnosis import Diagnosis, Disagreement, EffectRecord, Parameter, Verdict, clock
 from ugat_marl.reporting.formats import number, share
-
-Record = Mapping[str, Any]
-"""The content of ``diagnosis.json``, or a part of it."""
 
 UNTRIED = 8
 """Most effects that are named as not examined; of more, the text gives their number."""
 
-VERDICTS = {
+VERDICTS: dict[Verdict, str] = {
     "no_discrepancy": "no discrepancy",
     "explained": "explained",
     "not_identifiable": "not identifiable",
@@ -23,7 +19,7 @@ VERDICTS = {
     "unknown": "unknown",
 }
 
-MEANINGS = {
+MEANINGS: dict[Verdict, str] = {
     "no_discrepancy": "The scenario as it is could have made these data. That does not say that it "
     "is right in what the data do not show.",
     "explained": "With these effects the simulation could have made the data they were judged "
@@ -37,44 +33,44 @@ MEANINGS = {
 }
 
 
-def meaning(record: Record) -> str:
+def meaning(diagnosis: Diagnosis) -> str:
     """Return the meaning of the verdict; "" if the search is not complete."""
-    if not record.get("complete", True):
+    if not diagnosis.complete:
         return ""
-    text = MEANINGS.get(str(record["verdict"]), "")
-    if record["verdict"] == "unknown" and record["effects"]:
+    text = MEANINGS[diagnosis.verdict]
+    if diagnosis.verdict == "unknown" and diagnosis.effects:
         text += " What is listed here stands in the log of the signals."
     return text
 
 
-def effect_name(item: Record) -> str:
+def effect_name(effect: EffectRecord) -> str:
     """Return the name of an effect with spaces."""
-    return str(item["name"]).replace("_", " ")
+    return effect.name.replace("_", " ")
 
 
-def place(item: Record) -> str:
+def place(effect: EffectRecord) -> str:
     """Return the place of an effect."""
-    where = item.get("place")
-    return "everywhere" if where in (None, "*", "") else str(where).replace(">", " → ")
+    where = effect.place
+    return "everywhere" if where in (None, "*", "") else where.replace(">", " → ")
 
 
-def window(span: Sequence[float] | None) -> str:
+def window(span: tuple[float, float] | None) -> str:
     """Return begin and end of a window on the scenario's clock; "" for None."""
     return "" if span is None else f"{clock(span[0])} – {clock(span[1])}"
 
 
-def values(item: Record, *, intervals: bool = True) -> str:
+def values(effect: EffectRecord, *, intervals: bool = True) -> str:
     """Return the parameters of an effect, with their intervals if wanted."""
-    found = [_parameter(name, given, intervals) for name, given in item["parameters"].items()]
-    return "; ".join(found) or "as such"
+    texts = [_parameter(name, value, intervals) for name, value in effect.parameters.items()]
+    return "; ".join(texts) or "as such"
 
 
-def _parameter(name: str, given: Record, intervals: bool) -> str:
-    value, low, high = given.get("value"), given.get("low"), given.get("high")
-    unit = str(given.get("unit") or "").replace("^2", "²")
+def _parameter(name: str, parameter: Parameter, intervals: bool) -> str:
+    value, low, high = parameter.value, parameter.low, parameter.high
+    unit = parameter.unit.replace("^2", "²")
     text = f"{name.removesuffix('_s').replace('_', ' ')} "
     text = "" if unit and name in ("seconds", "metres", "mps2", "seconds_per_hour") else text
-    if not intervals or value is None or low is None or high is None or low == high:
+    if not intervals or low is None or high is None or low == high:
         return f"{text}{number(value)} {unit}".rstrip()
     middle, low, high = (_rounded(x, high - low) for x in (value, low, high))
     return f"{text}{middle} {unit}".rstrip() + f" ({low} to {high})"
@@ -86,52 +82,45 @@ def _rounded(value: float, width: float) -> str:
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
-def disagreement_place(item: Record) -> str:
+def disagreement_place(disagreement: Disagreement) -> str:
     """Return the narrowest known place of a disagreement: lane, approach or traffic light."""
-    for key in ("lane", "approach", "tls"):
-        if item.get(key) is not None:
-            return str(item[key])
-    return "all of the network"
+    places = (disagreement.lane, disagreement.approach, disagreement.tls)
+    return next((name for name in places if name is not None), "all of the network")
 
 
-def strongest(record: Record, count: int) -> list[Record]:
+def strongest(diagnosis: Diagnosis, count: int) -> list[Disagreement]:
     """Return the strongest disagreements, one per statistic: the first one in the record."""
-    found: list[Record] = []
-    seen: set[str] = set()
-    for item in record.get("where") or ():
-        if item["statistic"] not in seen:
-            seen.add(item["statistic"])
-            found.append(item)
-    found.sort(key=lambda item: -abs(item["z"]))
-    return found[:count]
+    first: dict[str, Disagreement] = {}
+    for disagreement in diagnosis.where:
+        first.setdefault(disagreement.statistic, disagreement)
+    return sorted(first.values(), key=lambda item: -abs(item.z))[:count]
 
 
-def partial(record: Record) -> str | None:
+def partial(diagnosis: Diagnosis) -> str | None:
     """Return the warning that a diagnosis is not complete; None if it is."""
-    if record.get("complete", True):
+    if diagnosis.complete:
         return None
-    untried = list(record.get("untried") or ())
+    untried = diagnosis.untried
     rest = f", … ({len(untried)} in all)" if len(untried) > UNTRIED else ""
     left = f" Not examined yet: {joined(untried[:UNTRIED])}{rest}." if untried else ""
     return (
-        f"Partial result: the budget of {number(record.get('budget_s'))} s ended before the search "
+        f"Partial result: the budget of {number(diagnosis.budget_s)} s ended before the search "
         f"did.{left} The same command goes on where this one stopped."
     )
 
 
-def geh_line(record: Record) -> str | None:
+def geh_line(diagnosis: Diagnosis) -> str | None:
     """Return a sentence on GEH, the usual criterion for counts; None without counts."""
-    tables = record.get("courtesy") or {}
-    before = (tables.get("before") or {}).get("geh_below_5")
-    after = (tables.get("after") or {}).get("geh_below_5")
-    if before is None:
+    criteria = diagnosis.courtesy
+    if criteria is None or criteria.before.geh_below_5 is None:
         return None
+    before, after = criteria.before.geh_below_5, criteria.after.geh_below_5
     text = f"GEH < 5 (usual: on 85 % of counts): {share(before)} before, {share(after)} after"
-    if record["verdict"] != "no_discrepancy" and before >= 0.85:
+    if diagnosis.verdict != "no_discrepancy" and before >= 0.85:
         return f"{text}. It passes without any correction: it does not see this gap."
     return f"{text}."
 
 
 def joined(names: Iterable[str]) -> str:
     """Return names as a list in a sentence."""
-    return ", ".join(str(name).replace("_", " ") for name in names)
+    return ", ".join(name.replace("_", " ") for name in names)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from rich import box
 from rich.console import Group, RenderableType
@@ -12,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ugat_marl.data import MEASURES
+from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.experiments import Estimate, Evaluation, Tuned
 
 
@@ -103,14 +103,12 @@ def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
     return table
 
 
-def policy_gap_table(
-    title: str, gap: Mapping[str, Mapping[str, Any]], seeds: int
-) -> RenderableType:
+def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> RenderableType:
     """Return distances of both simulations from the real domain, policy by policy.
 
     Args:
         title: Title of the table.
-        gap: Gaps as returned by `ugat_marl.experiments.policy_gaps.policy_gap`.
+        gaps: Gap of each policy; see `ugat_marl.experiments.policy_gaps.policy_gap`.
         seeds: Number of episodes behind every number.
     """
     table = Table(
@@ -128,23 +126,24 @@ def policy_gap_table(
     table.add_column("policy", max_width=24, overflow="fold")
     for heading in ("sim", "corrected", "real", "before", "after", "shrink"):
         table.add_column(heading, justify="right")
-    for policy, row in gap.items():
-        att = [row[world] for world in ("sim", "corrected", "real")]
+    for policy, gap in gaps.items():
+        times = (gap.sim, gap.corrected, gap.real)
         table.add_row(
             Text(policy),
-            *(number(item["mean"]) for item in att),
-            number(row["before"]),
-            number(row["after"]),
-            "-" if row["shrink"] is None else f"{100 * row['shrink']:.0f} %",
+            *(number(time.mean) for time in times),
+            number(gap.before),
+            number(gap.after),
+            "-" if gap.shrink is None else f"{100 * gap.shrink:.0f} %",
         )
-        if any(item["low"] is not None for item in att):
-            table.add_row(*_dim("  95 % interval", *map(_limits, att)))
+        if any(time.low is not None for time in times):
+            table.add_row(*_dim("  95 % interval", *map(_limits, times)))
     return table
 
 
-def _limits(att: Mapping[str, float | None]) -> str:
-    low, high = att["low"], att["high"]
-    return "-" if low is None or high is None else f"{number(low)}-{number(high)}"
+def _limits(time: TravelTimeEstimate) -> str:
+    if time.low is None or time.high is None:
+        return "-"
+    return f"{number(time.low)}-{number(time.high)}"
 
 
 def _backlog(found: Evaluation, domain: str) -> list[str]:
