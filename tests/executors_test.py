@@ -21,8 +21,8 @@ import pytest
 from ugat_marl.cli.arguments import workers_of
 from ugat_marl.data import TransitionLog
 from ugat_marl.diagnosis.engine import Engine
+from ugat_marl.diagnosis.features import Site
 from ugat_marl.diagnosis.replay import Replay
-from ugat_marl.diagnosis.site import Site
 from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import TrafficEnv
 from ugat_marl.errors import OptionError, SimulatorCrashed

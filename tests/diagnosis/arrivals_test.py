@@ -12,9 +12,8 @@ import pytest
 from ugat_marl.data import follows_traffic
 from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.engine import Engine
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Site
 from ugat_marl.diagnosis.replay import Arrivals, Due, Replay, by_lane_left, corrected, unhindered
-from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.effects import Effect, load_scenario, parse_domain
 from ugat_marl.experiments import policy_factory, record

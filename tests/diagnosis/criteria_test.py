@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 from ugat_marl.diagnosis import Tally
-from ugat_marl.diagnosis.criteria import Criteria, fhwa, geh, hourly, representative
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.verify import Criteria, fhwa, geh, hourly, representative
 
 STOP = BIN_FEATURES.index("count_stop")
 

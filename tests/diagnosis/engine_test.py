@@ -14,9 +14,8 @@ import pytest
 from ugat_marl.diagnosis import Tally, default_cache
 from ugat_marl.diagnosis import engine as module
 from ugat_marl.diagnosis.engine import Engine, OutOfTime, Replicate
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, Site
 from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
-from ugat_marl.diagnosis.site import Site
 from ugat_marl.effects import Effect, load_scenario, observed, parse_domain
 from ugat_marl.errors import SimulatorError
 from ugat_marl.scenarios import Network, Passages, Period, Scenario

@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from ugat_marl.diagnosis import Tally
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, SPEED_FEATURES, tally
-from ugat_marl.diagnosis.site import Site, SiteLane
+from ugat_marl.diagnosis.features import (
+    BIN_FEATURES,
+    FEATURES,
+    INDEX,
+    SPEED_FEATURES,
+    Site,
+    SiteLane,
+    tally,
+)
 from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period, SignalLog
 
 NAN = float("nan")

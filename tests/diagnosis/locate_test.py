@@ -10,10 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Reference, Tally
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Site, SiteLane
 from ugat_marl.diagnosis.locate import locate
 from ugat_marl.diagnosis.records import Disagreement
-from ugat_marl.diagnosis.site import Site, SiteLane
 from ugat_marl.diagnosis.statistics import Pools
 
 Array = NDArray[np.float64]

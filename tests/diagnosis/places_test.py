@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Routes, Tally
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, tally
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Site, SiteLane, tally
 from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.diagnosis.places import Proposer, _later
-from ugat_marl.diagnosis.site import Site, SiteLane
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.effects import Domain, load_scenario, observed, parse_domain
 from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ugat_marl.diagnosis.features import Site
 from ugat_marl.diagnosis.replay import Day, Replay, replay_document
-from ugat_marl.diagnosis.site import Site
 from ugat_marl.effects import apply_effects, load_scenario, parse_domain
 from ugat_marl.errors import MeasuredDataError, SimulatorError
 from ugat_marl.scenarios import Network, Period, Scenario, SignalLog

@@ -14,13 +14,13 @@ from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     FEATURES,
     INDEX,
+    Site,
     bins_together,
     counts_tally,
     without_gaps,
 )
-from ugat_marl.diagnosis.signal_timing import timing_effects
-from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.diagnosis.study import timing_effects
 from ugat_marl.effects import load_scenario
 from ugat_marl.scenarios import Network, Period, Scenario, SignalLog
 from ugat_marl.simulation import standard_detectors

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ugat_marl.diagnosis.features import tally
-from ugat_marl.diagnosis.site import Greens, Site, SiteLane
+from ugat_marl.diagnosis.features import Greens, Site, SiteLane, tally
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Detector, Network, Passages, Period, SignalLog

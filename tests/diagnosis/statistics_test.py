@@ -9,9 +9,15 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Reference, Tally, added, shift
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, SPEED_FEATURES
+from ugat_marl.diagnosis.features import (
+    BIN_FEATURES,
+    FEATURES,
+    INDEX,
+    SPEED_FEATURES,
+    Site,
+    SiteLane,
+)
 from ugat_marl.diagnosis.residual import Null
-from ugat_marl.diagnosis.site import Site, SiteLane
 from ugat_marl.diagnosis.statistics import Pools, Whitener
 
 Array = NDArray[np.float64]

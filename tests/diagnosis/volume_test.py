@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from ugat_marl.diagnosis import Hypothesis, Routes
-from ugat_marl.diagnosis.features import FEATURES, INDEX
+from ugat_marl.diagnosis.features import FEATURES, INDEX, Site, SiteLane
 from ugat_marl.diagnosis.places import Volume
-from ugat_marl.diagnosis.site import Site, SiteLane
 from ugat_marl.diagnosis.statistics import Distance
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import load_scenario

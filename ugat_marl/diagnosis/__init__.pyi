@@ -4,6 +4,7 @@ from .hypotheses import Hypothesis as Hypothesis
 from .hypotheses import free_values as free_values
 from .hypotheses import global_hypotheses as global_hypotheses
 from .hypotheses import ordered as ordered
+from .locate import locate_gap as locate_gap
 from .places import Routes as Routes
 from .records import CORRECTED as CORRECTED
 from .records import FILE as FILE
@@ -32,12 +33,12 @@ from .records import TravelTimeEstimate as TravelTimeEstimate
 from .records import TravelTimes as TravelTimes
 from .records import Verdict as Verdict
 from .records import Verified as Verified
-from .signal_timing import IN_THE_LOG as IN_THE_LOG
 from .statistics import Reference as Reference
 from .statistics import added as added
 from .statistics import groups_of as groups_of
 from .statistics import independent as independent
 from .statistics import shift as shift
+from .study import IN_THE_LOG as IN_THE_LOG
 from .study import DiagnosisConfig as DiagnosisConfig
 from .study import Study as Study
 from .thresholds import THRESHOLDS as THRESHOLDS
@@ -48,4 +49,3 @@ from .verdict import conclude as conclude
 from .verdict import statistic as statistic
 from .verify import verify_model as verify_model
 from .workflow import diagnose as diagnose
-from .workflow import locate_gap as locate_gap

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import version_of
-from ugat_marl.diagnosis.features import FEATURES, Tally, tally
+from ugat_marl.diagnosis.features import FEATURES, Greens, Site, Tally, tally
 from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
-from ugat_marl.diagnosis.site import Greens, Site
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError

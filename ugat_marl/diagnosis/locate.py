@@ -1,4 +1,4 @@
-"""Disagreements of data and model by place, regime and window, with few false discoveries."""
+"""Location of the gap: the test of the scenario as it is, and the places that contradict it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,39 @@ from typing import Any
 import numpy as np
 from scipy import special, stats
 
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.records import Disagreement
-from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.engine import OutOfTime
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, Site
+from ugat_marl.diagnosis.records import Disagreement, Located, Tested
+from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
+from ugat_marl.diagnosis.study import Study
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 SHOWN = 40
 """Largest number of disagreements that are reported."""
 _REGIME_OF_BINS = ("volume", "volume", "volume", "storage")
+
+
+def locate_gap(study: Study, base: Tested, selector: Selector) -> Located:
+    """Test the scenario as it is, and find the places where the data contradict it."""
+    complete = True
+    if base.residual.p > study.config.alpha:
+        try:
+            base = selector.looked_closer(base)
+        except OutOfTime:
+            complete = False
+    contradicted = base.residual.p <= study.config.alpha
+    places = disagreements(study, base) if contradicted else ()
+    return Located(base, places, complete, frozenset(selector.examined))
+
+
+def disagreements(study: Study, model: Tested) -> tuple[Disagreement, ...]:
+    """Find where the fitted periods disagree with a model."""
+    periods = study.measured.of("fit")
+    spans = {(period.begin_s, period.end_s) for period in periods}
+    span = spans.pop() if len(spans) == 1 else None
+    distance = model.model.reference.distance(study.fit)
+    return locate(study.site, model.model.reference, distance, study.config.alpha, span)
 
 
 def locate(

@@ -15,9 +15,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX
+from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, Site
 from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
-from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Distance, Reference
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Examined

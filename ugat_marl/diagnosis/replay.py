@@ -35,10 +35,10 @@ from ugat_marl.diagnosis.features import (
     INDEX,
     PLATOON_FEATURES,
     Array,
+    Site,
     Tally,
     bins_of,
 )
-from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import (
     Effect,

@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.features import EVENT_FEATURES, FEATURES, SPEED_FEATURES, Tally
-from ugat_marl.diagnosis.site import Site
+from ugat_marl.diagnosis.features import EVENT_FEATURES, FEATURES, SPEED_FEATURES, Site, Tally
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import functools
+import itertools
+import math
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +15,7 @@ import numpy as np
 
 from ugat_marl.data import Finding, Measured, follows_traffic
 from ugat_marl.diagnosis.engine import Engine, default_cache
-from ugat_marl.diagnosis.features import Tally, bins_together, counts_tally, without_gaps
+from ugat_marl.diagnosis.features import Site, Tally, bins_together, counts_tally, without_gaps
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, library
 from ugat_marl.diagnosis.places import Proposer, Routes
@@ -20,14 +23,22 @@ from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import Selector
-from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, added, shift
 from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, THRESHOLDS, Effort
-from ugat_marl.effects import Effect
+from ugat_marl.effects import Effect, effect_from
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios import Detector, Network, Period, Scenario, driven_routes, edge_of
+from ugat_marl.scenarios import (
+    GREEN,
+    Detector,
+    Network,
+    Period,
+    Scenario,
+    SignalLog,
+    driven_routes,
+    edge_of,
+)
 
 
 @dataclass(frozen=True)
@@ -381,3 +392,60 @@ def unreached(
 def _few(edges: set[str]) -> str:
     named = sorted(edges)
     return ", ".join(named[:_NAMED]) + (" ..." if len(named) > _NAMED else "")
+
+
+# --- effects that the signal log shows by itself --------------------------------------------------
+
+IN_THE_LOG = ("yellow_time", "all_red_time")
+"""Effects that are read off the signal log. A replay of the log contains them already."""
+_AMBER = frozenset("yY")
+
+
+def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> tuple[Effect, ...]:
+    """Return effects for yellow and all-red times of the log that differ from the scenario's.
+
+    Logs with only states of the network's own programme are left out.
+    """
+    yellow: Counter[float] = Counter()
+    red: Counter[float] = Counter()
+    controlled = {item.id: item for item in network.intersections}
+    for period in measured.periods:
+        for tls, log in period.signals.items():
+            if tls in controlled and not _own(log, controlled[tls].programme):
+                for kind, duration in _clearances(log):
+                    (yellow if kind == "y" else red)[round(duration, 1)] += 1
+    found: list[Effect] = []
+    control = scenario.control
+    clearances = (yellow, control.yellow_s), (red, control.all_red_s)
+    for name, (seen, now) in zip(IN_THE_LOG, clearances, strict=True):
+        total = sum(seen.values())
+        if total >= THRESHOLDS.least_clearances:
+            value, count = seen.most_common(1)[0]
+            if count >= THRESHOLDS.usual_share * total and abs(value - now) > 0.05:
+                found.append(effect_from({"name": name, "seconds": value}))
+    return tuple(found)
+
+
+def _own(log: SignalLog, programme: tuple[tuple[float, str], ...]) -> bool:
+    """Return True if a log shows only states of the network's own programme."""
+    return {state for _, state in log} <= {state for _, state in programme}
+
+
+def _clearances(log: SignalLog) -> list[tuple[str, float]]:
+    """Return durations in s of yellow (``y``), and from its end to the next green (``r``).
+
+    Other links may be green at the same time. Red-yellow does not count as yellow.
+    """
+    found: list[tuple[str, float]] = []
+    began = ended = math.nan
+    for (_, before), (time_s, state) in itertools.pairwise(log):
+        pairs = list(zip(before, state, strict=False))
+        if any(new in _AMBER and old not in _AMBER for old, new in pairs):
+            began = time_s
+        if any(old in _AMBER and new not in _AMBER for old, new in pairs):
+            found.append(("y", time_s - began))
+            ended = time_s
+        if any(new in GREEN and old not in GREEN for old, new in pairs):
+            found.append(("r", time_s - ended))
+            ended = math.nan
+    return [(kind, duration) for kind, duration in found if duration == duration]

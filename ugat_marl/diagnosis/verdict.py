@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from scipy import stats
 
-from ugat_marl.diagnosis.features import FEATURES
+from ugat_marl.diagnosis.features import FEATURES, Site
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members
 from ugat_marl.diagnosis.places import one_behind_the_other
 from ugat_marl.diagnosis.records import (
@@ -21,7 +21,6 @@ from ugat_marl.diagnosis.records import (
     Verified,
 )
 from ugat_marl.diagnosis.select import Selector
-from ugat_marl.diagnosis.site import Site
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect, known_effects
 

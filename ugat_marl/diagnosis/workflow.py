@@ -13,13 +13,12 @@ from pathlib import Path
 
 from ugat_marl.data import Measured, versions_of
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.locate import locate
+from ugat_marl.diagnosis.locate import disagreements, locate_gap
 from ugat_marl.diagnosis.records import (
     CORRECTED,
     SCHEMA,
     Conclusion,
     Diagnosis,
-    Disagreement,
     EffectRecord,
     Explanation,
     FitEvidence,
@@ -38,9 +37,7 @@ from ugat_marl.diagnosis.records import (
     Verdict,
     Verified,
 )
-from ugat_marl.diagnosis.select import Selector
-from ugat_marl.diagnosis.signal_timing import IN_THE_LOG, timing_effects
-from ugat_marl.diagnosis.study import DiagnosisConfig, Study
+from ugat_marl.diagnosis.study import IN_THE_LOG, DiagnosisConfig, Study, timing_effects
 from ugat_marl.diagnosis.verdict import conclude, effect_record, unchallenged, unverified
 from ugat_marl.diagnosis.verify import tables_of, verify_model
 from ugat_marl.effects import Effect, apply_effects
@@ -129,28 +126,6 @@ def _compared(
         verified, conclusion = unverified(located, selected)
         diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
     return diagnosis, () if conclusion.verdict == "unknown" else conclusion.best.model.effects
-
-
-def locate_gap(study: Study, base: Tested, selector: Selector) -> Located:
-    """Test the scenario as it is, and find the places where the data contradict it."""
-    complete = True
-    if base.residual.p > study.config.alpha:
-        try:
-            base = selector.looked_closer(base)
-        except OutOfTime:
-            complete = False
-    contradicted = base.residual.p <= study.config.alpha
-    places = disagreements(study, base) if contradicted else ()
-    return Located(base, places, complete, frozenset(selector.examined))
-
-
-def disagreements(study: Study, model: Tested) -> tuple[Disagreement, ...]:
-    """Find where the fitted periods disagree with a model."""
-    periods = study.measured.of("fit")
-    spans = {(period.begin_s, period.end_s) for period in periods}
-    span = spans.pop() if len(spans) == 1 else None
-    distance = model.model.reference.distance(study.fit)
-    return locate(study.site, model.model.reference, distance, study.config.alpha, span)
 
 
 def _beside_the_log(
