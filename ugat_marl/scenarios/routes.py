@@ -7,7 +7,6 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 from ugat_marl.errors import ScenarioError
@@ -59,14 +58,9 @@ def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
     Args:
         scenario: Any scenario; `as_vehicles` turns its trips and flows into vehicles.
     """
-    begin = scenario.settings.begin_s
-    end = begin + scenario.settings.duration_s
-    for document in as_vehicles(scenario).routes:
-        for vehicle in chain.from_iterable(part.iter("vehicle") for part in document.parts()):
-            route = vehicle.find("route")
-            edges = () if route is None else tuple(route.get("edges", "").split())
-            if edges and begin <= seconds_of(vehicle.get("depart", "0")) < end:
-                yield edges
+    for _, depart, edges in departures(scenario, routed=False):
+        if edges and depart >= scenario.settings.begin_s:
+            yield tuple(edges)
 
 
 def departures(
