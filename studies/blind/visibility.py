@@ -24,9 +24,9 @@ from ugat_marl.diagnosis import (
     Study,
     Tally,
     added,
+    change_between,
     groups_of,
     independent,
-    shift,
 )
 from ugat_marl.effects import Effect, effect_from, known_effects, load_scenario
 from ugat_marl.files import write_whole
@@ -123,7 +123,7 @@ def separation(
     Returns:
         Standard deviations; 0 where chance turns the estimate of the square negative.
     """
-    halves = [shift(reference.pools, after[i::2], before[i::2])[0] for i in (0, 1)]
+    halves = [change_between(reference.pools, after[i::2], before[i::2])[0] for i in (0, 1)]
     sums = reference.pools.pool(added(data))
     squares: list[float] = []
     for name, block in reference.blocks.items():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis import Reference, Tally, added, shift
+from ugat_marl.diagnosis import Reference, Tally, added, change_between
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     FEATURES,
@@ -228,7 +228,7 @@ def test_a_shift_is_measured_on_the_same_days() -> None:
     values = gaussian(13, 8)
     moved = values.copy()
     moved[:, 1] += 1.5
-    difference, variance = shift(NETWORK, days_of(moved), days_of(values))
+    difference, variance = change_between(NETWORK, days_of(moved), days_of(values))
     assert difference["network"][0, INDEX[USED[1]]] == pytest.approx(1.5)
     assert difference["network"][0, INDEX[USED[0]]] == pytest.approx(0.0)
     assert variance["network"][0, INDEX[USED[1]]] == pytest.approx(0.0, abs=1e-12)

@@ -11,7 +11,7 @@ from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_of
 from ugat_marl.diagnosis.records import Fitted
-from ugat_marl.diagnosis.statistics import Array, Pools, Reference, Whitener, shift, shrunk
+from ugat_marl.diagnosis.statistics import Array, Pools, Reference, Whitener, change_between, shrunk
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import EVERYWHERE
 
@@ -241,7 +241,7 @@ class Fitter:
         numbers = list(model.days)[: days or self.days]
         found = self.engine.ordinary(effects_of(members), numbers)
         before = [model.days[number] for number in found]
-        return shift(self.pools, [day.tally for day in found.values()], before)
+        return change_between(self.pools, [day.tally for day in found.values()], before)
 
     def _moved(self, model: Fitted, step: Array) -> Members:
         """Return the model's members after a step, clipped to the ranges and to a longest move."""
@@ -391,7 +391,7 @@ def uncertainty(
     influences: list[Array] = []
     days = days or model.tallies
     for item in days:
-        difference, _ = shift(fitter.pools, [item], days)
+        difference, _ = change_between(fitter.pools, [item], days)
         influences.append(inverse @ (jacobian @ whitener(difference)))
     spread = np.atleast_2d(np.cov(np.stack(influences).T))
     # measured periods and simulated days both vary

@@ -370,7 +370,7 @@ def _mahalanobis(z: Array, used: NDArray[np.bool_], correlation: Array) -> float
     return total
 
 
-def shift(
+def change_between(
     pools: Pools, after: Sequence[Tally], before: Sequence[Tally]
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return the change of the statistics between two models, from the same days.

@@ -23,7 +23,7 @@ from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import Selector
-from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, added, shift
+from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, added, change_between
 from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, THRESHOLDS, Effort
 from ugat_marl.effects import Effect, effect_from
 from ugat_marl.errors import MeasuredDataError, OptionError
@@ -272,7 +272,7 @@ class Study:
             other = self.other_days.ordinary(effects, numbers)
             both = [number for number in own if number in other]
             days = [[found[number].tally for number in both] for found in (own, other)]
-            apart, _ = shift(self.pools, *days)
+            apart, _ = change_between(self.pools, *days)
             self._doubts[effects] = {
                 name: (THRESHOLDS.left_open * values) ** 2 for name, values in apart.items()
             }
