@@ -23,10 +23,10 @@ from ugat_marl.diagnosis import (
     Reference,
     Study,
     Tally,
-    added,
     change_between,
     groups_of,
     independent,
+    sum_of,
 )
 from ugat_marl.effects import Effect, effect_from, known_effects, load_scenario
 from ugat_marl.files import write_whole
@@ -124,7 +124,7 @@ def separation(
         Standard deviations; 0 where chance turns the estimate of the square negative.
     """
     halves = [change_between(reference.pools, after[i::2], before[i::2])[0] for i in (0, 1)]
-    sums = reference.pools.pool(added(data))
+    sums = reference.pools.pool(sum_of(data))
     squares: list[float] = []
     for name, block in reference.blocks.items():
         weight = sums[name][..., 1] / len(data)

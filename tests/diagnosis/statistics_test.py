@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis import Reference, Tally, added, change_between
+from ugat_marl.diagnosis import Reference, Tally, change_between, sum_of
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     FEATURES,
@@ -252,7 +252,7 @@ def test_whitened_noise_is_white() -> None:
     mean = reference.blocks["network"].mean
     rows = []
     for values in gaussian(18, 1500, correlation=0.7).reshape(300, 5, len(USED), 1):
-        pooled = NETWORK.pool(added(days_of(values)))["network"]
+        pooled = NETWORK.pool(sum_of(days_of(values)))["network"]
         value = pooled[..., 0] / np.maximum(pooled[..., 1], 1e-9)
         difference = np.where(pooled[..., 1] > 0, value - np.nan_to_num(mean), 0.0)
         time = np.zeros((len(BIN_FEATURES), 1))

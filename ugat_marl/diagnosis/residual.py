@@ -25,10 +25,10 @@ from ugat_marl.diagnosis.statistics import (
     Group,
     Pools,
     Reference,
-    added,
     groups_of,
     independent,
     softened,
+    sum_of,
     without_noise,
 )
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
@@ -186,7 +186,7 @@ class MatchedFilters:
         extra: Mapping[str, Array] | None = None,
         fitted: Sequence[Mapping[str, Array]] = (),
     ) -> None:
-        sums = reference.pools.pool(added(data))
+        sums = reference.pools.pool(sum_of(data))
         self._parts: list[tuple[str, list[Group]]] = []
         scales: dict[str, Array] = {}
         for name in blocks:

@@ -218,7 +218,7 @@ class Reference:
                 None for this model without a penalty.
             extra: Further variance of the expected statistics, by block.
         """
-        sums = self.pools.pool(added(data))
+        sums = self.pools.pool(sum_of(data))
         total = penalty = 0.0
         parts: dict[str, float] = {}
         z: dict[str, Array] = {}
@@ -256,7 +256,7 @@ def _stack(pools: Pools, tallies: Sequence[Tally]) -> dict[str, Array]:
     return {name: np.stack([item[name] for item in pooled]) for name in pooled[0]}
 
 
-def added(tallies: Sequence[Tally]) -> Tally:
+def sum_of(tallies: Sequence[Tally]) -> Tally:
     """Return the tally of several periods together."""
     total = tallies[0]
     for item in tallies[1:]:
@@ -452,7 +452,7 @@ class Whitener:
     ) -> None:
         chosen = relative_to or reference
         found = reference.distance(data, relative_to=chosen)
-        sums = reference.pools.pool(added(data))
+        sums = reference.pools.pool(sum_of(data))
         self._parts: list[tuple[str, Array, list[Group]]] = []
         for name, block in reference.blocks.items():
             if blocks is not None and name not in blocks:

@@ -23,7 +23,7 @@ from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import Selector
-from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, added, change_between
+from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, change_between, sum_of
 from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, THRESHOLDS, Effort
 from ugat_marl.effects import Effect, effect_from
 from ugat_marl.errors import MeasuredDataError, OptionError
@@ -222,7 +222,7 @@ class Study:
         Raises:
             OutOfTime: The budget does not suffice for the days that `doubt` needs.
         """
-        data = added(self.fit)
+        data = sum_of(self.fit)
         counted, known = data.sums[..., 1:] > 0, data.counted >= data.days
         width = min(known.shape[-1], *(day.bins.shape[-1] for day in tallies))
         seen = [

@@ -28,7 +28,7 @@ from ugat_marl.diagnosis.records import (
     Verified,
 )
 from ugat_marl.diagnosis.residual import Null
-from ugat_marl.diagnosis.statistics import Array, added
+from ugat_marl.diagnosis.statistics import Array, sum_of
 from ugat_marl.diagnosis.study import Study
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect
@@ -121,11 +121,11 @@ def courtesy(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
     They do not affect the verdict. GEH and headway use the held-out days. The criteria of FHWA use
     all measured days, since they need the variation between days.
     """
-    data, every = added(study.heldout), study.all_days
+    data, every = sum_of(study.heldout), study.all_days
 
     def row(model: Tested) -> CriteriaRow:
         tallies = model.model.tallies
-        values = geh(hourly(data), hourly(added(tallies)))
+        values = geh(hourly(data), hourly(sum_of(tallies)))
         criteria = fhwa(every, tallies, study.pools.together)
         some = len(values) > 0
         return CriteriaRow(
@@ -143,7 +143,7 @@ def courtesy(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
 
 def _headway(days: Sequence[Tally]) -> float | None:
     """Return the mean gap of queued vehicles from the fourth on, s."""
-    sums = added(days).sums
+    sums = sum_of(days).sums
     rows = [INDEX["gap4-5"], INDEX["gap6-8"], INDEX["gap9+"]]
     total = sums[rows].sum(axis=(0, 1))
     return float(total[0] / total[1]) if total[1] else None
