@@ -24,9 +24,9 @@ from ugat_marl.diagnosis import (
     Study,
     Tally,
     change_between,
-    groups_of,
-    independent,
+    correlation_groups,
     sum_of,
+    whitened,
 )
 from ugat_marl.effects import Effect, effect_from, known_effects, load_scenario
 from ugat_marl.files import write_whole
@@ -129,7 +129,7 @@ def separation(
     for name, block in reference.blocks.items():
         weight = sums[name][..., 1] / len(data)
         noise = np.sqrt(block.noise(weight, len(data)))
-        groups = groups_of(block.used & (weight >= 1.0), block.correlation)
-        one, two = (independent(half[name] / noise, groups) for half in halves)
+        groups = correlation_groups(block.used & (weight >= 1.0), block.correlation)
+        one, two = (whitened(half[name] / noise, groups) for half in halves)
         squares.append(float(one @ two))
     return math.sqrt(max(0.0, *squares))

@@ -25,10 +25,10 @@ from ugat_marl.diagnosis.statistics import (
     Group,
     Pools,
     Reference,
-    groups_of,
-    independent,
+    correlation_groups,
     softened,
     sum_of,
+    whitened,
     without_noise,
 )
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
@@ -194,7 +194,7 @@ class MatchedFilters:
                 continue
             block = reference.blocks[name]
             weight = sums[name][..., 1] / len(data)
-            groups = groups_of(block.used & (weight >= 1.0), block.correlation)
+            groups = correlation_groups(block.used & (weight >= 1.0), block.correlation)
             self._parts.append((name, groups))
             more = 0.0 if extra is None else extra[name]
             scales[name] = np.sqrt(block.noise(weight, len(data)) + more)
@@ -220,7 +220,7 @@ class MatchedFilters:
         return float((components**2).max(initial=0.0))
 
     def _whitened(self, z: Mapping[str, Array]) -> Array:
-        return np.concatenate([independent(z[name], groups) for name, groups in self._parts])
+        return np.concatenate([whitened(z[name], groups) for name, groups in self._parts])
 
 
 def _spanned(rows: Array) -> Array:

@@ -463,18 +463,18 @@ class Whitener:
             soft = 0.0 if SOFT[name] == np.inf else 1.0 / SOFT[name]
             scale = np.sqrt(noise + (max(tolerance, soft) * difference) ** 2)
             used = chosen.blocks[name].used & (weight >= 1.0)
-            self._parts.append((name, scale, groups_of(used, block.correlation)))
+            self._parts.append((name, scale, correlation_groups(used, block.correlation)))
         self.measured = self(found.difference)
 
     def __call__(self, differences: Mapping[str, Array]) -> Array:
         """Return whitened differences of all blocks, ``(statistics,)``."""
         rows: list[Array] = []
         for name, scale, groups in self._parts:
-            rows.append(independent(differences[name] / scale, groups))
+            rows.append(whitened(differences[name] / scale, groups))
         return np.concatenate(rows)
 
 
-def groups_of(used: NDArray[np.bool_], correlation: Array) -> list[Group]:
+def correlation_groups(used: NDArray[np.bool_], correlation: Array) -> list[Group]:
     """Group members that use the same features.
 
     Args:
@@ -491,12 +491,12 @@ def groups_of(used: NDArray[np.bool_], correlation: Array) -> list[Group]:
     return groups
 
 
-def independent(z: Array, groups: Sequence[Group]) -> Array:
+def whitened(z: Array, groups: Sequence[Group]) -> Array:
     """Return ``L^-1 z`` of every member, one after the other, where ``C = L L'``.
 
     Args:
         z: Standardised differences, ``(members, features)``.
-        groups: Groups of members, from `groups_of`.
+        groups: Groups of members, from `correlation_groups`.
     """
     z = np.nan_to_num(z)
     rows = [(z[members][:, used] @ inverse.T).ravel() for members, used, inverse in groups]
