@@ -180,17 +180,17 @@ def test_filters_look_at_pools_and_at_single_places() -> None:
     moved[1, ROWS[0]] = 2.0
     nothing = {name: np.zeros_like(block.mean) for name, block in made.blocks.items()}
     hypothesis = Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,))
-    ray = Direction(hypothesis, (1.5,), nothing | {"lane": moved}, nothing, (1.0,))
+    direction = Direction(hypothesis, (1.5,), nothing | {"lane": moved}, nothing, (1.0,))
     values = np.tile(lane.mean[:, ROWS].T[None], (PERIODS, 1, 1))
     values[:, 0, 1] += 2.0
     data = days_of(values)
-    filters = Directions((ray,)).filters(made, data)
+    filters = Directions((direction,)).filters(made, data)
     assert set(filters) == {"one effect", "one effect, lanes"}
     distance = made.distance(data)
     assert filters["one effect"](distance) == 0.0, "the effect does not show in the pool"
     assert filters["one effect, lanes"](distance) > 10.0
-    # What may be chance in the ray of a single place is left out.
-    doubtful = replace(ray, variance=nothing | {"lane": np.ones_like(moved)})
+    # What may be chance in the direction of a single place is left out.
+    doubtful = replace(direction, variance=nothing | {"lane": np.ones_like(moved)})
     assert Directions((doubtful,)).filters(made, data)["one effect, lanes"](distance) == 0.0
 
 

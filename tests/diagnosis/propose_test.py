@@ -41,7 +41,7 @@ def reference() -> Reference:
     return Reference(POOLS, [day(20.0 + values) for values in noise])
 
 
-def rays(seed: int = 2, size: float = 12.0) -> list[Direction]:
+def directions(seed: int = 2, size: float = 12.0) -> list[Direction]:
     """Hypotheses that move the statistics in directions of their own."""
     generator = np.random.default_rng(seed)
     found: list[Direction] = []
@@ -69,11 +69,11 @@ def whitener(
     among: Sequence[Direction],
     noise: int | None = None,
 ) -> Whitener:
-    """For data in which these hypotheses are present, at multiples of their rays."""
+    """For data in which these hypotheses are present, at multiples of their directions."""
     values = reference.blocks["network"].mean[0, :WIDTH].copy()
-    for ray in among:
-        strength = planted.get(ray.hypothesis.name, 0.0)
-        values = values + strength * ray.difference["network"][0, :WIDTH]
+    for direction in among:
+        strength = planted.get(direction.hypothesis.name, 0.0)
+        values = values + strength * direction.difference["network"][0, :WIDTH]
     rows = np.tile(values, (5, 1))
     if noise is not None:
         rows = rows + np.random.default_rng(noise).standard_normal(rows.shape)
@@ -96,7 +96,7 @@ def values(proposal: Proposed) -> dict[str, float]:
 def test_planted_combinations_are_recovered_exactly(
     reference: Reference, planted: dict[str, float]
 ) -> None:
-    among = rays()
+    among = directions()
     best = propose(among, whitener(reference, planted, among), PRICE)[0]
     expected = {
         name: NOMINAL[NAMES.index(name)]
@@ -109,8 +109,8 @@ def test_planted_combinations_are_recovered_exactly(
 
 
 def test_effects_that_hide_each_other_are_proposed_together(reference: Reference) -> None:
-    # Two rays that nearly cancel: neither alone helps much, both together explain all.
-    among = rays()[:4]
+    # Two directions that nearly cancel: neither alone helps much, both together explain all.
+    among = directions()[:4]
     other = among[1]
     hidden = {
         "network": -0.95 * among[0].difference["network"] + 0.3 * other.difference["network"],
@@ -124,7 +124,7 @@ def test_effects_that_hide_each_other_are_proposed_together(reference: Reference
 
 
 def test_a_price_keeps_spurious_effects_out(reference: Reference) -> None:
-    among = rays()
+    among = directions()
     sizes: list[int] = []
     for seed in range(40):
         best = propose(among, whitener(reference, {"headway": 0.8}, among, noise=seed), PRICE)[0]
@@ -134,7 +134,7 @@ def test_a_price_keeps_spurious_effects_out(reference: Reference) -> None:
 
 
 def test_of_nothing_but_noise_nothing_is_worth_its_price(reference: Reference) -> None:
-    among = rays()
+    among = directions()
     tempted = 0
     for seed in range(100, 140):
         target = whitener(reference, {}, among, noise=seed)
@@ -144,21 +144,23 @@ def test_of_nothing_but_noise_nothing_is_worth_its_price(reference: Reference) -
 
 
 def test_no_effect_works_backwards(reference: Reference) -> None:
-    among = rays()[:3]
+    among = directions()[:3]
     found = propose(among, whitener(reference, {"headway": -0.8}, among), PRICE)
     assert all("headway" not in values(item) for item in found)
 
 
 def test_rays_are_followed_only_so_far(reference: Reference) -> None:
-    among = rays()[:1]
+    among = directions()[:1]
     best = propose(among, whitener(reference, {"headway": 5.0}, among), PRICE)[0]
     assert values(best)["headway"] == pytest.approx(1.0 + THRESHOLDS.farthest * 0.5)
 
 
 def test_two_strengths_of_one_hypothesis_never_stand_in_one_model(reference: Reference) -> None:
-    among = rays()[:2]
+    among = directions()[:2]
     first = among[0]
-    among.append(Direction(first.hypothesis, (1.9,), rays(9)[0].difference, first.variance, (1.0,)))
+    among.append(
+        Direction(first.hypothesis, (1.9,), directions(9)[0].difference, first.variance, (1.0,))
+    )
     target = whitener(reference, {"headway": 0.8, "min_gap": 0.6}, among)
     for item in propose(among, target, 0.0):
         names = [hypothesis.name for hypothesis, _ in item.members]
@@ -167,10 +169,10 @@ def test_two_strengths_of_one_hypothesis_never_stand_in_one_model(reference: Ref
 
 
 def test_a_hypothesis_without_numbers_is_there_or_not(reference: Reference) -> None:
-    among = rays()[:2]
+    among = directions()[:2]
     model = Hypothesis("driver_model", (("model", "IDM"),), (), ((),), None)
-    among.append(Direction(model, (), rays(5)[0].difference, among[0].variance, None))
-    # Its ray alone makes the difference.
+    among.append(Direction(model, (), directions(5)[0].difference, among[0].variance, None))
+    # Its direction alone makes the difference.
     values_ = (
         reference.blocks["network"].mean[0, :WIDTH] + among[2].difference["network"][0, :WIDTH]
     )
@@ -190,8 +192,8 @@ def test_many_rays_are_searched_in_good_time(reference: Reference) -> None:
         Direction(
             Hypothesis("headway", (("place", str(i)),), ("seconds",), ((1.5,),), (1.0,)),
             (1.5,),
-            rays(100 + i)[0].difference,
-            rays()[0].variance,
+            directions(100 + i)[0].difference,
+            directions()[0].variance,
             (1.0,),
         )
         for i in range(60)
@@ -213,7 +215,7 @@ def test_many_rays_are_searched_in_good_time(reference: Reference) -> None:
 
 
 def test_rays_between_two_strengths_of_one_effect() -> None:
-    one, other = rays(3)[0], rays(4)[0]
+    one, other = directions(3)[0], directions(4)[0]
     strong = Direction(one.hypothesis, (2.0,), other.difference, one.variance, one.origin)
     weak = Direction(one.hypothesis, (0.7,), other.difference, one.variance, one.origin)
     found = between([one, strong])
@@ -224,4 +226,4 @@ def test_rays_between_two_strengths_of_one_effect() -> None:
     assert middle == pytest.approx(straight)
     # Nothing lies between shorter and longer than nominal, nor between two effects.
     assert len(between([weak, one])) == 2
-    assert len(between(rays()[:2])) == 2
+    assert len(between(directions()[:2])) == 2

@@ -103,9 +103,9 @@ class Proposer:
             mean = np.where(np.isfinite(block.mean[rows]), block.mean[rows], 0.0)
             noise = np.where(known, difference[rows] / np.where(known, z[rows], 1.0), np.inf)
             for shift in THRESHOLDS.shifts_s:
-                ray = (_later(mean, shift / width) - mean) / np.abs(noise)
-                size = float((ray**2).sum())
-                strength = float((ray * z[rows]).sum()) / max(size, 1e-9)
+                change = (_later(mean, shift / width) - mean) / np.abs(noise)
+                size = float((change**2).sum())
+                strength = float((change * z[rows]).sum()) / max(size, 1e-9)
                 if 0.5 < strength < 2.0 and strength**2 * size > THRESHOLDS.suspect_timing:
                     found.append((strength**2 * size, origin, shift))
         chosen: dict[str, float] = {}
@@ -406,13 +406,13 @@ class _Counts:
         Returns:
             Strength s, squared z of the fit ``s^2 r·r``, squared z of strength 1 ``r·r``.
         """
-        ray = np.zeros(len(self.place))
+        expected = np.zeros(len(self.place))
         for edge, value in change.items():
             if edge in self.place:
-                ray[self.place[edge]] += value
-        ray = self.whiten @ ray
-        size = float(ray @ ray)
-        strength = float(ray @ self.measured) / max(size, 1e-9)
+                expected[self.place[edge]] += value
+        expected = self.whiten @ expected
+        size = float(expected @ expected)
+        strength = float(expected @ self.measured) / max(size, 1e-9)
         return strength, strength**2 * size, size
 
 
@@ -531,7 +531,7 @@ class Volume:
         """Return squared z of more vehicles on those lanes of an edge that lead to the target."""
         rates = self._routes.turns[origin]
         row = INDEX["count_stop"]
-        ray: list[float] = []
+        changes: list[float] = []
         z: list[float] = []
         errors: list[float] = []
         lanes = [(i, lane) for i, lane in enumerate(self._site.lanes) if lane.edge == origin]
@@ -545,12 +545,12 @@ class Volume:
                 alike = sum(edge in other.following for _, other in lanes)
                 come = sum(rates.values()) if edge == target else 0.0
                 change += (come - rates[edge]) / alike
-            ray.append(change)
+            changes.append(change)
             z.append(score)
             errors.append(60.0 * abs(difference / score))
-        if len(ray) < 2:
+        if len(changes) < 2:
             return 0.0
-        scaled = np.array(ray) / np.array(errors)
+        scaled = np.array(changes) / np.array(errors)
         scaled -= scaled.mean()  # the total over the lanes is tested by `weighed` already
         found = float(scaled @ np.array(z))
         return max(found, 0.0) ** 2 / max(float(scaled @ scaled), 1e-9)

@@ -1,8 +1,8 @@
 """Sets of effects, with their strengths, that would make the measured difference.
 
-Every hypothesis is simulated at a few strengths. Each change of the statistics is a direction, also
-called a ray. Sets of up to three directions are fitted to the measured difference by least
-squares, without further simulations. So effects that hide each other are proposed together.
+Every hypothesis is simulated at a few strengths. Each change of the statistics is a direction. Sets
+of up to three directions are fitted to the measured difference by least squares, without further
+simulations. So effects that hide each other are proposed together.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ class Direction:
         return self.hypothesis.clipped(values)
 
 
-def between(rays: Sequence[Direction]) -> list[Direction]:
-    """Return the rays, and rays at one and two thirds between strengths of the same hypothesis.
+def between(directions: Sequence[Direction]) -> list[Direction]:
+    """Return the directions, and those at one and two thirds between strengths of a hypothesis.
 
     The change by an effect is not proportional to its strength, but between two simulated strengths
     it is nearly linear.
     """
-    found = list(rays)
-    for first, second in itertools.pairwise(rays):
+    found = list(directions)
+    for first, second in itertools.pairwise(directions):
         near = first.hypothesis == second.hypothesis and first.origin is not None
         if not near or not first.level or _side(first) != _side(second):
             continue
@@ -77,21 +77,21 @@ def between(rays: Sequence[Direction]) -> list[Direction]:
     return found
 
 
-def _side(ray: Direction) -> bool:
-    assert ray.origin is not None
-    return ray.level > ray.origin
+def _side(direction: Direction) -> bool:
+    assert direction.origin is not None
+    return direction.level > direction.origin
 
 
 def propose(
-    rays: Sequence[Direction], whitener: Whitener, price: float, largest: int = 3
+    directions: Sequence[Direction], whitener: Whitener, price: float, largest: int = 3
 ) -> list[Proposed]:
     """Find sets of effects, in order of the cost that they would leave.
 
-    For rays A (one per row, whitened) and the measured difference m, the strengths x minimise
+    For directions A (one per row, whitened) and the measured difference m, the strengths x minimise
     ``|m - A' x|^2``, and cost = this minimum + price * number of effects.
 
     Args:
-        rays: Changes of the statistics under hypotheses.
+        directions: Changes of the statistics under hypotheses.
         whitener: The measured difference and its noise.
         price: Cost of every effect.
         largest: Size of the largest sets.
@@ -99,23 +99,23 @@ def propose(
     Returns:
         Each set of hypotheses once, at its best strengths, least cost first.
     """
-    if not rays:
+    if not directions:
         return []
     target = whitener.measured
-    basis = np.stack([whitener(without_noise(ray.difference, ray.variance)) for ray in rays])
+    basis = np.stack([whitener(without_noise(x.difference, x.variance)) for x in directions])
     gram = basis @ basis.T
     match = basis @ target
     start = float(target @ target)
     best: dict[tuple[object, ...], Proposed] = {}
-    kept = list(range(len(rays)))
+    kept = list(range(len(directions)))
     for size in range(1, largest + 1):
-        if size == 3 and len(kept) > 40:  # all triples would take too long: keep the best rays
-            kept = _useful(best, rays, 40)
+        if size == 3 and len(kept) > 40:  # all triples would take too long
+            kept = _useful(best, directions, 40)
         for chosen in itertools.combinations(kept, size):
-            keys = tuple(sorted(str(rays[index].hypothesis.key) for index in chosen))
+            keys = tuple(sorted(str(directions[index].hypothesis.key) for index in chosen))
             if len(set(keys)) < size:
                 continue
-            signs = tuple(rays[index].hypothesis.both for index in chosen)
+            signs = tuple(directions[index].hypothesis.both for index in chosen)
             found = _least_squares(gram, match, chosen, signs)
             if found is None:
                 continue
@@ -125,7 +125,7 @@ def propose(
             cost = left + price * size
             if keys not in best or cost < best[keys].expected:
                 members = tuple(
-                    (rays[index].hypothesis, rays[index].at(float(strength)))
+                    (directions[index].hypothesis, directions[index].at(float(strength)))
                     for index, strength in zip(chosen, found, strict=True)
                 )
                 if all(_is_something(hypothesis, values) for hypothesis, values in members):
@@ -141,13 +141,13 @@ def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
 def _least_squares(
     gram: Array, match: Array, chosen: tuple[int, ...], both: tuple[bool, ...]
 ) -> Array | None:
-    """Return strengths along the rays, clipped; None if one of the rays does not help.
+    """Return strengths along the directions, clipped; None if one of the directions does not help.
 
     Args:
-        gram: Scalar products of all rays, ``(rays, rays)``.
-        match: Scalar products of the rays with the measured difference, ``(rays,)``.
-        chosen: Indices of the rays to use.
-        both: True for rays that may have a negative strength.
+        gram: Scalar products of all directions, ``(directions, directions)``.
+        match: Scalar products of the directions with the measured difference, ``(directions,)``.
+        chosen: Indices of the directions to use.
+        both: True for directions that may have a negative strength.
     """
     part = gram[np.ix_(chosen, chosen)]
     try:
@@ -164,16 +164,18 @@ def _least_squares(
 
 
 def _useful(
-    best: dict[tuple[object, ...], Proposed], rays: Sequence[Direction], count: int
+    best: dict[tuple[object, ...], Proposed], directions: Sequence[Direction], count: int
 ) -> list[int]:
-    """Return the indices of up to `count` rays, of the hypotheses in the best sets so far."""
+    """Return the indices of up to `count` directions, of the hypotheses in the best sets so far."""
     keys: list[str] = []
     for item in sorted(best.values(), key=lambda item: item.expected):
         keys += [str(hypothesis.key) for hypothesis, _ in item.members]
     wanted = list(dict.fromkeys(keys))
     found: list[int] = []
     for key in wanted:
-        found += [i for i, ray in enumerate(rays) if str(ray.hypothesis.key) == key]
+        found += [
+            i for i, direction in enumerate(directions) if str(direction.hypothesis.key) == key
+        ]
         if len(found) >= count:
             break
     return found[:count]

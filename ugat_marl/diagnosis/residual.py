@@ -234,12 +234,12 @@ class Directions:
     """Directions in which single effects would change the remaining difference.
 
     Attributes:
-        rays: Changes by effects, simulated on top of the scenario as it is.
+        changes: Changes by effects, simulated on top of the scenario as it is.
         extra: Variance of the model's statistics for errors of its free values, by block.
         fitted: Changes of the statistics by the model's own free values.
     """
 
-    rays: tuple[Direction, ...]
+    changes: tuple[Direction, ...]
     extra: Mapping[str, Array] | None = None
     fitted: tuple[Mapping[str, Array], ...] = ()
 
@@ -250,10 +250,12 @@ class Directions:
             reference: Model that gives the noise.
             data: Tallies of the fitted periods.
         """
-        if not self.rays:
+        if not self.changes:
             return {}
-        wide = [ray.difference for ray in self.rays]
-        single = [without_noise(ray.difference, ray.variance) for ray in self.rays]
+        wide = [direction.difference for direction in self.changes]
+        single = [
+            without_noise(direction.difference, direction.variance) for direction in self.changes
+        ]
         return {
             name: MatchedFilters(changes, reference, data, blocks, self.extra, self.fitted)
             for name, changes, blocks in (

@@ -75,7 +75,7 @@ class Selector:
         self._reporter = reporter
         self._first = fitter.base.distance(fitter.data)
         self._seen: dict[str, Fitted] = {}
-        self._rays: tuple[Direction, ...] = ()
+        self._of_library: tuple[Direction, ...] = ()
         self._places: tuple[Direction, ...] = ()
         self.examined: set[str] = set()
 
@@ -87,7 +87,7 @@ class Selector:
         """
         data = self._fitter.data
         self._places = tuple(self._bank(base.model, self._proposer.everywhere(), 0, "places"))
-        directions = Directions((*self._library_rays(base.model, 0), *self._places))
+        directions = Directions((*self._library_directions(base.model, 0), *self._places))
         null = self._null(base.model.tallies, len(data), directions, ())
         return replace(base, residual=null.test(data))
 
@@ -133,7 +133,7 @@ class Selector:
         for name, difference in self._first.difference.items():
             extra[name] = extra[name] + (THRESHOLDS.tolerance * difference) ** 2
         fitted = tuple(change for change, _ in fitter.changes(model))
-        directions = Directions((*self._rays, *self._places), extra, fitted)
+        directions = Directions((*self._of_library, *self._places), extra, fitted)
         null = self._null(days, len(fitter.data), directions, model.effects)
         return Tested(model, null.test(fitter.data, extra), errors, extra)
 
@@ -148,23 +148,23 @@ class Selector:
 
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Add, change or remove effects; return None if no change is worth its price."""
-        rays = between(self._library_rays(start.model, number))
+        directions = between(self._library_directions(start.model, number))
         whitener = self._whitener(start.model, WIDE)
         gap = float(whitener.measured @ whitener.measured)
         chance = float(len(whitener.measured))  # expected squared length if only noise is left
         enough = chance + THRESHOLDS.look_elsewhere * max(gap - chance, 0.0)
-        proposals = propose(rays, whitener, self._fitter.price)
+        proposals = propose(directions, whitener, self._fitter.price)
         chosen = [item.members for item in promising(proposals)]
         little = gap < THRESHOLDS.little * chance  # the difference is then in single places
         near = little or not proposals or proposals[0].expected > enough
         if near:
-            chosen = [*chosen[:2], *self._elsewhere(start.model, rays, number)]
+            chosen = [*chosen[:2], *self._elsewhere(start.model, directions, number)]
         if number == 0:
             chosen += self._nearest()
             chosen += settings_as_members(self._library) if gap > THRESHOLDS.huge * chance else []
         best = self._fitted(start, chosen, f"round {number + 1}: candidates")
         if best is None and not near:  # simulations did not confirm the prediction of the library
-            chosen = self._elsewhere(start.model, rays, number)
+            chosen = self._elsewhere(start.model, directions, number)
             best = self._fitted(start, chosen, f"round {number + 1}: places")
         return best
 
@@ -200,16 +200,18 @@ class Selector:
                     found.append((model.cost, place))
         return [strengths[place] for _, place in sorted(found)[: THRESHOLDS.nearest]]
 
-    def _elsewhere(self, model: Fitted, rays: Sequence[Direction], number: int) -> list[Members]:
+    def _elsewhere(
+        self, model: Fitted, directions: Sequence[Direction], number: int
+    ) -> list[Members]:
         """Propose effects at places and in windows; lanes and bins of time are compared as well."""
         present = {item.key for item in self._library}
         found = self._proposer.hypotheses(model.reference, model.distance, self._periods)
         local = [item for item in found if item.key not in present]
         known = [] if number else list(self._places)  # simulated on the scenario as it is
-        places = {ray.hypothesis.key for ray in known}
+        places = {direction.hypothesis.key for direction in known}
         added = self._bank(model, [h for h in local if h.key not in places], number, "places")
         added += known
-        proposals = propose([*rays, *added], self._whitener(model, None), self._fitter.price)
+        proposals = propose([*directions, *added], self._whitener(model, None), self._fitter.price)
         places |= {item.key for item in local}
         self.examined |= self._proposer.allowed
         alone = [item for item in proposals if len(item.members) == 1]
@@ -219,7 +221,7 @@ class Selector:
             if hypothesis.key in places:
                 best.setdefault(hypothesis.name, item.members)
         here = list(best.values())[: THRESHOLDS.kinds_of_places]
-        # The strength estimated from counts may be nearer than the strength along a ray.
+        # The strength estimated from counts may be nearer than the strength along a direction.
         here += [((h, h.levels[0]),) for ((h, _),) in here if h.levels[0]]
         return [*(item.members for item in promising(proposals)), *here]
 
@@ -227,12 +229,12 @@ class Selector:
         data, base = self._fitter.data, self._fitter.base
         return Whitener(model.reference, data, THRESHOLDS.foresight, base, blocks)
 
-    def _library_rays(self, model: Fitted, number: int) -> tuple[Direction, ...]:
-        """Return rays of the library on top of a model; rays of the first round are kept."""
+    def _library_directions(self, model: Fitted, number: int) -> tuple[Direction, ...]:
+        """Return directions of the library on top of a model; those of the first round are kept."""
         if number:
             return tuple(self._bank(model, self._library, number))
-        self._rays = self._rays or tuple(self._bank(model, self._library, 0))
-        return self._rays
+        self._of_library = self._of_library or tuple(self._bank(model, self._library, 0))
+        return self._of_library
 
     def _bank(
         self, model: Fitted, hypotheses: Sequence[Hypothesis], number: int, what: str = "library"
@@ -248,7 +250,7 @@ class Selector:
             for hypothesis, values in model.members:
                 jobs += both_ways(hypothesis, values)
         days = self._effort.bank
-        rays: list[Direction] = []
+        directions: list[Direction] = []
         numbers = list(model.days)[:days]
         models = [merged(model.members, ((h, level),)) for h, level, _ in jobs]
         with self._reporter.task(f"round {number + 1}: {what}", len(jobs)) as advance:
@@ -263,8 +265,8 @@ class Selector:
                 if what == "library":
                     self._reporter.say(f"note: {hypothesis.name} left out: {error}")
                 continue
-            rays.append(Direction(hypothesis, level, difference, variance, origin))
-        return rays
+            directions.append(Direction(hypothesis, level, difference, variance, origin))
+        return directions
 
     def _tried(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
         """Simulate sets of effects on top of a model."""

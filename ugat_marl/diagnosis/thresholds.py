@@ -179,8 +179,8 @@ class Thresholds:
     """Least time of uninterrupted occupation for a detector that may be stuck, s. By hand: longer
     than a red. Halved: long reds are proposed."""
     farthest: float = 1.6
-    """Largest strength along a ray, as a multiple of the simulated strength. By hand. Halved: a ray
-    cannot even reach the simulated strength."""
+    """Largest strength along a direction, as a multiple of the simulated strength. By hand. Halved:
+    the simulated strength itself cannot be reached."""
     least_strength: float = 0.08
     """Strength below which an effect does not help, as a multiple of the simulated strength. By
     hand. Halved: weak false effects join strong true ones more often."""
@@ -188,8 +188,8 @@ class Thresholds:
     """Largest numbers of sets of one, two and three effects that are simulated in a round. By hand,
     to save time. Halved: the right set is missed if several are similar."""
     foresight: float = 0.05
-    """Share of a difference that counts as error of the prediction along rays. By hand. Halved:
-    rays are trusted where effects are not linear."""
+    """Share of a difference that counts as error of the prediction along directions. By hand.
+    Halved: directions are trusted where effects are not linear."""
 
     # --- fit ----------------------------------------------------------------------------------
 
@@ -264,7 +264,7 @@ class Thresholds:
     Halved: rarer kinds wait for another round."""
     nearest: int = 3
     """Simulated strengths that are tried unchanged. By hand. Halved: effects that act in steps are
-    missed where rays mislead."""
+    missed where directions mislead."""
     nearer: float = 0.8
     """Share of the gap that such a strength may leave. By hand. Halved: only strong ones are
     tried."""
