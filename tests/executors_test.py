@@ -21,7 +21,7 @@ import pytest
 from ugat_marl.cli.arguments import workers_of
 from ugat_marl.data import TransitionLog
 from ugat_marl.diagnosis.engine import Engine
-from ugat_marl.diagnosis.features import Site
+from ugat_marl.diagnosis.features import DetectorLayout
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import TrafficEnv
@@ -150,11 +150,11 @@ def engine_of(data: Path, workers: Any) -> Engine:
     scenario = load_scenario(data / "crossing")
     network = Network.read(scenario)
     detectors = standard_detectors(network)
-    site = Site.of(network, detectors)
+    layout = DetectorLayout.of(network, detectors)
     shown = ((0.0, "Gr"), (30.0, "rG"), (60.0, "Gr"), (90.0, "rG"))
     periods = [Period("day1", 0.0, 120.0, "fit", {"C": shown}, {})]
-    replay = Replay(scenario, network, detectors, site.owner)
-    return Engine(scenario, site, replay, periods, 3, workers=workers)
+    replay = Replay(scenario, network, detectors, layout.owner)
+    return Engine(scenario, layout, replay, periods, 3, workers=workers)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pytest
 from ugat_marl.data import follows_traffic
 from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.engine import Engine
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Site
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout
 from ugat_marl.diagnosis.replay import Arrivals, Due, Replay, by_lane_left, corrected, unhindered
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.effects import Effect, load_scenario, parse_domain
@@ -90,10 +90,10 @@ def test_nobody_leaves_before_he_can_have_come() -> None:
 
 
 @pytest.fixture(scope="module")
-def crossing(data: Path) -> tuple[Scenario, Network, Site]:
+def crossing(data: Path) -> tuple[Scenario, Network, DetectorLayout]:
     scenario = load_scenario(data / "crossing")
     network = Network.read(scenario)
-    return scenario, network, Site.of(network, standard_detectors(network))
+    return scenario, network, DetectorLayout.of(network, standard_detectors(network))
 
 
 def passages(times: Mapping[str, Sequence[float]]) -> dict[str, Passages]:
@@ -112,14 +112,14 @@ def departs(scenario: Scenario) -> dict[str, list[float]]:
 
 
 def test_vehicles_depart_so_that_they_come_when_others_came(
-    crossing: tuple[Scenario, Network, Site],
+    crossing: tuple[Scenario, Network, DetectorLayout],
 ) -> None:
-    scenario, network, site = crossing
+    scenario, network, layout = crossing
     day = another_day(scenario, 3)
     came = {"advance:S_C_0": [60.0, 75.0, 99.0], "stop:S_C_0": [65.0, 80.0, 105.0]}
     period = a_period(passages(came))
-    found, due = Arrivals(site, network).given(day, day, period)
-    position = {item.id: item.position_m for item in site.detectors}["advance:S_C_0"]
+    found, due = Arrivals(layout, network).given(day, day, period)
+    position = {item.id: item.position_m for item in layout.detectors}["advance:S_C_0"]
     way = position / network.lanes["S_C_0"].speed_mps
     rows = departs(found)
     assert set(rows) == {"S_C"}, "nobody was seen to come from the west"
@@ -129,23 +129,23 @@ def test_vehicles_depart_so_that_they_come_when_others_came(
     assert due.asked["W_C"].sum() > 0, "the demand asks for them all the same"
 
 
-def test_more_came_than_the_model_has(crossing: tuple[Scenario, Network, Site]) -> None:
-    scenario, network, site = crossing
+def test_more_came_than_the_model_has(crossing: tuple[Scenario, Network, DetectorLayout]) -> None:
+    scenario, network, layout = crossing
     day = another_day(scenario, 3)
     times = np.linspace(20.0, 180.0, 60).tolist()
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
-    found, _ = Arrivals(site, network).given(day, day, period)
+    found, _ = Arrivals(layout, network).given(day, day, period)
     names = [item.get("id") for item in found.routes[0].parse().iter("vehicle")]
     assert len(names) == len(set(names)) == 60
 
 
 def test_effects_on_demand_leave_what_is_simulated_alone(
-    crossing: tuple[Scenario, Network, Site],
+    crossing: tuple[Scenario, Network, DetectorLayout],
 ) -> None:
-    scenario, network, site = crossing
+    scenario, network, layout = crossing
     times = np.linspace(20.0, 180.0, 8).tolist()
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
-    replay = Replay(scenario, network, site.detectors, site.owner, answering=True)
+    replay = Replay(scenario, network, layout.detectors, layout.owner, answering=True)
     plain, more = (replay.simulate(parse_domain(x), period, 1) for x in ("sim", "demand_level=*,3"))
     for name, item in plain.period.passages.items():
         np.testing.assert_array_equal(item.on_s, more.period.passages[name].on_s)
@@ -155,15 +155,15 @@ def test_effects_on_demand_leave_what_is_simulated_alone(
 
 
 def test_effects_on_demand_cost_no_simulation(
-    crossing: tuple[Scenario, Network, Site], tmp_path: Path
+    crossing: tuple[Scenario, Network, DetectorLayout], tmp_path: Path
 ) -> None:
-    scenario, network, site = crossing
+    scenario, network, layout = crossing
     times = np.linspace(20.0, 180.0, 8).tolist()
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
 
     def engine() -> Engine:
-        replay = Replay(scenario, network, site.detectors, site.owner, answering=True)
-        return Engine(scenario, site, replay, [period], 5, cache=tmp_path)
+        replay = Replay(scenario, network, layout.detectors, layout.owner, answering=True)
+        return Engine(scenario, layout, replay, [period], 5, cache=tmp_path)
 
     first = engine()
     more = parse_domain("demand_level=*,3+headway=1.5")
@@ -183,28 +183,28 @@ def test_effects_on_demand_cost_no_simulation(
 
 
 def test_detectors_that_missed_vehicles_do_not_keep_them_away(
-    crossing: tuple[Scenario, Network, Site],
+    crossing: tuple[Scenario, Network, DetectorLayout],
 ) -> None:
-    scenario, network, site = crossing
+    scenario, network, layout = crossing
     day = another_day(scenario, 3)
     times = np.linspace(5.0, 195.0, 40)
     few = {"advance:S_C_0": times[::2].tolist(), "stop:S_C_0": (times + 3).tolist()}
-    found, due = Arrivals(site, network).given(day, day, a_period(passages(few)))
+    found, due = Arrivals(layout, network).given(day, day, a_period(passages(few)))
     assert len(departs(found)["S_C"]) >= 38
     assert due.given["S_C"].sum() >= 36
 
 
-def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, Site]) -> None:
-    _, _, site = crossing
-    place = [lane.id for lane in site.lanes].index("S_C_0")
-    sums = np.zeros((len(FEATURES), len(site.places), 2))
-    bins = np.zeros((len(BIN_FEATURES), len(site.places), 2))
+def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, DetectorLayout]) -> None:
+    _, _, layout = crossing
+    place = [lane.id for lane in layout.lanes].index("S_C_0")
+    sums = np.zeros((len(FEATURES), len(layout.places), 2))
+    bins = np.zeros((len(BIN_FEATURES), len(layout.places), 2))
     sums[INDEX["count_stop"], place] = (8.0, 10.0)
     sums[INDEX["platoon_gap"], place] = (8.0, 10.0)
     bins[BIN_FEATURES.index("count_stop"), place] = (6.0, 2.0)
-    none = {edge: np.zeros(2) for _, edge, _ in site.places}
+    none = {edge: np.zeros(2) for _, edge, _ in layout.places}
     due = Due(none | {"S_C": np.array([9.0, 3.0])}, none | {"S_C": np.array([5.0, 5.0])})
-    found = corrected(Tally(sums, bins), site, due)
+    found = corrected(Tally(sums, bins), layout, due)
     # 8 of 10 that came were counted, so 8 of 10 of the two more that were due would have been.
     assert found.sums[INDEX["count_stop"], place].tolist() == pytest.approx([9.6, 10.0])
     assert found.bins[BIN_FEATURES.index("count_stop"), place].tolist() == pytest.approx([9.2, 0.4])
@@ -216,14 +216,14 @@ def test_days_under_signals_that_answered_others_are_like_the_measured_one(data:
     scenario = load_scenario("single-v1").with_duration(1200.0)
     measured = record(scenario, "sim", policy_factory("max-pressure:10"), periods=4, seed=21)
     network = Network.read(scenario)
-    site = Site.of(network, measured.detectors)
-    assert follows_traffic(measured.periods, site.intersections[0])
+    layout = DetectorLayout.of(network, measured.detectors)
+    assert follows_traffic(measured.periods, layout.intersections[0])
 
     def distance(answering: bool) -> float:
-        replay = Replay(scenario, network, measured.detectors, site.owner, answering=answering)
-        engine = Engine(scenario, site, replay, measured.periods, 5)
+        replay = Replay(scenario, network, measured.detectors, layout.owner, answering=answering)
+        engine = Engine(scenario, layout, replay, measured.periods, 5)
         days = [day.tally for day in engine.replicates(NOTHING, range(16))]
-        reference = Reference(Pools.of(site), days)
+        reference = Reference(Pools.of(layout), days)
         return reference.distance(engine.measured(measured.periods)).parts["network"]
 
     assert distance(True) < 0.5 * distance(False)

@@ -14,7 +14,7 @@ import pytest
 from ugat_marl.diagnosis import Tally, default_cache
 from ugat_marl.diagnosis import engine as module
 from ugat_marl.diagnosis.engine import Engine, OutOfTime, Replicate
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, Site
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
 from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
 from ugat_marl.effects import Effect, load_scenario, observed, parse_domain
 from ugat_marl.errors import SimulatorError
@@ -31,9 +31,9 @@ PERIODS = (
 class Streets(Replay):
     """Vehicles at random times that depend on the day and on the effects; counts its calls."""
 
-    def __init__(self, site: Site) -> None:
+    def __init__(self, layout: DetectorLayout) -> None:
         self.calls: list[tuple[tuple[str, ...], str, int]] = []
-        self._site = site
+        self._layout = layout
         self._calls = threading.Lock()
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
@@ -42,13 +42,13 @@ class Streets(Replay):
             self.calls.append((names, period.id, seed))
         generator = np.random.default_rng([seed, *"".join(names).encode()])
         seen: dict[str, Passages] = {}
-        for item in self._site.detectors:
+        for item in self._layout.detectors:
             on = np.sort(generator.uniform(period.begin_s, period.end_s - 1, 20))
             seen[item.id] = Passages(on, on + generator.uniform(0.1, 0.9, 20), on % 14, on % 7)
         return Day(replace(period, passages=seen), float(generator.uniform(50, 60)))
 
     def observed(self, effects: Sequence[Effect], period: Period) -> Period:
-        return observed(period, effects, self._site.detectors, dict(self._site.owner))
+        return observed(period, effects, self._layout.detectors, dict(self._layout.owner))
 
 
 @pytest.fixture(scope="module")
@@ -57,14 +57,14 @@ def scenario(data: Path) -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def site(scenario: Scenario) -> Site:
+def layout(scenario: Scenario) -> DetectorLayout:
     network = Network.read(scenario)
-    return Site.of(network, standard_detectors(network))
+    return DetectorLayout.of(network, standard_detectors(network))
 
 
 def an_engine(
     scenario: Scenario,
-    site: Site,
+    layout: DetectorLayout,
     cache: Path | None,
     *,
     seed: int = 3,
@@ -72,10 +72,10 @@ def an_engine(
     deadline: float | None = None,
     base_days: int = 0,
 ) -> tuple[Engine, Streets]:
-    streets = Streets(site)
+    streets = Streets(layout)
     made = Engine(
         scenario,
-        site,
+        layout,
         streets,
         periods,
         seed,
@@ -100,12 +100,12 @@ FAULTY = parse_domain("undercount=*,0.3")
 
 
 def test_a_remembered_day_is_the_simulated_day_to_the_last_digit(
-    scenario: Scenario, site: Site, tmp_path: Path
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path
 ) -> None:
-    first, streets = an_engine(scenario, site, tmp_path)
+    first, streets = an_engine(scenario, layout, tmp_path)
     simulated = first.replicates(HEADWAY, range(4))
     assert len(streets.calls) == first.simulated == 4
-    again, silent = an_engine(scenario, site, tmp_path)
+    again, silent = an_engine(scenario, layout, tmp_path)
     remembered = again.replicates(HEADWAY, range(4))
     assert silent.calls == []
     assert again.simulated == 0
@@ -115,9 +115,9 @@ def test_a_remembered_day_is_the_simulated_day_to_the_last_digit(
 @pytest.mark.parametrize("speeds", [True, False])
 @pytest.mark.parametrize("lengths", [True, False])
 def test_simulated_days_tell_no_more_than_the_measured_ones(
-    speeds: bool, lengths: bool, scenario: Scenario, site: Site, tmp_path: Path
+    speeds: bool, lengths: bool, scenario: Scenario, layout: DetectorLayout, tmp_path: Path
 ) -> None:
-    day = Streets(site).simulate((), PERIODS[0], 7).period
+    day = Streets(layout).simulate((), PERIODS[0], 7).period
     told = {
         name: Passages(
             item.on_s,
@@ -133,17 +133,17 @@ def test_simulated_days_tell_no_more_than_the_measured_ones(
         def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
             return Day(day, 50.0)
 
-    made = Engine(scenario, site, SameDay(site), [measured], 3, cache=tmp_path, workers=1)
+    made = Engine(scenario, layout, SameDay(layout), [measured], 3, cache=tmp_path, workers=1)
     (simulated,) = made.replicates((), [0])
     (seen,) = made.measured([measured])
     assert np.allclose(simulated.tally.sums, seen.sums)
-    with_all = Engine(scenario, site, SameDay(site), [day], 3, cache=tmp_path, workers=1)
+    with_all = Engine(scenario, layout, SameDay(layout), [day], 3, cache=tmp_path, workers=1)
     (other,) = with_all.replicates((), [0])
     assert np.allclose(other.tally.sums, simulated.tally.sums) == (speeds and lengths)
 
 
-def test_a_detector_that_saw_nobody_tells_nothing_of_speeds(site: Site) -> None:
-    names = [item.id for item in site.detectors]
+def test_a_detector_that_saw_nobody_tells_nothing_of_speeds(layout: DetectorLayout) -> None:
+    names = [item.id for item in layout.detectors]
     none = np.full(3, np.nan)
     times = np.arange(3.0)
     passages = {names[0]: Passages.none(), names[1]: Passages(times, times, none, times)}
@@ -155,28 +155,32 @@ def test_a_detector_that_saw_nobody_tells_nothing_of_speeds(site: Site) -> None:
     assert (found.kept_from(full).passages[names[1]].length_m == times).all()
 
 
-def test_within_one_run_no_day_is_simulated_twice(scenario: Scenario, site: Site) -> None:
-    made, streets = an_engine(scenario, site, None)
+def test_within_one_run_no_day_is_simulated_twice(
+    scenario: Scenario, layout: DetectorLayout
+) -> None:
+    made, streets = an_engine(scenario, layout, None)
     made.replicates((), range(3))
     made.replicates((), range(5))
     assert len(streets.calls) == 5
 
 
-def test_days_come_in_the_order_asked_for(scenario: Scenario, site: Site) -> None:
-    made, _ = an_engine(scenario, site, None)
+def test_days_come_in_the_order_asked_for(scenario: Scenario, layout: DetectorLayout) -> None:
+    made, _ = an_engine(scenario, layout, None)
     up, down = made.replicates((), [0, 1, 2]), made.replicates((), [2, 1, 0])
     assert all(same(one, two) for one, two in zip(up, down[::-1], strict=True))
     assert not same(up[0], up[1])
 
 
-def test_a_day_is_played_under_the_signals_of_its_period(scenario: Scenario, site: Site) -> None:
-    made, streets = an_engine(scenario, site, None)
+def test_a_day_is_played_under_the_signals_of_its_period(
+    scenario: Scenario, layout: DetectorLayout
+) -> None:
+    made, streets = an_engine(scenario, layout, None)
     made.replicates((), range(4))
     assert sorted(call[1] for call in streets.calls) == ["day1", "day1", "day2", "day2"]
 
 
-def test_models_share_the_seeds_of_their_days(scenario: Scenario, site: Site) -> None:
-    made, streets = an_engine(scenario, site, None)
+def test_models_share_the_seeds_of_their_days(scenario: Scenario, layout: DetectorLayout) -> None:
+    made, streets = an_engine(scenario, layout, None)
     made.replicates((), range(3))
     made.replicates(HEADWAY, range(3))
     plain = {seed for names, _, seed in streets.calls if not names}
@@ -185,8 +189,8 @@ def test_models_share_the_seeds_of_their_days(scenario: Scenario, site: Site) ->
     assert plain == slow
 
 
-def test_faults_of_detectors_cost_no_simulation(scenario: Scenario, site: Site) -> None:
-    made, streets = an_engine(scenario, site, None)
+def test_faults_of_detectors_cost_no_simulation(scenario: Scenario, layout: DetectorLayout) -> None:
+    made, streets = an_engine(scenario, layout, None)
     plain = made.replicates((), range(2))
     faulty = made.replicates(FAULTY, range(2))
     assert len(streets.calls) == 2
@@ -196,9 +200,9 @@ def test_faults_of_detectors_cost_no_simulation(scenario: Scenario, site: Site) 
 
 @pytest.mark.parametrize("damage", ["empty", "half", "text", "flipped", "other"])
 def test_a_damaged_file_is_simulated_again(
-    scenario: Scenario, site: Site, tmp_path: Path, damage: str
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path, damage: str
 ) -> None:
-    first, _ = an_engine(scenario, site, tmp_path)
+    first, _ = an_engine(scenario, layout, tmp_path)
     simulated = first.replicates((), [0])[0]
     (file,) = tmp_path.rglob("*.npz")
     content = file.read_bytes()
@@ -210,26 +214,26 @@ def test_a_damaged_file_is_simulated_again(
     else:
         changed = {"empty": b"", "half": content[: len(content) // 2], "text": b"no archive"}
         file.write_bytes(changed.get(damage, bytes(flipped)))
-    again, streets = an_engine(scenario, site, tmp_path)
+    again, streets = an_engine(scenario, layout, tmp_path)
     assert same(again.replicates((), [0])[0], simulated)
     assert len(streets.calls) == 1
-    third, silent = an_engine(scenario, site, tmp_path)
+    third, silent = an_engine(scenario, layout, tmp_path)
     assert same(third.replicates((), [0])[0], simulated), "the file was not written again"
     assert silent.calls == []
 
 
 def test_what_decides_a_day_decides_which_is_remembered(
-    scenario: Scenario, site: Site, tmp_path: Path
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path
 ) -> None:
-    an_engine(scenario, site, tmp_path)[0].replicates((), [0])
+    an_engine(scenario, layout, tmp_path)[0].replicates((), [0])
     shorter = replace(PERIODS[0], end_s=180.0)
     others = {
-        "seed": an_engine(scenario, site, tmp_path, seed=4),
-        "signals": an_engine(scenario, site, tmp_path, periods=PERIODS[1:]),
-        "end": an_engine(scenario, site, tmp_path, periods=[shorter]),
-        "scenario": an_engine(scenario.with_duration(100.0), site, tmp_path),
+        "seed": an_engine(scenario, layout, tmp_path, seed=4),
+        "signals": an_engine(scenario, layout, tmp_path, periods=PERIODS[1:]),
+        "end": an_engine(scenario, layout, tmp_path, periods=[shorter]),
+        "scenario": an_engine(scenario.with_duration(100.0), layout, tmp_path),
         "detectors": an_engine(
-            scenario, replace(site, detectors=site.detectors[::-1]), tmp_path
+            scenario, replace(layout, detectors=layout.detectors[::-1]), tmp_path
         ),
     }  # fmt: skip
     for name, (made, streets) in others.items():
@@ -238,20 +242,20 @@ def test_what_decides_a_day_decides_which_is_remembered(
 
 
 def test_another_version_of_the_features_forgets(
-    scenario: Scenario, site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    an_engine(scenario, site, tmp_path)[0].replicates((), [0])
+    an_engine(scenario, layout, tmp_path)[0].replicates((), [0])
     monkeypatch.setattr(module, "VERSION", module.VERSION + 1)
-    made, streets = an_engine(scenario, site, tmp_path)
+    made, streets = an_engine(scenario, layout, tmp_path)
     made.replicates((), [0])
     assert len(streets.calls) == 1
 
 
 def test_when_time_is_up_only_what_is_remembered_is_given(
-    scenario: Scenario, site: Site, tmp_path: Path
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path
 ) -> None:
-    known = an_engine(scenario, site, tmp_path)[0].replicates((), range(2))
-    late, streets = an_engine(scenario, site, tmp_path, deadline=time.monotonic() - 1)
+    known = an_engine(scenario, layout, tmp_path)[0].replicates((), range(2))
+    late, streets = an_engine(scenario, layout, tmp_path, deadline=time.monotonic() - 1)
     assert same(late.replicates((), [1])[0], known[1])
     with pytest.raises(OutOfTime, match="budget"):
         late.replicates((), range(3))
@@ -261,9 +265,9 @@ def test_when_time_is_up_only_what_is_remembered_is_given(
 
 
 def test_a_failure_of_sumo_is_passed_on(
-    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+    scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, streets = an_engine(scenario, site, None)
+    made, streets = an_engine(scenario, layout, None)
 
     def fails(effects: Sequence[Effect], period: Period, seed: int) -> Day:
         raise SimulatorError("SUMO failed")
@@ -273,15 +277,17 @@ def test_a_failure_of_sumo_is_passed_on(
         made.replicates((), range(5))
 
 
-def test_progress_is_told_day_by_day(scenario: Scenario, site: Site) -> None:
-    made, _ = an_engine(scenario, site, None)
+def test_progress_is_told_day_by_day(scenario: Scenario, layout: DetectorLayout) -> None:
+    made, _ = an_engine(scenario, layout, None)
     told: list[None] = []
     made.replicates((), range(5), lambda: told.append(None))
     assert len(told) == 5
 
 
-def test_work_of_unknown_length_is_told_by_the_days_it_adds(scenario: Scenario, site: Site) -> None:
-    made, _ = an_engine(scenario, site, None)
+def test_work_of_unknown_length_is_told_by_the_days_it_adds(
+    scenario: Scenario, layout: DetectorLayout
+) -> None:
+    made, _ = an_engine(scenario, layout, None)
     made.replicates((), range(3))
     told: list[int] = []
     with made.watched(lambda: told.append(1), 4):
@@ -294,11 +300,11 @@ def test_work_of_unknown_length_is_told_by_the_days_it_adds(scenario: Scenario, 
 
 
 def test_measured_periods_are_tallied_under_their_own_signals(
-    scenario: Scenario, site: Site
+    scenario: Scenario, layout: DetectorLayout
 ) -> None:
-    made, _ = an_engine(scenario, site, None)
+    made, _ = an_engine(scenario, layout, None)
     (day,) = made.replicates((), [0])
-    streets = Streets(site)
+    streets = Streets(layout)
     streets.simulate((), PERIODS[0], 0)
     seen = streets.simulate((), PERIODS[0], 5).period
     (counted,) = made.measured([seen])
@@ -317,9 +323,9 @@ def test_the_cache_lies_where_caches_lie(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 def test_days_on_which_traffic_stood_still_are_passed_over(
-    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+    scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    every, _ = an_engine(scenario, site, None)
+    every, _ = an_engine(scenario, layout, None)
     assert every.first(4) == [0, 1, 2, 3]
     assert every.first(0) == []
 
@@ -329,7 +335,7 @@ def test_days_on_which_traffic_stood_still_are_passed_over(
         bins[:, 0, 0, 0] = [10.0 if n in (0, 3) else 100.0 + n % 3 for n in numbers]
         return [Replicate(Tally(np.zeros((len(FEATURES), 1, 2)), day), 60.0) for day in bins]
 
-    made, _ = an_engine(scenario, site, None, base_days=20)
+    made, _ = an_engine(scenario, layout, None, base_days=20)
     monkeypatch.setattr(made, "replicates", counted)
     assert made.usual.set_aside == {0, 3}
     assert made.usual.day_to_day == pytest.approx(1.4826)
@@ -337,14 +343,14 @@ def test_days_on_which_traffic_stood_still_are_passed_over(
 
 
 def test_prepared_days_are_those_that_are_simulated_one_by_one(
-    scenario: Scenario, site: Site
+    scenario: Scenario, layout: DetectorLayout
 ) -> None:
-    made, streets = an_engine(scenario, site, None)
+    made, streets = an_engine(scenario, layout, None)
     told: list[None] = []
     models = [(HEADWAY, [0, 1, 2]), ((), [0, 3]), (FAULTY, [0, 3])]
     made.prepare(models, lambda: told.append(None))
     assert len(told) == len(models)
-    plain, _ = an_engine(scenario, site, None)
+    plain, _ = an_engine(scenario, layout, None)
     calls = len(streets.calls)
     for effects, numbers in models:
         one, two = made.replicates(effects, numbers), plain.replicates(effects, numbers)
@@ -353,9 +359,9 @@ def test_prepared_days_are_those_that_are_simulated_one_by_one(
 
 
 def test_what_sumo_refuses_is_reported_when_it_is_asked_for(
-    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+    scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, streets = an_engine(scenario, site, None)
+    made, streets = an_engine(scenario, layout, None)
     plays = streets.simulate
 
     def refuses(effects: Sequence[Effect], period: Period, seed: int) -> Day:
@@ -371,9 +377,9 @@ def test_what_sumo_refuses_is_reported_when_it_is_asked_for(
 
 
 def test_a_mistake_while_days_are_prepared_is_not_swallowed(
-    scenario: Scenario, site: Site, monkeypatch: pytest.MonkeyPatch
+    scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, streets = an_engine(scenario, site, None)
+    made, streets = an_engine(scenario, layout, None)
 
     def fails(effects: Sequence[Effect], period: Period, seed: int) -> Day:
         raise ZeroDivisionError
@@ -383,9 +389,11 @@ def test_a_mistake_while_days_are_prepared_is_not_swallowed(
         made.prepare([((), [0, 1])])
 
 
-def test_no_day_is_prepared_when_time_is_up(scenario: Scenario, site: Site, tmp_path: Path) -> None:
-    an_engine(scenario, site, tmp_path)[0].replicates((), range(2))
-    late, streets = an_engine(scenario, site, tmp_path, deadline=time.monotonic() - 1)
+def test_no_day_is_prepared_when_time_is_up(
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path
+) -> None:
+    an_engine(scenario, layout, tmp_path)[0].replicates((), range(2))
+    late, streets = an_engine(scenario, layout, tmp_path, deadline=time.monotonic() - 1)
     late.prepare([((), [0, 1])])
     with pytest.raises(OutOfTime, match="budget"):
         late.prepare([((), [0, 1]), (HEADWAY, [0])])

@@ -13,8 +13,8 @@ from ugat_marl.diagnosis.features import (
     FEATURES,
     INDEX,
     SPEED_FEATURES,
-    Site,
-    SiteLane,
+    DetectorLayout,
+    IncomingLane,
     tally,
 )
 from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period, SignalLog
@@ -26,10 +26,12 @@ LOG: SignalLog = ((0.0, "r"), (10.0, "G"), (40.0, "y"), (43.0, "r"), (60.0, "G")
 """Two greens of 30 s: from 10 s and from 60 s."""
 
 
-def a_site(kinds: Sequence[DetectorKind] = ("advance", "stop"), lanes: int = 1) -> Site:
+def a_layout(kinds: Sequence[DetectorKind] = ("advance", "stop"), lanes: int = 1) -> DetectorLayout:
     """Lanes of one approach side by side, all under the first letter of the light, and one exit."""
     inner = tuple(
-        SiteLane(f"in_{i}", "in", 0, (0,), LIMIT_MPS, {kind: (f"{kind}:in_{i}",) for kind in kinds})
+        IncomingLane(
+            f"in_{i}", "in", 0, (0,), LIMIT_MPS, {kind: (f"{kind}:in_{i}",) for kind in kinds}
+        )
         for i in range(lanes)
     )
     detectors = [
@@ -41,7 +43,7 @@ def a_site(kinds: Sequence[DetectorKind] = ("advance", "stop"), lanes: int = 1) 
     exits = ((0, "out_0", ("exit:out_0",)),)
     detectors.append(Detector("exit:out_0", "out_0", 10.0, 0.0, "exit"))
     owner = {item.id: "C" for item in detectors}
-    return Site(("C",), inner, exits, tuple(detectors), owner)
+    return DetectorLayout(("C",), inner, exits, tuple(detectors), owner)
 
 
 def passages(
@@ -68,11 +70,14 @@ def a_period(
 
 
 def counted(
-    seen: dict[str, Passages], site: Site | None = None, log: SignalLog = LOG, end: float = 120.0
+    seen: dict[str, Passages],
+    layout: DetectorLayout | None = None,
+    log: SignalLog = LOG,
+    end: float = 120.0,
 ) -> Tally:
-    site = site or a_site()
+    layout = layout or a_layout()
     period = a_period(seen, log, end=end)
-    return tally(site, period, site.greens(period))
+    return tally(layout, period, layout.greens(period))
 
 
 def of(found: Tally, name: str, place: int = 0) -> tuple[float, float]:
@@ -190,7 +195,7 @@ def test_vehicles_are_conserved_or_not() -> None:
         "stop:in_1": passages(np.arange(8.0).tolist()),
         "exit:out_0": passages(np.arange(12.0).tolist()),
     }
-    found = counted(seen, a_site(lanes=2))
+    found = counted(seen, a_layout(lanes=2))
     # Vehicles may change lanes between the detectors: the approach counts, at its first lane.
     assert of(found, "kept_to_stop") == (16, 16)
     assert of(found, "kept_to_exit") == (12, 16)
@@ -267,7 +272,7 @@ def test_lengths_are_measured_or_follow_from_speed_and_time() -> None:
 
 def test_a_lane_without_a_stop_detector_tells_of_arrivals_only() -> None:
     seen = {"advance:in_0": passages((20.0, 30.0), speed=12.0, length=5.0)}
-    found = counted(seen, a_site(("advance",)))
+    found = counted(seen, a_layout(("advance",)))
     assert of(found, "count_advance") == (2, 2)
     assert of(found, "vehicle_length") == (10.0, 2)
     for name in ("count_stop", "queued", "lost", "yellow_crossings", "kept_to_stop"):
@@ -283,9 +288,11 @@ def test_a_detector_that_saw_nothing_counted_nothing() -> None:
 
 
 def test_two_detectors_of_a_kind_count_a_vehicle_once() -> None:
-    site = a_site()
-    lane = SiteLane("in_0", "in", 0, (0,), LIMIT_MPS, {"stop": ("stop:in_0", "stop:b")})
-    double = Site(site.intersections, (lane,), site.exits, site.detectors, site.owner)
+    layout = a_layout()
+    lane = IncomingLane("in_0", "in", 0, (0,), LIMIT_MPS, {"stop": ("stop:in_0", "stop:b")})
+    double = DetectorLayout(
+        layout.intersections, (lane,), layout.exits, layout.detectors, layout.owner
+    )
     both = {"stop:in_0": passages(ON, OFF), "stop:b": passages(ON, OFF)}
     assert of(counted(both, double), "count_stop") == (7, 2)
     assert of(counted({"stop:b": passages(ON, OFF)}, double), "count_stop") == (7, 2)

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Reference, Tally
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Site, SiteLane
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout, IncomingLane
 from ugat_marl.diagnosis.locate import locate
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.statistics import Pools
@@ -18,9 +18,9 @@ from ugat_marl.diagnosis.statistics import Pools
 Array = NDArray[np.float64]
 
 LANES, BINS, SPAN = 4, 12, (0.0, 3600.0)
-SITE = Site(
+SITE = DetectorLayout(
     ("A", "B"),
-    tuple(SiteLane(f"in{i}_0", f"in{i}", i // 2, (0,), 14.0, {}) for i in range(LANES)),
+    tuple(IncomingLane(f"in{i}_0", f"in{i}", i // 2, (0,), 14.0, {}) for i in range(LANES)),
     ((0, "out0_0", ("x0",)), (1, "out1_0", ("x1",))),
     (),
     {},

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Routes, Tally
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Site, SiteLane, tally
+from ugat_marl.diagnosis.features import (
+    BIN_FEATURES,
+    FEATURES,
+    INDEX,
+    DetectorLayout,
+    IncomingLane,
+    tally,
+)
 from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.diagnosis.places import Proposer, _later
 from ugat_marl.diagnosis.statistics import Pools
@@ -29,20 +36,24 @@ END_S = 3600.0
 CYCLE_S = 60.0
 
 
-def a_site() -> Site:
+def a_layout() -> DetectorLayout:
     """Four arms of one lane in and one lane out."""
     kinds: tuple[DetectorKind, ...] = ("advance", "stop")
     lanes = tuple(
-        SiteLane(f"{arm}_in_0", f"{arm}_in", 0, (index,), 14.0, {k: (f"{k}:{arm}",) for k in kinds})
+        IncomingLane(
+            f"{arm}_in_0", f"{arm}_in", 0, (index,), 14.0, {k: (f"{k}:{arm}",) for k in kinds}
+        )
         for index, arm in enumerate(ARMS)
     )
     exits = tuple((0, f"{arm}_out_0", (f"exit:{arm}",)) for arm in ARMS)
     detectors = [Detector(f"{k}:{arm}", f"{arm}_in_0", 1.0, 0.0, k) for arm in ARMS for k in kinds]
     detectors += [Detector(f"exit:{arm}", f"{arm}_out_0", 1.0, 0.0, "exit") for arm in ARMS]
-    return Site(("C",), lanes, exits, tuple(detectors), {item.id: "C" for item in detectors})
+    return DetectorLayout(
+        ("C",), lanes, exits, tuple(detectors), {item.id: "C" for item in detectors}
+    )
 
 
-SITE = a_site()
+SITE = a_layout()
 ROUTES = Routes(
     {f"{arm}_in": rate for arm, rate in RATE_PER_HOUR.items()},
     {
@@ -289,8 +300,8 @@ def test_the_same_data_give_the_same_proposals(reference: Reference) -> None:
 
 
 def test_the_traffic_light_that_starts_late() -> None:
-    lanes = tuple(SiteLane(f"in{i}_0", f"in{i}", i, (0,), 14.0, {}) for i in range(4))
-    site = Site(("A", "B", "C", "D"), lanes, (), (), {})
+    lanes = tuple(IncomingLane(f"in{i}_0", f"in{i}", i, (0,), 14.0, {}) for i in range(4))
+    layout = DetectorLayout(("A", "B", "C", "D"), lanes, (), (), {})
 
     def day(seed: int, late: float) -> Tally:
         sums = np.zeros((len(FEATURES), 4, 2))
@@ -299,8 +310,8 @@ def test_the_traffic_light_that_starts_late() -> None:
         sums[INDEX["lost"]] = np.stack([40 * values, np.full(4, 40.0)], axis=-1)
         return Tally(sums, np.zeros((len(BIN_FEATURES), 4, 1)))
 
-    reference = Reference(Pools.of(site), [day(seed, 0.0) for seed in range(50)])
-    proposer = Proposer(site, Routes({}, {}, {}, {}), {"late_green", "signal_clock"})
+    reference = Reference(Pools.of(layout), [day(seed, 0.0) for seed in range(50)])
+    proposer = Proposer(layout, Routes({}, {}, {}, {}), {"late_green", "signal_clock"})
     distance = reference.distance([day(100 + seed, 1.5) for seed in range(5)])
     found = proposer.hypotheses(reference, distance, [replace(street(1), passages={})])
     for name in ("late_green", "signal_clock"):
@@ -322,7 +333,9 @@ def test_lanes_are_examined_for_parking_that_traffic_avoids_or_queues_on(
     moved: dict[tuple[str, str], float], lanes: set[str] | None
 ) -> None:
     names_ = ("a_0", "a_1", "b_0", "b_1", "c_0")
-    site = Site(("A",), tuple(SiteLane(x, x[0], 0, (0,), 14.0, {}) for x in names_), (), (), {})
+    layout = DetectorLayout(
+        ("A",), tuple(IncomingLane(x, x[0], 0, (0,), 14.0, {}) for x in names_), (), (), {}
+    )
 
     def day(seed: int, planted: dict[tuple[str, str], float]) -> Tally:
         values = 20.0 + 0.3 * np.random.default_rng(seed).standard_normal((len(FEATURES), 5))
@@ -331,9 +344,9 @@ def test_lanes_are_examined_for_parking_that_traffic_avoids_or_queues_on(
         sums = np.stack([40 * values, np.full_like(values, 40.0)], axis=-1)
         return Tally(sums, np.zeros((len(BIN_FEATURES), 5, 1)))
 
-    reference = Reference(Pools.of(site), [day(seed, {}) for seed in range(50)])
+    reference = Reference(Pools.of(layout), [day(seed, {}) for seed in range(50)])
     distance = reference.distance([day(100 + seed, moved) for seed in range(5)])
-    proposer = Proposer(site, Routes({}, {}, {}, {}), {"parking"})
+    proposer = Proposer(layout, Routes({}, {}, {}, {}), {"parking"})
     found = proposer.hypotheses(reference, distance, [replace(street(1), passages={})])
     parked = [str(dict(item.fixed)["lane"]) for item in found]
     assert len(parked) == len(set(parked)) <= 4, "two edges, two lanes of each"

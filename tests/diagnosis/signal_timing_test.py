@@ -14,7 +14,7 @@ from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     FEATURES,
     INDEX,
-    Site,
+    DetectorLayout,
     bins_together,
     counts_tally,
     without_gaps,
@@ -136,8 +136,8 @@ def test_links_that_stay_green_do_not_hide_a_yellow(scenario: Scenario, network:
 
 
 @pytest.fixture(scope="module")
-def site(network: Network) -> Site:
-    return Site.of(network, standard_detectors(network))
+def layout(network: Network) -> DetectorLayout:
+    return DetectorLayout.of(network, standard_detectors(network))
 
 
 def counts(*rows: tuple[str, float, float, str, float]) -> pl.DataFrame:
@@ -148,7 +148,7 @@ def counts(*rows: tuple[str, float, float, str, float]) -> pl.DataFrame:
 PERIOD = Period("day1", 0.0, 900.0, "fit", {}, {})
 
 
-def test_counts_stand_where_detections_would(site: Site) -> None:
+def test_counts_stand_where_detections_would(layout: DetectorLayout) -> None:
     table = counts(
         ("day1", 0.0, 300.0, "stop:S_C_0", 10),
         ("day1", 300.0, 600.0, "stop:S_C_0", 20),
@@ -157,12 +157,12 @@ def test_counts_stand_where_detections_would(site: Site) -> None:
         ("day2", 0.0, 900.0, "stop:S_C_0", 999),
         ("day1", 0.0, 900.0, "nowhere", 999),
     )
-    found = counts_tally(site, PERIOD, table, without_gaps(table, [PERIOD]))
-    lane = next(i for i, item in enumerate(site.lanes) if item.id == "S_C_0")
-    behind = next(i for i, item in enumerate(site.exits) if item[1] == "C_E_0")
+    found = counts_tally(layout, PERIOD, table, without_gaps(table, [PERIOD]))
+    lane = next(i for i, item in enumerate(layout.lanes) if item.id == "S_C_0")
+    behind = next(i for i, item in enumerate(layout.exits) if item[1] == "C_E_0")
     assert found.sums[INDEX["count_stop"], lane].tolist() == [60.0, 15.0]
     assert found.bins[BIN_FEATURES.index("count_stop"), lane].tolist() == [10.0, 20.0, 30.0]
-    place = len(site.lanes) + behind
+    place = len(layout.lanes) + behind
     assert found.sums[INDEX["count_exit"], place].tolist() == [90.0, 15.0]
     assert found.bins[BIN_FEATURES.index("count_exit"), place].tolist() == [30.0, 30.0, 30.0]
     others = [i for i, (name, _, _) in enumerate(FEATURES) if not name.startswith("count_")]
@@ -170,22 +170,22 @@ def test_counts_stand_where_detections_would(site: Site) -> None:
     assert not found.sums[others].any(), "nothing else is known"
 
 
-def test_a_count_across_bins_is_shared_out(site: Site) -> None:
+def test_a_count_across_bins_is_shared_out(layout: DetectorLayout) -> None:
     table = counts(
         ("day1", 0.0, 200.0, "stop:S_C_0", 20),
         ("day1", 200.0, 600.0, "stop:S_C_0", 40),
         ("day1", 600.0, 900.0, "stop:S_C_0", 5),
     )
-    found = counts_tally(site, PERIOD, table, without_gaps(table, [PERIOD]))
-    lane = next(i for i, item in enumerate(site.lanes) if item.id == "S_C_0")
+    found = counts_tally(layout, PERIOD, table, without_gaps(table, [PERIOD]))
+    lane = next(i for i, item in enumerate(layout.lanes) if item.id == "S_C_0")
     assert found.bins[BIN_FEATURES.index("count_stop"), lane] == pytest.approx([30.0, 30.0, 5.0])
     assert bins_together(table) == 2, "nobody knows when in 400 s they came"
-    pooled = Pools.of(site, 2).pool(found)["time"]
-    row = BIN_FEATURES.index("count_stop") * len(site.places) + lane
+    pooled = Pools.of(layout, 2).pool(found)["time"]
+    row = BIN_FEATURES.index("count_stop") * len(layout.places) + lane
     assert pooled[row].tolist() == [[60.0, 1.0]], "what is left at the end is not used"
 
 
-def test_what_was_not_counted_is_no_count_of_zero(site: Site) -> None:
+def test_what_was_not_counted_is_no_count_of_zero(layout: DetectorLayout) -> None:
     table = counts(
         ("day1", 0.0, 300.0, "stop:S_C_0", 10),
         ("day1", 600.0, 900.0, "stop:S_C_0", 30),
@@ -194,8 +194,8 @@ def test_what_was_not_counted_is_no_count_of_zero(site: Site) -> None:
     whole = without_gaps(table, [PERIOD])
     assert whole == {"exit:C_E_0"}
     assert not without_gaps(table, [PERIOD, replace(PERIOD, id="day2")])
-    found = counts_tally(site, PERIOD, table, whole)
-    lane = next(i for i, item in enumerate(site.lanes) if item.id == "S_C_0")
+    found = counts_tally(layout, PERIOD, table, whole)
+    lane = next(i for i, item in enumerate(layout.lanes) if item.id == "S_C_0")
     line = BIN_FEATURES.index("count_stop"), lane
     assert found.bins[line].tolist() == [10.0, 0.0, 30.0]
     assert found.counted[line].tolist() == [1.0, 0.0, 1.0]
@@ -207,8 +207,8 @@ def test_what_was_not_counted_is_no_count_of_zero(site: Site) -> None:
     assert (found + events).counted[line].tolist() == [2.0, 1.0, 2.0]
 
 
-def test_no_counts_no_weight(site: Site) -> None:
-    found = counts_tally(site, PERIOD, counts().cast({"period_id": pl.String}), frozenset())
+def test_no_counts_no_weight(layout: DetectorLayout) -> None:
+    found = counts_tally(layout, PERIOD, counts().cast({"period_id": pl.String}), frozenset())
     assert not found.sums.any()
     assert not found.counted.any()
     assert found.bins.shape[-1] == 3

@@ -14,8 +14,8 @@ from ugat_marl.diagnosis.features import (
     FEATURES,
     INDEX,
     SPEED_FEATURES,
-    Site,
-    SiteLane,
+    DetectorLayout,
+    IncomingLane,
 )
 from ugat_marl.diagnosis.residual import Null
 from ugat_marl.diagnosis.statistics import Pools, Whitener
@@ -109,13 +109,13 @@ def test_lanes_pool_by_adding() -> None:
 
 
 def test_intersections_pool_only_where_there_are_several() -> None:
-    def site(lights: int) -> Site:
-        lanes = tuple(SiteLane(f"in{i}_0", f"in{i}", i, (0,), 10.0, {}) for i in range(lights))
+    def layout(lights: int) -> DetectorLayout:
+        lanes = tuple(IncomingLane(f"in{i}_0", f"in{i}", i, (0,), 10.0, {}) for i in range(lights))
         exits = ((0, "out_0", ("x",)),)
-        return Site(tuple(f"C{i}" for i in range(lights)), lanes, exits, (), {})
+        return DetectorLayout(tuple(f"C{i}" for i in range(lights)), lanes, exits, (), {})
 
-    assert set(Pools.of(site(1)).blocks) == {"network", "lane"}
-    pools = Pools.of(site(2)).blocks
+    assert set(Pools.of(layout(1)).blocks) == {"network", "lane"}
+    pools = Pools.of(layout(2)).blocks
     assert pools["intersection"].tolist() == [[1, 0, 1], [0, 1, 0]]
     assert pools["network"].tolist() == [[1, 1, 1]]
 

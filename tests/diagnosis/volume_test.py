@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.diagnosis import Hypothesis, Routes
-from ugat_marl.diagnosis.features import FEATURES, INDEX, Site, SiteLane
+from ugat_marl.diagnosis.features import FEATURES, INDEX, DetectorLayout, IncomingLane
 from ugat_marl.diagnosis.places import Volume
 from ugat_marl.diagnosis.statistics import Distance
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
@@ -21,10 +21,10 @@ Counts = Mapping[str, tuple[float, float]]
 """Edge to measured minus expected vehicles per hour, and the standard error of that."""
 
 
-def a_site(incoming: tuple[str, ...], outgoing: tuple[str, ...] = ()) -> Site:
-    lanes = tuple(SiteLane(f"{edge}_0", edge, 0, (0,), 14.0, {}) for edge in incoming)
+def a_layout(incoming: tuple[str, ...], outgoing: tuple[str, ...] = ()) -> DetectorLayout:
+    lanes = tuple(IncomingLane(f"{edge}_0", edge, 0, (0,), 14.0, {}) for edge in incoming)
     exits = tuple((0, f"{edge}_0", (f"exit:{edge}",)) for edge in outgoing)
-    return Site(("C",), lanes, exits, (), {})
+    return DetectorLayout(("C",), lanes, exits, (), {})
 
 
 def routes(ways: Mapping[Way, float]) -> Routes:
@@ -46,38 +46,38 @@ def routes(ways: Mapping[Way, float]) -> Routes:
     return found
 
 
-def a_distance(site: Site, counts: Counts) -> Distance:
+def a_distance(layout: DetectorLayout, counts: Counts) -> Distance:
     """A distance of which nothing but counts is known."""
-    difference = np.zeros((len(site.places), len(FEATURES)))
+    difference = np.zeros((len(layout.places), len(FEATURES)))
     z = np.zeros_like(difference)
-    for place, (_, edge, _) in enumerate(site.places):
+    for place, (_, edge, _) in enumerate(layout.places):
         if edge in counts:
-            row = INDEX["count_stop" if place < len(site.lanes) else "count_exit"]
+            row = INDEX["count_stop" if place < len(layout.lanes) else "count_exit"]
             value, error = counts[edge]
             difference[place, row], z[place, row] = value / 60.0, value / error
     return Distance(0.0, {}, 0.0, {"lane": z}, {"lane": difference})
 
 
-def directed(site: Site, ways: Mapping[Way, float], counts: Counts) -> dict[str, float]:
-    return Volume(site, routes(ways)).directed(a_distance(site, counts))
+def directed(layout: DetectorLayout, ways: Mapping[Way, float], counts: Counts) -> dict[str, float]:
+    return Volume(layout, routes(ways)).directed(a_distance(layout, counts))
 
 
-def proposed(site: Site, ways: Mapping[Way, float], counts: Counts) -> list[Hypothesis]:
-    return Volume(site, routes(ways)).hypotheses(a_distance(site, counts))
+def proposed(layout: DetectorLayout, ways: Mapping[Way, float], counts: Counts) -> list[Hypothesis]:
+    return Volume(layout, routes(ways)).hypotheses(a_distance(layout, counts))
 
 
 def test_one_edge_is_its_squared_z() -> None:
-    found = directed(a_site(("a",)), {("a", "x"): 400.0}, {"a": (60.0, 20.0)})
+    found = directed(a_layout(("a",)), {("a", "x"): 400.0}, {"a": (60.0, 20.0)})
     assert found == {"demand": pytest.approx(9.0), "turning": 0.0}
 
 
 def test_a_vehicle_that_is_counted_twice_counts_once() -> None:
-    site, counts = a_site(("a",), ("b",)), {"a": (60.0, 20.0), "b": (60.0, 20.0)}
+    layout, counts = a_layout(("a",), ("b",)), {"a": (60.0, 20.0), "b": (60.0, 20.0)}
     # 1' C^-1 1 with correlation 1 - _ALONE between them: 2 / (2 - _ALONE), and not 2.
-    shared = directed(site, {("a", "b"): 400.0}, counts)["demand"]
+    shared = directed(layout, {("a", "b"): 400.0}, counts)["demand"]
     assert shared == pytest.approx(9.0 * 2 / (2 - THRESHOLDS.alone))
     # Two edges of one origin that share no vehicle are two observations.
-    apart = directed(a_site(("a", "c")), {("o", "a"): 400.0, ("o", "c"): 400.0},
+    apart = directed(a_layout(("a", "c")), {("o", "a"): 400.0, ("o", "c"): 400.0},
                      {"a": (60.0, 20.0), "c": (60.0, 20.0)})["demand"]  # fmt: skip
     assert apart == pytest.approx(2 * 9.0)
 
@@ -85,14 +85,14 @@ def test_a_vehicle_that_is_counted_twice_counts_once() -> None:
 def test_counts_that_share_vehicles_and_disagree_are_no_demand() -> None:
     # One detector has 60 more and the other 60 fewer of the same vehicles: strength 0.
     counts = {"a": (60.0, 20.0), "b": (-60.0, 20.0)}
-    found = directed(a_site(("a",), ("b",)), {("a", "b"): 400.0}, counts)
+    found = directed(a_layout(("a",), ("b",)), {("a", "b"): 400.0}, counts)
     assert found["demand"] == pytest.approx(0.0, abs=1e-9)
 
 
 WAYS: dict[Way, float] = {
     ("a", "x"): 100.0, ("a", "y"): 300.0, ("b", "x"): 240.0, ("b", "y"): 80.0, ("b", "z"): 60.0,
 }  # fmt: skip
-SITE = a_site(("a", "b"), ("x", "y", "z"))
+SITE = a_layout(("a", "b"), ("x", "y", "z"))
 RATES = {"a": 400.0, "b": 380.0, "x": 340.0, "y": 380.0, "z": 60.0}
 
 
@@ -132,25 +132,29 @@ def test_a_planted_turn_comes_out_with_its_share(way: Way, share: float) -> None
 def test_lanes_tell_from_where_vehicles_turn_elsewhere(origin: str) -> None:
     """Two approaches with a lane for each of two ways: where they go is the same for both."""
     lanes = tuple(
-        SiteLane(f"{edge}_{i}", edge, 0, (i,), 14.0, {}, frozenset({target}))
+        IncomingLane(f"{edge}_{i}", edge, 0, (i,), 14.0, {}, frozenset({target}))
         for edge in "ab"
         for i, target in enumerate("xy")
     )
-    site = Site(("C",), lanes, tuple((0, f"{x}_0", (f"exit:{x}",)) for x in "xy"), (), {})
+    layout = DetectorLayout(
+        ("C",), lanes, tuple((0, f"{x}_0", (f"exit:{x}",)) for x in "xy"), (), {}
+    )
     ways: dict[Way, float] = {(edge, target): 200.0 for edge in "ab" for target in "xy"}
-    distance = a_distance(site, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
+    distance = a_distance(layout, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
     row = INDEX["count_stop"]
     for place, lane in enumerate(lanes):
         moved = 80.0 if lane.edge == origin else 1e-6
         value = moved if "x" in lane.following else -moved
         distance.difference["lane"][place, row] = value / 60.0
         distance.z["lane"][place, row] = value / 14.0
-    first = next(h for h in Volume(site, routes(ways)).hypotheses(distance) if h.name == "turning")
+    first = next(
+        h for h in Volume(layout, routes(ways)).hypotheses(distance) if h.name == "turning"
+    )
     assert first.fixed == (("from_edge", origin), ("to_edge", "x"))
     # Two lanes, 80 more and 80 fewer, errors of 14: 2 (80 / 14)^2 beside what the exits say.
-    counted = a_distance(site, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
-    gain = Volume(site, routes(ways)).directed(distance)["turning"]
-    alone = Volume(site, routes(ways)).directed(counted)["turning"]
+    counted = a_distance(layout, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
+    gain = Volume(layout, routes(ways)).directed(distance)["turning"]
+    alone = Volume(layout, routes(ways)).directed(counted)["turning"]
     assert gain - alone == pytest.approx(2 * (80.0 / 14.0) ** 2, rel=0.01)
 
 
@@ -163,28 +167,28 @@ def test_the_size_of_a_difference_is_that_of_chi_square_where_vehicles_come_by_c
     # the counts' own share of the noise is more than there is here.
     generator = np.random.default_rng(1)
     ways = {("a", "x"): 200.0, ("a", "y"): 300.0}
-    site, sizes = a_site(("a",), ("x", "y")), list[float]()
+    layout, sizes = a_layout(("a",), ("x", "y")), list[float]()
     for _ in range(400):
         left, right = (generator.poisson(rate) - rate for rate in (200.0, 300.0))
         counts = {"a": (left + right, 500**0.5), "x": (left, 200**0.5), "y": (right, 300**0.5)}
-        sizes.append(directed(site, ways, counts)["demand"])
+        sizes.append(directed(layout, ways, counts)["demand"])
     assert 0.8 < np.mean(sizes) < 1.25  # 2 if each vehicle counted at both of its detectors
 
 
 @pytest.mark.parametrize("known", [{}, {("c", "d"): 100.0}, {("a", "x"): 400.0}])
 def test_edges_without_routes_do_no_harm(known: Mapping[Way, float]) -> None:
-    site = a_site(("a", "b"), ("x",))
+    layout = a_layout(("a", "b"), ("x",))
     counts = {"a": (60.0, 20.0), "b": (60.0, 20.0), "x": (-60.0, 20.0)}
-    found = directed(site, known, counts)
+    found = directed(layout, known, counts)
     assert set(found) == {"demand", "turning"}
     assert all(np.isfinite(value) and value >= 0 for value in found.values())
-    proposed(site, known, counts)
+    proposed(layout, known, counts)
 
 
-@pytest.mark.parametrize("site", [a_site(()), a_site((), ("x",)), SITE])
-def test_without_counts_there_is_nothing_to_tell(site: Site) -> None:
-    assert directed(site, WAYS, {}) == {"demand": 0.0, "turning": 0.0}
-    assert proposed(site, WAYS, {}) == []
+@pytest.mark.parametrize("layout", [a_layout(()), a_layout((), ("x",)), SITE])
+def test_without_counts_there_is_nothing_to_tell(layout: DetectorLayout) -> None:
+    assert directed(layout, WAYS, {}) == {"demand": 0.0, "turning": 0.0}
+    assert proposed(layout, WAYS, {}) == []
 
 
 def test_routes_say_which_edges_share_vehicles(data: Path) -> None:

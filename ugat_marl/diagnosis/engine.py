@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import version_of
-from ugat_marl.diagnosis.features import FEATURES, Greens, Site, Tally, tally
+from ugat_marl.diagnosis.features import FEATURES, DetectorLayout, Greens, Tally, tally
 from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import Effect
@@ -124,7 +124,7 @@ class Engine:
 
     Args:
         scenario: The scenario without effects.
-        site: Lanes and detectors.
+        layout: Lanes and detectors.
         replay: Simulator of one day with SUMO.
         periods: Measured periods; day ``r`` runs under the signals of period
             ``r mod len(periods)``.
@@ -139,7 +139,7 @@ class Engine:
     def __init__(
         self,
         scenario: Scenario,
-        site: Site,
+        layout: DetectorLayout,
         replay: Replay,
         periods: Sequence[Period],
         seed: int,
@@ -150,7 +150,7 @@ class Engine:
         base_days: int = 0,
     ) -> None:
         self._base_days = base_days
-        self.site = site
+        self.layout = layout
         self.periods = tuple(periods)
         self.simulated = 0
         self.deadline = deadline
@@ -158,15 +158,15 @@ class Engine:
         self._seed = seed
         self._cache = cache
         self._workers = workers
-        self._greens: list[tuple[Greens, ...]] = [site.greens(period) for period in periods]
+        self._greens: list[tuple[Greens, ...]] = [layout.greens(period) for period in periods]
         self._days: OrderedDict[str, Day] = OrderedDict()
         self._known: dict[str, Replicate] = {}
         self._unmeasured = Unmeasured.of(periods)
         versions = version_of("eclipse-sumo"), version_of("numpy")
-        head = (VERSION, FEATURES, scenario.hash, site.detectors, versions, seed)
+        head = (VERSION, FEATURES, scenario.hash, layout.detectors, versions, seed)
         head += (self._unmeasured,) if self._unmeasured else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
-        self._edges = sorted({edge for _, edge, _ in site.places})
+        self._edges = sorted({edge for _, edge, _ in layout.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
         self._known_by: Callable[[], None] | None = None
 
@@ -177,7 +177,7 @@ class Engine:
 
     def measured(self, periods: Sequence[Period]) -> list[Tally]:
         """Return the tallies of measured periods."""
-        return [tally(self.site, period, self.site.greens(period)) for period in periods]
+        return [tally(self.layout, period, self.layout.greens(period)) for period in periods]
 
     @contextlib.contextmanager
     def watched(self, advance: Callable[[], None], most: int) -> Iterator[None]:
@@ -329,7 +329,7 @@ class Engine:
         """Simulate a day and count it."""
         day = self._day(effects, number)
         period = self._unmeasured.kept_from(day.period)
-        counted = tally(self.site, period, self._greens[number % len(self.periods)])
+        counted = tally(self.layout, period, self._greens[number % len(self.periods)])
         # The cache holds float32, so round here: the result must not depend on the cache.
         counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
         return self._with_due(counted, day.travel_time_s, day.due)
@@ -347,7 +347,7 @@ class Engine:
     def _with_due(self, counted: Tally, travel_time_s: float, due: Due | None) -> Replicate:
         if due is None:
             return Replicate(counted, travel_time_s)
-        return Replicate(corrected(counted, self.site, due), travel_time_s, counted, due)
+        return Replicate(corrected(counted, self.layout, due), travel_time_s, counted, due)
 
     def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
         """Return a day as the detectors saw it; faults of detectors need no new simulation."""

@@ -39,13 +39,13 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class SiteLane:
+class IncomingLane:
     """A lane in front of a traffic light.
 
     Attributes:
         id: SUMO id of the lane.
         edge: SUMO id of its edge.
-        intersection: Index of its intersection in `Site.intersections`.
+        intersection: Index of its intersection in `DetectorLayout.intersections`.
         links: Indices of its letters in the signal state.
         speed_mps: Speed limit, m/s.
         detectors: Ids of the detectors on it, by kind.
@@ -81,8 +81,8 @@ class Greens:
 
 
 @dataclass(frozen=True)
-class Site:
-    """All intersections with measured lanes.
+class DetectorLayout:
+    """Detectors of a street with their lanes and traffic lights, in a fixed order.
 
     Attributes:
         intersections: SUMO ids of the traffic lights.
@@ -93,13 +93,13 @@ class Site:
     """
 
     intersections: tuple[str, ...]
-    lanes: tuple[SiteLane, ...]
+    lanes: tuple[IncomingLane, ...]
     exits: tuple[tuple[int, str, tuple[str, ...]], ...]
     detectors: tuple[Detector, ...]
     owner: Mapping[str, str]
 
     @classmethod
-    def of(cls, network: Network, detectors: Sequence[Detector]) -> Site:
+    def of(cls, network: Network, detectors: Sequence[Detector]) -> DetectorLayout:
         """Find the traffic light and the lane of every detector.
 
         Raises:
@@ -108,7 +108,7 @@ class Site:
         by_lane: dict[str, dict[DetectorKind, list[str]]] = {}
         for item in detectors:
             by_lane.setdefault(item.lane, {}).setdefault(item.kind, []).append(item.id)
-        lanes: list[SiteLane] = []
+        lanes: list[IncomingLane] = []
         exits: list[tuple[int, str, tuple[str, ...]]] = []
         owner: dict[str, str] = {}
         for index, item in enumerate(network.intersections):
@@ -118,7 +118,7 @@ class Site:
                     kind: tuple(names) for kind, names in found.items() if kind != "exit"
                 }
                 lanes.append(
-                    SiteLane(
+                    IncomingLane(
                         lane,
                         network.lanes[lane].edge,
                         index,
@@ -336,23 +336,23 @@ def bins_of(period: Period) -> int:
     return max(1, round((period.end_s - period.begin_s) / THRESHOLDS.bin_s))
 
 
-def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
+def tally(layout: DetectorLayout, period: Period, greens: Sequence[Greens]) -> Tally:
     """Reduce a period to its features.
 
     Args:
-        site: Lanes and detectors.
+        layout: Lanes and detectors.
         period: Period with passages.
-        greens: Greens of every lane, ``site.greens(period)``; simulated days use those of the
+        greens: Greens of every lane, ``layout.greens(period)``; simulated days use those of the
             measured period.
     """
-    places = len(site.lanes) + len(site.exits)
+    places = len(layout.lanes) + len(layout.exits)
     bins = bins_of(period)
     counter = _Counter(
         np.zeros((len(FEATURES), places, 2)), np.zeros((len(BIN_FEATURES), places, bins)), period
     )
-    stops = np.zeros(len(site.lanes))
-    advances = np.zeros(len(site.lanes))
-    for index, (lane, green) in enumerate(zip(site.lanes, greens, strict=True)):
+    stops = np.zeros(len(layout.lanes))
+    advances = np.zeros(len(layout.lanes))
+    for index, (lane, green) in enumerate(zip(layout.lanes, greens, strict=True)):
         counter.place = index
         stop, advance = _passages(period, lane, "stop"), _passages(period, lane, "advance")
         if stop is not None:
@@ -366,11 +366,11 @@ def tally(site: Site, period: Period, greens: Sequence[Greens]) -> Tally:
             _storage(counter, advance, green)
             if stop is None:
                 _lengths(counter, advance)
-    exits = np.zeros(len(site.exits))
-    for index, (_, _, names) in enumerate(site.exits):
-        counter.place = len(site.lanes) + index
+    exits = np.zeros(len(layout.exits))
+    for index, (_, _, names) in enumerate(layout.exits):
+        counter.place = len(layout.lanes) + index
         exits[index] = counter.volume("count_exit", 2, _merged(period, names))
-    _conserved(counter, site, advances, stops, exits)
+    _conserved(counter, layout, advances, stops, exits)
     return Tally(counter.sums, counter.bins)
 
 
@@ -406,7 +406,7 @@ class _Counter:
         return float(len(times))
 
 
-def _passages(period: Period, lane: SiteLane, kind: str) -> Passages | None:
+def _passages(period: Period, lane: IncomingLane, kind: str) -> Passages | None:
     """Return the passages over the lane's detector of a kind; None if it has none."""
     names = lane.detectors.get(kind)  # pyright: ignore[reportArgumentType,reportCallIssue]
     return None if not names else _merged(period, names)
@@ -572,18 +572,20 @@ def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
     counter.add("queue_over", standing.astype(np.float64))
 
 
-def _conserved(counter: _Counter, site: Site, advances: Array, stops: Array, exits: Array) -> None:
+def _conserved(
+    counter: _Counter, layout: DetectorLayout, advances: Array, stops: Array, exits: Array
+) -> None:
     """Add the ratios of counts: stop to advance by approach, exit to stop by intersection."""
     approaches: dict[str, list[int]] = {}
-    for index, lane in enumerate(site.lanes):
+    for index, lane in enumerate(layout.lanes):
         if "stop" in lane.detectors and "advance" in lane.detectors:
             approaches.setdefault(lane.edge, []).append(index)
     for members in approaches.values():
         counter.place = members[0]
         counter.ratio("kept_to_stop", stops[members].sum(), advances[members].sum())
-    for number in range(len(site.intersections)):
-        incoming = [i for i, lane in enumerate(site.lanes) if lane.intersection == number]
-        outgoing = [i for i, (owner, _, _) in enumerate(site.exits) if owner == number]
+    for number in range(len(layout.intersections)):
+        incoming = [i for i, lane in enumerate(layout.lanes) if lane.intersection == number]
+        outgoing = [i for i, (owner, _, _) in enumerate(layout.exits) if owner == number]
         if incoming and outgoing:
             counter.place = incoming[0]
             counter.ratio("kept_to_exit", exits[outgoing].sum(), stops[incoming].sum())
@@ -616,24 +618,26 @@ def without_gaps(counts: pl.DataFrame, periods: Sequence[Period]) -> frozenset[s
     return frozenset(found)
 
 
-def counts_tally(site: Site, period: Period, counts: pl.DataFrame, whole: Collection[str]) -> Tally:
+def counts_tally(
+    layout: DetectorLayout, period: Period, counts: pl.DataFrame, whole: Collection[str]
+) -> Tally:
     """Return a tally that holds only counts; all other features stay empty.
 
     Args:
-        site: Lanes and detectors.
+        layout: Lanes and detectors.
         period: Period to tally.
         counts: Table with ``period_id, begin_s, end_s, detector_id, count``.
         whole: Detectors `without_gaps`. Other detectors fill only their known bins, since the mean
             of some hours is not the mean of the period.
     """
-    places = len(site.lanes) + len(site.exits)
+    places = len(layout.lanes) + len(layout.exits)
     length = bins_of(period)
     sums = np.zeros((len(FEATURES), places, 2))
     bins = np.zeros((len(BIN_FEATURES), places, length))
     covered = np.zeros_like(bins)
     edges = np.linspace(period.begin_s, period.end_s, length + 1)
     for row in counts.filter(pl.col("period_id") == period.id).iter_rows(named=True):
-        name, place = site.counted.get(row["detector_id"], ("", -1))
+        name, place = layout.counted.get(row["detector_id"], ("", -1))
         if place >= 0:
             begin, end, count = float(row["begin_s"]), float(row["end_s"]), float(row["count"])
             if row["detector_id"] in whole:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special, stats
 
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, Site
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
 from ugat_marl.diagnosis.records import Disagreement, Located, Tested
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
@@ -41,11 +41,11 @@ def disagreements(study: Study, model: Tested) -> tuple[Disagreement, ...]:
     spans = {(period.begin_s, period.end_s) for period in periods}
     span = spans.pop() if len(spans) == 1 else None
     distance = model.model.reference.distance(study.fit)
-    return locate(study.site, model.model.reference, distance, study.config.alpha, span)
+    return locate(study.layout, model.model.reference, distance, study.config.alpha, span)
 
 
 def locate(
-    site: Site,
+    layout: DetectorLayout,
     reference: Reference,
     distance: Distance,
     alpha: float,
@@ -57,7 +57,7 @@ def locate(
     stretches of time. Then the strongest statistic of each place and regime is kept.
 
     Args:
-        site: Lanes and detectors.
+        layout: Lanes and detectors.
         reference: Statistics of the model.
         distance: Distance of the data from the model.
         alpha: Largest expected share of false discoveries.
@@ -67,9 +67,9 @@ def locate(
     found: list[Disagreement] = []
     for name, z in distance.z.items():
         if name != "time":
-            found += _statistics(site, name, z, distance.difference[name])
+            found += _statistics(layout, name, z, distance.difference[name])
     if span is not None:
-        found += _stretches(site, reference, distance, span)
+        found += _stretches(layout, reference, distance, span)
     tested = sum(int(block.used.sum()) for block in reference.blocks.values())
     found.sort(key=lambda item: item.p)
     kept = discoveries([item.p for item in found], tested, alpha)
@@ -98,10 +98,12 @@ def two_sided(z: float) -> float:
     return max(2.0 * float(special.ndtr(-soft)), 1e-300)
 
 
-def _statistics(site: Site, pool: str, z: Array, difference: Array) -> list[Disagreement]:
+def _statistics(
+    layout: DetectorLayout, pool: str, z: Array, difference: Array
+) -> list[Disagreement]:
     found: list[Disagreement] = []
     for member, feature in zip(*np.nonzero(z), strict=True):
-        tls, approach, lane = _place(site, pool, int(member))
+        tls, approach, lane = _place(layout, pool, int(member))
         name, regime, unit = FEATURES[int(feature)]
         value = float(z[member, feature])
         size = float(difference[member, feature])
@@ -113,22 +115,24 @@ def _statistics(site: Site, pool: str, z: Array, difference: Array) -> list[Disa
     return found
 
 
-def _place(site: Site, pool: str, member: int) -> tuple[str | None, str | None, str | None]:
+def _place(
+    layout: DetectorLayout, pool: str, member: int
+) -> tuple[str | None, str | None, str | None]:
     if pool == "network":
-        return (site.intersections[0] if len(site.intersections) == 1 else None, None, None)
+        return (layout.intersections[0] if len(layout.intersections) == 1 else None, None, None)
     if pool == "intersection":
-        return (site.intersections[member], None, None)
-    owner, edge, name = site.places[member]
-    return (site.intersections[owner], edge, name)
+        return (layout.intersections[member], None, None)
+    owner, edge, name = layout.places[member]
+    return (layout.intersections[owner], edge, name)
 
 
 def _stretches(
-    site: Site, reference: Reference, distance: Distance, span: tuple[float, float]
+    layout: DetectorLayout, reference: Reference, distance: Distance, span: tuple[float, float]
 ) -> list[Disagreement]:
     """Find the most unusual stretch of every kind of count at every place."""
     z, difference = distance.z["time"], distance.difference["time"]
     used = reference.blocks["time"].used
-    places = len(site.places)
+    places = len(layout.places)
     bins = z.shape[1]
     width = (span[1] - span[0]) / bins
     found: list[Disagreement] = []
@@ -141,7 +145,7 @@ def _stretches(
             continue
         value, first, last = best
         kind, place = divmod(row, places)
-        tls, approach, lane = _place(site, "lane", place)
+        tls, approach, lane = _place(layout, "lane", place)
         size = float(difference[row, first:last].sum())
         stretches = bins * (bins + 1) / 2
         found.append(

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, Site
+from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout
 from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.statistics import Distance, Reference
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
@@ -37,17 +37,17 @@ class Proposer:
     """Finder of places and windows.
 
     Args:
-        site: Lanes and detectors.
+        layout: Lanes and detectors.
         routes: Routes of the scenario.
         allowed: Names of effects to examine.
     """
 
-    def __init__(self, site: Site, routes: Routes, allowed: Collection[str]) -> None:
-        self._site = site
+    def __init__(self, layout: DetectorLayout, routes: Routes, allowed: Collection[str]) -> None:
+        self._layout = layout
         self._routes = routes
         self.allowed = frozenset(allowed)
-        self._edges = [edge for _, edge, _ in site.places]
-        self._volume = Volume(site, routes)
+        self._edges = [edge for _, edge, _ in layout.places]
+        self._volume = Volume(layout, routes)
 
     def hypotheses(
         self, reference: Reference, distance: Distance, periods: Sequence[Period]
@@ -64,7 +64,7 @@ class Proposer:
         found += self._timing(reference, distance)
         found += self._windows(reference, distance, periods)
         found += self._places(reference, distance)
-        found += fault_hypotheses(self._site, reference, distance, periods)
+        found += fault_hypotheses(self._layout, reference, distance, periods)
         return [item for item in found if item.name in self.allowed]
 
     def everywhere(self) -> list[Hypothesis]:
@@ -73,7 +73,7 @@ class Proposer:
         Drivers avoid a lane with parked vehicles and use its neighbour. The sum over both lanes
         hardly changes, so differences of the data do not show parking reliably.
         """
-        lanes = self._site.lanes
+        lanes = self._layout.lanes
         if len(lanes) > THRESHOLDS.most_lanes or "parking" not in self.allowed:
             return []
         return [_parking(lane.id) for lane in lanes]
@@ -94,7 +94,7 @@ class Proposer:
         for origin in self._routes.passing:
             rows = [
                 first + index
-                for index, lane in enumerate(self._site.lanes)
+                for index, lane in enumerate(self._layout.lanes)
                 if self._routes.share(origin, lane.edge) > THRESHOLDS.mostly
             ]
             known = z[rows] != 0
@@ -136,7 +136,7 @@ class Proposer:
                 level = float(np.clip(factor, 0.1, 4.0))
                 surge = Hypothesis("demand_surge", fixed, ("factor",), ((level,),), (1.0,), 0.1)
                 found.append((z, surge))
-        for index, lane in enumerate(self._site.lanes):
+        for index, lane in enumerate(self._layout.lanes):
             # The queue that leaves after a closure differs more than the closure itself, so each
             # kind of count is scanned to the side that a closure changes.
             for kind, side in (("occupied", 1), ("count_stop", -1), ("count_advance", -1)):
@@ -181,7 +181,7 @@ class Proposer:
         places = len(self._edges)
         rows: list[int] = []
         for index in members:
-            name = kind if index < len(self._site.lanes) else other
+            name = kind if index < len(self._layout.lanes) else other
             row = BIN_FEATURES.index(name) * places + index
             if block.used[row].any():
                 rows.append(row)
@@ -210,7 +210,7 @@ class Proposer:
             edges = np.linspace(period.begin_s, period.end_s, minutes + 1)
             for index in members:
                 passages = self._passages(
-                    period, index, kind if index < len(self._site.lanes) else other
+                    period, index, kind if index < len(self._layout.lanes) else other
                 )
                 if passages is None or not len(passages):
                     continue
@@ -223,9 +223,9 @@ class Proposer:
         return total / len(periods)
 
     def _passages(self, period: Period, index: int, kind: str) -> Passages | None:
-        lanes = self._site.lanes
+        lanes = self._layout.lanes
         if index >= len(lanes):
-            names = self._site.exits[index - len(lanes)][2]
+            names = self._layout.exits[index - len(lanes)][2]
         else:
             names = lanes[index].detectors.get("stop" if kind == "count_stop" else "advance", ())
         return next((period.passages[n] for n in names if n in period.passages), None)
@@ -235,7 +235,7 @@ class Proposer:
     def _places(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
         """Propose parking on lanes, speeds on edges, lost time and clocks at traffic lights."""
         found: list[Hypothesis] = []
-        lanes = self._site.lanes
+        lanes = self._layout.lanes
         found += [_parking(lane) for lane in self._disturbed(distance)]
         speed = distance.z["lane"][: len(lanes), INDEX["free_speed"]]
         by_edge: dict[str, float] = defaultdict(float)
@@ -256,13 +256,13 @@ class Proposer:
                 )
                 for edge in ranked[:2]
             ]
-        if len(self._site.intersections) > 1:
+        if len(self._layout.intersections) > 1:
             found += self._traffic_lights(distance)
         return found
 
     def _disturbed(self, distance: Distance) -> list[str]:
         """Return lanes on which a vehicle may stand: lanes with odd flow, and avoided lanes."""
-        lanes = self._site.lanes
+        lanes = self._layout.lanes
         z = np.clip(distance.z["lane"][: len(lanes)], -15, 15)
         unusual = np.abs(z[:, [INDEX[name] for name in _FLOW]]).sum(axis=1)
         fewer = z[:, [INDEX[name] for name in _AVOIDED]].sum(axis=1)
@@ -294,7 +294,7 @@ class Proposer:
         lost = lost - np.median(lost)
         drift = distance.z["intersection"][:, INDEX["lost_trend"]]
         drift = drift - np.median(drift)
-        names = self._site.intersections
+        names = self._layout.intersections
         found: list[Hypothesis] = []
         for index in np.argsort(-np.abs(lost))[:2]:
             place = (("place", names[int(index)]),)
@@ -420,14 +420,14 @@ class Volume:
     """Finder of origins and turns, from counts alone.
 
     Args:
-        site: Lanes and detectors.
+        layout: Lanes and detectors.
         routes: Routes of the scenario.
     """
 
-    def __init__(self, site: Site, routes: Routes) -> None:
-        self._site = site
+    def __init__(self, layout: DetectorLayout, routes: Routes) -> None:
+        self._layout = layout
         self._routes = routes
-        self._edges = [edge for _, edge, _ in site.places]
+        self._edges = [edge for _, edge, _ in layout.places]
 
     def directed(self, distance: Distance) -> dict[str, float]:
         """Return the squared standardised sizes of the best origin and of the best turn."""
@@ -463,7 +463,7 @@ class Volume:
 
     def _counts(self, distance: Distance) -> _Counts:
         hour = 60.0
-        lanes = len(self._site.lanes)
+        lanes = len(self._layout.lanes)
         place: dict[str, int] = {}
         differences: list[float] = []
         errors: list[float] = []
@@ -514,7 +514,7 @@ class Volume:
         the lanes that vehicles left show that one.
         """
         found: list[tuple[float, str, str, float]] = []
-        approaches = {lane.edge for lane in self._site.lanes}
+        approaches = {lane.edge for lane in self._layout.lanes}
         for origin in sorted(approaches & set(self._routes.turns)):
             leaving = self._routes.turns[origin]
             total = sum(leaving.values())
@@ -534,7 +534,7 @@ class Volume:
         changes: list[float] = []
         z: list[float] = []
         errors: list[float] = []
-        lanes = [(i, lane) for i, lane in enumerate(self._site.lanes) if lane.edge == origin]
+        lanes = [(i, lane) for i, lane in enumerate(self._layout.lanes) if lane.edge == origin]
         for index, lane in lanes:
             difference = float(distance.difference["lane"][index, row])
             score = float(distance.z["lane"][index, row])
@@ -664,11 +664,11 @@ def occupied_between(on: Array, off: Array, edges: Array) -> Array:
 
 
 def fault_hypotheses(
-    site: Site, reference: Reference, distance: Distance, periods: Sequence[Period]
+    layout: DetectorLayout, reference: Reference, distance: Distance, periods: Sequence[Period]
 ) -> list[Hypothesis]:
     """Propose detectors that count too few, stay on, fall silent, or are exchanged."""
     found: list[Hypothesis] = []
-    places = {name: (place, INDEX[kind]) for name, (kind, place) in site.counted.items()}
+    places = {name: (place, INDEX[kind]) for name, (kind, place) in layout.counted.items()}
     z = {name: float(distance.z["lane"][row]) for name, row in places.items()}
     mean = {name: float(reference.blocks["lane"].mean[row]) for name, row in places.items()}
     difference = {n: float(distance.difference["lane"][r]) for n, r in places.items()}
@@ -682,7 +682,7 @@ def fault_hypotheses(
     on = {dict(item.fixed)["detector"] for item in stuck}
     silent = [x for x in _silent(periods, mean) if dict(x.fixed)["detector"] not in on]
     found += stuck + silent
-    kinds = {item.id: item.kind for item in site.detectors}
+    kinds = {item.id: item.kind for item in layout.detectors}
     found += _swapped(kinds, mean, difference, z)
     return found
 
@@ -755,7 +755,7 @@ def _swapped(
     return [item for _, item in found[:2]]
 
 
-def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None:
+def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str, str] | None:
     """Find two consecutive detectors of one stream that both count too few.
 
     A single detector with too few vehicles contradicts its neighbours, so it is at fault. If the
@@ -765,8 +765,8 @@ def one_behind_the_other(members: Members, site: Site) -> tuple[str, str] | None
         Ids of the upstream and the downstream detector, or None.
     """
     short = [dict(item.fixed)["place"] for item, _ in members if item.name == "undercount"]
-    known = {item.id: item for item in site.detectors}
-    lanes = {lane.id: lane for lane in site.lanes}
+    known = {item.id: item for item in layout.detectors}
+    lanes = {lane.id: lane for lane in layout.lanes}
     found = [known[str(name)] for name in short if name in known]
     for one in found:
         for other in found:

@@ -35,7 +35,7 @@ from ugat_marl.diagnosis.features import (
     INDEX,
     PLATOON_FEATURES,
     Array,
-    Site,
+    DetectorLayout,
     Tally,
     bins_of,
 )
@@ -114,7 +114,9 @@ class Replay:
         self._network = network
         self._detectors = tuple(detectors)
         self._owner = dict(owner)
-        self._arrivals = Arrivals(Site.of(network, detectors), network) if answering else None
+        self._arrivals = (
+            Arrivals(DetectorLayout.of(network, detectors), network) if answering else None
+        )
         self._own = detector_effects(scenario)
         self._days: OrderedDict[int, Scenario] = OrderedDict()
         self._lock = threading.Lock()
@@ -323,16 +325,16 @@ class Arrivals:
     """Measured arrivals for the vehicles of a simulated day.
 
     Args:
-        site: Lanes and detectors.
+        layout: Lanes and detectors.
         network: The network.
     """
 
-    def __init__(self, site: Site, network: Network) -> None:
+    def __init__(self, layout: DetectorLayout, network: Network) -> None:
         lanes = network.lanes.values()
         self._pace_s = {lane.edge: lane.length_m / lane.speed_mps for lane in lanes}
         self._ways: dict[str, _Way] = {}
-        self._approaches = _approaches(site)
-        self._counted = frozenset(edge for _, edge, _ in site.places)
+        self._approaches = _approaches(layout)
+        self._counted = frozenset(edge for _, edge, _ in layout.places)
 
     def given(self, asked: Scenario, drivers: Scenario, period: Period) -> tuple[Scenario, Due]:
         """Give a day the measured arrivals.
@@ -530,7 +532,7 @@ def _filled(
     return found
 
 
-def corrected(counted: Tally, site: Site, due: Due) -> Tally:
+def corrected(counted: Tally, layout: DetectorLayout, due: Due) -> Tally:
     """Return the tally of a day, with counts corrected to the model's demand.
 
     Corrected count = count + share * (asked - given), where the share of a lane is its part of the
@@ -538,15 +540,15 @@ def corrected(counted: Tally, site: Site, due: Due) -> Tally:
 
     Args:
         counted: Tally of a day with measured arrivals.
-        site: Lanes and detectors.
+        layout: Lanes and detectors.
         due: Vehicles asked for and given.
 
     Returns:
         The tally without platoon features, since these repeat the measured arrivals.
     """
     sums, bins = counted.sums.copy(), counted.bins.copy()
-    lanes = Counter(edge for _, edge, _ in site.places)
-    for place, (_, edge, _) in enumerate(site.places):
+    lanes = Counter(edge for _, edge, _ in layout.places)
+    for place, (_, edge, _) in enumerate(layout.places):
         more = due.asked[edge] - due.given[edge]
         given = float(due.given[edge].sum())
         for name in COUNT_FEATURES:
@@ -560,11 +562,11 @@ def corrected(counted: Tally, site: Site, due: Due) -> Tally:
     return replace(counted, sums=sums, bins=np.maximum(bins, 0.0))
 
 
-def _approaches(site: Site) -> dict[str, tuple[_Lane, ...]]:
+def _approaches(layout: DetectorLayout) -> dict[str, tuple[_Lane, ...]]:
     """Find edges with an advance detector on every lane in front of the traffic light."""
-    zones = {item.id: item for item in site.detectors}
+    zones = {item.id: item for item in layout.detectors}
     lanes: dict[str, list[_Lane] | None] = {}
-    for lane in site.lanes:
+    for lane in layout.lanes:
         advance = lane.detectors.get("advance")
         known = lanes.setdefault(lane.edge, [])
         if advance is None or known is None:

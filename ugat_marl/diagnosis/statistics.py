@@ -16,7 +16,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.features import EVENT_FEATURES, FEATURES, SPEED_FEATURES, Site, Tally
+from ugat_marl.diagnosis.features import (
+    EVENT_FEATURES,
+    FEATURES,
+    SPEED_FEATURES,
+    DetectorLayout,
+    Tally,
+)
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
@@ -48,16 +54,16 @@ class Pools:
     together: int = 1
 
     @classmethod
-    def of(cls, site: Site, together: int = 1) -> Pools:
+    def of(cls, layout: DetectorLayout, together: int = 1) -> Pools:
         """Pool the network, every intersection if there are several, every lane."""
-        places = len(site.places)
-        owners = [owner for owner, _, _ in site.places]
+        places = len(layout.places)
+        owners = [owner for owner, _, _ in layout.places]
         blocks = {"network": np.ones((1, places))}
-        if len(site.intersections) > 1:
+        if len(layout.intersections) > 1:
             blocks["intersection"] = np.array(
                 [
                     [float(owner == index) for owner in owners]
-                    for index in range(len(site.intersections))
+                    for index in range(len(layout.intersections))
                 ]
             )
         blocks["lane"] = np.eye(places)

@@ -15,7 +15,13 @@ import numpy as np
 
 from ugat_marl.data import Finding, Measured, follows_traffic
 from ugat_marl.diagnosis.engine import Engine, default_cache
-from ugat_marl.diagnosis.features import Site, Tally, bins_together, counts_tally, without_gaps
+from ugat_marl.diagnosis.features import (
+    DetectorLayout,
+    Tally,
+    bins_together,
+    counts_tally,
+    without_gaps,
+)
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, library
 from ugat_marl.diagnosis.places import Proposer, Routes
@@ -82,7 +88,7 @@ class Study:
         network: The network of the scenario.
         measured: The measured data of the street.
         config: Options of the diagnosis.
-        site: Measured lanes, with their signals and detectors.
+        layout: Measured lanes, with their signals and detectors.
         engine: Simulator of days.
         pools: Pools of lanes: network, intersections, lanes.
         allowed: Names of the effects that are examined.
@@ -99,7 +105,7 @@ class Study:
     network: Network
     measured: Measured
     config: DiagnosisConfig
-    site: Site
+    layout: DetectorLayout
     engine: Engine
     pools: Pools
     allowed: frozenset[str]
@@ -128,21 +134,21 @@ class Study:
         detectors = heard(measured)
         noted = (*measured.findings, *unreached(scenario, measured, detectors))
         measured = replace(measured, findings=noted)
-        site = Site.of(network, detectors)
+        layout = DetectorLayout.of(network, detectors)
         ruled_out = frozenset(name for item in measured.findings for name in item.rules_out)
         allowed = library(config.leave_out) - ruled_out
         periods = measured.of("fit")
         if not periods:
             raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
-        lights = site.intersections
+        lights = layout.intersections
         answering = any(follows_traffic(measured.periods, tls) for tls in lights)
         effort = config.effort or effort_for(len(lights))
 
         def simulating(answering: bool, base_days: int) -> Engine:
             return Engine(
                 scenario,
-                site,
-                Replay(scenario, network, detectors, site.owner, answering=answering),
+                layout,
+                Replay(scenario, network, detectors, layout.owner, answering=answering),
                 [*periods, *measured.of("heldout")],
                 config.seed,
                 cache=config.cache or default_cache(),
@@ -157,14 +163,14 @@ class Study:
             network,
             measured,
             config,
-            site,
+            layout,
             engine,
-            Pools.of(site, 1 if measured.has_events else bins_together(measured.counts)),
+            Pools.of(layout, 1 if measured.has_events else bins_together(measured.counts)),
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
             effort,
-            _tallies(site, engine, measured, periods),
-            _tallies(site, engine, measured, measured.of("heldout") or periods),
+            _tallies(layout, engine, measured, periods),
+            _tallies(layout, engine, measured, measured.of("heldout") or periods),
             simulating(False, 0) if answering else None,
             ruled_out,
         )
@@ -281,7 +287,7 @@ class Study:
     @functools.cached_property
     def proposer(self) -> Proposer:
         """Finder of places and windows."""
-        return Proposer(self.site, Routes.of(self.scenario), self.allowed)
+        return Proposer(self.layout, Routes.of(self.scenario), self.allowed)
 
     def fitter(self, base: Tested) -> Fitter:
         """Make the fitter of single models; see `selector` for the search."""
@@ -329,12 +335,12 @@ def heard(measured: Measured) -> tuple[Detector, ...]:
 
 
 def _tallies(
-    site: Site, engine: Engine, measured: Measured, periods: Sequence[Period]
+    layout: DetectorLayout, engine: Engine, measured: Measured, periods: Sequence[Period]
 ) -> tuple[Tally, ...]:
     if measured.has_events or measured.counts is None:
         return tuple(engine.measured(periods))
     whole = without_gaps(measured.counts, measured.periods)
-    return tuple(counts_tally(site, period, measured.counts, whole) for period in periods)
+    return tuple(counts_tally(layout, period, measured.counts, whole) for period in periods)
 
 
 # --- measured edges without demand ----------------------------------------------------------------

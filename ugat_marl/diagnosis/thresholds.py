@@ -141,7 +141,7 @@ class Thresholds:
     parking doubles."""
     most_lanes: int = 24
     """Largest number of incoming lanes for which parking is tried on each. By hand, to save time.
-    Halved: on larger sites only suspicious lanes are tried."""
+    Halved: on networks with more lanes only suspicious lanes are tried."""
     shifts_s: tuple[float, ...] = (-900.0, -600.0, -300.0, -150.0, 150.0, 300.0, 600.0, 900.0)
     """Shifts of demand in time that are tried, s. By hand. Halved: fits of shifts of ten minutes
     and more start too far from the solution."""

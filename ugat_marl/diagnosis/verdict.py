@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from scipy import stats
 
-from ugat_marl.diagnosis.features import FEATURES, Site
+from ugat_marl.diagnosis.features import FEATURES, DetectorLayout
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members
 from ugat_marl.diagnosis.places import one_behind_the_other
 from ugat_marl.diagnosis.records import (
@@ -34,7 +34,7 @@ def conclude(
     selector: Selector,
     verification: Verified,
     alpha: float,
-    site: Site,
+    layout: DetectorLayout,
 ) -> Conclusion:
     """Draw the conclusion of a search.
 
@@ -44,7 +44,7 @@ def conclude(
         selector: The search, which also tests rivals.
         verification: Tests on the held-out periods.
         alpha: Level of the tests.
-        site: Lanes and detectors.
+        layout: Lanes and detectors.
     """
     base, best = located.base, selection.best
     confirmed = verification.before.distance - verification.after.distance >= THRESHOLDS.confirmed
@@ -67,7 +67,7 @@ def conclude(
         )
         return Conclusion("unknown", best, (), sentence, "more periods")
     if chance_only and selection.complete:
-        return _sufficient(selection, selector, alpha, site)
+        return _sufficient(selection, selector, alpha, layout)
     if shrink >= THRESHOLDS.part:
         verb = "explains" if len(best.model.members) == 1 else "explain"
         sentence = f"{names[:1].upper()}{names[1:]} {verb} {100 * shrink:.0f} % of the gap; " + (
@@ -113,7 +113,9 @@ def unverified(located: Located, selected: Selected) -> tuple[Verified, Conclusi
     return Verified(residual, residual, None), conclusion
 
 
-def _sufficient(selection: Selected, selector: Selector, alpha: float, site: Site) -> Conclusion:
+def _sufficient(
+    selection: Selected, selector: Selector, alpha: float, layout: DetectorLayout
+) -> Conclusion:
     """Conclude if the selected set of effects leaves no more than chance."""
     best = selection.best
     names = describe_members(best.model.members)
@@ -123,7 +125,7 @@ def _sufficient(selection: Selected, selector: Selector, alpha: float, site: Sit
             "effect goes: something else may be behind it."
         )
         return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
-    if counters := one_behind_the_other(best.model.members, site):
+    if counters := one_behind_the_other(best.model.members, layout):
         first, behind = counters
         sentence = f"The data fit {names} and vehicles that leave the road equally well."
         return Conclusion(

@@ -101,11 +101,11 @@ def lanes_table(study: Study, base: Tested, best: Tested) -> tuple[LaneRow, ...]
     return tuple(
         LaneRow(
             lane=name,
-            tls=study.site.intersections[owner],
+            tls=study.layout.intersections[owner],
             before=_rms(before[index]),
             after=_rms(after[index]),
         )
-        for index, (owner, _, name) in enumerate(study.site.places)
+        for index, (owner, _, name) in enumerate(study.layout.places)
         if np.any(before[index])
     )
 

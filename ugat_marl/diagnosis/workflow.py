@@ -116,7 +116,9 @@ def _compared(
     selected = selector.select(located)
     try:
         verified = verify_model(study, located.base, selected.best)
-        conclusion = conclude(located, selected, selector, verified, study.config.alpha, study.site)
+        conclusion = conclude(
+            located, selected, selector, verified, study.config.alpha, study.layout
+        )
         if conclusion.verdict == "no_discrepancy":
             verified = Verified(verified.before, verified.before, None)
             conclusion = _beside_the_log(study, located, conclusion, timing)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ugat_marl.diagnosis.features import Greens, Site, SiteLane, tally
+from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane, tally
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Detector, Network, Passages, Period, SignalLog
@@ -19,10 +19,10 @@ from ugat_marl.simulation import standard_detectors
 def greens(
     log: SignalLog, links: tuple[int, ...] = (0,), begin: float = 0.0, end: float = 100.0
 ) -> Greens:
-    lane = SiteLane("in_0", "in", 0, links, 14.0, {"stop": ("stop",)})
+    lane = IncomingLane("in_0", "in", 0, links, 14.0, {"stop": ("stop",)})
     detectors = (Detector("stop", "in_0", 90.0, 0.0, "stop"),)
-    site = Site(("C",), (lane,), (), detectors, {"stop": "C"})
-    return site.greens(Period("day1", begin, end, "fit", {"C": log}, {}))[0]
+    layout = DetectorLayout(("C",), (lane,), (), detectors, {"stop": "C"})
+    return layout.greens(Period("day1", begin, end, "fit", {"C": log}, {}))[0]
 
 
 def rows(found: Greens) -> list[tuple[float, float, float, float]]:
@@ -89,32 +89,32 @@ def test_no_log_no_greens() -> None:
 
 def test_the_crossing_has_two_lanes_with_their_own_letters(data: Path) -> None:
     network = Network.read(load_scenario(data / "crossing"))
-    site = Site.of(network, standard_detectors(network))
-    assert site.intersections == ("C",)
-    assert {lane.id: (lane.edge, lane.links) for lane in site.lanes} == {
+    layout = DetectorLayout.of(network, standard_detectors(network))
+    assert layout.intersections == ("C",)
+    assert {lane.id: (lane.edge, lane.links) for lane in layout.lanes} == {
         "S_C_0": ("S_C", (0,)),
         "W_C_0": ("W_C", (1,)),
     }
-    assert site.lanes[0].detectors == {"advance": ("advance:S_C_0",), "stop": ("stop:S_C_0",)}
-    assert {lane for _, lane, _ in site.exits} == {"C_N_0", "C_E_0"}
-    assert set(site.owner.values()) == {"C"}
+    assert layout.lanes[0].detectors == {"advance": ("advance:S_C_0",), "stop": ("stop:S_C_0",)}
+    assert {lane for _, lane, _ in layout.exits} == {"C_N_0", "C_E_0"}
+    assert set(layout.owner.values()) == {"C"}
     period = Period("day1", 0.0, 100.0, "fit", {"C": ((0.0, "Gr"), (40.0, "rG"), (50.0, "Gr"))}, {})
-    south, west = site.greens(period)
+    south, west = layout.greens(period)
     assert (south.start_s.tolist(), west.start_s.tolist()) == ([0.0], [40.0])
 
 
 def test_lanes_without_detectors_are_kept_and_empty(data: Path) -> None:
     network = Network.read(load_scenario(data / "crossing"))
-    site = Site.of(network, [Detector("d", "S_C_0", 487.0, 0.0, "stop")])
-    assert [dict(lane.detectors) for lane in site.lanes] == [{"stop": ("d",)}, {}]
-    assert site.exits == ()
-    assert site.owner == {"d": "C"}
+    layout = DetectorLayout.of(network, [Detector("d", "S_C_0", 487.0, 0.0, "stop")])
+    assert [dict(lane.detectors) for lane in layout.lanes] == [{"stop": ("d",)}, {}]
+    assert layout.exits == ()
+    assert layout.owner == {"d": "C"}
 
 
 def test_detectors_at_no_traffic_light_are_refused(data: Path) -> None:
     network = Network.read(load_scenario(data / "crossing"))
     with pytest.raises(MeasuredDataError, match="no detector lies on a lane"):
-        Site.of(network, [Detector("d", "nowhere_0", 1.0, 0.0, "stop")])
+        DetectorLayout.of(network, [Detector("d", "nowhere_0", 1.0, 0.0, "stop")])
 
 
 # --- whatever is logged, nothing breaks ----------------------------------------------------------
@@ -158,12 +158,12 @@ def test_greens_are_in_order_and_inside_the_period(log: SignalLog) -> None:
 @example(((0.0, "GG"), (0.0, "YG"), (601.0, "GG")), {})  # a yellow beyond the period's end
 def test_features_of_anything_are_finite(log: SignalLog, seen: dict[str, Passages]) -> None:
     lanes = (
-        SiteLane("in_0", "in", 0, (0,), 14.0, {"advance": ("a",), "stop": ("s", "b")}),
-        SiteLane("in_1", "in", 0, (1,), 14.0, {}),
+        IncomingLane("in_0", "in", 0, (0,), 14.0, {"advance": ("a",), "stop": ("s", "b")}),
+        IncomingLane("in_1", "in", 0, (1,), 14.0, {}),
     )
-    site = Site(("C",), lanes, ((0, "out_0", ("x",)),), (), {})
+    layout = DetectorLayout(("C",), lanes, ((0, "out_0", ("x",)),), (), {})
     period = Period("day1", 0.0, 600.0, "fit", {"C": log}, seen)
-    found = tally(site, period, site.greens(period))
+    found = tally(layout, period, layout.greens(period))
     assert np.isfinite(found.sums).all()
     assert np.isfinite(found.bins).all()
     assert (found.sums[..., 1] >= 0).all()
