@@ -19,7 +19,7 @@ from ugat_marl.diagnosis.features import (
     tally,
 )
 from ugat_marl.diagnosis.hypotheses import library
-from ugat_marl.diagnosis.places import Proposer, _later
+from ugat_marl.diagnosis.places import PlaceFinder, _later
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.effects import Domain, load_scenario, observed, parse_domain
 from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period
@@ -126,8 +126,8 @@ def reference() -> Reference:
 def proposed(
     reference: Reference, data: Sequence[Period], allowed: frozenset[str] | None = None
 ) -> list[Hypothesis]:
-    proposer = Proposer(SITE, ROUTES, allowed or library())
-    return proposer.hypotheses(reference, reference.distance(tallies(data)), data)
+    place_finder = PlaceFinder(SITE, ROUTES, allowed or library())
+    return place_finder.hypotheses(reference, reference.distance(tallies(data)), data)
 
 
 def first(found: Sequence[Hypothesis], name: str) -> Hypothesis:
@@ -311,9 +311,9 @@ def test_the_traffic_light_that_starts_late() -> None:
         return Tally(sums, np.zeros((len(BIN_FEATURES), 4, 1)))
 
     reference = Reference(Pools.of(layout), [day(seed, 0.0) for seed in range(50)])
-    proposer = Proposer(layout, Routes({}, {}, {}, {}), {"late_green", "signal_clock"})
+    place_finder = PlaceFinder(layout, Routes({}, {}, {}, {}), {"late_green", "signal_clock"})
     distance = reference.distance([day(100 + seed, 1.5) for seed in range(5)])
-    found = proposer.hypotheses(reference, distance, [replace(street(1), passages={})])
+    found = place_finder.hypotheses(reference, distance, [replace(street(1), passages={})])
     for name in ("late_green", "signal_clock"):
         assert dict(first(found, name).fixed) == {"place": "C"}
         assert first(found, name).levels[0][0] > 0
@@ -346,8 +346,8 @@ def test_lanes_are_examined_for_parking_that_traffic_avoids_or_queues_on(
 
     reference = Reference(Pools.of(layout), [day(seed, {}) for seed in range(50)])
     distance = reference.distance([day(100 + seed, moved) for seed in range(5)])
-    proposer = Proposer(layout, Routes({}, {}, {}, {}), {"parking"})
-    found = proposer.hypotheses(reference, distance, [replace(street(1), passages={})])
+    place_finder = PlaceFinder(layout, Routes({}, {}, {}, {}), {"parking"})
+    found = place_finder.hypotheses(reference, distance, [replace(street(1), passages={})])
     parked = [str(dict(item.fixed)["lane"]) for item in found]
     assert len(parked) == len(set(parked)) <= 4, "two edges, two lanes of each"
     if lanes is not None:
@@ -368,9 +368,9 @@ def test_routes_are_counted_per_hour(data: Path) -> None:
 
 def test_parking_is_tried_on_every_lane_of_a_small_site() -> None:
     allowed = library([])
-    found = Proposer(SITE, ROUTES, allowed).everywhere()
+    found = PlaceFinder(SITE, ROUTES, allowed).everywhere()
     assert [dict(item.fixed)["lane"] for item in found] == [f"{arm}_in_0" for arm in ARMS]
     assert {item.name for item in found} == {"parking"}
-    assert Proposer(SITE, ROUTES, allowed - {"parking"}).everywhere() == []
+    assert PlaceFinder(SITE, ROUTES, allowed - {"parking"}).everywhere() == []
     many = replace(SITE, lanes=SITE.lanes * 7)
-    assert Proposer(many, ROUTES, allowed).everywhere() == []
+    assert PlaceFinder(many, ROUTES, allowed).everywhere() == []

@@ -33,7 +33,7 @@ _AVOIDED = ("count_advance", "count_stop")
 """Features that show that drivers avoid a lane."""
 
 
-class Proposer:
+class PlaceFinder:
     """Finder of places and windows.
 
     Args:

@@ -22,7 +22,7 @@ from ugat_marl.diagnosis.hypotheses import (
     names_of,
     settings_as_members,
 )
-from ugat_marl.diagnosis.places import Proposer
+from ugat_marl.diagnosis.places import PlaceFinder
 from ugat_marl.diagnosis.propose import Direction, between, promising, propose, squared_gap
 from ugat_marl.diagnosis.records import Fitted, Located, Selected, Tested
 from ugat_marl.diagnosis.residual import Directions, Null
@@ -42,7 +42,7 @@ class Selector:
 
     Args:
         fitter: Simulator and fitter of models.
-        proposer: Finder of places and windows.
+        place_finder: Finder of places and windows.
         library: Hypotheses about the whole network.
         periods: The fitted periods.
         effort: Numbers of simulated days.
@@ -57,7 +57,7 @@ class Selector:
     def __init__(
         self,
         fitter: Fitter,
-        proposer: Proposer,
+        place_finder: PlaceFinder,
         library: Sequence[Hypothesis],
         periods: Sequence[Period],
         effort: Effort,
@@ -66,7 +66,7 @@ class Selector:
         reporter: Reporter,
     ) -> None:
         self._fitter = fitter
-        self._proposer = proposer
+        self._place_finder = place_finder
         self._library = tuple(library)
         self._periods = tuple(periods)
         self._effort = effort
@@ -86,7 +86,7 @@ class Selector:
             OutOfTime: The budget does not suffice for their simulation.
         """
         data = self._fitter.data
-        self._places = tuple(self._bank(base.model, self._proposer.everywhere(), 0, "places"))
+        self._places = tuple(self._bank(base.model, self._place_finder.everywhere(), 0, "places"))
         directions = Directions((*self._library_directions(base.model, 0), *self._places))
         null = self._null(base.model.tallies, len(data), directions, ())
         return replace(base, residual=null.test(data))
@@ -205,7 +205,7 @@ class Selector:
     ) -> list[Members]:
         """Propose effects at places and in windows; lanes and bins of time are compared as well."""
         present = {item.key for item in self._library}
-        found = self._proposer.hypotheses(model.reference, model.distance, self._periods)
+        found = self._place_finder.hypotheses(model.reference, model.distance, self._periods)
         local = [item for item in found if item.key not in present]
         known = [] if number else list(self._places)  # simulated on the scenario as it is
         places = {direction.hypothesis.key for direction in known}
@@ -213,7 +213,7 @@ class Selector:
         added += known
         proposals = propose([*directions, *added], self._whitener(model, None), self._fitter.price)
         places |= {item.key for item in local}
-        self.examined |= self._proposer.allowed
+        self.examined |= self._place_finder.allowed
         alone = [item for item in proposals if len(item.members) == 1]
         best: dict[str, Members] = {}
         for item in alone:

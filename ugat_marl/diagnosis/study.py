@@ -24,7 +24,7 @@ from ugat_marl.diagnosis.features import (
 )
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, library
-from ugat_marl.diagnosis.places import Proposer, Routes
+from ugat_marl.diagnosis.places import PlaceFinder, Routes
 from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
@@ -240,7 +240,7 @@ class Study:
             filters = {} if directions is None else directions.filters(reference, self.fit)
 
             def statistics(distance: Distance) -> dict[str, float]:
-                found = self.proposer.directed(distance)
+                found = self.place_finder.directed(distance)
                 return found | {name: matched(distance) for name, matched in filters.items()}
 
             return statistics
@@ -285,9 +285,9 @@ class Study:
         return self._doubts[effects]
 
     @functools.cached_property
-    def proposer(self) -> Proposer:
+    def place_finder(self) -> PlaceFinder:
         """Finder of places and windows."""
-        return Proposer(self.layout, Routes.of(self.scenario), self.allowed)
+        return PlaceFinder(self.layout, Routes.of(self.scenario), self.allowed)
 
     def fitter(self, base: Tested) -> Fitter:
         """Make the fitter of single models; see `selector` for the search."""
@@ -306,7 +306,7 @@ class Study:
         """Make the search for sets of effects."""
         return Selector(
             self.fitter(base),
-            self.proposer,
+            self.place_finder,
             self.hypotheses,
             self.measured.of("fit"),
             self.effort,
