@@ -46,7 +46,7 @@ from ugat_marl.grounding import (
 from ugat_marl.grounding.fitting import OffData
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.transform import Transform
-from ugat_marl.policies import CPU, DQN, NetworkPolicy, device_of, placed, require_device_name
+from ugat_marl.policies import CPU, DQN, NetworkPolicy, device_of, on_device, require_device_name
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.replay import Batch
 from ugat_marl.policies.networks.structure import Junction, Structure
@@ -363,7 +363,7 @@ def trainings(monkeypatch: pytest.MonkeyPatch) -> list[torch.device]:
 
     def noted(device: torch.device, *modules: torch.nn.Module) -> Any:
         found.append(device)
-        return placed(device, *modules)
+        return on_device(device, *modules)
 
     monkeypatch.setattr("ugat_marl.grounding.fitting.placed", noted)
     return found
@@ -443,7 +443,7 @@ def test_invented_inputs_that_were_not_moved_are_noticed(
 
 def test_placed_modules_are_on_the_device_for_a_while(standin: torch.device) -> None:
     layer = torch.nn.Linear(2, 2)
-    with placed(standin, layer):
+    with on_device(standin, layer):
         assert layer.weight.device == standin
     assert layer.weight.device == CPU
 

@@ -27,7 +27,7 @@ from ugat_marl.grounding.reports import ForwardReport, TrainingRecord, forward_r
 from ugat_marl.grounding.stacked import Stack, StackedTransitions
 from ugat_marl.grounding.uncertainty import Lesson, Method, MethodName, annealing
 from ugat_marl.grounding.view import View
-from ugat_marl.policies import CPU, placed
+from ugat_marl.policies import CPU, on_device
 from ugat_marl.seeding import torch_generator
 
 PAIRS = ("observed", "smoothed")
@@ -313,7 +313,7 @@ class Fitter:
             return (error**2).sum(-1) / outputs
 
         generator = torch_generator(self.seed, lesson.name, "batches")
-        with placed(self.device, model):
+        with on_device(self.device, model):
             record = self._train(lesson.name, model, loss, rows.to(self.device), generator)
             with torch.no_grad():
                 predicted = (model.read_all(inputs) * model.scale).to(CPU)
@@ -358,7 +358,7 @@ class Fitter:
             )
             return model.net.loss(taken(inputs, columns), taken(answers, columns), about)
 
-        with placed(self.device, model):
+        with on_device(self.device, model):
             annealed = config.kl_epochs if fresh and config.uncertainty != "none" else 0
             return self._train("inverse", model, loss, rows, generator, annealed)
 

@@ -1,6 +1,6 @@
 from .devices import CPU as CPU
 from .devices import device_of as device_of
-from .devices import placed as placed
+from .devices import on_device as on_device
 from .devices import require_device_name as require_device_name
 from .export import NumpyPolicy as NumpyPolicy
 from .export import export_policy as export_policy

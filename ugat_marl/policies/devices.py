@@ -57,7 +57,7 @@ def device_of(name: str) -> torch.device:
 
 
 @contextlib.contextmanager
-def placed(device: torch.device, *modules: nn.Module) -> Iterator[None]:
+def on_device(device: torch.device, *modules: nn.Module) -> Iterator[None]:
     """Move modules to a device, and back to the CPU at the end (also after an error)."""
     try:
         for module in modules:
