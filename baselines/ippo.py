@@ -33,8 +33,8 @@ from ugat_marl.policies import (
     SharedMLP,
     flatten_parameters,
     header,
+    observation_mask,
     one_thread,
-    places,
     reading_unscaled,
 )
 from ugat_marl.policies import EpisodeCallback as Callback
@@ -252,7 +252,7 @@ class IPPO:
     def _look(self, env: Env, observations: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
         """Return the inputs of actors and critics, scaled by the running scales."""
         rows = self.agents.stack(observations)
-        self._seen.note(rows, places(self.agents))
+        self._seen.note(rows, observation_mask(self.agents))
         seen = torch.from_numpy(rows * self._seen.factors)
         if not self.config.centralised:
             return seen, seen

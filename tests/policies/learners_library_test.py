@@ -20,8 +20,8 @@ from ugat_marl.policies import (
     decisions_of,
     kept_generators,
     linear_layers,
+    observation_mask,
     perceptron,
-    places,
     roll_out_length,
     seed_generators,
 )
@@ -138,8 +138,8 @@ def test_what_is_seen_is_divided_by_its_size_so_far() -> None:
     assert scale.sums.tolist() == [[2, 1, 2], [25, 0.25, 0]]
     assert scale.factors == pytest.approx([1 / np.sqrt(12.5), 2, 1 / LEAST])
     agents = AgentSet.of(ToyTraffic())
-    assert places(agents).sum(1).tolist() == list(agents.observation_sizes)
-    assert places(agents)[:, : min(agents.observation_sizes)].all()
+    assert observation_mask(agents).sum(1).tolist() == list(agents.observation_sizes)
+    assert observation_mask(agents)[:, : min(agents.observation_sizes)].all()
 
 
 def test_libraries_see_scaled_numbers_and_policies_plain_ones() -> None:

@@ -26,7 +26,7 @@ from .learners.library import perceptron as perceptron
 from .learners.library import roll_out_length as roll_out_length
 from .learners.library import seed_generators as seed_generators
 from .learners.scaling import InputScale as InputScale
-from .learners.scaling import places as places
+from .learners.scaling import observation_mask as observation_mask
 from .network_policy import NetworkPolicy as NetworkPolicy
 from .network_policy import header as header
 from .networks.batched import BatchedLinear as BatchedLinear

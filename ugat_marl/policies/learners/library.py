@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import AgentSet, AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
-from ugat_marl.policies.learners.scaling import InputScale, RewardScale, places
+from ugat_marl.policies.learners.scaling import InputScale, RewardScale, observation_mask
 from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
 from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.policies.protocols import EpisodeCallback
@@ -164,7 +164,7 @@ class TrainingEnv(BaseParallelWrapper[str, Any, Any]):
         self._agents = learner.agents
         self._seed = seed
         self._on_episode = on_episode
-        self._places = places(self._agents)
+        self._places = observation_mask(self._agents)
         self._allowed: NDArray[np.bool_] | None = None
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:

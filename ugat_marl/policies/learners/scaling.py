@@ -86,14 +86,14 @@ def input_factors(observations: Tensor, agents: AgentSet, pooled: bool) -> Tenso
     Returns:
         Factors ``(agents, widest_observation)``; 1 where an agent has no number.
     """
-    own = torch.from_numpy(places(agents))
+    own = torch.from_numpy(observation_mask(agents))
     square = observations.square().mean(1) * own
     if pooled:
         square = (square.sum(0) / own.sum(0)).expand_as(square)
     return torch.where(own, 1 / square.sqrt().clamp_min(LEAST), 1.0)
 
 
-def places(agents: AgentSet) -> NDArray[np.bool_]:
+def observation_mask(agents: AgentSet) -> NDArray[np.bool_]:
     """Return a mask of each agent's own numbers, ``(agents, widest_observation)``."""
     return np.arange(agents.widest_observation) < np.array(agents.observation_sizes)[:, None]
 
