@@ -22,7 +22,7 @@ from ugat_marl.grounding.networks import (
 )
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.view import View
-from ugat_marl.policies import BatchedMLP, mask_of
+from ugat_marl.policies import BatchedMLP, size_mask
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class ForwardModel(TrainableModel):
         self.width = max(fan_in)
         self.register_buffer("scale", torch.ones(len(heads), 1, 1))
         self.register_buffer("offsets", torch.tensor(sizes)[:, None, None], persistent=False)
-        self.register_buffer("valid_outputs", mask_of(heads)[:, None, :], persistent=False)
+        self.register_buffer("valid_outputs", size_mask(heads)[:, None, :], persistent=False)
         behind = torch.tensor(sizes) + torch.tensor(stack.phases)
         places = behind[:, None, None] + torch.arange(extra)
         self.register_buffer("extra_places", places, persistent=False)

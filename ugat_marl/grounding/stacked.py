@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ugat_marl.data import AgentLayout, TransitionLog
 from ugat_marl.errors import LogError
-from ugat_marl.policies import mask_of
+from ugat_marl.policies import size_mask
 
 
 class Stack:
@@ -38,7 +38,7 @@ class Stack:
         self.phases = [layout.phases for layout in layouts.values()]
         self.width = max(self.sizes)
         self.actions = max(self.phases)
-        self.valid_actions = mask_of(self.phases)
+        self.valid_actions = size_mask(self.phases)
 
     def heads(self, include_phase: bool) -> list[int]:
         """Return the length of each agent's head: features, plus phases if included."""

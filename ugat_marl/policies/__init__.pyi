@@ -32,8 +32,8 @@ from .network_policy import header as header
 from .networks.batched import BatchedLinear as BatchedLinear
 from .networks.batched import BatchedMLP as BatchedMLP
 from .networks.batched import SharedMLP as SharedMLP
-from .networks.batched import mask_of as mask_of
 from .networks.batched import one_thread as one_thread
+from .networks.batched import size_mask as size_mask
 from .networks.q_network import flatten_parameters as flatten_parameters
 from .networks.q_network import reading_unscaled as reading_unscaled
 from .protocols import EpisodeCallback as EpisodeCallback

@@ -109,7 +109,7 @@ class SharedMLP(nn.Module):
         return self.rest(first.view(1, agents * batch, -1)).view(agents, batch, -1)
 
 
-def mask_of(sizes: Sequence[int]) -> Tensor:
+def size_mask(sizes: Sequence[int]) -> Tensor:
     """Return a mask ``(agents, max(sizes))``, true for an agent's own entries."""
     return torch.arange(max(sizes))[None, :] < torch.tensor(list(sizes))[:, None]
 

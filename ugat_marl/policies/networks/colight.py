@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.envs import AgentSet
-from ugat_marl.policies.networks.batched import BatchedLinear, SharedMLP, mask_of
+from ugat_marl.policies.networks.batched import BatchedLinear, SharedMLP, size_mask
 
 HEADS = 5
 """Number of attention heads; Wei et al. found it best."""
@@ -50,7 +50,7 @@ class CoLight(nn.Module):
     ) -> None:
         super().__init__()
         embedding, joint = hidden
-        present = mask_of([1 + len(near) for near in neighbours])
+        present = size_mask([1 + len(near) for near in neighbours])
         around = torch.zeros(present.shape, dtype=torch.int64)
         around[present] = torch.tensor([j for i, near in enumerate(neighbours) for j in (i, *near)])
         self.register_buffer("around", around, persistent=False)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.envs import AgentSet
-from ugat_marl.policies.networks.batched import BatchedLinear, BatchedMLP, mask_of
+from ugat_marl.policies.networks.batched import BatchedLinear, BatchedMLP, size_mask
 from ugat_marl.policies.networks.structure import Junction
 
 
@@ -124,6 +124,6 @@ def _rivals(agents: AgentSet) -> Tensor:
 
     The weight is ``1 / (phases - 1)``, and 0 for the phase itself and where padded.
     """
-    own = mask_of(agents.action_counts).float()
+    own = size_mask(agents.action_counts).float()
     pairs = own.unsqueeze(2) * own.unsqueeze(1) * (1 - torch.eye(agents.most_actions))
     return pairs / (own.sum(dim=1) - 1).clamp_min(1)[:, None, None]
