@@ -30,7 +30,7 @@ from ugat_marl.policies import (
     controller_for,
     parse_spec,
     roll_out,
-    until,
+    stop_callback,
 )
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
@@ -278,7 +278,7 @@ def _play(task: _Task, stop: Stop) -> list[Result]:
     # The scenario's files hold the effects of the domain already.
     env = parallel_env(task.world.scenario, **policy.env_options)
     results: list[Result] = []
-    check = until(stop)
+    check = stop_callback(stop)
     look = task.watch(task.name, task.world.domain, env) if task.watch is not None else check
 
     def on_step(step: int) -> None:

@@ -16,7 +16,14 @@ from ugat_marl.grounding.fitting import FitConfig, split
 from ugat_marl.grounding.stacked import Stack, stack_log
 from ugat_marl.grounding.wrappers import RandomDelays
 from ugat_marl.parallel import Stop, Workers, as_done, persistently
-from ugat_marl.policies import Exploring, Policy, PolicyFactory, observer_of, roll_out, until
+from ugat_marl.policies import (
+    Exploring,
+    Policy,
+    PolicyFactory,
+    observer_of,
+    roll_out,
+    stop_callback,
+)
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed
@@ -152,7 +159,9 @@ def _delayed(
 
 def _recorded(env: AnyParallelEnv, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
     observer = observer_of(env)
-    played = persistently(lambda: roll_out(env, policy, seed, record=observer, on_step=until(stop)))
+    played = persistently(
+        lambda: roll_out(env, policy, seed, record=observer, on_step=stop_callback(stop))
+    )
     assert played.log is not None
     return played.log
 
@@ -215,7 +224,7 @@ class RollOut:
         exploring = Exploring(policy, self.epsilon)
         try:
             played = persistently(
-                lambda: roll_out(env, exploring, seed, record=observer, on_step=until(stop))
+                lambda: roll_out(env, exploring, seed, record=observer, on_step=stop_callback(stop))
             )
             assert played.log is not None
             return played.log, env.scores()

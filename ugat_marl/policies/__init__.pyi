@@ -45,7 +45,7 @@ from .rollout import StepCallback as StepCallback
 from .rollout import Stopped as Stopped
 from .rollout import observer_of as observer_of
 from .rollout import roll_out as roll_out
-from .rollout import until as until
+from .rollout import stop_callback as stop_callback
 from .rules.approaches import ControlledNetwork as ControlledNetwork
 from .rules.catalogue import RULE_NAMES as RULE_NAMES
 from .rules.catalogue import RULES as RULES

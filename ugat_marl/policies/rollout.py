@@ -43,7 +43,7 @@ class Stopped(Exception):
     """A roll-out ended early: another thread failed, or the user interrupted."""
 
 
-def until(stop: threading.Event) -> StepCallback:
+def stop_callback(stop: threading.Event) -> StepCallback:
     """Return a callback that raises `Stopped` after `stop` is set."""
 
     def check(_step: int) -> None:

@@ -16,7 +16,7 @@ from xml.sax.saxutils import unescape
 from ugat_marl.envs import EnvOptions, TrafficEnv, parallel_env
 from ugat_marl.errors import SimulatorError
 from ugat_marl.files import parse_xml, xml_bytes
-from ugat_marl.policies import PolicyFactory, roll_out, until
+from ugat_marl.policies import PolicyFactory, roll_out, stop_callback
 from ugat_marl.scenarios import Document, Network, Scenario, SignalLog, signals, sumo_program
 from ugat_marl.simulation import launch_of
 
@@ -60,7 +60,7 @@ def play(
     env = _LoggingEnv(scenario, "sim", EnvOptions.of(policy.env_options))
     env.commanded = defaultdict(list)
     try:
-        roll_out(env, policy, seed, on_step=until(stop))
+        roll_out(env, policy, seed, on_step=stop_callback(stop))
     finally:
         env.close()
     return {tls: tuple(log) for tls, log in env.commanded.items()}
