@@ -31,8 +31,8 @@ from ugat_marl.policies import (
     InputScale,
     NetworkPolicy,
     SharedMLP,
+    checkpoint_header,
     flatten_parameters,
-    header,
     observation_mask,
     one_thread,
     reading_unscaled,
@@ -212,7 +212,9 @@ class IPPO:
         weights = self._weights.detach().clone()
         moments = dict(zip(_MOMENTS, (torch.tensor(0.0), 0 * weights, 0 * weights), strict=True))
         return {
-            **header(self.agents, self.config.hidden, self.env_options, self.config.shared),
+            **checkpoint_header(
+                self.agents, self.config.hidden, self.env_options, self.config.shared
+            ),
             "centralised": self.config.centralised,
             "episodes": self.episodes,
             "weights": weights,

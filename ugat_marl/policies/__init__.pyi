@@ -28,7 +28,7 @@ from .learners.library import seed_generators as seed_generators
 from .learners.scaling import InputScale as InputScale
 from .learners.scaling import observation_mask as observation_mask
 from .network_policy import NetworkPolicy as NetworkPolicy
-from .network_policy import header as header
+from .network_policy import checkpoint_header as checkpoint_header
 from .networks.batched import BatchedLinear as BatchedLinear
 from .networks.batched import BatchedMLP as BatchedMLP
 from .networks.batched import SharedMLP as SharedMLP

@@ -177,10 +177,10 @@ class NumpyPolicy:
 
 
 def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
-    from ugat_marl.policies.network_policy import header
+    from ugat_marl.policies.network_policy import checkpoint_header
 
     agents = policy.agents
-    own = header(agents, policy.hidden, policy.env_options, policy.shared)
+    own = checkpoint_header(agents, policy.hidden, policy.env_options, policy.shared)
     if env is not None and AgentSet.of(env) != agents:
         raise OptionError(
             f"the policy acts for {_brief(agents)}, the environment has "

@@ -102,7 +102,9 @@ class NetworkPolicy:
 
     def save(self, path: Path) -> None:
         """Write the policy to one file; `load` reads it."""
-        content = header(self.agents, self.hidden, self.env_options, self.shared, self.structure)
+        content = checkpoint_header(
+            self.agents, self.hidden, self.env_options, self.shared, self.structure
+        )
         content["parameters"] = torch.from_numpy(self.parameters)
         if self._ceiling is not None:
             content["ceiling"] = self._ceiling
@@ -130,7 +132,7 @@ class NetworkPolicy:
         return NetworkPolicy, (*own, self.structure, self.ceiling)
 
 
-def header(
+def checkpoint_header(
     agents: AgentSet,
     hidden: tuple[int, ...],
     env_options: Mapping[str, Any],

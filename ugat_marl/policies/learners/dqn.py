@@ -25,7 +25,7 @@ from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
 from ugat_marl.policies.learners.replay import Replay
 from ugat_marl.policies.learners.scaling import ceilings, input_factors
-from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
+from ugat_marl.policies.network_policy import NetworkPolicy, checkpoint_header, parse_header
 from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.policies.networks.q_network import (
     flatten_parameters,
@@ -388,7 +388,9 @@ class DQN:
         """
         config = self.config
         content = {
-            **header(self.agents, config.hidden, self.env_options, config.shared, self.structure),
+            **checkpoint_header(
+                self.agents, config.hidden, self.env_options, config.shared, self.structure
+            ),
             "counters": {name: getattr(self, name) for name in _COUNTERS}
             | {"added": self._replay.added},
             "tensors": {name: x.to(CPU, copy=True) for name, x in self._tensors().items()},

@@ -26,7 +26,7 @@ from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import AgentSet, AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.learners.scaling import InputScale, RewardScale, observation_mask
-from ugat_marl.policies.network_policy import NetworkPolicy, header, parse_header
+from ugat_marl.policies.network_policy import NetworkPolicy, checkpoint_header, parse_header
 from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.policies.protocols import EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator
@@ -83,7 +83,7 @@ class LibraryLearner(abc.ABC):
         """Write the whole state; a learner that loads it continues exactly as this one."""
         policy = self.policy()
         content = {
-            **header(self.agents, policy.hidden, self.env_options, policy.shared),
+            **checkpoint_header(self.agents, policy.hidden, self.env_options, policy.shared),
             "episodes": self.episodes,
             "sums": [torch.from_numpy(one.sums.copy()) for one in self._scales],
             "networks": {name: tensor.clone() for name, tensor in self._networks().items()},
