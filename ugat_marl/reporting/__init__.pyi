@@ -7,7 +7,7 @@ from .comparison_tables import markdown as markdown
 from .comparison_tables import number as number
 from .comparison_tables import percent as percent
 from .comparison_tables import seeds_csv as seeds_csv
-from .comparison_tables import share as share
+from .comparison_tables import share_text as share_text
 from .comparison_tables import terminal_tables as terminal_tables
 from .diagnosis_page import commands_on_page as commands_on_page
 from .diagnosis_page import write_diagnosis_page as write_diagnosis_page

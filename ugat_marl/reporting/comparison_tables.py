@@ -141,7 +141,7 @@ def _headlines(found: Comparison, direct: str) -> list[tuple[str, Cell]]:
         ),
         (
             "share of the regret won back (1: the best in the table)",
-            lambda s, t: share(found.won_back(s, t, direct)),
+            lambda s, t: share_text(found.won_back(s, t, direct)),
         ),
     ]
 
@@ -240,7 +240,7 @@ def with_interval(interval: Interval) -> str:
     return f"{number(interval.mean)} ({number(interval.low)}{to}{number(interval.high)})"
 
 
-def share(value: float) -> str:
+def share_text(value: float) -> str:
     """Return a share of the regret; a dash for nan."""
     return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
 
