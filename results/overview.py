@@ -15,7 +15,7 @@ from statistics import fmean
 
 from ugat_marl.experiments import CONTROL, DIRECT, ORACLE, RULE, TIMED, matched_name
 from ugat_marl.files import write_whole
-from ugat_marl.reporting import number, percent, share_text
+from ugat_marl.reporting import number, percent_text, share_text
 
 FOLDER = Path(__file__).parent
 BEGIN, END = "<!-- overview -->\n", "<!-- end of overview -->\n"
@@ -129,7 +129,7 @@ def _att(column: Column, settings: Sequence[str]) -> str:
 def _grounded(setting: str, column: Column) -> str:
     if setting not in column:
         return ""
-    gap, back = percent(reduction(setting, column)), share_text(won_back(setting, column))
+    gap, back = percent_text(reduction(setting, column)), share_text(won_back(setting, column))
     return f"**{number(column[setting].att_s)}** {gap}, {back}"
 
 
@@ -140,7 +140,7 @@ def _mean(found: Sequence[Column]) -> str:
         if len(having) < len(found):
             cells.append("")
             continue
-        gap = percent(fmean(reduction(setting, column) for column in having))
+        gap = percent_text(fmean(reduction(setting, column) for column in having))
         back = share_text(fmean(won_back(setting, column) for column in having))
         cells.append(f"*{gap}, {back}*")
     return f"| {' | '.join(cells)} | | | | |"

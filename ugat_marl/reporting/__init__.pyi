@@ -5,7 +5,7 @@ from .charts import transfer_picture as transfer_picture
 from .comparison_tables import as_csv as as_csv
 from .comparison_tables import markdown as markdown
 from .comparison_tables import number as number
-from .comparison_tables import percent as percent
+from .comparison_tables import percent_text as percent_text
 from .comparison_tables import seeds_csv as seeds_csv
 from .comparison_tables import share_text as share_text
 from .comparison_tables import terminal_tables as terminal_tables

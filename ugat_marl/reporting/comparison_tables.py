@@ -133,7 +133,7 @@ def _headlines(found: Comparison, direct: str) -> list[tuple[str, Cell]]:
         ("average travel time in the simulation, s", _estimated(found, found.sim)),
         (
             "change of the gap Δ against direct transfer",
-            lambda s, t: percent(-found.reduction(s, t, direct)),
+            lambda s, t: percent_text(-found.reduction(s, t, direct)),
         ),
         (
             "transfer regret, s above the best in the table",
@@ -245,7 +245,7 @@ def share_text(value: float) -> str:
     return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
 
 
-def percent(value: float) -> str:
+def percent_text(value: float) -> str:
     """Return a signed share in per cent; a dash for nan."""
     return "–" if math.isnan(value) else f"{'−' if value < 0 else '+'}{abs(100 * value):.0f} %"
 
