@@ -12,7 +12,7 @@ import pytest
 
 from ugat_marl.data import Scores
 from ugat_marl.experiments import Comparison, Trial
-from ugat_marl.reporting import as_csv, gap_picture, markdown, seeds_csv
+from ugat_marl.reporting import as_csv, comparison_page, gap_picture, seeds_csv
 
 BLANK = Scores(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
 FACTS = {
@@ -90,7 +90,7 @@ def test_episodes_that_broke_down_are_counted_one_by_one() -> None:
     found = Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
     assert found.median_s("direct transfer", "V4") == 120.0
     assert found.unserved("direct transfer", "V4") == pytest.approx(1 / 3)
-    assert "| direct transfer | 120, 33 % |" in markdown(found, "direct transfer", FACTS)
+    assert "| direct transfer | 120, 33 % |" in comparison_page(found, "direct transfer", FACTS)
 
 
 @pytest.mark.parametrize("shared", ["", "+blocker_patience=60+reach=100", "+reach=100" * 6])
@@ -109,7 +109,7 @@ def test_bars_are_told_apart_within_the_picture(shared: str, tmp_path: Path) -> 
 
 
 def test_pages_hold_the_numbers(found: Comparison) -> None:
-    page = markdown(found, "direct transfer", FACTS)
+    page = comparison_page(found, "direct transfer", FACTS)
     assert "# toy: main" in page
     assert "| UGAT | −54 % |" in page
     assert "| UGAT | 0.80 |" in page

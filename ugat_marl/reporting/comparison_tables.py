@@ -49,7 +49,7 @@ def terminal_tables(found: Comparison, direct: str) -> RenderableType:
     return Group(*blocks)
 
 
-def markdown(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
+def comparison_page(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
     """Return the whole comparison as a page of Markdown.
 
     Args:
