@@ -12,7 +12,7 @@ import pytest
 
 from ugat_marl.data import Scores
 from ugat_marl.experiments import Comparison, Trial
-from ugat_marl.reporting import as_csv, comparison_page, gap_picture, seeds_csv
+from ugat_marl.reporting import comparison_csv, comparison_page, gap_picture, seeds_csv
 
 BLANK = Scores(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
 FACTS = {
@@ -116,7 +116,7 @@ def test_pages_hold_the_numbers(found: Comparison) -> None:
     assert "| direct transfer | 100 (-154 to 354) |" in page  # t = 12.71, 20 s apart from the mean
     assert "| best constant | constant delay 2 s |" in page
     assert "| UGAT | -80.0 (" in page
-    table = as_csv(found).splitlines()
+    table = comparison_csv(found).splitlines()
     assert len(table) == 5
     assert table[0].startswith("scenario,setting,domain,training_seeds,att_s,")
     assert "UGAT,V4,0,130.0,71.0,0.0" in seeds_csv(found).splitlines()

@@ -25,7 +25,7 @@ from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import device_of
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import (
-    as_csv,
+    comparison_csv,
     comparison_page,
     comparison_radar,
     gap_picture,
@@ -146,7 +146,7 @@ class Gap(_Paper):
 
 def _write(found: Comparison, folder: Path) -> None:
     write_whole(folder / "table.md", comparison_page(found, DIRECT, machine_facts()) + "\n")
-    write_whole(folder / "table.csv", as_csv(found))
+    write_whole(folder / "table.csv", comparison_csv(found))
     write_whole(folder / "seeds.csv", seeds_csv(found))
     grounded = [*GROUNDED_NAME.values(), matched_name("timed")]
     drawn = [DIRECT, *(name for name in grounded if name in found.settings)]

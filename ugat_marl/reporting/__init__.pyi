@@ -2,7 +2,7 @@ from .charts import calibration_picture as calibration_picture
 from .charts import comparison_radar as comparison_radar
 from .charts import gap_picture as gap_picture
 from .charts import transfer_picture as transfer_picture
-from .comparison_tables import as_csv as as_csv
+from .comparison_tables import comparison_csv as comparison_csv
 from .comparison_tables import comparison_page as comparison_page
 from .comparison_tables import number as number
 from .comparison_tables import percent_text as percent_text

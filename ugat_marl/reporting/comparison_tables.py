@@ -97,7 +97,7 @@ def comparison_page(found: Comparison, direct: str, facts: Mapping[str, Any]) ->
     return "\n".join(lines)
 
 
-def as_csv(found: Comparison) -> str:
+def comparison_csv(found: Comparison) -> str:
     """Return `Comparison.rows` as CSV with a heading; a missing value is an empty cell."""
     rows = found.rows()
     text = io.StringIO()
