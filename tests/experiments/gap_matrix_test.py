@@ -15,7 +15,7 @@ from ugat_marl.effects import NAMED, load_scenario
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
 from ugat_marl.experiments.scores import Result
-from ugat_marl.reporting import hidden_tables, matrix_table
+from ugat_marl.reporting import matrix_table, objective_tables
 from ugat_marl.scenarios import validated
 
 BASE = Scores(100.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 5.0)
@@ -74,11 +74,11 @@ def test_each_cell_is_the_mean_over_domains_and_seeds() -> None:
 
 
 def test_the_tables_fit_a_terminal() -> None:
-    text = shown(matrix_table(planted()), *hidden_tables(planted()))
+    text = shown(matrix_table(planted()), *objective_tables(planted()))
     assert max(map(len, text.splitlines())) <= 80
     assert "+30" in text and "+200.0" in text and "zone-50" in text
     assert "3.0" in text and "measured in want-safety" in text
-    assert not hidden_tables(Evaluation("x", "0", (Result("a", "sim", 0, scores(1)),), {}))
+    assert not objective_tables(Evaluation("x", "0", (Result("a", "sim", 0, scores(1)),), {}))
 
 
 def test_a_table_survives_writing(tmp_path: Path) -> None:

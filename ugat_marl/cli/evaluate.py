@@ -17,7 +17,7 @@ from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments import evaluate, gaps_of, policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import hidden_tables, matrix_table, measures_table
+from ugat_marl.reporting import matrix_table, measures_table, objective_tables
 from ugat_marl.scenarios import Scenario
 
 MOST_IN_DETAIL = 8
@@ -87,7 +87,7 @@ class Evaluate:
             console.print(matrix_table(found))
         else:
             console.print(measures_table(found))
-        for table in hidden_tables(found):
+        for table in objective_tables(found):
             console.print(table)
         if self.out is not None:
             found.write(self.out)

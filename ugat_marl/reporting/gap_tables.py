@@ -44,7 +44,7 @@ def matrix_table(found: Evaluation) -> RenderableType:
     return Group(table, Text(legend, style="dim"), _by_domain(found))
 
 
-def hidden_tables(found: Evaluation) -> list[RenderableType]:
+def objective_tables(found: Evaluation) -> list[RenderableType]:
     """Return the measures of domains with an objective; an empty list without such domains."""
     told = {result.domain for result in found.results if result.scores.hidden}
     domains = [domain for domain in found.domains if domain in told]
