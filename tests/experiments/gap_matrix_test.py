@@ -15,7 +15,7 @@ from ugat_marl.effects import NAMED, load_scenario
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
 from ugat_marl.experiments.scores import Result
-from ugat_marl.reporting import matrix_table, objective_tables
+from ugat_marl.reporting import gap_matrix_table, objective_tables
 from ugat_marl.scenarios import validated
 
 BASE = Scores(100.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 5.0)
@@ -74,7 +74,7 @@ def test_each_cell_is_the_mean_over_domains_and_seeds() -> None:
 
 
 def test_the_tables_fit_a_terminal() -> None:
-    text = shown(matrix_table(planted()), *objective_tables(planted()))
+    text = shown(gap_matrix_table(planted()), *objective_tables(planted()))
     assert max(map(len, text.splitlines())) <= 80
     assert "+30" in text and "+200.0" in text and "zone-50" in text
     assert "3.0" in text and "measured in want-safety" in text

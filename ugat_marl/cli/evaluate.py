@@ -17,7 +17,7 @@ from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments import evaluate, gaps_of, policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import matrix_table, measures_table, objective_tables
+from ugat_marl.reporting import gap_matrix_table, measures_table, objective_tables
 from ugat_marl.scenarios import Scenario
 
 MOST_IN_DETAIL = 8
@@ -84,7 +84,7 @@ class Evaluate:
                 reporter=Bars(console),
             )
         if len(domains) > MOST_IN_DETAIL and gaps_of(found):
-            console.print(matrix_table(found))
+            console.print(gap_matrix_table(found))
         else:
             console.print(measures_table(found))
         for table in objective_tables(found):

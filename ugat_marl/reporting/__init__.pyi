@@ -12,7 +12,7 @@ from .comparison_tables import terminal_tables as terminal_tables
 from .diagnosis_page import commands_on_page as commands_on_page
 from .diagnosis_page import write_diagnosis_page as write_diagnosis_page
 from .diagnosis_tables import diagnosis_summary as diagnosis_summary
-from .gap_tables import matrix_table as matrix_table
+from .gap_tables import gap_matrix_table as gap_matrix_table
 from .gap_tables import objective_tables as objective_tables
 from .learning_curves import curves_as_csv as curves_as_csv
 from .learning_curves import curves_page as curves_page

@@ -14,7 +14,7 @@ from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
 from ugat_marl.reporting.tables import number
 
 
-def matrix_table(found: Evaluation) -> RenderableType:
+def gap_matrix_table(found: Evaluation) -> RenderableType:
     """Return the cost of each gap for each controller, then travel times by domain."""
     gaps = gaps_of(found)
     first = found.domains[0]
