@@ -12,7 +12,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from tests.interrupts import KillAfter
-from ugat_marl.data import Scores, locked
+from ugat_marl.data import Scores, lock_folder
 from ugat_marl.errors import MeasurementError, OptionError
 from ugat_marl.experiments import (
     Job,
@@ -183,7 +183,7 @@ def test_a_failed_job_says_why_and_the_others_go_on_if_they_shall(tmp_path: Path
 
 
 def test_two_drivers_do_not_train_in_one_folder(tmp_path: Path) -> None:
-    lock = locked(tmp_path)
+    lock = lock_folder(tmp_path)
     with pytest.raises(OptionError, match="another process"):
         perform_all([], tmp_path, 1, Silent(), "test")
     lock.close()

@@ -94,7 +94,7 @@ class Run:
         identity = json.loads(json.dumps(identity, sort_keys=True))
         file = directory / "run.json"
         require_writable(file)
-        self._lock = locked(directory)
+        self._lock = lock_folder(directory)
         _remove_remains(directory)
         if file.exists() and self.resumable:
             if not resume:
@@ -189,7 +189,7 @@ def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
     write_whole(directory / SETTINGS, json.dumps(content, indent=1, default=str) + "\n")
 
 
-def locked(directory: Path) -> IO[str]:
+def lock_folder(directory: Path) -> IO[str]:
     """Lock a folder: return a file that stays locked while it is open; a killed process frees it.
 
     Raises:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
 
-from ugat_marl.data import locked
+from ugat_marl.data import lock_folder
 from ugat_marl.errors import MeasurementError
 from ugat_marl.experiments.jobs import Job, Record, perform
 from ugat_marl.files import require_writable
@@ -67,7 +67,7 @@ def perform_all(
     running: dict[Future[None], Job] = {}
     failures: dict[str, str] = {}
     require_writable(folder / LOG)
-    lock, stop = locked(folder), Stop()
+    lock, stop = lock_folder(folder), Stop()
     with reporter.task(title, len(jobs)) as advance, executor_of(workers) as pool:
         for _ in range(len(jobs) - len(left)):
             advance()
