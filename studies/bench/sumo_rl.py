@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.data import version_of, versions_of
+from ugat_marl.data import installed_version, versions_of
 from ugat_marl.errors import MeasurementError
 from ugat_marl.files import write_whole
 
@@ -62,7 +62,7 @@ def install_sumo_rl(cache: Path, say: Callable[[str], None]) -> SumoRl:
     Raises:
         MeasurementError: The installation failed; the message quotes pip.
     """
-    libsumo = version_of("libsumo")
+    libsumo = installed_version("libsumo")
     wanted = [f"sumo-rl=={SUMO_RL}", f"pettingzoo=={PETTINGZOO}", f"libsumo=={libsumo}"]
     python_version = ".".join(map(str, sys.version_info[:2]))
     folder = cache.resolve() / f"sumo-rl-{SUMO_RL}-libsumo-{libsumo}-py{python_version}"

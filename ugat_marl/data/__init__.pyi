@@ -15,9 +15,9 @@ from .runs import METRICS as METRICS
 from .runs import SETTINGS as SETTINGS
 from .runs import Metrics as Metrics
 from .runs import Run as Run
+from .runs import installed_version as installed_version
 from .runs import lock_folder as lock_folder
 from .runs import remove_temporaries as remove_temporaries
-from .runs import version_of as version_of
 from .runs import versions_of as versions_of
 from .runs import write_settings as write_settings
 from .scores import MEASURES as MEASURES

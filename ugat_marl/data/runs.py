@@ -249,7 +249,7 @@ def remove_temporaries(directory: Path) -> None:
         remains.unlink(missing_ok=True)
 
 
-def version_of(distribution: str) -> str | None:
+def installed_version(distribution: str) -> str | None:
     """Return the installed version of a package, or None."""
     try:
         return importlib.metadata.version(distribution)
@@ -259,4 +259,4 @@ def version_of(distribution: str) -> str | None:
 
 def versions_of(*distributions: str) -> dict[str, str | None]:
     """Return package to installed version, or None if it is not installed."""
-    return {name: version_of(name) for name in distributions}
+    return {name: installed_version(name) for name in distributions}

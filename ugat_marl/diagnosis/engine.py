@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data import version_of
+from ugat_marl.data import installed_version
 from ugat_marl.diagnosis.features import FEATURES, DetectorLayout, Greens, Tally, tally
 from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
@@ -162,7 +162,7 @@ class Engine:
         self._days: OrderedDict[str, Day] = OrderedDict()
         self._known: dict[str, Replicate] = {}
         self._unmeasured = Unmeasured.of(periods)
-        versions = version_of("eclipse-sumo"), version_of("numpy")
+        versions = installed_version("eclipse-sumo"), installed_version("numpy")
         head = (VERSION, FEATURES, scenario.hash, layout.detectors, versions, seed)
         head += (self._unmeasured,) if self._unmeasured else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()

@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.data import version_of
+from ugat_marl.data import installed_version
 from ugat_marl.effects import Domain, describe, in_domain
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race
@@ -200,7 +200,7 @@ def _place(
     world = in_domain(scenario, domain)
     if duration_s is not None:
         world = world.with_duration(duration_s)
-    sumo = version_of("eclipse-sumo")
+    sumo = installed_version("eclipse-sumo")
     content = (VERSION, sumo, scenario.hash, world.hash, name, budget, TUNING_SEED, *specs)
     return user_cache("tuned") / f"{hashlib.sha256(repr(content).encode()).hexdigest()}.json"
 

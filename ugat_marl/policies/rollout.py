@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data import Provenance, TransitionLog, TransitionRecorder, version_of
+from ugat_marl.data import Provenance, TransitionLog, TransitionRecorder, installed_version
 from ugat_marl.envs import UNITS, Actions, AnyParallelEnv, Infos, Observations, Observer
 from ugat_marl.policies.protocols import Policy
 from ugat_marl.seeding import numpy_generator
@@ -160,7 +160,7 @@ def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Prove
         decision_interval_s=base.decision_interval_s,
         observation=observer.name,
         layouts=dict(zip(observer.agents, observer.layouts, strict=True)),
-        versions={name: version_of(name) or "not installed" for name in SIMULATING},
+        versions={name: installed_version(name) or "not installed" for name in SIMULATING},
         units={"observation": UNITS[observer.name], "reward": str(base.options.reward)},
     )
 

@@ -18,7 +18,7 @@ from typing import Any, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from ugat_marl.data import version_of
+from ugat_marl.data import installed_version
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.policies.learners.dqn_config import DQNConfig
@@ -160,7 +160,7 @@ def require_known(name: str) -> None:
 def library_of(name: str) -> str:
     """Return a learner's library with its version; "" for the suite's own learners."""
     library = _library(name)
-    return library and f"{library} {version_of(library) or '-'}"
+    return library and f"{library} {installed_version(library) or '-'}"
 
 
 def is_installed(name: str) -> bool:
