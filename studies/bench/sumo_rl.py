@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.data import installed_version, versions_of
+from ugat_marl.data import installed_version, installed_versions
 from ugat_marl.errors import MeasurementError
 from ugat_marl.files import write_whole
 
@@ -80,7 +80,7 @@ def _install(folder: Path, python: Path, wanted: list[str]) -> None:
     shutil.rmtree(folder, ignore_errors=True)  # an interrupted run may have left it
     folder.parent.mkdir(parents=True, exist_ok=True)
     _run([sys.executable, "-m", "venv", str(folder)], "no virtual environment could be made")
-    same = versions_of(*_OWN_VERSIONS)
+    same = installed_versions(*_OWN_VERSIONS)
     constraints = folder / "constraints.txt"
     constraints.write_text("".join(f"{name}=={v}\n" for name, v in same.items() if v))
     options = ["--disable-pip-version-check", "--no-input", "--quiet", "-c", str(constraints)]

@@ -16,9 +16,9 @@ from .runs import SETTINGS as SETTINGS
 from .runs import Metrics as Metrics
 from .runs import Run as Run
 from .runs import installed_version as installed_version
+from .runs import installed_versions as installed_versions
 from .runs import lock_folder as lock_folder
 from .runs import remove_temporaries as remove_temporaries
-from .runs import versions_of as versions_of
 from .runs import write_settings as write_settings
 from .scores import MEASURES as MEASURES
 from .scores import MORE_IS_BETTER as MORE_IS_BETTER

@@ -185,7 +185,7 @@ def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
 
     ``run.json`` holds only the values that must be equal for `--resume`.
     """
-    content = {"settings": settings, "versions": versions_of(*_VERSIONS)}
+    content = {"settings": settings, "versions": installed_versions(*_VERSIONS)}
     write_whole(directory / SETTINGS, json.dumps(content, indent=1, default=str) + "\n")
 
 
@@ -257,6 +257,6 @@ def installed_version(distribution: str) -> str | None:
         return None
 
 
-def versions_of(*distributions: str) -> dict[str, str | None]:
+def installed_versions(*distributions: str) -> dict[str, str | None]:
     """Return package to installed version, or None if it is not installed."""
     return {name: installed_version(name) for name in distributions}

@@ -11,7 +11,7 @@ from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
-from ugat_marl.data import Measured, versions_of
+from ugat_marl.data import Measured, installed_versions
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.locate import disagreements, locate_gap
 from ugat_marl.diagnosis.records import (
@@ -224,7 +224,7 @@ def _begun(
         ),
         verified_on_fitted_periods=not measured.of("heldout"),
         hashes={"scenario": study.scenario.hash, "measured": measured.hash},
-        versions=versions_of("ugat-marl", "eclipse-sumo"),
+        versions=installed_versions("ugat-marl", "eclipse-sumo"),
         verdict=verdict,
         sentence=sentence,
         effects=tuple(_from_the_log(effect) for effect in timing),

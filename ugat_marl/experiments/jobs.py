@@ -21,7 +21,7 @@ from typing import Any
 from pydantic import TypeAdapter
 from rich.console import Console
 
-from ugat_marl.data import Run, Scores, remove_temporaries, versions_of
+from ugat_marl.data import Run, Scores, installed_versions, remove_temporaries
 from ugat_marl.effects import in_domain, load_scenario
 from ugat_marl.envs import AnyParallelEnv, parallel_env
 from ugat_marl.errors import OptionError, UgatMarlError
@@ -121,7 +121,7 @@ class Job:
             "every": self.every,
             "options": dict(self.options),
             "worlds": {world: _hash(self.scenario, world) for world in worlds},
-            "versions": versions_of("eclipse-sumo", "torch"),
+            "versions": installed_versions("eclipse-sumo", "torch"),
         }
         if self.setting.recipe == "rule":
             found |= {"target": self.target, "tuning": VERSION, "rule_budget": self.rule_budget}

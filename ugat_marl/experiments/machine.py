@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.data import versions_of
+from ugat_marl.data import installed_versions
 from ugat_marl.parallel import usable_cores
 
 _LIBRARIES = (
@@ -27,7 +27,7 @@ def machine_facts() -> dict[str, Any]:
         "memory_gib": memory_gib(),
         "system": platform.platform(),
         "python": platform.python_version(),
-        "versions": versions_of(*_LIBRARIES),
+        "versions": installed_versions(*_LIBRARIES),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": shlex.join([*_program(), *sys.argv[1:]]),
     }
