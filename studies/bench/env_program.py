@@ -12,7 +12,14 @@ from typing import Any
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.seeding import numpy_generator
-from ugat_marl.simulation import Launch, LibsumoSimulator, Plans, Snapshot, Trips, VehiclePicture
+from ugat_marl.simulation import (
+    Launch,
+    LibsumoSimulator,
+    SignalPlans,
+    Snapshot,
+    Trips,
+    VehiclePicture,
+)
 
 
 class RecordingSimulator:
@@ -41,7 +48,7 @@ class RecordingSimulator:
         shutil.copytree(launch.directory, self._folder, dirs_exist_ok=True)
         return snapshot
 
-    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
         """Simulate `seconds` and note every change of a signal."""
         changes: dict[float, list[tuple[str, str]]] = {}
         for light, segments in plans.items():

@@ -22,8 +22,8 @@ from ugat_marl.policies import Policy, Stopped, roll_out
 from ugat_marl.simulation import (
     HALTING_MPS,
     Launch,
-    Plans,
     ProcessSimulator,
+    SignalPlans,
     Simulator,
     Snapshot,
     Trips,
@@ -91,7 +91,7 @@ class Filmed:
         self.scenes = []
         return self._inner.start(launch)
 
-    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
         """Simulate `seconds`: in one call outside of the stretch, second by second inside."""
         begin_s, end_s = (self._start_s + edge for edge in self._stretch)
         if self._now_s + seconds <= begin_s or self._now_s >= end_s:
@@ -125,7 +125,7 @@ class Filmed:
         self._inner.close()
 
 
-def between(plans: Plans, begin_s: float, end_s: float) -> dict[str, list[tuple[float, str]]]:
+def between(plans: SignalPlans, begin_s: float, end_s: float) -> dict[str, list[tuple[float, str]]]:
     """Return the part of signal plans between two times, in s from the beginning of the plans."""
     found: dict[str, list[tuple[float, str]]] = {}
     for tls, segments in plans.items():

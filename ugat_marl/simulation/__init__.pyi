@@ -11,7 +11,7 @@ from .process import ProcessSimulator as ProcessSimulator
 from .process import simulator_of as simulator_of
 from .simulator import Launch as Launch
 from .simulator import LibsumoSimulator as LibsumoSimulator
-from .simulator import Plans as Plans
+from .simulator import SignalPlans as SignalPlans
 from .simulator import Simulator as Simulator
 from .simulator import VehiclePicture as VehiclePicture
 from .simulator import launch_of as launch_of

@@ -18,7 +18,7 @@ from ugat_marl.simulation.host import Host, StartMethod, Worker
 from ugat_marl.simulation.simulator import (
     Launch,
     LibsumoSimulator,
-    Plans,
+    SignalPlans,
     Simulator,
     VehiclePicture,
 )
@@ -57,7 +57,7 @@ class ProcessSimulator:
         launch.write()
         return _snapshot(self._ask("start", launch=launch.as_dict()))
 
-    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
         """Simulate `seconds` under the given signals, in one round trip.
 
         Raises:

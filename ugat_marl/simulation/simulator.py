@@ -33,7 +33,7 @@ from ugat_marl.simulation.mesoscopic import MesoscopicLanes, refuse_in_queues
 from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
 from ugat_marl.simulation.trips import measuring_options, read_trips
 
-Plans = Mapping[str, Sequence[Segment]]
+SignalPlans = Mapping[str, Sequence[Segment]]
 """Traffic light to its states for the coming seconds. Lights left out continue as before."""
 
 _Floats = NDArray[np.float64]
@@ -114,7 +114,7 @@ class Simulator(Protocol):
         """Start a simulation; end a running one first."""
         ...
 
-    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
         """Simulate `seconds` under the given signals."""
         ...
 
@@ -275,7 +275,7 @@ class LibsumoSimulator:
             self._mesoscopic = MesoscopicLanes(libsumo, launch.lanes, launch.segment_m)
         return self._snapshot()
 
-    def advance(self, seconds: float, plans: Plans) -> Snapshot:
+    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
         """Simulate `seconds` and show the planned signal states.
 
         Raises:
