@@ -18,7 +18,7 @@ from ugat_marl.simulation import (
     SignalPlans,
     Snapshot,
     Trips,
-    VehiclePicture,
+    VehiclePositions,
 )
 
 
@@ -62,7 +62,7 @@ class RecordingSimulator:
         self._now += seconds
         return self._simulator.advance(seconds, plans)
 
-    def vehicles(self) -> VehiclePicture:
+    def vehicles(self) -> VehiclePositions:
         """Return the current positions of all vehicles."""
         return self._simulator.vehicles()
 

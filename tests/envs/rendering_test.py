@@ -13,7 +13,7 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import Picture, parallel_env
 from ugat_marl.envs.rendering import _RED, _SIGNALS, _SPEEDS
 from ugat_marl.scenarios import Network
-from ugat_marl.simulation import VehiclePicture
+from ugat_marl.simulation import VehiclePositions
 
 
 @pytest.fixture(scope="module")
@@ -21,10 +21,10 @@ def network(data: Path) -> Network:
     return Network.read(load_scenario(data / "crossing"))
 
 
-def traffic(*rows: tuple[float, float, float, float, float]) -> VehiclePicture:
+def traffic(*rows: tuple[float, float, float, float, float]) -> VehiclePositions:
     """x, y, heading, length, speed."""
     table = np.array(rows, dtype=np.float64).reshape(-1, 5)
-    return VehiclePicture(table[:, :2], table[:, 2], table[:, 3], table[:, 4])
+    return VehiclePositions(table[:, :2], table[:, 2], table[:, 3], table[:, 4])
 
 
 def near(pixels: np.ndarray, colour: str, tolerance: int = 12) -> np.ndarray:

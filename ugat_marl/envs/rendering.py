@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.scenarios import Network
-from ugat_marl.simulation import VehiclePicture
+from ugat_marl.simulation import VehiclePositions
 
 SIZE_PX = 1000
 """Longer side of a picture by default, in pixels."""
@@ -77,7 +77,7 @@ class Picture:
             self._axes.add_collection(artist, autolim=False)
         self._draw_signals({})
 
-    def draw(self, vehicles: VehiclePicture, states: Mapping[str, str]) -> None:
+    def draw(self, vehicles: VehiclePositions, states: Mapping[str, str]) -> None:
         """Draw vehicles and signal states (traffic light to SUMO's state letters)."""
         self._canvas.restore_region(self._empty)
         self._draw_signals(states)
@@ -97,7 +97,7 @@ class Picture:
         self._lines.set_color(colours)
         self._axes.draw_artist(self._lines)
 
-    def _outlines(self, vehicles: VehiclePicture) -> Floats:
+    def _outlines(self, vehicles: VehiclePositions) -> Floats:
         """Return the rectangles of vehicles, ``(vehicles, 4, 2)`` in pixels."""
         front = self._view.pixels(vehicles.position)
         angle = np.deg2rad(vehicles.angle_deg)

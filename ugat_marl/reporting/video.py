@@ -27,7 +27,7 @@ from ugat_marl.simulation import (
     Simulator,
     Snapshot,
     Trips,
-    VehiclePicture,
+    VehiclePositions,
 )
 
 Frame = NDArray[np.uint8]
@@ -49,7 +49,7 @@ class Scene:
     """
 
     time_s: float
-    vehicles: VehiclePicture
+    vehicles: VehiclePositions
     states: dict[str, str]
 
 
@@ -108,7 +108,7 @@ class Filmed:
             if done >= seconds:
                 return snapshot
 
-    def vehicles(self) -> VehiclePicture:
+    def vehicles(self) -> VehiclePositions:
         """See `Simulator`."""
         return self._inner.vehicles()
 

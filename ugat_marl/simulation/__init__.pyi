@@ -13,7 +13,7 @@ from .simulator import Launch as Launch
 from .simulator import LibsumoSimulator as LibsumoSimulator
 from .simulator import SignalPlans as SignalPlans
 from .simulator import Simulator as Simulator
-from .simulator import VehiclePicture as VehiclePicture
+from .simulator import VehiclePositions as VehiclePositions
 from .simulator import launch_of as launch_of
 from .simulator import simulates_here as simulates_here
 from .snapshots import HALTING_MPS as HALTING_MPS

@@ -20,7 +20,7 @@ from ugat_marl.simulation.simulator import (
     LibsumoSimulator,
     SignalPlans,
     Simulator,
-    VehiclePicture,
+    VehiclePositions,
 )
 from ugat_marl.simulation.snapshots import Snapshot, Trips
 
@@ -66,10 +66,10 @@ class ProcessSimulator:
         """
         return _snapshot(self._ask("advance", seconds=seconds, plans=plans))
 
-    def vehicles(self) -> VehiclePicture:
+    def vehicles(self) -> VehiclePositions:
         """Return the positions of all vehicles now."""
         (table,) = self._ask("vehicles").arrays
-        return VehiclePicture(table[:2].T, table[2], table[3], table[4])
+        return VehiclePositions(table[:2].T, table[2], table[3], table[4])
 
     def signals(self) -> dict[str, str]:
         """Return the state of every traffic light now."""

@@ -91,7 +91,7 @@ class Launch:
 
 
 @dataclass(frozen=True)
-class VehiclePicture:
+class VehiclePositions:
     """Positions of the vehicles, for drawing.
 
     Attributes:
@@ -118,7 +118,7 @@ class Simulator(Protocol):
         """Simulate `seconds` under the given signals."""
         ...
 
-    def vehicles(self) -> VehiclePicture:
+    def vehicles(self) -> VehiclePositions:
         """Return the positions of all vehicles now."""
         ...
 
@@ -310,11 +310,11 @@ class LibsumoSimulator:
         snapshot = self._snapshot()
         return replace(snapshot, mean_left=mean_left) if instants else snapshot
 
-    def vehicles(self) -> VehiclePicture:
+    def vehicles(self) -> VehiclePositions:
         """Return the positions of all vehicles now."""
         api = libsumo.vehicle
         names = api.getIDList()
-        return VehiclePicture(
+        return VehiclePositions(
             np.array([api.getPosition(name) for name in names], dtype=np.float64).reshape(-1, 2),
             np.array([api.getAngle(name) for name in names], dtype=np.float64),
             np.array([api.getLength(name) for name in names], dtype=np.float64),
