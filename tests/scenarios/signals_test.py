@@ -14,7 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.scenarios import (
     GREEN,
-    LateGreen,
+    LateGreenMemory,
     Segment,
     SignalState,
     SignalTiming,
@@ -306,7 +306,7 @@ def test_good_phases_pass() -> None:
 
 
 def test_late_green_by_hand() -> None:
-    before = LateGreen.after("GGrr")
+    before = LateGreenMemory.after("GGrr")
     commanded = [(3.0, "yyrr"), (2.0, "rrrr"), (5.0, "rrGG")]
     after, shown = with_late_green(commanded, 2, 1, before)
     assert shown == [(3, "yyrr"), (4, "rrrr"), (3, "rrGG")]
@@ -319,14 +319,14 @@ def test_late_green_by_hand() -> None:
 def test_a_green_shorter_than_its_delay_is_not_shown_nor_its_yellow() -> None:
     for green in (2.0, 3.0):
         state, shown = with_late_green(
-            [(green, "Gr"), (3, "yr"), (5, "rG")], 3, 1, LateGreen.after("rr")
+            [(green, "Gr"), (3, "yr"), (5, "rG")], 3, 1, LateGreenMemory.after("rr")
         )
         assert shown == [(green + 6, "rr"), (2, "rG")]
         assert with_late_green([(9, "Gr")], 3, 1, state)[1] == [(3, "rr"), (6, "Gr")]
 
 
 def test_half_a_second_is_given_to_every_other_green() -> None:
-    state, lost = LateGreen.after("G"), []
+    state, lost = LateGreenMemory.after("G"), []
     for _ in range(6):
         state, shown = with_late_green([(10, "r"), (10, "G")], 1.5, 1, state)
         lost.append(shown[0][0] - 10)
@@ -338,7 +338,7 @@ def test_late_green_takes_greens_away_and_nothing_else(
     data: st.DataObject, phases: tuple[str, ...], timing: SignalTiming, late: float
 ) -> None:
     """Seconds are conserved, an interval may be split, and only the start of a green is missing."""
-    state, held, whole = initial_state(timing), LateGreen.after(phases[0]), []
+    state, held, whole = initial_state(timing), LateGreenMemory.after(phases[0]), []
     commanded: list[str] = []
     shown: list[str] = []
     for _ in range(data.draw(st.integers(1, 6))):
@@ -350,7 +350,10 @@ def test_late_green_takes_greens_away_and_nothing_else(
         commanded += by_half_second(plan)
         shown += by_half_second(part)
     assert len(shown) == len(commanded)
-    assert by_half_second(with_late_green(whole, late, 0.5, LateGreen.after(phases[0]))[1]) == shown
+    assert (
+        by_half_second(with_late_green(whole, late, 0.5, LateGreenMemory.after(phases[0]))[1])
+        == shown
+    )
     for link in range(LINKS):
         ago = math.inf
         for second, (asked, seen) in enumerate(zip(commanded, shown, strict=True)):

@@ -10,7 +10,7 @@ from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Parameter, Text
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import ScenarioError
-from ugat_marl.scenarios import LateGreen as Held
+from ugat_marl.scenarios import LateGreenMemory as Held
 from ugat_marl.scenarios import Scenario, seconds_of, validated, with_late_green
 
 QUEUE_START_S = 2.0

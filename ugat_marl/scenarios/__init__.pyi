@@ -61,7 +61,7 @@ from .settings import validated as validated
 from .signals import GREEN as GREEN
 from .signals import STATES as STATES
 from .signals import YELLOW as YELLOW
-from .signals import LateGreen as LateGreen
+from .signals import LateGreenMemory as LateGreenMemory
 from .signals import Segment as Segment
 from .signals import SignalState as SignalState
 from .signals import SignalTiming as SignalTiming

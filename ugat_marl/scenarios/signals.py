@@ -192,7 +192,7 @@ def _ending(before: str, after: str, cleared: str) -> str:
     return before if before == after else "r"
 
 
-class LateGreen(NamedTuple):
+class LateGreenMemory(NamedTuple):
     """Memory of `with_late_green` about one traffic light.
 
     Attributes:
@@ -209,15 +209,15 @@ class LateGreen(NamedTuple):
     owed_s: tuple[float, ...]
 
     @classmethod
-    def after(cls, state: str) -> LateGreen:
+    def after(cls, state: str) -> LateGreenMemory:
         """Return the memory of a light that shows `state` and has no delays."""
         nothing = (0.0,) * len(state)
         return cls(state, state, nothing, nothing)
 
 
 def with_late_green(
-    segments: Sequence[Segment], late_s: float, step_s: float, before: LateGreen
-) -> tuple[LateGreen, list[Segment]]:
+    segments: Sequence[Segment], late_s: float, step_s: float, before: LateGreenMemory
+) -> tuple[LateGreenMemory, list[Segment]]:
     """Delay greens: every link that turns green stays red for `late_s` first.
 
     The end of the green does not move. Greens are delayed by whole steps of the simulation, and the
@@ -251,7 +251,7 @@ def with_late_green(
             part = min([left, *(wait for wait in waits if wait < math.inf)])
             _append(shown, (part, visible))
             waiting = tuple(max(wait - part, 0.0) for wait in state.waiting_s)
-            state = LateGreen(commanded, visible, waiting, state.owed_s)
+            state = LateGreenMemory(commanded, visible, waiting, state.owed_s)
             left -= part
     return state, shown
 
@@ -272,7 +272,9 @@ class GreenDelays:
         self._step_s = step_s
         self._asked: Mapping[str, float] = {}
         self._commanded = dict(shown)
-        self._held: dict[str, LateGreen] = {}  # lights with a delayed link or an owed remainder
+        self._held: dict[
+            str, LateGreenMemory
+        ] = {}  # lights with a delayed link or an owed remainder
 
     def ask(self, seconds: Mapping[str, float]) -> None:
         """Set, per traffic light, the extra delay in s of greens that begin in the next `hold`."""
@@ -285,7 +287,7 @@ class GreenDelays:
             late = self._late_s.get(tls, 0.0) + self._asked.get(tls, 0.0)
             before = self._held.pop(tls, None)
             if late or before:
-                before = before or LateGreen.after(self._commanded[tls])
+                before = before or LateGreenMemory.after(self._commanded[tls])
                 after, shown[tls] = with_late_green(plan, late, self._step_s, before)
                 if after.shown != after.commanded or any(after.owed_s):
                     self._held[tls] = after
@@ -294,7 +296,9 @@ class GreenDelays:
         return shown
 
 
-def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -> LateGreen:
+def _commanded(
+    state: LateGreenMemory, commanded: str, late_s: float, step_s: float
+) -> LateGreenMemory:
     """Return the memory when `commanded` begins; its `shown` holds the letters of delayed links."""
     if commanded == state.commanded:
         return state
@@ -311,7 +315,7 @@ def _commanded(state: LateGreen, commanded: str, late_s: float, step_s: float) -
             waiting[link] = math.inf  # its green was never shown
         elif new not in GREEN:
             waiting[link] = 0.0
-    return LateGreen(commanded, "".join(shown), tuple(waiting), tuple(owed))
+    return LateGreenMemory(commanded, "".join(shown), tuple(waiting), tuple(owed))
 
 
 def delayed_log(
@@ -326,7 +330,7 @@ def delayed_log(
     """
     if len(log) < 2:
         return tuple(log)
-    state = LateGreen.after(log[0][1])
+    state = LateGreenMemory.after(log[0][1])
     delayed = [(float(log[0][0]), log[0][1])]
     for (since, commanded), until in zip(
         log[1:], [*(since for since, _ in log[2:]), math.inf], strict=True
