@@ -21,7 +21,7 @@ from ugat_marl.errors import OptionError
 from ugat_marl.grounding import (
     CHUNK,
     MATCHED_REWARD,
-    Placebo,
+    NegativeControl,
     Probe,
     ShuffledWorld,
     SimulatedWorld,
@@ -93,7 +93,7 @@ def train_grounded(
     run: Run,
     *,
     start: Path | None = None,
-    placebo: Placebo = "none",
+    placebo: NegativeControl = "none",
     probe: Probe | None = None,
     device: str = "cpu",
 ) -> State:

@@ -43,7 +43,7 @@ from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES, tuned_rules
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
     PLACEBOS,
-    Placebo,
+    NegativeControl,
     RecordedWorld,
     SimulatedWorld,
     State,
@@ -134,7 +134,7 @@ class TransferConfig:
     random_delay_s: int | None = None
     fine_tuned: bool = False
     oracle: bool = False
-    placebo: Placebo = "none"
+    placebo: NegativeControl = "none"
     learner: str = DQN_NAME
     learner_settings: tuple[str, ...] = ()
     device: str = "cpu"

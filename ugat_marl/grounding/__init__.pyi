@@ -1,6 +1,6 @@
 from .config import UgatConfig as UgatConfig
 from .controls import PLACEBOS as PLACEBOS
-from .controls import Placebo as Placebo
+from .controls import NegativeControl as NegativeControl
 from .controls import ShuffledWorld as ShuffledWorld
 from .controls import answer_with_noise as answer_with_noise
 from .delays import MATCHED_REWARD as MATCHED_REWARD

@@ -21,8 +21,8 @@ from ugat_marl.grounding.worlds import World
 from ugat_marl.policies import Policy
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
-Placebo = Literal["none", "same-world", "shuffled", "noise"]
-PLACEBOS: tuple[str, ...] = get_args(Placebo)
+NegativeControl = Literal["none", "same-world", "shuffled", "noise"]
+PLACEBOS: tuple[str, ...] = get_args(NegativeControl)
 
 
 def answer_with_noise(model: ForwardModel, seed: int) -> None:
