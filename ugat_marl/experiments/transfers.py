@@ -42,7 +42,7 @@ from ugat_marl.experiments.training import simulated_worlds, train_grounded
 from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES, tuned_rules
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
-    PLACEBOS,
+    NEGATIVE_CONTROLS,
     NegativeControl,
     RecordedWorld,
     SimulatedWorld,
@@ -166,8 +166,8 @@ class TransferConfig:
     def _refuse_impossible_controls(self) -> None:
         require_known(self.learner)
         require_device_name(self.device)
-        if self.placebo not in PLACEBOS:
-            raise UnknownNameError("placebo", self.placebo, PLACEBOS)
+        if self.placebo not in NEGATIVE_CONTROLS:
+            raise UnknownNameError("placebo", self.placebo, NEGATIVE_CONTROLS)
         if self.placebo == "same-world" and self.real_log is not None:
             raise OptionError('the placebo "same-world" takes the place of a real_log; give one')
         if self.random_delay_s is not None and self.random_delay_s < 1:

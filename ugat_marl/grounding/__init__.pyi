@@ -1,5 +1,5 @@
 from .config import UgatConfig as UgatConfig
-from .controls import PLACEBOS as PLACEBOS
+from .controls import NEGATIVE_CONTROLS as NEGATIVE_CONTROLS
 from .controls import NegativeControl as NegativeControl
 from .controls import ShuffledWorld as ShuffledWorld
 from .controls import answer_with_noise as answer_with_noise

@@ -22,7 +22,7 @@ from ugat_marl.policies import Policy
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
 NegativeControl = Literal["none", "same-world", "shuffled", "noise"]
-PLACEBOS: tuple[str, ...] = get_args(NegativeControl)
+NEGATIVE_CONTROLS: tuple[str, ...] = get_args(NegativeControl)
 
 
 def answer_with_noise(model: ForwardModel, seed: int) -> None:
