@@ -15,7 +15,7 @@ from statistics import fmean
 
 from ugat_marl.experiments import CONTROL, DIRECT, ORACLE, RULE, TIMED, matched_name
 from ugat_marl.files import write_whole
-from ugat_marl.reporting import number, percent_text, share_text
+from ugat_marl.reporting import number_text, percent_text, share_text
 
 FOLDER = Path(__file__).parent
 BEGIN, END = "<!-- overview -->\n", "<!-- end of overview -->\n"
@@ -117,20 +117,20 @@ def _line(name: str, domain: str, column: Column) -> str:
         _att(column, [own for own in column if own.startswith(start)])
         for start in (CONTROL, CONSTANT, ORACLE, RULE)
     ]
-    direct = f"{_att(column, [DIRECT])} ({number(regret_s(DIRECT, column))})"
+    direct = f"{_att(column, [DIRECT])} ({number_text(regret_s(DIRECT, column))})"
     cells = [name, domain, direct, *(_grounded(g, column) for g in GROUNDED)]
     return f"| {' | '.join(cells + others)} |"
 
 
 def _att(column: Column, settings: Sequence[str]) -> str:
-    return number(min(column[own].att_s for own in settings)) if settings else ""
+    return number_text(min(column[own].att_s for own in settings)) if settings else ""
 
 
 def _grounded(setting: str, column: Column) -> str:
     if setting not in column:
         return ""
     gap, back = percent_text(reduction(setting, column)), share_text(won_back(setting, column))
-    return f"**{number(column[setting].att_s)}** {gap}, {back}"
+    return f"**{number_text(column[setting].att_s)}** {gap}, {back}"
 
 
 def _mean(found: Sequence[Column]) -> str:

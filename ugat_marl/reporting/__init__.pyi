@@ -4,7 +4,7 @@ from .charts import gap_picture as gap_picture
 from .charts import transfer_picture as transfer_picture
 from .comparison_tables import comparison_csv as comparison_csv
 from .comparison_tables import comparison_page as comparison_page
-from .comparison_tables import number as number
+from .comparison_tables import number_text as number_text
 from .comparison_tables import percent_text as percent_text
 from .comparison_tables import seeds_csv as seeds_csv
 from .comparison_tables import share_text as share_text

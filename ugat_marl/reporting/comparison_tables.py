@@ -17,7 +17,7 @@ from rich.text import Text
 from ugat_marl.data import MEASURES
 from ugat_marl.experiments import LEAST_SHARE_ARRIVED, Comparison, Interval, PairedTest
 from ugat_marl.reporting.formats import PAGE_WIDTH, command_block, listed, made_with
-from ugat_marl.reporting.tables import number
+from ugat_marl.reporting.tables import number_text
 
 CERTAIN = 0.05
 """Level of the paired tests in the paragraph that says what the table means."""
@@ -151,14 +151,14 @@ def _estimated(found: Comparison, domain: str | None) -> Cell:
 
 
 def _episodes(found: Comparison) -> Cell:
-    return lambda s, t: f"{number(found.median_s(s, t))}, {100 * found.unserved(s, t):.0f} %"
+    return lambda s, t: f"{number_text(found.median_s(s, t))}, {100 * found.unserved(s, t):.0f} %"
 
 
 def _with_gap(found: Comparison, measure: str) -> Cell:
     def cell(setting: str, target: str) -> str:
         gap = float(found.gaps(setting, target, measure).mean())
-        mean = number(found.estimate(setting, target, measure).mean)
-        return f"{mean} ({'+' if gap >= 0 else ''}{number(gap)})"
+        mean = number_text(found.estimate(setting, target, measure).mean)
+        return f"{mean} ({'+' if gap >= 0 else ''}{number_text(gap)})"
 
     return cell
 
@@ -235,9 +235,9 @@ def _provenance(found: Comparison, facts: Mapping[str, Any]) -> list[str]:
 def with_interval(interval: Interval) -> str:
     """Return a mean with its interval, if it has one."""
     if math.isnan(interval.low) or interval.low == interval.high:
-        return number(interval.mean)
+        return number_text(interval.mean)
     to = " to " if interval.low < 0 else "–"
-    return f"{number(interval.mean)} ({number(interval.low)}{to}{number(interval.high)})"
+    return f"{number_text(interval.mean)} ({number_text(interval.low)}{to}{number_text(interval.high)})"
 
 
 def share_text(value: float) -> str:
@@ -252,9 +252,9 @@ def percent_text(value: float) -> str:
 
 def _tested(test: PairedTest) -> str:
     mean = test.difference
-    text = f"{'+' if mean.mean >= 0 else ''}{number(mean.mean)}"
+    text = f"{'+' if mean.mean >= 0 else ''}{number_text(mean.mean)}"
     if not math.isnan(mean.low):
-        text += f" ({number(mean.low)} to {number(mean.high)}), p {_p(test.p)}"
+        text += f" ({number_text(mean.low)} to {number_text(mean.high)}), p {_p(test.p)}"
     return f"{text}, {test.better}/{test.count}"
 
 

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
-from ugat_marl.reporting.tables import number
+from ugat_marl.reporting.tables import number_text
 
 
 def gap_matrix_table(found: Evaluation) -> RenderableType:
@@ -28,7 +28,7 @@ def gap_matrix_table(found: Evaluation) -> RenderableType:
     for policy, cells in gap_matrix(found).items():
         start = found.estimate(policy, first, "att_s").mean
         table.add_row(
-            Text(policy), number(start), *(f"{cell.cost.mean:+.1f}" for cell in cells.values())
+            Text(policy), number_text(start), *(f"{cell.cost.mean:+.1f}" for cell in cells.values())
         )
         worst = [
             f"{cell.worst.removeprefix('want-')}\n{cell.worst_cost:+.0f}"
@@ -56,7 +56,7 @@ def objective_tables(found: Evaluation) -> list[RenderableType]:
         table.add_column(domain.removeprefix("want-"), justify="right", overflow="fold")
     for policy in found.policies:
         costs = (found.estimate(policy, domain, "cost").mean for domain in domains)
-        table.add_row(Text(policy), *map(number, costs))
+        table.add_row(Text(policy), *map(number_text, costs))
     legend = ", ".join(OBJECTIVE_MEASURES[name] for name in _SHORT)
     return [
         table,
@@ -93,7 +93,7 @@ def _measured(found: Evaluation, domains: Sequence[str]) -> list[Table]:
             table.add_column(heading, justify="right")
         for place, policy in enumerate(found.policies):
             own = values[place * len(_SHORT) : (place + 1) * len(_SHORT)]
-            table.add_row(Text(policy), *map(number, own))
+            table.add_row(Text(policy), *map(number_text, own))
         tables.append(table)
     return tables
 
@@ -105,7 +105,7 @@ def _by_domain(found: Evaluation) -> RenderableType:
         table.add_column(policy, justify="right", overflow="fold")
     for domain in found.domains:
         values = (found.estimate(policy, domain, "att_s").mean for policy in found.policies)
-        table.add_row(Text(domain), *map(number, values))
+        table.add_row(Text(domain), *map(number_text, values))
     return table
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from ugat_marl.experiments import Curve, Curves, CurvesConfig, Interval
 from ugat_marl.reporting.comparison_tables import with_interval
 from ugat_marl.reporting.formats import command_block, made_with
-from ugat_marl.reporting.tables import number
+from ugat_marl.reporting.tables import number_text
 
 
 def curves_page(found: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -> str:
@@ -62,7 +62,7 @@ def curves_page(found: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -
     ]
     for rule, att_s in found.rules.items():
         mark = " (best tuned rule)" if rule == found.best else ""
-        lines.append(f"| *{rule}*{mark} | | | | | | {number(att_s)} | | | |")
+        lines.append(f"| *{rule}*{mark} | | | | | | {number_text(att_s)} | | | |")
     return "\n".join(lines)
 
 
@@ -73,10 +73,10 @@ def _row(curves: Sequence[Curve], fixed_s: float, best_rule_s: float) -> str:
         curves[0].library,
         str(len(curves)),
         f"{np.median([curve.speed for curve in curves]):.0f}",
-        number(float(np.median([curve.own_ms for curve in curves]))),
+        number_text(float(np.median([curve.own_ms for curve in curves]))),
         with_interval(Interval.of(np.array([curve.best_s for curve in curves]))),
         with_interval(Interval.of(last)),
-        number(float(last.mean() - fixed_s)),
+        number_text(float(last.mean() - fixed_s)),
         *(f"{(last < rule_s).sum()} of {len(last)}" for rule_s in (fixed_s, best_rule_s)),
     ]
     return f"| {' | '.join(cells)} |"

@@ -37,7 +37,7 @@ def transfer_table(found: Evaluation) -> RenderableType:
             cells += [
                 _with_interval(found.estimate(policy, domain, "att_s")),
                 _signed(found.gap(policy, domain, "att_s")),
-                number(found.regret(policy, domain).mean),
+                number_text(found.regret(policy, domain).mean),
             ]
         table.add_row(Text(policy), *cells)
     return table
@@ -61,9 +61,9 @@ def measures_table(found: Evaluation) -> RenderableType:
         for policy in found.policies:
             estimates = [found.estimate(policy, domain, measure) for measure in MEASURES]
             estimates.append(found.regret(policy, domain))
-            table.add_row(Text(policy), *(number(e.mean) for e in estimates))
+            table.add_row(Text(policy), *(number_text(e.mean) for e in estimates))
             if not math.isnan(estimates[0].low):
-                halves = (f"±{number((e.high - e.low) / 2)}" for e in estimates)
+                halves = (f"±{number_text((e.high - e.low) / 2)}" for e in estimates)
                 table.add_row(*_dim("  95 % interval", *halves))
             if domain != found.domains[0]:
                 gaps = [found.gap(policy, domain, measure) for measure in MEASURES]
@@ -95,8 +95,8 @@ def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
         worst = max(trial.att_s for trial in tuned.trials)
         table.add_row(
             Text(tuned.best.spec),
-            number(tuned.best.att_s),
-            number(worst) if len(tuned.trials) > 1 else "-",
+            number_text(tuned.best.att_s),
+            number_text(worst) if len(tuned.trials) > 1 else "-",
             str(len(tuned.trials)),
             str(tuned.episodes),
         )
@@ -130,9 +130,9 @@ def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> R
         times = (gap.sim, gap.corrected, gap.real)
         table.add_row(
             Text(policy),
-            *(number(time.mean) for time in times),
-            number(gap.before),
-            number(gap.after),
+            *(number_text(time.mean) for time in times),
+            number_text(gap.before),
+            number_text(gap.after),
             "-" if gap.shrink is None else f"{100 * gap.shrink:.0f} %",
         )
         if any(time.low is not None for time in times):
@@ -143,13 +143,13 @@ def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> R
 def _limits(time: TravelTimeEstimate) -> str:
     if time.low is None or time.high is None:
         return "-"
-    return f"{number(time.low)}-{number(time.high)}"
+    return f"{number_text(time.low)}-{number_text(time.high)}"
 
 
 def _backlog(found: Evaluation, domain: str) -> list[str]:
     """Return a line on vehicles that never entered; throughput and queue do not show them."""
     waiting = {name: found.estimate(name, domain, "backlog").mean for name in found.policies}
-    kept_out = [f"{name} {number(mean)}" for name, mean in waiting.items() if mean >= 0.5]
+    kept_out = [f"{name} {number_text(mean)}" for name, mean in waiting.items() if mean >= 0.5]
     return [f"vehicles due that never entered: {', '.join(kept_out)}"] if kept_out else []
 
 
@@ -174,7 +174,7 @@ def _medians(found: Evaluation) -> list[str]:
     for domain in found.domains:
         both = {name: found.estimate(name, domain, "att_s") for name in found.policies}
         if any(abs(e.mean - e.median) > 0.1 * e.median for e in both.values()):
-            values = ", ".join(f"{name} {number(e.median)}" for name, e in both.items())
+            values = ", ".join(f"{name} {number_text(e.median)}" for name, e in both.items())
             lines.append(f"medians in {domain}: {values}")
     return lines
 
@@ -197,16 +197,18 @@ def _dim(*cells: str) -> list[Text]:
 
 def _with_interval(estimate: Estimate) -> str:
     if math.isnan(estimate.low):
-        return number(estimate.mean)
-    return f"{number(estimate.mean)} ({number(estimate.low)}-{number(estimate.high)})"
+        return number_text(estimate.mean)
+    return (
+        f"{number_text(estimate.mean)} ({number_text(estimate.low)}-{number_text(estimate.high)})"
+    )
 
 
 def _signed(estimate: Estimate) -> str:
-    text = number(estimate.mean)
+    text = number_text(estimate.mean)
     return text if text.startswith("-") else f"+{text}"
 
 
-def number(value: float) -> str:
+def number_text(value: float) -> str:
     """Return three significant digits, or a whole number above a hundred."""
     if math.isnan(value):
         return "-"
