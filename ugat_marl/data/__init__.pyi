@@ -1,5 +1,5 @@
+from .checkpoints import checked_tensors as checked_tensors
 from .checkpoints import read_checkpoint as read_checkpoint
-from .checkpoints import tensors_like as tensors_like
 from .checkpoints import write_checkpoint as write_checkpoint
 from .measured.atspm import import_atspm as import_atspm
 from .measured.coverage import follows_traffic as follows_traffic

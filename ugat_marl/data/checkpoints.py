@@ -89,7 +89,7 @@ def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> N
             raise CheckpointError(f"{name}: {key} holds NaN or infinity; the file {consequence}")
 
 
-def tensors_like(
+def checked_tensors(
     path: Path, found: Mapping[str, torch.Tensor], own: Mapping[str, torch.Tensor]
 ) -> dict[str, torch.Tensor]:
     """Return the tensors of a checkpoint, checked against the learner's own.

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ugat_marl.data import read_checkpoint, tensors_like, write_checkpoint
+from ugat_marl.data import checked_tensors, read_checkpoint, write_checkpoint
 from ugat_marl.envs import AgentSet, AnyParallelEnv, Mask
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.devices import CPU
@@ -422,9 +422,9 @@ class DQN:
                     "this learner's; give the checkpoint of this scenario, or train a new one"
                 )
             counters = {name: int(content["counters"][name]) for name in (*_COUNTERS, "added")}
-            tensors = tensors_like(path, content["tensors"], self._tensors())
-            stored = tensors_like(path, content["replay"], self._replay.rows(counters["added"]))
-            moments = tensors_like(
+            tensors = checked_tensors(path, content["tensors"], self._tensors())
+            stored = checked_tensors(path, content["replay"], self._replay.rows(counters["added"]))
+            moments = checked_tensors(
                 path, content["adam"], self._moments() if content["adam"] else {}
             )
             if min(counters.values()) < 0 or not self._are_actions(stored["action"]):
