@@ -13,7 +13,13 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ugat_marl.data import Measured, as_logged, read_measured, split_periods, write_measured
+from ugat_marl.data import (
+    Measured,
+    passages_as_written,
+    read_measured,
+    split_periods,
+    write_measured,
+)
 from ugat_marl.errors import MeasuredDataError, OutputError
 from ugat_marl.scenarios import (
     Detector,
@@ -218,7 +224,7 @@ def test_what_only_a_simulation_knows_is_not_logged(reread: Callable[..., Measur
         np.array([0.0, 2.0, 3.0, 4.0, 6.0]),
         np.full(5, nan),
     )
-    logged = as_logged(passages.at(np.array([6, 5, 4, 3, 2, 1, 0])), 0.0, 200.0)
+    logged = passages_as_written(passages.at(np.array([6, 5, 4, 3, 2, 1, 0])), 0.0, 200.0)
     base = recording(1)
     read = reread(
         given=replace(base, periods=(replace(base.periods[0], passages={"s": passages}),))
@@ -248,12 +254,12 @@ times = st.one_of(
 def test_what_is_logged_is_what_is_read(
     rows: list[tuple[float, float]], crossing_scenario: Scenario, network: Network
 ) -> None:
-    """Whatever a simulation says, writing and reading it is `as_logged`, and nothing is lost."""
+    """Whatever a simulation says, writing and reading it is `passages_as_written`, and nothing is lost."""
     table = np.array([row for row in rows if not row[1] < row[0]], np.float64).reshape(-1, 2)
     table = table[~np.isnan(table).all(1)]
     nothing = np.full(len(table), np.nan)
-    logged = as_logged(Passages(table[:, 0], table[:, 1], nothing, nothing), 0.0, 200.0)
-    again = as_logged(logged, 0.0, 200.0)
+    logged = passages_as_written(Passages(table[:, 0], table[:, 1], nothing, nothing), 0.0, 200.0)
+    again = passages_as_written(logged, 0.0, 200.0)
     np.testing.assert_array_equal(logged.on_s, again.on_s)
     np.testing.assert_array_equal(logged.off_s, again.off_s)
     # An off and an on at the very first moment could be a pulse just as well.

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data import as_logged
+from ugat_marl.data import passages_as_written
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     COUNT_FEATURES,
@@ -215,7 +215,7 @@ def _with(scenario: Scenario, effects: Sequence[Effect]) -> Scenario:
 def _logged(period: Period) -> Period:
     """Return a period with passages as a signal controller would have logged them."""
     passages = {
-        name: as_logged(item, period.begin_s, period.end_s)
+        name: passages_as_written(item, period.begin_s, period.end_s)
         for name, item in period.passages.items()
     }
     return replace(period, passages=passages)

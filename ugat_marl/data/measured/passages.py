@@ -303,7 +303,7 @@ def _share(some: NDArray[np.int64], many: NDArray[np.int64]) -> float:
     return float(np.mean(many[at] == some))
 
 
-def as_logged(passages: Passages, begin_s: float, end_s: float) -> Passages:
+def passages_as_written(passages: Passages, begin_s: float, end_s: float) -> Passages:
     """Return the passages in the form of the files, as if they were written and read again.
 
     Simulated detectors report more than detectors of a street, such as two vehicles on one zone at

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from ugat_marl.data.measured.passages import as_logged
+from ugat_marl.data.measured.passages import passages_as_written
 from ugat_marl.data.measured.tables import (
     COUNTS,
     DETECTIONS,
@@ -32,7 +32,7 @@ from ugat_marl.scenarios import Passages, Period
 def write_measured(measured: Measured, directory: Path, *, csv: bool = False) -> Path:
     """Write measured data. The directory appears whole or not at all.
 
-    Passages are written in the form of `as_logged`: times in milliseconds, within their period, one
+    Passages are written in the form of `passages_as_written`: times in milliseconds, within their period, one
     vehicle at a time.
 
     Args:
@@ -165,7 +165,7 @@ def _detections(periods: Sequence[Period]) -> pl.DataFrame:
 
 
 def _events(period: Period, detector: str, passages: Passages) -> pl.DataFrame:
-    passages = as_logged(passages, period.begin_s, period.end_s)
+    passages = passages_as_written(passages, period.begin_s, period.end_s)
     time = np.stack([passages.on_s, passages.off_s], 1).reshape(-1)
     is_on = np.tile([True, False], len(passages))
     inside = np.isfinite(time)

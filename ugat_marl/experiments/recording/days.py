@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from ugat_marl.data import Measured, as_logged, split_periods
+from ugat_marl.data import Measured, passages_as_written, split_periods
 from ugat_marl.effects import (
     Domain,
     Effect,
@@ -292,7 +292,7 @@ def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scena
 def _logged(period: Period) -> Period:
     """Return a period as the detectors' electronics log it, without empty detectors."""
     found = {
-        name: as_logged(passages, period.begin_s, period.end_s)
+        name: passages_as_written(passages, period.begin_s, period.end_s)
         for name, passages in period.passages.items()
     }
     return replace(period, passages={name: x for name, x in found.items() if len(x)})
