@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ugat_marl.data import follows_traffic
+from ugat_marl.data import is_actuated
 from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout
@@ -217,7 +217,7 @@ def test_days_under_signals_that_answered_others_are_like_the_measured_one(data:
     measured = record(scenario, "sim", policy_factory("max-pressure:10"), periods=4, seed=21)
     network = Network.read(scenario)
     layout = DetectorLayout.of(network, measured.detectors)
-    assert follows_traffic(measured.periods, layout.intersections[0])
+    assert is_actuated(measured.periods, layout.intersections[0])
 
     def distance(answering: bool) -> float:
         replay = Replay(scenario, network, measured.detectors, layout.owner, answering=answering)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ugat_marl.data import Finding, Measured, follows_traffic
+from ugat_marl.data import Finding, Measured, is_actuated
 from ugat_marl.diagnosis.engine import Engine, default_cache
 from ugat_marl.diagnosis.features import (
     DetectorLayout,
@@ -141,7 +141,7 @@ class Study:
         if not periods:
             raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
         lights = layout.intersections
-        answering = any(follows_traffic(measured.periods, tls) for tls in lights)
+        answering = any(is_actuated(measured.periods, tls) for tls in lights)
         effort = config.effort or effort_for(len(lights))
 
         def simulating(answering: bool, base_days: int) -> Engine:

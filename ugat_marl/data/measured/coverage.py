@@ -146,7 +146,7 @@ def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Ite
                 NEEDS_YELLOW if len(bare) == len(controlled) - len(never) else (),
             )
 
-    adaptive = [tls for tls in controlled if follows_traffic(periods, tls)]
+    adaptive = [tls for tls in controlled if is_actuated(periods, tls)]
     if adaptive:
         yield Finding(
             f"signals: {_list('traffic light', adaptive)} with greens of many lengths, as if they "
@@ -155,7 +155,7 @@ def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Ite
         )
 
 
-def follows_traffic(periods: Sequence[Period], tls: str) -> bool:
+def is_actuated(periods: Sequence[Period], tls: str) -> bool:
     """Return True if a green has more different lengths than a fixed programme gives it."""
     lengths: dict[str, set[float]] = {}
     for period in periods:
