@@ -11,7 +11,7 @@ from statistics import fmean
 
 import pytest
 
-from ugat_marl.data import METRICS, Metrics
+from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.experiments import (
     CONTROL,
     DIRECT,
@@ -54,7 +54,7 @@ def accepted(table_name: str, setting: str, runs: Path) -> float:
     values = [
         value
         for job in Planner(table_name, "single-v1", CONFIG).jobs(row)
-        for _, _, name, value in Metrics.read(runs / job.name / METRICS).rows
+        for _, _, name, value in Metrics.read(runs / job.name / METRICS_FILE).rows
         if name == "gate/acceptance"
     ]
     assert len(values) == CONFIG.seeds * CONFIG.iterations

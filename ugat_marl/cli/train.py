@@ -11,7 +11,7 @@ from rich.console import Console
 from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, workers_of
-from ugat_marl.data import METRICS, Metrics
+from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.effects import describe
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig, transfer
@@ -54,7 +54,7 @@ class Train:
                 config, directory, resume=self.resume, reporter=Bars(console), workers=workers
             )
         picture = directory / "gap.png"
-        metrics = Metrics.read(directory / METRICS)
+        metrics = Metrics.read(directory / METRICS_FILE)
         transfer_picture(found, metrics, picture)
         calibration_picture(metrics, directory / "calibration.png")
         console.print(transfer_table(found))

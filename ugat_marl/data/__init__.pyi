@@ -11,7 +11,7 @@ from .measured.values import split_periods as split_periods
 from .measured.writing import require_replaceable as require_replaceable
 from .measured.writing import write_measured as write_measured
 from .runs import CHECKPOINT as CHECKPOINT
-from .runs import METRICS as METRICS
+from .runs import METRICS_FILE as METRICS_FILE
 from .runs import SETTINGS as SETTINGS
 from .runs import Metrics as Metrics
 from .runs import Run as Run

@@ -24,7 +24,7 @@ from ugat_marl.files import replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
 
 CHECKPOINT = "checkpoint"
-METRICS = "metrics.parquet"
+METRICS_FILE = "metrics.parquet"
 SETTINGS = "settings.json"
 _VERSIONS = ("ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch")
 _SCHEMA = {"stage": pl.String, "step": pl.Int64, "name": pl.String, "value": pl.Float64}
@@ -121,14 +121,14 @@ class Run:
         fresh = self.directory / f".{CHECKPOINT}.new"
         fresh.mkdir(parents=True)
         write(fresh)
-        self.metrics.write(fresh / METRICS)
+        self.metrics.write(fresh / METRICS_FILE)
         write_whole(fresh / "state.json", json.dumps(dict(state), indent=1) + "\n")
         current, old = self.directory / CHECKPOINT, self.directory / f".{CHECKPOINT}.old"
         if current.exists():
             current.rename(old)
         fresh.rename(current)
         shutil.rmtree(old, ignore_errors=True)
-        self.metrics.write(self.directory / METRICS)
+        self.metrics.write(self.directory / METRICS_FILE)
         if self._board is not None:
             self._board.flush()
 
@@ -152,7 +152,7 @@ class Run:
                 f"{folder}: cannot be read ({error}); remove {self.directory} and start again"
             ) from None
         read(folder)
-        self.metrics = Metrics.read(folder / METRICS)
+        self.metrics = Metrics.read(folder / METRICS_FILE)
         return state
 
     def log(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:

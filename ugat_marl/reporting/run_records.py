@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import polars as pl
 
-from ugat_marl.data import CHECKPOINT, METRICS, SETTINGS, Metrics
+from ugat_marl.data import CHECKPOINT, METRICS_FILE, SETTINGS, Metrics
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.experiments import QUEUES, Evaluation, read_queues, result_of
 from ugat_marl.reporting.formats import commands_in
@@ -213,7 +213,7 @@ def as_number(value: Any) -> float:
 
 
 def _folders(path: Path, depth: int) -> Iterable[Path]:
-    if any((path / name).is_file() for name in (RUN, JOB, TABLE, METRICS, TABLE_CSV)):
+    if any((path / name).is_file() for name in (RUN, JOB, TABLE, METRICS_FILE, TABLE_CSV)):
         yield path
     elif depth:
         try:
@@ -293,9 +293,9 @@ def _texts(value: Any) -> dict[str, str]:
 def _metrics(reader: _Reader) -> Metrics | None:
     """Return the metrics of the run or, without them, those of its last checkpoint."""
     without = "no learning curves, nothing of the gate"
-    found = reader.read(METRICS, Metrics.read, without)
-    if found is None and (reader.directory / CHECKPOINT / METRICS).is_file():
-        name = f"{CHECKPOINT}/{METRICS}"
+    found = reader.read(METRICS_FILE, Metrics.read, without)
+    if found is None and (reader.directory / CHECKPOINT / METRICS_FILE).is_file():
+        name = f"{CHECKPOINT}/{METRICS_FILE}"
         found = reader.read(name, Metrics.read, without)
         if found is not None:
             reader.missing[-1] = reader.missing[-1].replace(without, f"{name} is shown instead")
@@ -314,7 +314,7 @@ def _state(reader: _Reader) -> dict[str, int] | None:
 def _written(directory: Path) -> float:
     """Return the time of the newest of the files that tell the state, in s since 1970."""
     times: list[float] = []
-    for name in (RUN, JOB, TABLE, SCORES, METRICS, f"{CHECKPOINT}/state.json"):
+    for name in (RUN, JOB, TABLE, SCORES, METRICS_FILE, f"{CHECKPOINT}/state.json"):
         with contextlib.suppress(OSError):
             times.append((directory / name).stat().st_mtime)
     return max(times, default=math.nan)
