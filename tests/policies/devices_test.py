@@ -24,7 +24,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 import ugat_marl.experiments.transfers as transfer_module
 from studies.bench.learning_program import Noise
 from ugat_marl.__main__ import main
-from ugat_marl.data import SETTINGS as SETTINGS_FILE
+from ugat_marl.data import SETTINGS_FILE as SETTINGS_FILE
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import OptionError

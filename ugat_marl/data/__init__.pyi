@@ -12,7 +12,7 @@ from .measured.writing import require_replaceable as require_replaceable
 from .measured.writing import write_measured as write_measured
 from .runs import CHECKPOINT as CHECKPOINT
 from .runs import METRICS_FILE as METRICS_FILE
-from .runs import SETTINGS as SETTINGS
+from .runs import SETTINGS_FILE as SETTINGS_FILE
 from .runs import Metrics as Metrics
 from .runs import Run as Run
 from .runs import installed_version as installed_version

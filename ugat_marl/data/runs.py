@@ -25,7 +25,7 @@ from ugat_marl.progress import Reporter
 
 CHECKPOINT = "checkpoint"
 METRICS_FILE = "metrics.parquet"
-SETTINGS = "settings.json"
+SETTINGS_FILE = "settings.json"
 _VERSIONS = ("ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch")
 _SCHEMA = {"stage": pl.String, "step": pl.Int64, "name": pl.String, "value": pl.Float64}
 
@@ -186,7 +186,7 @@ def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
     ``run.json`` holds only the values that must be equal for `--resume`.
     """
     content = {"settings": settings, "versions": installed_versions(*_VERSIONS)}
-    write_whole(directory / SETTINGS, json.dumps(content, indent=1, default=str) + "\n")
+    write_whole(directory / SETTINGS_FILE, json.dumps(content, indent=1, default=str) + "\n")
 
 
 def lock_folder(directory: Path) -> IO[str]:

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import polars as pl
 
-from ugat_marl.data import CHECKPOINT, METRICS_FILE, SETTINGS, Metrics
+from ugat_marl.data import CHECKPOINT, METRICS_FILE, SETTINGS_FILE, Metrics
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.experiments import QUEUES, Evaluation, read_queues, result_of
 from ugat_marl.reporting.formats import commands_in
@@ -244,7 +244,7 @@ def _object(path: Path) -> dict[str, Any]:
 def _run(directory: Path, name: str) -> RunRecord:
     reader = _Reader(directory)
     job = (directory / JOB).is_file()
-    kept = reader.read(JOB if job else SETTINGS, _object, "its settings are unknown") or {}
+    kept = reader.read(JOB if job else SETTINGS_FILE, _object, "its settings are unknown") or {}
     settings = kept.get("settings", kept)
     settings = settings if isinstance(settings, dict) else {}
     if isinstance(setting := settings.get("setting"), dict):  # a job nests its setting and its name
