@@ -10,7 +10,7 @@ from .measured.values import Measured as Measured
 from .measured.values import split_periods as split_periods
 from .measured.writing import require_replaceable as require_replaceable
 from .measured.writing import write_measured as write_measured
-from .runs import CHECKPOINT as CHECKPOINT
+from .runs import CHECKPOINT_FOLDER as CHECKPOINT_FOLDER
 from .runs import METRICS_FILE as METRICS_FILE
 from .runs import SETTINGS_FILE as SETTINGS_FILE
 from .runs import Metrics as Metrics

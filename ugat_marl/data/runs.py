@@ -23,7 +23,7 @@ from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.files import replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
 
-CHECKPOINT = "checkpoint"
+CHECKPOINT_FOLDER = "checkpoint"
 METRICS_FILE = "metrics.parquet"
 SETTINGS_FILE = "settings.json"
 _VERSIONS = ("ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch")
@@ -109,7 +109,7 @@ class Run:
     @property
     def resumable(self) -> bool:
         """True if there is a checkpoint."""
-        return (self.directory / CHECKPOINT / "state.json").is_file()
+        return (self.directory / CHECKPOINT_FOLDER / "state.json").is_file()
 
     def save(self, state: Mapping[str, Any], write: Callable[[Path], None]) -> None:
         """Save the next checkpoint.
@@ -118,12 +118,15 @@ class Run:
             state: Progress of the run, as plain values.
             write: Function that writes all other files into a given folder.
         """
-        fresh = self.directory / f".{CHECKPOINT}.new"
+        fresh = self.directory / f".{CHECKPOINT_FOLDER}.new"
         fresh.mkdir(parents=True)
         write(fresh)
         self.metrics.write(fresh / METRICS_FILE)
         write_whole(fresh / "state.json", json.dumps(dict(state), indent=1) + "\n")
-        current, old = self.directory / CHECKPOINT, self.directory / f".{CHECKPOINT}.old"
+        current, old = (
+            self.directory / CHECKPOINT_FOLDER,
+            self.directory / f".{CHECKPOINT_FOLDER}.old",
+        )
         if current.exists():
             current.rename(old)
         fresh.rename(current)
@@ -144,7 +147,7 @@ class Run:
         Raises:
             CheckpointError: The checkpoint cannot be used.
         """
-        folder = self.directory / CHECKPOINT
+        folder = self.directory / CHECKPOINT_FOLDER
         try:
             state: dict[str, Any] = json.loads((folder / "state.json").read_text())
         except (OSError, ValueError) as error:
@@ -231,8 +234,8 @@ def _short(value: Any) -> str:
 
 def _remove_remains(directory: Path) -> None:
     """Remove remains of a killed run; keep one whole checkpoint."""
-    current, old = directory / CHECKPOINT, directory / f".{CHECKPOINT}.old"
-    fresh = directory / f".{CHECKPOINT}.new"
+    current, old = directory / CHECKPOINT_FOLDER, directory / f".{CHECKPOINT_FOLDER}.old"
+    fresh = directory / f".{CHECKPOINT_FOLDER}.new"
     if old.exists() and not current.exists():
         old.rename(current)
     for remains in (old, fresh):

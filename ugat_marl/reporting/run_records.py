@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import polars as pl
 
-from ugat_marl.data import CHECKPOINT, METRICS_FILE, SETTINGS_FILE, Metrics
+from ugat_marl.data import CHECKPOINT_FOLDER, METRICS_FILE, SETTINGS_FILE, Metrics
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.experiments import QUEUES, Evaluation, read_queues, result_of
 from ugat_marl.reporting.formats import commands_in
@@ -294,8 +294,8 @@ def _metrics(reader: _Reader) -> Metrics | None:
     """Return the metrics of the run or, without them, those of its last checkpoint."""
     without = "no learning curves, nothing of the gate"
     found = reader.read(METRICS_FILE, Metrics.read, without)
-    if found is None and (reader.directory / CHECKPOINT / METRICS_FILE).is_file():
-        name = f"{CHECKPOINT}/{METRICS_FILE}"
+    if found is None and (reader.directory / CHECKPOINT_FOLDER / METRICS_FILE).is_file():
+        name = f"{CHECKPOINT_FOLDER}/{METRICS_FILE}"
         found = reader.read(name, Metrics.read, without)
         if found is not None:
             reader.missing[-1] = reader.missing[-1].replace(without, f"{name} is shown instead")
@@ -303,9 +303,11 @@ def _metrics(reader: _Reader) -> Metrics | None:
 
 
 def _state(reader: _Reader) -> dict[str, int] | None:
-    if not (reader.directory / CHECKPOINT).is_dir():
+    if not (reader.directory / CHECKPOINT_FOLDER).is_dir():
         return None
-    found = reader.read(f"{CHECKPOINT}/state.json", _object, "how far it had come is unknown")
+    found = reader.read(
+        f"{CHECKPOINT_FOLDER}/state.json", _object, "how far it had come is unknown"
+    )
     if found is None:
         return None
     return {k: v for k, v in found.items() if isinstance(v, int)}
@@ -314,7 +316,7 @@ def _state(reader: _Reader) -> dict[str, int] | None:
 def _written(directory: Path) -> float:
     """Return the time of the newest of the files that tell the state, in s since 1970."""
     times: list[float] = []
-    for name in (RUN, JOB, TABLE, SCORES, METRICS_FILE, f"{CHECKPOINT}/state.json"):
+    for name in (RUN, JOB, TABLE, SCORES, METRICS_FILE, f"{CHECKPOINT_FOLDER}/state.json"):
         with contextlib.suppress(OSError):
             times.append((directory / name).stat().st_mtime)
     return max(times, default=math.nan)
