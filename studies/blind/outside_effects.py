@@ -7,7 +7,15 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from ugat_marl.effects import Effect, Parameter, Text, draw, edit_scenario, places_of, seconds_text
+from ugat_marl.effects import (
+    Effect,
+    Parameter,
+    TextParameter,
+    draw,
+    edit_scenario,
+    places_of,
+    seconds_text,
+)
 from ugat_marl.errors import BlindTestError
 from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Document, Network, Scenario
@@ -28,7 +36,7 @@ class BusStops(Effect):
         "per_hour": Parameter("1/h", 1.0, 60.0),
         "dwell_s": Parameter("s", 5.0, 300.0),
     }
-    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge")}
+    texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge")}
     edge: str
     per_hour: float
     dwell_s: float
@@ -70,7 +78,7 @@ class Driveway(Effect):
 
     name: ClassVar[str] = "driveway"
     ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
-    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge")}
+    texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge")}
     edge: str
     share: float
 

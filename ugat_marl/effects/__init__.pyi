@@ -8,7 +8,7 @@ from .base import ControllerEffect as ControllerEffect
 from .base import Effect as Effect
 from .base import Examined as Examined
 from .base import Parameter as Parameter
-from .base import Text as Text
+from .base import TextParameter as TextParameter
 from .base import draw as draw
 from .controllers import Actuator as Actuator
 from .controllers import Cost as Cost

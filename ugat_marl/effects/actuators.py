@@ -15,7 +15,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects.base import ControllerEffect, Effect, Parameter, Text
+from ugat_marl.effects.base import ControllerEffect, Effect, Parameter, TextParameter
 from ugat_marl.effects.controllers import Actuator, Commands
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import Intersection, Network, Scenario, SignalState, SignalTiming
@@ -97,7 +97,9 @@ class PhaseOrder(ControllerEffect):
     """Only some phases may follow a phase; a command for another one is not obeyed."""
 
     name: ClassVar[str] = "phase_order"
-    texts: ClassVar[dict[str, Text]] = {"rule": Text("phase order", allowed=PHASE_ORDERS)}
+    texts: ClassVar[dict[str, TextParameter]] = {
+        "rule": TextParameter("phase order", allowed=PHASE_ORDERS)
+    }
     rule: str
 
     def actuator(

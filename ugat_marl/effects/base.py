@@ -42,7 +42,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Text:
+class TextParameter:
     """Name that is a parameter of an effect: a place of the network, or a model.
 
     Attributes:
@@ -101,7 +101,7 @@ class Effect:
 
     name: ClassVar[str]
     ranges: ClassVar[dict[str, Parameter]] = {}
-    texts: ClassVar[dict[str, Text]] = {}
+    texts: ClassVar[dict[str, TextParameter]] = {}
     attribute: ClassVar[str] = ""
     examined: ClassVar[Examined | None] = None
     on_detectors: ClassVar[bool] = False

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Parameter, Text, draw
+from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Parameter, TextParameter, draw
 from ugat_marl.effects.documents import (
     depart_s,
     edit_scenario,
@@ -101,7 +101,7 @@ class DemandLevel(Effect):
     name: ClassVar[str] = "demand_level"
     on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, Parameter]] = {"factor": _FACTOR}
-    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
+    texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge", everywhere=True)}
     examined: ClassVar[Examined] = Examined((1.15,), 1.0, 0.03, both=True)
     edge: str
     factor: float
@@ -122,7 +122,7 @@ class DemandSurge(Effect):
     name: ClassVar[str] = "demand_surge"
     on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME, "factor": _FACTOR}
-    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
+    texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge", everywhere=True)}
     edge: str
     begin_s: float
     end_s: float
@@ -147,7 +147,7 @@ class DemandTiming(Effect):
     name: ClassVar[str] = "demand_timing"
     on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -7200.0, 7200.0)}
-    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge", everywhere=True)}
+    texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge", everywhere=True)}
     examined: ClassVar[Examined] = Examined((300.0,), 0.0, 45.0, both=True)
     edge: str
     seconds: float

@@ -9,13 +9,21 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Owner, Parameter, Text, draw
+from ugat_marl.effects.base import (
+    EVERYWHERE,
+    Effect,
+    Examined,
+    Owner,
+    Parameter,
+    TextParameter,
+    draw,
+)
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Detector, Passages, Period, Scenario
 
 _TIME = Parameter("s", 0.0, 1e7)
-_CLOCK = Text("traffic light", everywhere=True)
+_CLOCK = TextParameter("traffic light", everywhere=True)
 
 
 def _both_sides(*levels: float) -> tuple[float, ...]:
@@ -65,7 +73,9 @@ class Undercount(DetectorEffect):
 
     name: ClassVar[str] = "undercount"
     ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
-    texts: ClassVar[dict[str, Text]] = {"place": Text("detector", everywhere=True)}
+    texts: ClassVar[dict[str, TextParameter]] = {
+        "place": TextParameter("detector", everywhere=True)
+    }
     examined: ClassVar[Examined] = Examined((0.15,), 0.0, 0.02)
     place: str
     share: float
@@ -91,7 +101,7 @@ class SignalClock(DetectorEffect):
 
     name: ClassVar[str] = "signal_clock"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -60.0, 60.0)}
-    texts: ClassVar[dict[str, Text]] = {"place": _CLOCK}
+    texts: ClassVar[dict[str, TextParameter]] = {"place": _CLOCK}
     examined: ClassVar[Examined] = Examined(_both_sides(0.7, 1.4, 2.2, 3.1, 4.3), 0.0, 0.2)
     place: str
     seconds: float
@@ -109,7 +119,7 @@ class ClockDrift(DetectorEffect):
 
     name: ClassVar[str] = "clock_drift"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds_per_hour": Parameter("s/h", -60.0, 60.0)}
-    texts: ClassVar[dict[str, Text]] = {"place": _CLOCK}
+    texts: ClassVar[dict[str, TextParameter]] = {"place": _CLOCK}
     examined: ClassVar[Examined] = Examined(_both_sides(1.5, 3.1, 5.2, 7.5), 0.0, 0.5)
     place: str
     seconds_per_hour: float
@@ -133,7 +143,7 @@ class Stuck(DetectorEffect):
 
     name: ClassVar[str] = "stuck"
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
-    texts: ClassVar[dict[str, Text]] = {"detector": Text("detector")}
+    texts: ClassVar[dict[str, TextParameter]] = {"detector": TextParameter("detector")}
     detector: str
     begin_s: float
     end_s: float
@@ -166,7 +176,7 @@ class Dropout(DetectorEffect):
 
     name: ClassVar[str] = "dropout"
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
-    texts: ClassVar[dict[str, Text]] = {"detector": Text("detector")}
+    texts: ClassVar[dict[str, TextParameter]] = {"detector": TextParameter("detector")}
     detector: str
     begin_s: float
     end_s: float
@@ -187,7 +197,10 @@ class Swapped(DetectorEffect):
     """Two detectors are taken for each other."""
 
     name: ClassVar[str] = "swapped"
-    texts: ClassVar[dict[str, Text]] = {"detector": Text("detector"), "other": Text("detector")}
+    texts: ClassVar[dict[str, TextParameter]] = {
+        "detector": TextParameter("detector"),
+        "other": TextParameter("detector"),
+    }
     detector: str
     other: str
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ugat_marl.effects.base import ControllerEffect, Text
+from ugat_marl.effects.base import ControllerEffect, TextParameter
 from ugat_marl.effects.controllers import Cost
 
 OBJECTIVES: dict[str, dict[str, float]] = {
@@ -41,7 +41,9 @@ class Objective(ControllerEffect):
     """Controllers are judged by efficiency, emissions, fairness, safety or person delay."""
 
     name: ClassVar[str] = "objective"
-    texts: ClassVar[dict[str, Text]] = {"wanted": Text("objective", allowed=tuple(OBJECTIVES))}
+    texts: ClassVar[dict[str, TextParameter]] = {
+        "wanted": TextParameter("objective", allowed=tuple(OBJECTIVES))
+    }
     wanted: str
 
     def cost(self) -> Cost:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, count
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Parameter, Text, draw
+from ugat_marl.effects.base import Effect, Parameter, TextParameter, draw
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import OptionError, ScenarioError
@@ -34,7 +34,7 @@ class LaneClosure(Effect):
 
     name: ClassVar[str] = "lane_closure"
     ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
-    texts: ClassVar[dict[str, Text]] = {"lane": Text("lane")}
+    texts: ClassVar[dict[str, TextParameter]] = {"lane": TextParameter("lane")}
     lane: str
     begin_s: float
     end_s: float
@@ -99,7 +99,7 @@ class Parking(Effect):
         "per_hour": Parameter("1/h", 0.0, 240.0),
         "dwell_s": Parameter("s", 1.0, 3600.0),
     }
-    texts: ClassVar[dict[str, Text]] = {"lane": Text("lane")}
+    texts: ClassVar[dict[str, TextParameter]] = {"lane": TextParameter("lane")}
     lane: str
     per_hour: float
     dwell_s: float
@@ -125,7 +125,7 @@ class LocalSpeed(Effect):
 
     name: ClassVar[str] = "local_speed"
     ranges: ClassVar[dict[str, Parameter]] = {"factor": Parameter("", 0.1, 3.0)}
-    texts: ClassVar[dict[str, Text]] = {"edge": Text("edge")}
+    texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge")}
     edge: str
     factor: float
 

@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Parameter, Text
+from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Parameter, TextParameter
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import ScenarioError
@@ -27,7 +27,9 @@ class LateGreen(Effect):
 
     name: ClassVar[str] = "late_green"
     ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 30.0)}
-    texts: ClassVar[dict[str, Text]] = {"place": Text("traffic light", everywhere=True)}
+    texts: ClassVar[dict[str, TextParameter]] = {
+        "place": TextParameter("traffic light", everywhere=True)
+    }
     # Tenths: fractions of a simulation step are spread over many greens.
     examined: ClassVar[Examined] = Examined((2.0,), 0.0, 0.3, step=0.1)
     place: str

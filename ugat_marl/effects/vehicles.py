@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Examined, Parameter, Text
+from ugat_marl.effects.base import Effect, Examined, Parameter, TextParameter
 from ugat_marl.effects.documents import edit_scenario, with_default_types
 from ugat_marl.scenarios import Scenario
 
@@ -250,7 +250,9 @@ class DriverModel(Effect):
     """
 
     name: ClassVar[str] = "driver_model"
-    texts: ClassVar[dict[str, Text]] = {"model": Text("model", allowed=DRIVER_MODELS)}
+    texts: ClassVar[dict[str, TextParameter]] = {
+        "model": TextParameter("model", allowed=DRIVER_MODELS)
+    }
     model: str
 
     def apply(self, scenario: Scenario) -> Scenario:
