@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from ugat_marl.effects import (
     Effect,
-    Parameter,
+    NumberParameter,
     TextParameter,
     draw,
     edit_scenario,
@@ -32,9 +32,9 @@ class BusStops(Effect):
     """Buses on the most usual route over an edge that stop there in their lane."""
 
     name: ClassVar[str] = "bus_stops"
-    ranges: ClassVar[dict[str, Parameter]] = {
-        "per_hour": Parameter("1/h", 1.0, 60.0),
-        "dwell_s": Parameter("s", 5.0, 300.0),
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "per_hour": NumberParameter("1/h", 1.0, 60.0),
+        "dwell_s": NumberParameter("s", 5.0, 300.0),
     }
     texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge")}
     edge: str
@@ -77,7 +77,7 @@ class Driveway(Effect):
     """Driveway before a stop line into which a share of the vehicles turns off."""
 
     name: ClassVar[str] = "driveway"
-    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
     texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge")}
     edge: str
     share: float

@@ -7,7 +7,7 @@ from .base import EVERYWHERE as EVERYWHERE
 from .base import ControllerEffect as ControllerEffect
 from .base import Effect as Effect
 from .base import Examined as Examined
-from .base import Parameter as Parameter
+from .base import NumberParameter as NumberParameter
 from .base import TextParameter as TextParameter
 from .base import draw as draw
 from .controllers import Actuator as Actuator

@@ -15,7 +15,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects.base import ControllerEffect, Effect, Parameter, TextParameter
+from ugat_marl.effects.base import ControllerEffect, Effect, NumberParameter, TextParameter
 from ugat_marl.effects.controllers import Actuator, Commands
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import Intersection, Network, Scenario, SignalState, SignalTiming
@@ -32,7 +32,7 @@ class ExecutionDelay(ControllerEffect):
     """Commands take effect after so many s, rounded to decisions; until then the light stays."""
 
     name: ClassVar[str] = "execution_delay"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 600.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 600.0)}
     seconds: float
 
     def actuator(
@@ -67,7 +67,7 @@ class LostCommands(ControllerEffect):
     """A command to one light is lost with this chance; the light then stays."""
 
     name: ClassVar[str] = "lost_commands"
-    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
     share: float
 
     def actuator(
@@ -128,7 +128,7 @@ class MaxGreen(ControllerEffect):
     """No green lasts longer than so many s, in whole decisions; then the next phase follows."""
 
     name: ClassVar[str] = "max_green"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 10.0, 600.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 10.0, 600.0)}
     seconds: float
 
     def actuator(
@@ -157,7 +157,7 @@ class MinGreen(Effect):
     """Greens of controlled signals last at least so many s, in whole simulation steps."""
 
     name: ClassVar[str] = "min_green"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 120.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 120.0)}
     seconds: float
 
     def apply(self, scenario: Scenario) -> Scenario:

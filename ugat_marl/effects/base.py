@@ -27,7 +27,7 @@ Owner = Mapping[str, str]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class NumberParameter:
     """Number that is a parameter of an effect.
 
     Attributes:
@@ -100,7 +100,7 @@ class Effect:
     """
 
     name: ClassVar[str]
-    ranges: ClassVar[dict[str, Parameter]] = {}
+    ranges: ClassVar[dict[str, NumberParameter]] = {}
     texts: ClassVar[dict[str, TextParameter]] = {}
     attribute: ClassVar[str] = ""
     examined: ClassVar[Examined | None] = None

@@ -14,7 +14,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Parameter, TextParameter, draw
+from ugat_marl.effects.base import (
+    EVERYWHERE,
+    Effect,
+    Examined,
+    NumberParameter,
+    TextParameter,
+    draw,
+)
 from ugat_marl.effects.documents import (
     depart_s,
     edit_scenario,
@@ -32,8 +39,8 @@ TAGS = ("<vehicle", "<trip", "<flow")
 TWIN_S = 15.0
 """Largest time between the departures of a twin and its original, in s."""
 
-_FACTOR = Parameter("", 0.0, 20.0)
-_TIME = Parameter("s", 0.0, 1e7)
+_FACTOR = NumberParameter("", 0.0, 20.0)
+_TIME = NumberParameter("s", 0.0, 1e7)
 _EXPONENTIAL = re.compile(r"\s*exp\((.*)\)\s*")
 _TWIN = re.compile(rb"(\++)(?:\d+|surge|after)[\"']")
 
@@ -100,7 +107,7 @@ class DemandLevel(Effect):
 
     name: ClassVar[str] = "demand_level"
     on_departures: ClassVar[bool] = True
-    ranges: ClassVar[dict[str, Parameter]] = {"factor": _FACTOR}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"factor": _FACTOR}
     texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge", everywhere=True)}
     examined: ClassVar[Examined] = Examined((1.15,), 1.0, 0.03, both=True)
     edge: str
@@ -121,7 +128,11 @@ class DemandSurge(Effect):
 
     name: ClassVar[str] = "demand_surge"
     on_departures: ClassVar[bool] = True
-    ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME, "factor": _FACTOR}
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "begin_s": _TIME,
+        "end_s": _TIME,
+        "factor": _FACTOR,
+    }
     texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge", everywhere=True)}
     edge: str
     begin_s: float
@@ -146,7 +157,9 @@ class DemandTiming(Effect):
 
     name: ClassVar[str] = "demand_timing"
     on_departures: ClassVar[bool] = True
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -7200.0, 7200.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "seconds": NumberParameter("s", -7200.0, 7200.0)
+    }
     texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge", everywhere=True)}
     examined: ClassVar[Examined] = Examined((300.0,), 0.0, 45.0, both=True)
     edge: str

@@ -13,8 +13,8 @@ from ugat_marl.effects.base import (
     EVERYWHERE,
     Effect,
     Examined,
+    NumberParameter,
     Owner,
-    Parameter,
     TextParameter,
     draw,
 )
@@ -22,7 +22,7 @@ from ugat_marl.effects.places import places_of
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Detector, Passages, Period, Scenario
 
-_TIME = Parameter("s", 0.0, 1e7)
+_TIME = NumberParameter("s", 0.0, 1e7)
 _CLOCK = TextParameter("traffic light", everywhere=True)
 
 
@@ -72,7 +72,7 @@ class Undercount(DetectorEffect):
     """A detector (``"*"``: all) misses this share of the vehicles."""
 
     name: ClassVar[str] = "undercount"
-    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
     texts: ClassVar[dict[str, TextParameter]] = {
         "place": TextParameter("detector", everywhere=True)
     }
@@ -100,7 +100,7 @@ class SignalClock(DetectorEffect):
     """Times of the detectors at a traffic light are so many s ahead of the clock of its signals."""
 
     name: ClassVar[str] = "signal_clock"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", -60.0, 60.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", -60.0, 60.0)}
     texts: ClassVar[dict[str, TextParameter]] = {"place": _CLOCK}
     examined: ClassVar[Examined] = Examined(_both_sides(0.7, 1.4, 2.2, 3.1, 4.3), 0.0, 0.2)
     place: str
@@ -118,7 +118,9 @@ class ClockDrift(DetectorEffect):
     """The clock of the detectors at a traffic light gains so many s per hour of a period."""
 
     name: ClassVar[str] = "clock_drift"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds_per_hour": Parameter("s/h", -60.0, 60.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "seconds_per_hour": NumberParameter("s/h", -60.0, 60.0)
+    }
     texts: ClassVar[dict[str, TextParameter]] = {"place": _CLOCK}
     examined: ClassVar[Examined] = Examined(_both_sides(1.5, 3.1, 5.2, 7.5), 0.0, 0.5)
     place: str
@@ -142,7 +144,7 @@ class Stuck(DetectorEffect):
     """A detector is always on between two times."""
 
     name: ClassVar[str] = "stuck"
-    ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"begin_s": _TIME, "end_s": _TIME}
     texts: ClassVar[dict[str, TextParameter]] = {"detector": TextParameter("detector")}
     detector: str
     begin_s: float
@@ -175,7 +177,7 @@ class Dropout(DetectorEffect):
     """A detector reports nothing between two times."""
 
     name: ClassVar[str] = "dropout"
-    ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"begin_s": _TIME, "end_s": _TIME}
     texts: ClassVar[dict[str, TextParameter]] = {"detector": TextParameter("detector")}
     detector: str
     begin_s: float

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Parameter
+from ugat_marl.effects.base import Effect, NumberParameter
 from ugat_marl.scenarios import Scenario, validated
 
 HEADWAY_S = 1.4
@@ -30,7 +30,7 @@ class QueueModel(Effect):
     """
 
     name: ClassVar[str] = "queue_model"
-    ranges: ClassVar[dict[str, Parameter]] = {"metres": Parameter("m", 20.0, 500.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", 20.0, 500.0)}
     metres: float
 
     def apply(self, scenario: Scenario) -> Scenario:
@@ -66,7 +66,7 @@ class BlockerPatience(Effect):
     """
 
     name: ClassVar[str] = "blocker_patience"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 1.0, 3600.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 1.0, 3600.0)}
     seconds: float
 
     def apply(self, scenario: Scenario) -> Scenario:
@@ -85,7 +85,7 @@ class Reach(Effect):
     """
 
     name: ClassVar[str] = "reach"
-    ranges: ClassVar[dict[str, Parameter]] = {"metres": Parameter("m", 1.0, 2000.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", 1.0, 2000.0)}
     metres: float
 
     def apply(self, scenario: Scenario) -> Scenario:

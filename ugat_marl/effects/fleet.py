@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from statistics import NormalDist, fmean
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Examined, Parameter, draw
+from ugat_marl.effects.base import Effect, Examined, NumberParameter, draw
 from ugat_marl.effects.demand import TAGS, scaled_flow
 from ugat_marl.effects.documents import (
     DEFAULT_TYPES,
@@ -82,7 +82,7 @@ class DesiredSpeed(Effect):
     """Desired speeds are multiplied by a factor: speedFactor of all types and vehicles."""
 
     name: ClassVar[str] = "desired_speed"
-    ranges: ClassVar[dict[str, Parameter]] = {"factor": Parameter("", 0.2, 3.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"factor": NumberParameter("", 0.2, 3.0)}
     examined: ClassVar[Examined] = Examined((0.87,), 1.0, 0.01, both=True)
     factor: float
 
@@ -101,7 +101,7 @@ class SpeedSpread(Effect):
     """The deviation of drivers' desired speeds, as a share of the limit (default 0.1)."""
 
     name: ClassVar[str] = "speed_spread"
-    ranges: ClassVar[dict[str, Parameter]] = {"deviation": Parameter("", 0.0, 0.8)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"deviation": NumberParameter("", 0.0, 0.8)}
     attribute: ClassVar[str] = "speedDev"
     examined: ClassVar[Examined] = Examined((0.03, 0.2), 0.1, 0.01)
     deviation: float
@@ -135,7 +135,7 @@ class HeavyShare(Effect):
     """
 
     name: ClassVar[str] = "heavy_share"
-    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
     examined: ClassVar[Examined] = Examined((0.12,), 0.0, 0.01)
     share: float
 

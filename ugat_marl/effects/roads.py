@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, count
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Parameter, TextParameter, draw
+from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, draw
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import OptionError, ScenarioError
@@ -25,7 +25,7 @@ _LENGTH_M = 5.0
 _LAST_M = 60.0
 _PARKED = "parking."
 """Beginning of the ids of vehicles that park."""
-_TIME = Parameter("s", 0.0, 1e7)
+_TIME = NumberParameter("s", 0.0, 1e7)
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class LaneClosure(Effect):
     """No vehicle passes a point near the end of a lane between two times, as after an accident."""
 
     name: ClassVar[str] = "lane_closure"
-    ranges: ClassVar[dict[str, Parameter]] = {"begin_s": _TIME, "end_s": _TIME}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"begin_s": _TIME, "end_s": _TIME}
     texts: ClassVar[dict[str, TextParameter]] = {"lane": TextParameter("lane")}
     lane: str
     begin_s: float
@@ -61,7 +61,10 @@ class Incident(Effect):
     """
 
     name: ClassVar[str] = "incident"
-    ranges: ClassVar[dict[str, Parameter]] = {"after_s": _TIME, "lasts_s": Parameter("s", 1.0, 1e7)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "after_s": _TIME,
+        "lasts_s": NumberParameter("s", 1.0, 1e7),
+    }
     after_s: float
     lasts_s: float
 
@@ -95,9 +98,9 @@ class Parking(Effect):
     """`per_hour` vehicles stop near the end of a lane each hour, for `dwell_s` s each."""
 
     name: ClassVar[str] = "parking"
-    ranges: ClassVar[dict[str, Parameter]] = {
-        "per_hour": Parameter("1/h", 0.0, 240.0),
-        "dwell_s": Parameter("s", 1.0, 3600.0),
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "per_hour": NumberParameter("1/h", 0.0, 240.0),
+        "dwell_s": NumberParameter("s", 1.0, 3600.0),
     }
     texts: ClassVar[dict[str, TextParameter]] = {"lane": TextParameter("lane")}
     lane: str
@@ -124,7 +127,7 @@ class LocalSpeed(Effect):
     """The speed limit of an edge is multiplied by a factor, by a sign that all obey."""
 
     name: ClassVar[str] = "local_speed"
-    ranges: ClassVar[dict[str, Parameter]] = {"factor": Parameter("", 0.1, 3.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"factor": NumberParameter("", 0.1, 3.0)}
     texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge")}
     edge: str
     factor: float

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects.base import ControllerEffect, Parameter
+from ugat_marl.effects.base import ControllerEffect, NumberParameter
 from ugat_marl.effects.controllers import Reading, Sensor, Stage
 from ugat_marl.scenarios import Network
 from ugat_marl.seeding import numpy_generator
@@ -28,7 +28,7 @@ class CountingNoise(ControllerEffect):
     """Every count has a normal error; its standard deviation is this share of the count."""
 
     name: ClassVar[str] = "counting_noise"
-    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
     share: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
@@ -57,7 +57,7 @@ class CountingError(ControllerEffect):
     """Every count has a normal error of so many vehicles, also on an empty lane."""
 
     name: ClassVar[str] = "counting_error"
-    ranges: ClassVar[dict[str, Parameter]] = {"vehicles": Parameter("veh", 0.0, 100.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"vehicles": NumberParameter("veh", 0.0, 100.0)}
     vehicles: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
@@ -87,7 +87,7 @@ class DetectorFailure(ControllerEffect):
     """This share of all lanes, drawn for each episode, has a dead detector, which reports 0."""
 
     name: ClassVar[str] = "detector_failure"
-    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
     share: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> DeadDetectors:
@@ -136,7 +136,7 @@ class DetectionZone(ControllerEffect):
     """Only vehicles within so many metres before a stop line are seen."""
 
     name: ClassVar[str] = "detection_zone"
-    ranges: ClassVar[dict[str, Parameter]] = {"metres": Parameter("m", 1.0, 1000.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", 1.0, 1000.0)}
     metres: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
@@ -164,7 +164,7 @@ class ObservationDelay(ControllerEffect):
     """Counts arrive after so many s, rounded to decisions; phases are known at once."""
 
     name: ClassVar[str] = "observation_delay"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 600.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 600.0)}
     seconds: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
@@ -195,7 +195,7 @@ class LostReadings(ControllerEffect):
     """A lane's counts are lost with this chance at each decision; the last ones are seen again."""
 
     name: ClassVar[str] = "lost_readings"
-    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
     share: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
@@ -226,7 +226,7 @@ class QuantisedCounts(ControllerEffect):
     """Counts are multiples of so many vehicles, rounded to the nearest."""
 
     name: ClassVar[str] = "quantised_counts"
-    ranges: ClassVar[dict[str, Parameter]] = {"vehicles": Parameter("veh", 1.0, 100.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"vehicles": NumberParameter("veh", 1.0, 100.0)}
     vehicles: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:

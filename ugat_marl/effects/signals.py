@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, Parameter, TextParameter
+from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, NumberParameter, TextParameter
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import ScenarioError
@@ -26,7 +26,7 @@ class LateGreen(Effect):
     """
 
     name: ClassVar[str] = "late_green"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 30.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 30.0)}
     texts: ClassVar[dict[str, TextParameter]] = {
         "place": TextParameter("traffic light", everywhere=True)
     }
@@ -64,7 +64,7 @@ class YellowTime(Effect):
     """The yellow of controlled signals lasts so many s, in whole simulation steps."""
 
     name: ClassVar[str] = "yellow_time"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 20.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 20.0)}
     seconds: float
 
     def apply(self, scenario: Scenario) -> Scenario:
@@ -77,7 +77,7 @@ class AllRedTime(Effect):
     """The all-red of controlled signals lasts so many s, in whole simulation steps."""
 
     name: ClassVar[str] = "all_red_time"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 20.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 20.0)}
     seconds: float
 
     def apply(self, scenario: Scenario) -> Scenario:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import accumulate, chain, pairwise
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Parameter, TextParameter, draw
+from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, draw
 from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
 from ugat_marl.effects.documents import edit_scenario, is_demand, mentions
 from ugat_marl.effects.places import Places, places_of
@@ -32,7 +32,7 @@ class Turning(Effect):
     """
 
     name: ClassVar[str] = "turning"
-    ranges: ClassVar[dict[str, Parameter]] = {"share": Parameter("", 0.0, 1.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
     texts: ClassVar[dict[str, TextParameter]] = {
         "from_edge": TextParameter("edge"),
         "to_edge": TextParameter("edge"),

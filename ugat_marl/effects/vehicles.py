@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Examined, Parameter, TextParameter
+from ugat_marl.effects.base import Effect, Examined, NumberParameter, TextParameter
 from ugat_marl.effects.documents import edit_scenario, with_default_types
 from ugat_marl.scenarios import Scenario
 
@@ -88,7 +88,7 @@ class Acceleration(VehicleEffect):
 
     name: ClassVar[str] = "acceleration"
     attribute: ClassVar[str] = "accel"
-    ranges: ClassVar[dict[str, Parameter]] = {"mps2": Parameter("m/s^2", 0.1, 10.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"mps2": NumberParameter("m/s^2", 0.1, 10.0)}
     examined: ClassVar[Examined] = Examined((0.8, 1.6), 2.6, 0.1, both=True)
     mps2: float
 
@@ -99,7 +99,7 @@ class Deceleration(VehicleEffect):
 
     name: ClassVar[str] = "deceleration"
     attribute: ClassVar[str] = "decel"
-    ranges: ClassVar[dict[str, Parameter]] = {"mps2": Parameter("m/s^2", 0.1, 10.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"mps2": NumberParameter("m/s^2", 0.1, 10.0)}
     examined: ClassVar[Examined] = Examined((2.0, 3.2), 4.5, 0.2, both=True)
     mps2: float
 
@@ -110,7 +110,7 @@ class EmergencyDeceleration(VehicleEffect):
 
     name: ClassVar[str] = "emergency_deceleration"
     attribute: ClassVar[str] = "emergencyDecel"
-    ranges: ClassVar[dict[str, Parameter]] = {"mps2": Parameter("m/s^2", 0.1, 20.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"mps2": NumberParameter("m/s^2", 0.1, 20.0)}
     examined: ClassVar[Examined] = Examined((3.0, 6.0), 9.0, 0.5)
     mps2: float
 
@@ -125,7 +125,7 @@ class StartupDelay(VehicleEffect):
 
     name: ClassVar[str] = "startup_delay"
     attribute: ClassVar[str] = "startupDelay"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 10.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 10.0)}
     examined: ClassVar[Examined] = Examined((0.3, 0.6, 0.8, 1.2), 0.0, 0.05, extreme=(2.4,))
     seconds: float
 
@@ -140,7 +140,7 @@ class Headway(VehicleEffect):
 
     name: ClassVar[str] = "headway"
     attribute: ClassVar[str] = "tau"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.1, 10.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.1, 10.0)}
     examined: ClassVar[Examined] = Examined((1.3, 1.7), 1.0, 0.05)
     seconds: float
 
@@ -154,7 +154,7 @@ class MinGap(VehicleEffect):
 
     name: ClassVar[str] = "min_gap"
     attribute: ClassVar[str] = "minGap"
-    ranges: ClassVar[dict[str, Parameter]] = {"metres": Parameter("m", 0.1, 20.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", 0.1, 20.0)}
     examined: ClassVar[Examined] = Examined((1.2, 1.8, 3.1, 3.8, 4.7), 2.5, 0.2)
     metres: float
 
@@ -165,7 +165,7 @@ class Imperfection(VehicleEffect):
 
     name: ClassVar[str] = "imperfection"
     attribute: ClassVar[str] = "sigma"
-    ranges: ClassVar[dict[str, Parameter]] = {"sigma": Parameter("", 0.0, 1.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"sigma": NumberParameter("", 0.0, 1.0)}
     examined: ClassVar[Examined] = Examined((0.15, 0.85), 0.5, 0.05)
     sigma: float
 
@@ -179,7 +179,7 @@ class ReactionStep(VehicleEffect):
 
     name: ClassVar[str] = "reaction_step"
     attribute: ClassVar[str] = "actionStepLength"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.1, 5.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.1, 5.0)}
     examined: ClassVar[Examined] = Examined((2.0,), 1.0, 0.5)
     seconds: float
 
@@ -198,7 +198,7 @@ class YellowRunning(VehicleEffect):
 
     name: ClassVar[str] = "yellow_running"
     attribute: ClassVar[str] = "jmDriveAfterYellowTime"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 10.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 10.0)}
     examined: ClassVar[Examined] = Examined((3.0,), 0.0, 0.3)
     seconds: float
 
@@ -212,7 +212,7 @@ class RedRunning(VehicleEffect):
 
     name: ClassVar[str] = "red_running"
     attribute: ClassVar[str] = "jmDriveAfterRedTime"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 10.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 10.0)}
     examined: ClassVar[Examined] = Examined((2.0,), 0.0, 0.3)
     seconds: float
 
@@ -226,7 +226,7 @@ class GapAcceptance(VehicleEffect):
 
     name: ClassVar[str] = "gap_acceptance"
     attribute: ClassVar[str] = "jmTimegapMinor"
-    ranges: ClassVar[dict[str, Parameter]] = {"seconds": Parameter("s", 0.0, 20.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 20.0)}
     examined: ClassVar[Examined] = Examined((0.4, 2.5), 1.0, 0.2)
     seconds: float
 
@@ -237,7 +237,7 @@ class LaneDiscipline(VehicleEffect):
 
     name: ClassVar[str] = "lane_discipline"
     attribute: ClassVar[str] = "lcStrategic"
-    ranges: ClassVar[dict[str, Parameter]] = {"strategic": Parameter("", 0.0, 100.0)}
+    ranges: ClassVar[dict[str, NumberParameter]] = {"strategic": NumberParameter("", 0.0, 100.0)}
     examined: ClassVar[Examined] = Examined((0.1, 5.0), 1.0, 0.2)
     strategic: float
 
