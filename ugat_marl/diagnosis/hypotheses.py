@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.effects import EVERYWHERE, SETTINGS, Effect, Examined, known_effects
+from ugat_marl.effects import EVERYWHERE, SETTINGS, Effect, ExaminedStrengths, known_effects
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
 
@@ -198,7 +198,7 @@ def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     return tuple(sorted(effects, key=rank))
 
 
-def examined(name: str) -> Examined:
+def examined(name: str) -> ExaminedStrengths:
     """Return the strengths of the first simulations of an effect of `GLOBAL`."""
     strengths = known_effects()[name].examined
     assert strengths is not None, name

@@ -19,7 +19,7 @@ from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout
 from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.statistics import Distance, Reference
 from ugat_marl.diagnosis.thresholds import THRESHOLDS
-from ugat_marl.effects import Examined
+from ugat_marl.effects import ExaminedStrengths
 from ugat_marl.scenarios import Passages, Period, Scenario, driven_routes, edge_of
 
 Array = NDArray[np.float64]
@@ -782,6 +782,6 @@ def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str,
     return None
 
 
-def _towards(sign: float, strengths: Examined) -> tuple[tuple[float, ...], ...]:
+def _towards(sign: float, strengths: ExaminedStrengths) -> tuple[tuple[float, ...], ...]:
     """Return the positive levels times the sign, in their order."""
     return tuple((sign * level,) for level in strengths.levels if level > 0)

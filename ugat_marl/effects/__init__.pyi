@@ -6,7 +6,7 @@ from .actuators import PhaseOrder as PhaseOrder
 from .base import EVERYWHERE as EVERYWHERE
 from .base import ControllerEffect as ControllerEffect
 from .base import Effect as Effect
-from .base import Examined as Examined
+from .base import ExaminedStrengths as ExaminedStrengths
 from .base import NumberParameter as NumberParameter
 from .base import TextParameter as TextParameter
 from .base import draw as draw

@@ -57,7 +57,7 @@ class TextParameter:
 
 
 @dataclass(frozen=True)
-class Examined:
+class ExaminedStrengths:
     """Strengths of an effect on a whole network that a diagnosis first simulates.
 
     Attributes:
@@ -103,7 +103,7 @@ class Effect:
     ranges: ClassVar[dict[str, NumberParameter]] = {}
     texts: ClassVar[dict[str, TextParameter]] = {}
     attribute: ClassVar[str] = ""
-    examined: ClassVar[Examined | None] = None
+    examined: ClassVar[ExaminedStrengths | None] = None
     on_detectors: ClassVar[bool] = False
     on_departures: ClassVar[bool] = False
 

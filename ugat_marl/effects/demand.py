@@ -17,7 +17,7 @@ from typing import ClassVar
 from ugat_marl.effects.base import (
     EVERYWHERE,
     Effect,
-    Examined,
+    ExaminedStrengths,
     NumberParameter,
     TextParameter,
     draw,
@@ -109,7 +109,7 @@ class DemandLevel(Effect):
     on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, NumberParameter]] = {"factor": _FACTOR}
     texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge", everywhere=True)}
-    examined: ClassVar[Examined] = Examined((1.15,), 1.0, 0.03, both=True)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((1.15,), 1.0, 0.03, both=True)
     edge: str
     factor: float
 
@@ -161,7 +161,7 @@ class DemandTiming(Effect):
         "seconds": NumberParameter("s", -7200.0, 7200.0)
     }
     texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge", everywhere=True)}
-    examined: ClassVar[Examined] = Examined((300.0,), 0.0, 45.0, both=True)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((300.0,), 0.0, 45.0, both=True)
     edge: str
     seconds: float
 

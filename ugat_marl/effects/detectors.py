@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ugat_marl.effects.base import (
     EVERYWHERE,
     Effect,
-    Examined,
+    ExaminedStrengths,
     NumberParameter,
     Owner,
     TextParameter,
@@ -76,7 +76,7 @@ class Undercount(DetectorEffect):
     texts: ClassVar[dict[str, TextParameter]] = {
         "place": TextParameter("detector", everywhere=True)
     }
-    examined: ClassVar[Examined] = Examined((0.15,), 0.0, 0.02)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((0.15,), 0.0, 0.02)
     place: str
     share: float
 
@@ -102,7 +102,9 @@ class SignalClock(DetectorEffect):
     name: ClassVar[str] = "signal_clock"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", -60.0, 60.0)}
     texts: ClassVar[dict[str, TextParameter]] = {"place": _CLOCK}
-    examined: ClassVar[Examined] = Examined(_both_sides(0.7, 1.4, 2.2, 3.1, 4.3), 0.0, 0.2)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths(
+        _both_sides(0.7, 1.4, 2.2, 3.1, 4.3), 0.0, 0.2
+    )
     place: str
     seconds: float
 
@@ -122,7 +124,9 @@ class ClockDrift(DetectorEffect):
         "seconds_per_hour": NumberParameter("s/h", -60.0, 60.0)
     }
     texts: ClassVar[dict[str, TextParameter]] = {"place": _CLOCK}
-    examined: ClassVar[Examined] = Examined(_both_sides(1.5, 3.1, 5.2, 7.5), 0.0, 0.5)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths(
+        _both_sides(1.5, 3.1, 5.2, 7.5), 0.0, 0.5
+    )
     place: str
     seconds_per_hour: float
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from statistics import NormalDist, fmean
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Examined, NumberParameter, draw
+from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, draw
 from ugat_marl.effects.demand import TAGS, scaled_flow
 from ugat_marl.effects.documents import (
     DEFAULT_TYPES,
@@ -83,7 +83,7 @@ class DesiredSpeed(Effect):
 
     name: ClassVar[str] = "desired_speed"
     ranges: ClassVar[dict[str, NumberParameter]] = {"factor": NumberParameter("", 0.2, 3.0)}
-    examined: ClassVar[Examined] = Examined((0.87,), 1.0, 0.01, both=True)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((0.87,), 1.0, 0.01, both=True)
     factor: float
 
     def apply(self, scenario: Scenario) -> Scenario:
@@ -103,7 +103,7 @@ class SpeedSpread(Effect):
     name: ClassVar[str] = "speed_spread"
     ranges: ClassVar[dict[str, NumberParameter]] = {"deviation": NumberParameter("", 0.0, 0.8)}
     attribute: ClassVar[str] = "speedDev"
-    examined: ClassVar[Examined] = Examined((0.03, 0.2), 0.1, 0.01)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((0.03, 0.2), 0.1, 0.01)
     deviation: float
 
     def apply(self, scenario: Scenario) -> Scenario:
@@ -136,7 +136,7 @@ class HeavyShare(Effect):
 
     name: ClassVar[str] = "heavy_share"
     ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
-    examined: ClassVar[Examined] = Examined((0.12,), 0.0, 0.01)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((0.12,), 0.0, 0.01)
     share: float
 
     def apply(self, scenario: Scenario) -> Scenario:

@@ -6,7 +6,13 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from ugat_marl.effects.base import EVERYWHERE, Effect, Examined, NumberParameter, TextParameter
+from ugat_marl.effects.base import (
+    EVERYWHERE,
+    Effect,
+    ExaminedStrengths,
+    NumberParameter,
+    TextParameter,
+)
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import ScenarioError
@@ -31,7 +37,7 @@ class LateGreen(Effect):
         "place": TextParameter("traffic light", everywhere=True)
     }
     # Tenths: fractions of a simulation step are spread over many greens.
-    examined: ClassVar[Examined] = Examined((2.0,), 0.0, 0.3, step=0.1)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((2.0,), 0.0, 0.3, step=0.1)
     place: str
     seconds: float
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, Examined, NumberParameter, TextParameter
+from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, TextParameter
 from ugat_marl.effects.documents import edit_scenario, with_default_types
 from ugat_marl.scenarios import Scenario
 
@@ -89,7 +89,7 @@ class Acceleration(VehicleEffect):
     name: ClassVar[str] = "acceleration"
     attribute: ClassVar[str] = "accel"
     ranges: ClassVar[dict[str, NumberParameter]] = {"mps2": NumberParameter("m/s^2", 0.1, 10.0)}
-    examined: ClassVar[Examined] = Examined((0.8, 1.6), 2.6, 0.1, both=True)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((0.8, 1.6), 2.6, 0.1, both=True)
     mps2: float
 
 
@@ -100,7 +100,7 @@ class Deceleration(VehicleEffect):
     name: ClassVar[str] = "deceleration"
     attribute: ClassVar[str] = "decel"
     ranges: ClassVar[dict[str, NumberParameter]] = {"mps2": NumberParameter("m/s^2", 0.1, 10.0)}
-    examined: ClassVar[Examined] = Examined((2.0, 3.2), 4.5, 0.2, both=True)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((2.0, 3.2), 4.5, 0.2, both=True)
     mps2: float
 
 
@@ -111,7 +111,7 @@ class EmergencyDeceleration(VehicleEffect):
     name: ClassVar[str] = "emergency_deceleration"
     attribute: ClassVar[str] = "emergencyDecel"
     ranges: ClassVar[dict[str, NumberParameter]] = {"mps2": NumberParameter("m/s^2", 0.1, 20.0)}
-    examined: ClassVar[Examined] = Examined((3.0, 6.0), 9.0, 0.5)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((3.0, 6.0), 9.0, 0.5)
     mps2: float
 
 
@@ -126,7 +126,9 @@ class StartupDelay(VehicleEffect):
     name: ClassVar[str] = "startup_delay"
     attribute: ClassVar[str] = "startupDelay"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 10.0)}
-    examined: ClassVar[Examined] = Examined((0.3, 0.6, 0.8, 1.2), 0.0, 0.05, extreme=(2.4,))
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths(
+        (0.3, 0.6, 0.8, 1.2), 0.0, 0.05, extreme=(2.4,)
+    )
     seconds: float
 
 
@@ -141,7 +143,7 @@ class Headway(VehicleEffect):
     name: ClassVar[str] = "headway"
     attribute: ClassVar[str] = "tau"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.1, 10.0)}
-    examined: ClassVar[Examined] = Examined((1.3, 1.7), 1.0, 0.05)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((1.3, 1.7), 1.0, 0.05)
     seconds: float
 
     def _write(self, item: ET.Element, number: float, step_s: float) -> None:
@@ -155,7 +157,7 @@ class MinGap(VehicleEffect):
     name: ClassVar[str] = "min_gap"
     attribute: ClassVar[str] = "minGap"
     ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", 0.1, 20.0)}
-    examined: ClassVar[Examined] = Examined((1.2, 1.8, 3.1, 3.8, 4.7), 2.5, 0.2)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((1.2, 1.8, 3.1, 3.8, 4.7), 2.5, 0.2)
     metres: float
 
 
@@ -166,7 +168,7 @@ class Imperfection(VehicleEffect):
     name: ClassVar[str] = "imperfection"
     attribute: ClassVar[str] = "sigma"
     ranges: ClassVar[dict[str, NumberParameter]] = {"sigma": NumberParameter("", 0.0, 1.0)}
-    examined: ClassVar[Examined] = Examined((0.15, 0.85), 0.5, 0.05)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((0.15, 0.85), 0.5, 0.05)
     sigma: float
 
 
@@ -180,7 +182,7 @@ class ReactionStep(VehicleEffect):
     name: ClassVar[str] = "reaction_step"
     attribute: ClassVar[str] = "actionStepLength"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.1, 5.0)}
-    examined: ClassVar[Examined] = Examined((2.0,), 1.0, 0.5)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((2.0,), 1.0, 0.5)
     seconds: float
 
     def _write(self, item: ET.Element, number: float, step_s: float) -> None:
@@ -199,7 +201,7 @@ class YellowRunning(VehicleEffect):
     name: ClassVar[str] = "yellow_running"
     attribute: ClassVar[str] = "jmDriveAfterYellowTime"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 10.0)}
-    examined: ClassVar[Examined] = Examined((3.0,), 0.0, 0.3)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((3.0,), 0.0, 0.3)
     seconds: float
 
 
@@ -213,7 +215,7 @@ class RedRunning(VehicleEffect):
     name: ClassVar[str] = "red_running"
     attribute: ClassVar[str] = "jmDriveAfterRedTime"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 10.0)}
-    examined: ClassVar[Examined] = Examined((2.0,), 0.0, 0.3)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((2.0,), 0.0, 0.3)
     seconds: float
 
 
@@ -227,7 +229,7 @@ class GapAcceptance(VehicleEffect):
     name: ClassVar[str] = "gap_acceptance"
     attribute: ClassVar[str] = "jmTimegapMinor"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 20.0)}
-    examined: ClassVar[Examined] = Examined((0.4, 2.5), 1.0, 0.2)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((0.4, 2.5), 1.0, 0.2)
     seconds: float
 
 
@@ -238,7 +240,7 @@ class LaneDiscipline(VehicleEffect):
     name: ClassVar[str] = "lane_discipline"
     attribute: ClassVar[str] = "lcStrategic"
     ranges: ClassVar[dict[str, NumberParameter]] = {"strategic": NumberParameter("", 0.0, 100.0)}
-    examined: ClassVar[Examined] = Examined((0.1, 5.0), 1.0, 0.2)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((0.1, 5.0), 1.0, 0.2)
     strategic: float
 
 
