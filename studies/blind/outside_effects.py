@@ -11,8 +11,8 @@ from ugat_marl.effects import (
     Effect,
     NumberParameter,
     TextParameter,
-    draw,
     edit_scenario,
+    hashed_uniform,
     places_of,
     seconds_text,
 )
@@ -94,7 +94,7 @@ class Driveway(Effect):
                 edges = [] if route is None else route.get("edges", "").split()
                 if route is None or self.edge not in edges[:-1] or item.find("stop") is not None:
                     continue
-                if draw(self.name, item.get("id", "")) < self.share:
+                if hashed_uniform(self.name, item.get("id", "")) < self.share:
                     route.set("edges", " ".join(edges[: edges.index(self.edge) + 1]))
                     item.set("arrivalPos", f"{position:.2f}")
                     item.attrib.pop("arrivalLane", None)

@@ -9,7 +9,7 @@ from .base import Effect as Effect
 from .base import ExaminedStrengths as ExaminedStrengths
 from .base import NumberParameter as NumberParameter
 from .base import TextParameter as TextParameter
-from .base import draw as draw
+from .base import hashed_uniform as hashed_uniform
 from .controllers import Actuator as Actuator
 from .controllers import Cost as Cost
 from .controllers import Reading as Reading

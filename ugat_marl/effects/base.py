@@ -222,7 +222,7 @@ class ControllerEffect(Effect):
         return replace(scenario, settings=settings, applied=(*scenario.applied, *known))
 
 
-def draw(salt: str, *names: str) -> float:
+def hashed_uniform(salt: str, *names: str) -> float:
     """Return a number in [0, 1) that belongs to a vehicle, or to anything else with a name.
 
     It replaces a random generator. A share of 0.2 contains all vehicles with a number below 0.2, so

@@ -20,7 +20,7 @@ from ugat_marl.effects.base import (
     ExaminedStrengths,
     NumberParameter,
     TextParameter,
-    draw,
+    hashed_uniform,
 )
 from ugat_marl.effects.documents import (
     depart_s,
@@ -308,13 +308,13 @@ def _scaled(
         if not (math.isnan(depart) or begin <= depart < end):
             return [item]
         name = item.get("id", "")
-        count = math.floor(factor) + (draw(salt, name) < factor - math.floor(factor))
+        count = math.floor(factor) + (hashed_uniform(salt, name) < factor - math.floor(factor))
         found = [item] if count else []
         for number in range(1, count):
             twin = copy.deepcopy(item)
             twin.set("id", f"{name}{mark}{number}")
             if not math.isnan(depart):
-                shift = TWIN_S * (2 * draw(salt, "when", name, str(number)) - 1)
+                shift = TWIN_S * (2 * hashed_uniform(salt, "when", name, str(number)) - 1)
                 time = depart + shift
                 if not least <= time < end:
                     time = depart - shift

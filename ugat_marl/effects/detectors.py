@@ -16,7 +16,7 @@ from ugat_marl.effects.base import (
     NumberParameter,
     Owner,
     TextParameter,
-    draw,
+    hashed_uniform,
 )
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import UnknownNameError
@@ -87,7 +87,7 @@ class Undercount(DetectorEffect):
         def thinned(name: str, passages: Passages) -> Passages:
             times = np.where(np.isnan(passages.on_s), passages.off_s, passages.on_s)
             kept = [
-                draw("undercount", name, str(n), f"{time:.3f}") >= self.share
+                hashed_uniform("undercount", name, str(n), f"{time:.3f}") >= self.share
                 for n, time in enumerate(times.tolist())
             ]
             return passages.at(np.array(kept, dtype=np.bool_))

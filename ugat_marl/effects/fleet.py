@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from statistics import NormalDist, fmean
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, draw
+from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, hashed_uniform
 from ugat_marl.effects.demand import TAGS, scaled_flow
 from ugat_marl.effects.documents import (
     DEFAULT_TYPES,
@@ -119,7 +119,9 @@ class SpeedSpread(Effect):
             if old.deviation > 0:
                 place = (value - old.mean) / old.deviation
             else:
-                place = NormalDist().inv_cdf(min(max(draw(self.name, name), 1e-9), 1 - 1e-9))
+                place = NormalDist().inv_cdf(
+                    min(max(hashed_uniform(self.name, name), 1e-9), 1 - 1e-9)
+                )
             value = old.mean + place * self.deviation
             return min(max(value, old.least), old.greatest)
 
@@ -153,7 +155,7 @@ class HeavyShare(Effect):
             name = item.get("id", "")
             truck = f"{_HEAVY}{cars[kind].get('id')}"
             if item.tag != "flow":
-                if draw(self.name, name) < self.share:
+                if hashed_uniform(self.name, name) < self.share:
                     used[truck] = cars[kind]
                     item.set("type", truck)
                 return [item]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, count
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, draw
+from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, hashed_uniform
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import places_of
 from ugat_marl.errors import OptionError, ScenarioError
@@ -88,7 +88,7 @@ class Incident(Effect):
                 "leads to a signal; name one with lane_closure"
             )
         wide = [lane for lane in lanes if len(places.edges[places.lanes[lane].edge]) > 1]
-        lane = min(wide or lanes, key=lambda lane: draw(self.name, lane))
+        lane = min(wide or lanes, key=lambda lane: hashed_uniform(self.name, lane))
         begin = scenario.settings.begin_s + self.after_s
         return LaneClosure(lane, begin, begin + self.lasts_s).apply(scenario)
 
@@ -116,7 +116,7 @@ class Parking(Effect):
         """
         settings = scenario.settings
         number = round(self.per_hour * settings.duration_s / 3600.0)
-        parts = [(n + draw(self.name, self.lane, str(n))) / number for n in range(number)]
+        parts = [(n + hashed_uniform(self.name, self.lane, str(n))) / number for n in range(number)]
         departs = [settings.begin_s + part * settings.duration_s for part in parts]
         stand = {"duration": seconds_text(self.dwell_s)}
         return _with_blockers(scenario, self, self.lane, departs, stand)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import accumulate, chain, pairwise
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, draw
+from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, hashed_uniform
 from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
 from ugat_marl.effects.documents import edit_scenario, is_demand, mentions
 from ugat_marl.effects.places import Places, places_of
@@ -109,7 +109,7 @@ class Turning(Effect):
         name = item.get("id", "")
         salt = f"{self.name} {self.from_edge} {self.to_edge}"
         if item.tag != "flow":
-            if draw(salt, name) >= self.share:
+            if hashed_uniform(salt, name) >= self.share:
                 return [item]
             return [_with_route(item, (*edges[: place + 1], *_drawn(tails, salt, name)))]
         parts = [scaled_flow(item, 1 - self.share, over_s)]
@@ -128,7 +128,7 @@ def _drawn(tails: Counter[Way], salt: str, name: str) -> Way:
     """Return one of the further ways, drawn by the number of vehicles on each."""
     ways = sorted(tails)
     bounds = list(accumulate(tails[way] for way in ways))
-    return ways[bisect_right(bounds, draw(salt, "way", name) * bounds[-1])]
+    return ways[bisect_right(bounds, hashed_uniform(salt, "way", name) * bounds[-1])]
 
 
 def _fastest(item: ET.Element, places: Places) -> Way:
