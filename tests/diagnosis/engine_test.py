@@ -16,7 +16,7 @@ from ugat_marl.diagnosis import engine as module
 from ugat_marl.diagnosis.engine import Engine, OutOfTime, Replicate
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
 from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
-from ugat_marl.effects import Effect, load_scenario, observed, parse_domain
+from ugat_marl.effects import Effect, apply_detector_effects, load_scenario, parse_domain
 from ugat_marl.errors import SimulatorError
 from ugat_marl.scenarios import Network, Passages, Period, Scenario
 from ugat_marl.simulation import standard_detectors
@@ -48,7 +48,9 @@ class Streets(Replay):
         return Day(replace(period, passages=seen), float(generator.uniform(50, 60)))
 
     def observed(self, effects: Sequence[Effect], period: Period) -> Period:
-        return observed(period, effects, self._layout.detectors, dict(self._layout.owner))
+        return apply_detector_effects(
+            period, effects, self._layout.detectors, dict(self._layout.owner)
+        )
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from ugat_marl.diagnosis.features import (
 from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.diagnosis.places import PlaceFinder, _later
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.effects import Domain, load_scenario, observed, parse_domain
+from ugat_marl.effects import Domain, apply_detector_effects, load_scenario, parse_domain
 from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period
 
 ARMS = ("a", "b", "c", "d")
@@ -143,7 +143,8 @@ def fault(domain: Domain) -> list[Period]:
     """Five days whose detectors are at fault."""
     effects = parse_domain(domain)
     return [
-        observed(street(900 + day), effects, SITE.detectors, dict(SITE.owner)) for day in range(5)
+        apply_detector_effects(street(900 + day), effects, SITE.detectors, dict(SITE.owner))
+        for day in range(5)
     ]
 
 

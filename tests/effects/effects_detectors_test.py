@@ -19,8 +19,8 @@ from ugat_marl.effects import (
     Stuck,
     Swapped,
     Undercount,
+    apply_detector_effects,
     load_scenario,
-    observed,
     owners,
     parse_domain,
     places_of,
@@ -129,10 +129,10 @@ def test_passages_are_missed_at_random_and_nested() -> None:
 
 def test_effects_on_detectors_are_picked_from_all() -> None:
     effects = [StartupDelay(1), SignalClock("A", 1), Dropout("b", 0, 5000)]
-    after = observed(DAY, effects, DETECTORS, OWNER)
+    after = apply_detector_effects(DAY, effects, DETECTORS, OWNER)
     assert times(after, "a")[0] == (1002, 1003)
     assert "b" not in after.passages
-    assert observed(DAY, effects[:1], DETECTORS, OWNER) is DAY
+    assert apply_detector_effects(DAY, effects[:1], DETECTORS, OWNER) is DAY
 
 
 @pytest.mark.parametrize(

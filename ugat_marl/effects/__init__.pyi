@@ -24,7 +24,7 @@ from .detectors import SignalClock as SignalClock
 from .detectors import Stuck as Stuck
 from .detectors import Swapped as Swapped
 from .detectors import Undercount as Undercount
-from .detectors import observed as observed
+from .detectors import apply_detector_effects as apply_detector_effects
 from .detectors import owners as owners
 from .documents import depart_s as depart_s
 from .documents import edit_scenario as edit_scenario

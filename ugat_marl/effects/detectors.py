@@ -221,7 +221,7 @@ class Swapped(DetectorEffect):
         return replace(period, passages=passages)
 
 
-def observed(
+def apply_detector_effects(
     period: Period,
     effects: Sequence[Effect],
     detectors: Sequence[Detector],

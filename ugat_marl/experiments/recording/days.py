@@ -23,10 +23,10 @@ from ugat_marl.data import Measured, passages_as_written, split_periods
 from ugat_marl.effects import (
     Domain,
     Effect,
+    apply_detector_effects,
     apply_effects,
     detector_effects,
     in_domain,
-    observed,
     owners,
     parked_at_other_times,
     parse_domain,
@@ -151,7 +151,9 @@ def record(
     network = Network.read(base)
     detectors = tuple(_zone(item, detector_length_m) for item in standard_detectors(network))
     empty = Period("", 0.0, 1.0, "fit", {}, {})
-    observed(empty, effects, detectors, owners(base, detectors))  # a wrong detector is an error now
+    apply_detector_effects(
+        empty, effects, detectors, owners(base, detectors)
+    )  # a wrong detector is an error now
     fixed, watched = own_programmes(base, network, policy)
     street = _Street(
         as_vehicles(base),
@@ -249,7 +251,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
         passages if street.speeds else {k: _without_speed(v) for k, v in passages.items()},
     )
     owner = owners(street.base, street.detectors)
-    period = _logged(observed(period, street.effects, street.detectors, owner))
+    period = _logged(apply_detector_effects(period, street.effects, street.detectors, owner))
     lanes = None
     if vehicles is not None and street.lanes:
         lanes = per_lane(vehicles, street.detectors, period)
