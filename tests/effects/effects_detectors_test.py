@@ -20,8 +20,8 @@ from ugat_marl.effects import (
     Swapped,
     Undercount,
     apply_detector_effects,
+    detector_lights,
     load_scenario,
-    owners,
     parse_domain,
     places_of,
 )
@@ -155,10 +155,10 @@ def test_detectors_belong_to_the_light_they_lead_to_or_stand_behind() -> None:
     places = places_of(scenario)
     between = next(lane for lane in places.lanes if lane in places.ends and lane in places.begins)
     made = [Detector(kind, between, 1, 1, kind) for kind in ("advance", "stop", "exit")]
-    found = owners(scenario, made)
+    found = detector_lights(scenario, made)
     assert found["advance"] == found["stop"] == places.ends[between]
     assert found["exit"] == places.begins[between] != found["stop"]
-    assert not owners(scenario, [Detector("far", "x_0", 1, 1, "stop")])
+    assert not detector_lights(scenario, [Detector("far", "x_0", 1, 1, "stop")])
 
 
 # --- spelling

@@ -25,7 +25,7 @@ from .detectors import Stuck as Stuck
 from .detectors import Swapped as Swapped
 from .detectors import Undercount as Undercount
 from .detectors import apply_detector_effects as apply_detector_effects
-from .detectors import owners as owners
+from .detectors import detector_lights as detector_lights
 from .documents import depart_s as depart_s
 from .documents import edit_scenario as edit_scenario
 from .documents import seconds_text as seconds_text

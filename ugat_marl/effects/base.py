@@ -135,7 +135,7 @@ class Effect:
         Args:
             period: Measured passages; it does not change itself.
             detectors: All detectors.
-            owner: Detector to its traffic light, see `owners`.
+            owner: Detector to its traffic light, see `detector_lights`.
 
         Raises:
             UnknownNameError: The detector does not exist.

@@ -31,7 +31,7 @@ def _both_sides(*levels: float) -> tuple[float, ...]:
     return (*(-level for level in reversed(levels)), *levels)
 
 
-def owners(scenario: Scenario, detectors: Sequence[Detector]) -> dict[str, str]:
+def detector_lights(scenario: Scenario, detectors: Sequence[Detector]) -> dict[str, str]:
     """Return the traffic light of every detector.
 
     An exit detector belongs to the light at the start of its lane, any other to the light at the

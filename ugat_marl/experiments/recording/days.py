@@ -26,8 +26,8 @@ from ugat_marl.effects import (
     apply_detector_effects,
     apply_effects,
     detector_effects,
+    detector_lights,
     in_domain,
-    owners,
     parked_at_other_times,
     parse_domain,
     scenario_of,
@@ -152,7 +152,7 @@ def record(
     detectors = tuple(_zone(item, detector_length_m) for item in standard_detectors(network))
     empty = Period("", 0.0, 1.0, "fit", {}, {})
     apply_detector_effects(
-        empty, effects, detectors, owners(base, detectors)
+        empty, effects, detectors, detector_lights(base, detectors)
     )  # a wrong detector is an error now
     fixed, watched = own_programmes(base, network, policy)
     street = _Street(
@@ -250,7 +250,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
         {**street.programmes, **shown, **commanded},
         passages if street.speeds else {k: _without_speed(v) for k, v in passages.items()},
     )
-    owner = owners(street.base, street.detectors)
+    owner = detector_lights(street.base, street.detectors)
     period = _logged(apply_detector_effects(period, street.effects, street.detectors, owner))
     lanes = None
     if vehicles is not None and street.lanes:
