@@ -16,7 +16,7 @@ import ugat_marl
 from ugat_marl.__main__ import main
 from ugat_marl.effects import (
     ALIASES,
-    GAPS,
+    GAP_KINDS,
     NAMED,
     SETTINGS,
     Effect,
@@ -57,7 +57,7 @@ def test_every_setting_of_the_benchmark_has_its_counterpart() -> None:
 
 def test_names_are_spelled_as_one_likes() -> None:
     for name, item in NAMED.items():
-        assert item.gap in GAPS
+        assert item.gap in GAP_KINDS
         assert parse_domain(name.upper()) == parse_domain(f" {name} ") == parse_domain(item.effects)
         assert describe(name.upper()) == name
         assert name not in ALIASES and parse_domain(f"{name}+V1")[-4:] == SETTINGS["V1"]
@@ -68,7 +68,7 @@ def test_names_are_spelled_as_one_likes() -> None:
 
 
 def test_no_name_is_that_of_an_effect_or_of_a_gap() -> None:
-    assert not set(NAMED) & {*effects_on_controllers(), *GAPS, "all", "sim"}
+    assert not set(NAMED) & {*effects_on_controllers(), *GAP_KINDS, "all", "sim"}
 
 
 def test_an_unknown_name_gets_the_nearest_of_all() -> None:

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from ugat_marl.effects import ALIASES, GAPS, NAMED, NamedDomain
+from ugat_marl.effects import ALIASES, GAP_KINDS, NAMED, NamedDomain
 from ugat_marl.errors import UnknownNameError
 
 _TITLES = {
@@ -46,13 +46,13 @@ class Domains:
 
     def run(self, console: Console) -> int:
         """Print the lists."""
-        if self.gap is not None and self.gap not in GAPS:
-            raise UnknownNameError("gap", self.gap, GAPS)
+        if self.gap is not None and self.gap not in GAP_KINDS:
+            raise UnknownNameError("gap", self.gap, GAP_KINDS)
         listed = [item for item in NAMED.values() if self.gap in (None, item.gap)]
         if self.json:
             console.print_json(json.dumps([asdict(item) for item in listed]))
             return 0
-        for gap in GAPS:
+        for gap in GAP_KINDS:
             own = [item for item in listed if item.gap == gap]
             if own:
                 console.print(_table(_TITLES[gap], own))

@@ -26,7 +26,7 @@ Domain = str | Sequence[Effect]
 
 Gap = Literal["observation", "action", "transition", "reward"]
 
-GAPS: tuple[Gap, ...] = get_args(Gap)
+GAP_KINDS: tuple[Gap, ...] = get_args(Gap)
 """Kinds of gap: in what controllers see, in their commands, in the traffic, in the objective."""
 
 
@@ -215,7 +215,7 @@ def spelled_out(names: Sequence[str]) -> list[str]:
     for name in names:
         if name.lower() == "all":
             found += ["sim", *(item.name for item in streets)]
-        elif name.lower() in GAPS:
+        elif name.lower() in GAP_KINDS:
             found += [item.name for item in streets if item.gap == name.lower()]
         else:
             found.append(name)

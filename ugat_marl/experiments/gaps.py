@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects import GAPS, NAMED
+from ugat_marl.effects import GAP_KINDS, NAMED
 from ugat_marl.experiments.scores import Estimate, Evaluation
 
 
@@ -34,7 +34,8 @@ def gaps_of(found: Evaluation) -> dict[str, list[str]]:
     """Return the names of the evaluation's domains by gap, without gaps that have no domain."""
     others = found.domains[1:]
     listed = {
-        gap: [name for name in others if name in NAMED and NAMED[name].gap == gap] for gap in GAPS
+        gap: [name for name in others if name in NAMED and NAMED[name].gap == gap]
+        for gap in GAP_KINDS
     }
     return {gap: names for gap, names in listed.items() if names}
 
