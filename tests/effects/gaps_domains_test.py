@@ -17,7 +17,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.effects import (
     ALIASES,
     GAP_KINDS,
-    NAMED,
+    NAMED_DOMAINS,
     SETTINGS,
     Effect,
     describe,
@@ -51,24 +51,26 @@ THEIRS = (  # scripts/run_nonrl_gap_evals.sh of the benchmark
 
 def test_every_setting_of_the_benchmark_has_its_counterpart() -> None:
     assert len(THEIRS) == 33
-    found = [item.counterpart for item in NAMED.values() if item.counterpart]
+    found = [item.counterpart for item in NAMED_DOMAINS.values() if item.counterpart]
     assert sorted(found) == sorted(THEIRS)
 
 
 def test_names_are_spelled_as_one_likes() -> None:
-    for name, item in NAMED.items():
+    for name, item in NAMED_DOMAINS.items():
         assert item.gap in GAP_KINDS
         assert parse_domain(name.upper()) == parse_domain(f" {name} ") == parse_domain(item.effects)
         assert describe(name.upper()) == name
         assert name not in ALIASES and parse_domain(f"{name}+V1")[-4:] == SETTINGS["V1"]
     for name, effects in SETTINGS.items():
-        assert parse_domain(NAMED[name].effects) == effects
-    assert len({in_domain(load_scenario("single-v1"), name).hash for name in NAMED}) == len(NAMED)
+        assert parse_domain(NAMED_DOMAINS[name].effects) == effects
+    assert len({in_domain(load_scenario("single-v1"), name).hash for name in NAMED_DOMAINS}) == len(
+        NAMED_DOMAINS
+    )
     assert describe("sim") == "sim" and describe("startup_delay=1") == "startup_delay=1"
 
 
 def test_no_name_is_that_of_an_effect_or_of_a_gap() -> None:
-    assert not set(NAMED) & {*effects_on_controllers(), *GAP_KINDS, "all", "sim"}
+    assert not set(NAMED_DOMAINS) & {*effects_on_controllers(), *GAP_KINDS, "all", "sim"}
 
 
 def test_an_unknown_name_gets_the_nearest_of_all() -> None:
@@ -77,19 +79,19 @@ def test_an_unknown_name_gets_the_nearest_of_all() -> None:
 
 
 def test_gaps_are_spelled_out() -> None:
-    assert spelled_out(["all"]) == ["sim", *(name for name in NAMED if name != "meso")]
+    assert spelled_out(["all"]) == ["sim", *(name for name in NAMED_DOMAINS if name != "meso")]
     assert spelled_out(["sim", "V4", "Transition", "V4"])[:4] == ["sim", "V4", "V1", "V2"]
-    assert {NAMED[name].gap for name in spelled_out(["action"])} == {"action"}
+    assert {NAMED_DOMAINS[name].gap for name in spelled_out(["action"])} == {"action"}
 
 
 @pytest.mark.parametrize("arguments", [[], ["action"], ["reward", "--json"]])
 def test_the_command(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["domains", *arguments]) == 0
     shown = capsys.readouterr().out
-    listed = [item for item in NAMED.values() if not arguments or item.gap == arguments[0]]
+    listed = [item for item in NAMED_DOMAINS.values() if not arguments or item.gap == arguments[0]]
     assert all(item.name in shown for item in listed)
     if not arguments:
-        assert f"{len(NAMED)} domains, 33 with a counterpart" in shown
+        assert f"{len(NAMED_DOMAINS)} domains, 33 with a counterpart" in shown
 
 
 def test_a_gap_that_does_not_exist(capsys: pytest.CaptureFixture[str]) -> None:
@@ -409,7 +411,7 @@ def values_of(effect: Effect) -> list[Any]:
 
 
 @pytest.mark.filterwarnings("ignore:.*no vehicle has entered")
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", NAMED_DOMAINS)
 def test_a_named_domain_is_read_back_from_the_running_environment(name: str) -> None:
     effects = {effect.name: effect for effect in parse_domain(name)}  # the last of equals counts
     trace = Trace(
@@ -423,7 +425,7 @@ def test_a_named_domain_is_read_back_from_the_running_environment(name: str) -> 
 def test_the_checks_can_fail() -> None:
     """A street without the effects fails every check."""
     trace = Trace("detector_failure=0+lost_commands=0", 300)
-    for effect in {effect for name in NAMED for effect in parse_domain(name)}:
+    for effect in {effect for name in NAMED_DOMAINS for effect in parse_domain(name)}:
         if effect.name not in ("max_green", "objective"):  # no green is long, costs are measured
             with pytest.raises(
                 (AssertionError, ValueError, TypeError, IndexError, ArithmeticError)

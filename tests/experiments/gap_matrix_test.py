@@ -11,7 +11,7 @@ from rich.console import Console
 from ugat_marl.__main__ import main
 from ugat_marl.cli.evaluate import Evaluate
 from ugat_marl.data import Scores
-from ugat_marl.effects import NAMED, load_scenario
+from ugat_marl.effects import NAMED_DOMAINS, load_scenario
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
 from ugat_marl.experiments.scores import Result
@@ -119,15 +119,15 @@ def test_domains_a_network_does_not_allow_are_left_out(
         left = Evaluate(str(scenario), domains=("sim", "action"))._domains(
             load_scenario(scenario), console
         )
-    assert {name for name in NAMED if NAMED[name].gap == "action"} - set(left) == {
+    assert {name for name in NAMED_DOMAINS if NAMED_DOMAINS[name].gap == "action"} - set(left) == {
         "barrier-leading", "barrier-lagging", "barrier-both",
     }  # fmt: skip
     assert "barrier-both is left out: phase order" in capture.get()
     command = Evaluate("single-v1", domains=("sim", "transition"), duration_s=300)
     with console.capture() as capture:
         left = command._domains(load_scenario("single-v1"), console)
-    late = {name for name, item in NAMED.items() if "demand_timing=*,300" in item.effects}
-    assert late and {name for name in NAMED if NAMED[name].gap == "transition"} - set(left) == {
+    late = {name for name, item in NAMED_DOMAINS.items() if "demand_timing=*,300" in item.effects}
+    assert late and {name for name in NAMED_DOMAINS if NAMED_DOMAINS[name].gap == "transition"} - set(left) == {
         *late, "meso",
     }  # fmt: skip
     assert all(f"{name} is left out: " in capture.get() for name in late)

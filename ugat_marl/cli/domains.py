@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from ugat_marl.effects import ALIASES, GAP_KINDS, NAMED, NamedDomain
+from ugat_marl.effects import ALIASES, GAP_KINDS, NAMED_DOMAINS, NamedDomain
 from ugat_marl.errors import UnknownNameError
 
 _TITLES = {
@@ -48,7 +48,7 @@ class Domains:
         """Print the lists."""
         if self.gap is not None and self.gap not in GAP_KINDS:
             raise UnknownNameError("gap", self.gap, GAP_KINDS)
-        listed = [item for item in NAMED.values() if self.gap in (None, item.gap)]
+        listed = [item for item in NAMED_DOMAINS.values() if self.gap in (None, item.gap)]
         if self.json:
             console.print_json(json.dumps([asdict(item) for item in listed]))
             return 0

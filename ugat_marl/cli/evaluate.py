@@ -11,7 +11,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import RayAddress, workers_of
-from ugat_marl.effects import NAMED, load_scenario, spelled_out
+from ugat_marl.effects import NAMED_DOMAINS, load_scenario, spelled_out
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments import evaluate, gaps_of, policy_factory
@@ -98,7 +98,7 @@ class Evaluate:
         """Return the names of all domains, without those that do not fit the network."""
         found: list[str] = []
         for name in spelled_out(self.domains):
-            if name in NAMED and name not in self.domains and _may_not_fit(name):
+            if name in NAMED_DOMAINS and name not in self.domains and _may_not_fit(name):
                 try:
                     parallel_env(scenario, name, duration_s=self.duration_s)
                 except ScenarioError as error:
@@ -115,7 +115,7 @@ def _may_not_fit(name: str) -> bool:
     demand, all vehicles may come after the end of a short episode.
     """
     words = ("phase_order=barrier", "incident=", "demand_timing=")
-    return any(word in NAMED[name].effects for word in words)
+    return any(word in NAMED_DOMAINS[name].effects for word in words)
 
 
 def names_of(policies: Sequence[str]) -> list[str]:

@@ -32,7 +32,7 @@ from .documents import seconds_text as seconds_text
 from .documents import sort_departures as sort_departures
 from .domains import ALIASES as ALIASES
 from .domains import GAP_KINDS as GAP_KINDS
-from .domains import NAMED as NAMED
+from .domains import NAMED_DOMAINS as NAMED_DOMAINS
 from .domains import SETTINGS as SETTINGS
 from .domains import Domain as Domain
 from .domains import NamedDomain as NamedDomain

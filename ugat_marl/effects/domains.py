@@ -32,7 +32,7 @@ GAP_KINDS: tuple[Gap, ...] = get_args(Gap)
 
 @dataclass(frozen=True)
 class NamedDomain:
-    """A domain with a name, see `NAMED`.
+    """A domain with a name, see `NAMED_DOMAINS`.
 
     Attributes:
         name: Name of the domain; small and capital letters are the same.
@@ -185,7 +185,7 @@ def _reward() -> list[NamedDomain]:
     ]
 
 
-NAMED: dict[str, NamedDomain] = {
+NAMED_DOMAINS: dict[str, NamedDomain] = {
     item.name: item for item in (*_observation(), *_action(), *_transition(), *_reward())
 }
 """All named domains, by name."""
@@ -211,7 +211,7 @@ def spelled_out(names: Sequence[str]) -> list[str]:
             domains. Both leave out those in `TO_TRAIN_IN`.
     """
     found: list[str] = []
-    streets = [item for item in NAMED.values() if item.name not in TO_TRAIN_IN]
+    streets = [item for item in NAMED_DOMAINS.values() if item.name not in TO_TRAIN_IN]
     for name in names:
         if name.lower() == "all":
             found += ["sim", *(item.name for item in streets)]
@@ -245,10 +245,10 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
     if name == "sim":
         return ()
     if name in _names():
-        return parse_domain(NAMED[_names()[name]].effects)
+        return parse_domain(NAMED_DOMAINS[_names()[name]].effects)
     if "=" in name:
         return (effect_from_text(parts[0]),)
-    near = nearest(name, ("sim", *NAMED, *ALIASES))
+    near = nearest(name, ("sim", *NAMED_DOMAINS, *ALIASES))
     raise UnknownNameError(
         "domain",
         domain,
@@ -260,7 +260,7 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
 
 def _names() -> dict[str, str]:
     """Return names and aliases in lower case, each with the name of its domain."""
-    return {name.lower(): name for name in NAMED} | ALIASES
+    return {name.lower(): name for name in NAMED_DOMAINS} | ALIASES
 
 
 def _parts(domain: str) -> list[str]:
@@ -337,7 +337,7 @@ def _signals(scenario: Scenario) -> set[tuple[str, ...]]:
 
 
 SETTINGS: dict[str, tuple[Effect, ...]] = {
-    name: parse_domain(NAMED[name].effects) for name in ("V1", "V2", "V3", "V4")
+    name: parse_domain(NAMED_DOMAINS[name].effects) for name in ("V1", "V2", "V3", "V4")
 }
 """Da et al. (2023), table "Real-world Configurations": accel, decel, emergencyDecel (m/s^2) and
 startupDelay (s). The default, our ``sim``, is 2.60 / 4.50 / 9.00 / 0.00."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects import GAP_KINDS, NAMED
+from ugat_marl.effects import GAP_KINDS, NAMED_DOMAINS
 from ugat_marl.experiments.scores import Estimate, Evaluation
 
 
@@ -34,7 +34,7 @@ def gaps_of(found: Evaluation) -> dict[str, list[str]]:
     """Return the names of the evaluation's domains by gap, without gaps that have no domain."""
     others = found.domains[1:]
     listed = {
-        gap: [name for name in others if name in NAMED and NAMED[name].gap == gap]
+        gap: [name for name in others if name in NAMED_DOMAINS and NAMED_DOMAINS[name].gap == gap]
         for gap in GAP_KINDS
     }
     return {gap: names for gap, names in listed.items() if names}
