@@ -17,7 +17,7 @@ import sumo
 
 from ugat_marl import parallel_env
 from ugat_marl.effects import (
-    ALIASES,
+    DOMAIN_ALIASES,
     SETTINGS,
     Acceleration,
     Deceleration,
@@ -60,14 +60,14 @@ def test_settings_are_the_paper_s(name: str) -> None:
         StartupDelay(startup),
     )
     assert SETTINGS[name] == expected
-    alias = next(alias for alias, target in ALIASES.items() if target == name)
+    alias = next(alias for alias, target in DOMAIN_ALIASES.items() if target == name)
     for spelling in (name, name.lower(), alias, alias.upper(), f" {name}"):
         assert parse_domain(spelling) == expected
     assert describe(name.lower()) == describe(alias) == name
 
 
 def test_aliases() -> None:
-    assert ALIASES == {"light-loads": "V1", "heavy-loads": "V2", "rain": "V3", "snow": "V4"}
+    assert DOMAIN_ALIASES == {"light-loads": "V1", "heavy-loads": "V2", "rain": "V3", "snow": "V4"}
 
 
 def test_sim_is_no_effect() -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import ugat_marl
 from ugat_marl.__main__ import main
 from ugat_marl.effects import (
-    ALIASES,
+    DOMAIN_ALIASES,
     GAP_KINDS,
     NAMED_DOMAINS,
     SETTINGS,
@@ -60,7 +60,7 @@ def test_names_are_spelled_as_one_likes() -> None:
         assert item.gap in GAP_KINDS
         assert parse_domain(name.upper()) == parse_domain(f" {name} ") == parse_domain(item.effects)
         assert describe(name.upper()) == name
-        assert name not in ALIASES and parse_domain(f"{name}+V1")[-4:] == SETTINGS["V1"]
+        assert name not in DOMAIN_ALIASES and parse_domain(f"{name}+V1")[-4:] == SETTINGS["V1"]
     for name, effects in SETTINGS.items():
         assert parse_domain(NAMED_DOMAINS[name].effects) == effects
     assert len({in_domain(load_scenario("single-v1"), name).hash for name in NAMED_DOMAINS}) == len(

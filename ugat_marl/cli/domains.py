@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from ugat_marl.effects import ALIASES, GAP_KINDS, NAMED_DOMAINS, NamedDomain
+from ugat_marl.effects import DOMAIN_ALIASES, GAP_KINDS, NAMED_DOMAINS, NamedDomain
 from ugat_marl.errors import UnknownNameError
 
 _TITLES = {
@@ -76,7 +76,7 @@ def _table(title: str, domains: list[NamedDomain]) -> Table:
     table.add_column("domain", no_wrap=True)
     table.add_column("effects", overflow="fold")
     table.add_column("Sim2Signal", max_width=21, overflow="fold")
-    aliases = {name: alias for alias, name in ALIASES.items()}
+    aliases = {name: alias for alias, name in DOMAIN_ALIASES.items()}
     for item in domains:
         alias = f" ({aliases[item.name]})" if item.name in aliases else ""
         effects = item.effects.replace("+", " + ")

@@ -8,7 +8,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from ugat_marl.effects import ALIASES, SETTINGS, load_scenario
+from ugat_marl.effects import DOMAIN_ALIASES, SETTINGS, load_scenario
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import Network, check_demand, resco_maps, shipped_scenarios
 
@@ -34,7 +34,7 @@ class ScenarioList:
         console.print(table)
         if not maps:
             console.print("RESCO networks: pip install 'ugat-marl[resco]'", markup=False)
-        aliases = {setting: alias for alias, setting in ALIASES.items()}
+        aliases = {setting: alias for alias, setting in DOMAIN_ALIASES.items()}
         for setting, effects in SETTINGS.items():
             values = ", ".join(map(str, effects))
             console.print(f"domain {setting} ({aliases[setting]}): {values}")

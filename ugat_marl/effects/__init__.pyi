@@ -30,7 +30,7 @@ from .documents import depart_s as depart_s
 from .documents import edit_scenario as edit_scenario
 from .documents import seconds_text as seconds_text
 from .documents import sort_departures as sort_departures
-from .domains import ALIASES as ALIASES
+from .domains import DOMAIN_ALIASES as DOMAIN_ALIASES
 from .domains import GAP_KINDS as GAP_KINDS
 from .domains import NAMED_DOMAINS as NAMED_DOMAINS
 from .domains import SETTINGS as SETTINGS

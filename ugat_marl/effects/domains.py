@@ -194,7 +194,7 @@ NAMED_DOMAINS: dict[str, NamedDomain] = {
 TO_TRAIN_IN = frozenset({"meso"})
 """Named domains that are simulations for training, and no real domains."""
 
-ALIASES: dict[str, str] = {
+DOMAIN_ALIASES: dict[str, str] = {
     "light-loads": "V1",
     "heavy-loads": "V2",
     "rain": "V3",
@@ -248,11 +248,11 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
         return parse_domain(NAMED_DOMAINS[_names()[name]].effects)
     if "=" in name:
         return (effect_from_text(parts[0]),)
-    near = nearest(name, ("sim", *NAMED_DOMAINS, *ALIASES))
+    near = nearest(name, ("sim", *NAMED_DOMAINS, *DOMAIN_ALIASES))
     raise UnknownNameError(
         "domain",
         domain,
-        ("sim", *SETTINGS, *ALIASES, *([near] if near else [])),
+        ("sim", *SETTINGS, *DOMAIN_ALIASES, *([near] if near else [])),
         "ugat-marl domains lists all names. Effects (startup_delay=0.5+acceleration=1.0) and the "
         "directory of another scenario on the same network work as well.",
     )
@@ -260,7 +260,7 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
 
 def _names() -> dict[str, str]:
     """Return names and aliases in lower case, each with the name of its domain."""
-    return {name.lower(): name for name in NAMED_DOMAINS} | ALIASES
+    return {name.lower(): name for name in NAMED_DOMAINS} | DOMAIN_ALIASES
 
 
 def _parts(domain: str) -> list[str]:
