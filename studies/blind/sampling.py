@@ -13,7 +13,7 @@ from studies.blind.outside_effects import BusStops, Driveway
 from studies.blind.places import Busy
 from studies.blind.strengths import KINDS, MODELS, SCALE, STRENGTHS, nominal_of
 from ugat_marl.diagnosis import IN_THE_LOG
-from ugat_marl.effects import EVERYWHERE, SETTINGS, Effect, effect_from, known_effects
+from ugat_marl.effects import EVERYWHERE, PAPER_WORLDS, Effect, effect_from, known_effects
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Scenario, edge_of
 
@@ -111,7 +111,7 @@ def draw_tasks(
 def _members(name: str, strengths: Sequence[str]) -> list[Task]:
     """Return all tasks of a group, or of an effect."""
     if name == "setting":
-        return [Task(name, setting) for setting in SETTINGS]
+        return [Task(name, setting) for setting in PAPER_WORLDS]
     if name == "outside":
         return [Task(name, member) for member in OUTSIDE]
     if name in GROUPS and name != "single":
@@ -132,7 +132,7 @@ def draw_sample(
     if task.group == "none":
         return _with_decoy(Sample("none", "none", "", ()), generator)
     if task.group == "setting":
-        sample = Sample("setting", task.member, "", SETTINGS[task.member])
+        sample = Sample("setting", task.member, "", PAPER_WORLDS[task.member])
         return _with_decoy(sample, generator)
     if task.group == "outside":
         return _outside(task.member, scenario, busy, generator)

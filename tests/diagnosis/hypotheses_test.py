@@ -10,7 +10,7 @@ import pytest
 
 from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
 from ugat_marl.diagnosis.hypotheses import LOCAL, library, settings_as_members
-from ugat_marl.effects import SETTINGS, known_effects, load_scenario, parse_domain
+from ugat_marl.effects import PAPER_WORLDS, known_effects, load_scenario, parse_domain
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
 
@@ -155,8 +155,8 @@ def test_trucks_keep_their_own_acceleration() -> None:
 
 def test_the_settings_of_the_paper_are_starting_points(single: Scenario) -> None:
     found = settings_as_members(global_hypotheses(single, library()))
-    assert len(found) == len(SETTINGS)
-    for members, effects in zip(found, SETTINGS.values(), strict=True):
+    assert len(found) == len(PAPER_WORLDS)
+    for members, effects in zip(found, PAPER_WORLDS.values(), strict=True):
         values = {hypothesis.name: value for hypothesis, value in members}
         for effect in effects:
             if effect.name in values:

@@ -18,7 +18,7 @@ import sumo
 from ugat_marl import parallel_env
 from ugat_marl.effects import (
     DOMAIN_ALIASES,
-    SETTINGS,
+    PAPER_WORLDS,
     Acceleration,
     Deceleration,
     Effect,
@@ -59,7 +59,7 @@ def test_settings_are_the_paper_s(name: str) -> None:
         EmergencyDeceleration(emergency),
         StartupDelay(startup),
     )
-    assert SETTINGS[name] == expected
+    assert PAPER_WORLDS[name] == expected
     alias = next(alias for alias, target in DOMAIN_ALIASES.items() if target == name)
     for spelling in (name, name.lower(), alias, alias.upper(), f" {name}"):
         assert parse_domain(spelling) == expected
@@ -82,10 +82,12 @@ def test_domains_of_effects() -> None:
     assert parse_domain(list(expected)) == expected
     assert describe(expected) == "startup_delay=0.5+acceleration=1"
     assert parse_domain(describe(expected)) == expected
-    assert parse_domain("V1+startup_delay=2") == (*SETTINGS["V1"], StartupDelay(2.0))
+    assert parse_domain("V1+startup_delay=2") == (*PAPER_WORLDS["V1"], StartupDelay(2.0))
 
 
-@pytest.mark.parametrize("effect", [e for setting in SETTINGS.values() for e in setting], ids=str)
+@pytest.mark.parametrize(
+    "effect", [e for setting in PAPER_WORLDS.values() for e in setting], ids=str
+)
 def test_an_effect_survives_every_spelling(effect: Effect) -> None:
     assert parse_domain(str(effect)) == (effect,)
     assert effect_from({"name": effect.name, **dataclasses.asdict(effect)}) == effect
@@ -331,18 +333,18 @@ def test_the_original_does_not_change(crossing: Crossing) -> None:
     before = {file: file.read_bytes() for file in directory.iterdir()}
     scenario = load_scenario(directory)
     original = scenario.hash
-    derived = {name: in_domain(scenario, name) for name in (*SETTINGS, "acceleration=2.5")}
+    derived = {name: in_domain(scenario, name) for name in (*PAPER_WORLDS, "acceleration=2.5")}
     assert load_scenario(directory).hash == scenario.hash == original
-    assert len({original, *(item.hash for item in derived.values())}) == 2 + len(SETTINGS)
+    assert len({original, *(item.hash for item in derived.values())}) == 2 + len(PAPER_WORLDS)
     assert {file: file.read_bytes() for file in directory.iterdir()} == before
     assert in_domain(scenario, "V2").hash == derived["V2"].hash
-    assert derived["V1"].applied == tuple(map(str, SETTINGS["V1"]))
+    assert derived["V1"].applied == tuple(map(str, PAPER_WORLDS["V1"]))
     assert derived["V1"].id == scenario.id
 
 
 def test_the_order_of_different_effects_does_not_matter(crossing: Crossing) -> None:
     scenario = load_scenario(crossing())
-    effects = list(SETTINGS["V3"])
+    effects = list(PAPER_WORLDS["V3"])
 
     def types(derived: Scenario) -> list[dict[str, str]]:
         documents = (*derived.additional, *derived.routes)

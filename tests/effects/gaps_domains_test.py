@@ -18,7 +18,7 @@ from ugat_marl.effects import (
     DOMAIN_ALIASES,
     GAP_KINDS,
     NAMED_DOMAINS,
-    SETTINGS,
+    PAPER_WORLDS,
     Effect,
     describe,
     effects_on_controllers,
@@ -60,8 +60,8 @@ def test_names_are_spelled_as_one_likes() -> None:
         assert item.gap in GAP_KINDS
         assert parse_domain(name.upper()) == parse_domain(f" {name} ") == parse_domain(item.effects)
         assert describe(name.upper()) == name
-        assert name not in DOMAIN_ALIASES and parse_domain(f"{name}+V1")[-4:] == SETTINGS["V1"]
-    for name, effects in SETTINGS.items():
+        assert name not in DOMAIN_ALIASES and parse_domain(f"{name}+V1")[-4:] == PAPER_WORLDS["V1"]
+    for name, effects in PAPER_WORLDS.items():
         assert parse_domain(NAMED_DOMAINS[name].effects) == effects
     assert len({in_domain(load_scenario("single-v1"), name).hash for name in NAMED_DOMAINS}) == len(
         NAMED_DOMAINS

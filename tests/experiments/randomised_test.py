@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ugat_marl.effects import SETTINGS, in_domain, load_scenario
+from ugat_marl.effects import PAPER_WORLDS, in_domain, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import ScenarioError
 from ugat_marl.experiments.randomised import RandomisedEnv, drawn, effect_ranges, randomised_env
@@ -34,7 +34,7 @@ def test_the_ranges_are_the_hull_of_the_worlds_the_simulation_and_the_library() 
         "emergency_deceleration": (2.0, 9.0),  # V4 and sim
         "startup_delay": (0.0, 1.2),  # sim and the strongest a diagnosis reckons with
     }
-    for effects in SETTINGS.values():
+    for effects in PAPER_WORLDS.values():
         for effect in effects:
             low, high = found[effect.name]
             assert low <= value(effect) <= high

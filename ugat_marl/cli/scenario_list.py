@@ -8,7 +8,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from ugat_marl.effects import DOMAIN_ALIASES, SETTINGS, load_scenario
+from ugat_marl.effects import DOMAIN_ALIASES, PAPER_WORLDS, load_scenario
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import Network, check_demand, resco_maps, shipped_scenarios
 
@@ -35,7 +35,7 @@ class ScenarioList:
         if not maps:
             console.print("RESCO networks: pip install 'ugat-marl[resco]'", markup=False)
         aliases = {setting: alias for alias, setting in DOMAIN_ALIASES.items()}
-        for setting, effects in SETTINGS.items():
+        for setting, effects in PAPER_WORLDS.items():
             values = ", ".join(map(str, effects))
             console.print(f"domain {setting} ({aliases[setting]}): {values}")
         return 0

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.effects import EVERYWHERE, SETTINGS, Effect, ExaminedStrengths, known_effects
+from ugat_marl.effects import EVERYWHERE, PAPER_WORLDS, Effect, ExaminedStrengths, known_effects
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
 
@@ -169,7 +169,7 @@ def settings_as_members(
     """
     known = {item.name: item for item in hypotheses}
     found: list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]] = []
-    for effects in SETTINGS.values():
+    for effects in PAPER_WORLDS.values():
         members = [
             (known[effect.name], free_values(effect, known[effect.name]))
             for effect in effects

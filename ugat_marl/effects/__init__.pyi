@@ -33,7 +33,7 @@ from .documents import sort_departures as sort_departures
 from .domains import DOMAIN_ALIASES as DOMAIN_ALIASES
 from .domains import GAP_KINDS as GAP_KINDS
 from .domains import NAMED_DOMAINS as NAMED_DOMAINS
-from .domains import SETTINGS as SETTINGS
+from .domains import PAPER_WORLDS as PAPER_WORLDS
 from .domains import Domain as Domain
 from .domains import NamedDomain as NamedDomain
 from .domains import describe as describe

@@ -252,7 +252,7 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
     raise UnknownNameError(
         "domain",
         domain,
-        ("sim", *SETTINGS, *DOMAIN_ALIASES, *([near] if near else [])),
+        ("sim", *PAPER_WORLDS, *DOMAIN_ALIASES, *([near] if near else [])),
         "ugat-marl domains lists all names. Effects (startup_delay=0.5+acceleration=1.0) and the "
         "directory of another scenario on the same network work as well.",
     )
@@ -336,7 +336,7 @@ def _signals(scenario: Scenario) -> set[tuple[str, ...]]:
     }
 
 
-SETTINGS: dict[str, tuple[Effect, ...]] = {
+PAPER_WORLDS: dict[str, tuple[Effect, ...]] = {
     name: parse_domain(NAMED_DOMAINS[name].effects) for name in ("V1", "V2", "V3", "V4")
 }
 """Da et al. (2023), table "Real-world Configurations": accel, decel, emergencyDecel (m/s^2) and

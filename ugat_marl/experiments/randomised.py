@@ -14,7 +14,7 @@ from typing import Any
 from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
-from ugat_marl.effects import SETTINGS, Domain, Effect, in_domain
+from ugat_marl.effects import PAPER_WORLDS, Domain, Effect, in_domain
 from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import Scenario
@@ -53,7 +53,7 @@ def effect_ranges(scenario: Scenario) -> tuple[Range, ...]:
     Args:
         scenario: The simulation; its vehicle types hold the present values.
     """
-    settings = [effect for effects in SETTINGS.values() for effect in effects]
+    settings = [effect for effects in PAPER_WORLDS.values() for effect in effects]
     found: list[Range] = []
     for item in global_hypotheses(scenario, {effect.name for effect in settings}):
         values = [level[0] for level in item.levels if level not in item.extreme]

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ugat_marl.effects import SETTINGS, in_domain, load_scenario
+from ugat_marl.effects import PAPER_WORLDS, in_domain, load_scenario
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.scenarios import (
     GREEN,
@@ -223,7 +223,7 @@ def effects_change_it(case: ScenarioCase) -> None:
     """V1 to V4 can be applied, give four new hashes, and run in SUMO."""
     case.need_demand()
     hashes = {case.scenario.hash: "sim"}
-    for name in SETTINGS:
+    for name in PAPER_WORLDS:
         changed = case.in_domain(name)
         other = hashes.setdefault(changed.hash, name)
         require(

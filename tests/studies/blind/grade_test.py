@@ -14,7 +14,7 @@ from studies.blind.cases import Case, Hidden, Label, write_label, write_plan
 from studies.blind.grade import Grade, grade, grade_cases, read_grades
 from studies.blind.strengths import KINDS, nominal_of
 from studies.blind.table import AIMS, confusion, markdown, rows_of, wilson, write_table
-from ugat_marl.effects import SETTINGS, effect_from, known_effects, load_scenario
+from ugat_marl.effects import PAPER_WORLDS, effect_from, known_effects, load_scenario
 from ugat_marl.errors import BlindTestError
 
 
@@ -58,7 +58,7 @@ OUTSIDE = replace(label(group="outside"), hidden="bus_stops")
 
 
 def setting(name: str) -> Label:
-    return replace(label(*map(Hidden.of, SETTINGS[name]), group="setting"), hidden=name)
+    return replace(label(*map(Hidden.of, PAPER_WORLDS[name]), group="setting"), hidden=name)
 
 
 THREE = (effect("acceleration"), effect("deceleration"), effect("startup_delay"))
