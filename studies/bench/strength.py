@@ -14,7 +14,7 @@ from statistics import fmean
 from typing import Any
 
 from studies.bench.report import Report, Target, require_positive
-from ugat_marl.effects import describe, load_scenario
+from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import (
     DIRECT,
@@ -142,7 +142,7 @@ class StrengthBench:
         learner = "DQN" if self.learner == DQN_NAME else self.learner
         seeds = evaluation_seeds(self.evaluation_seeds)
         notes = [
-            f"{self.scenario} in {describe(self.domain)}: {named} {rule}, {rule_s:.1f} s; "
+            f"{self.scenario} in {domain_label(self.domain)}: {named} {rule}, {rule_s:.1f} s; "
             f"{learner} after {self.episodes} episodes {final_s:.1f} s. ATT over all vehicles due, "
             f"on seeds {seeds[0]} to {seeds[-1]}."
         ]

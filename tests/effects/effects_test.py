@@ -25,7 +25,7 @@ from ugat_marl.effects import (
     EmergencyDeceleration,
     StartupDelay,
     apply_effects,
-    describe,
+    domain_label,
     effect_from,
     in_domain,
     known_effects,
@@ -63,7 +63,7 @@ def test_settings_are_the_paper_s(name: str) -> None:
     alias = next(alias for alias, target in DOMAIN_ALIASES.items() if target == name)
     for spelling in (name, name.lower(), alias, alias.upper(), f" {name}"):
         assert parse_domain(spelling) == expected
-    assert describe(name.lower()) == describe(alias) == name
+    assert domain_label(name.lower()) == domain_label(alias) == name
 
 
 def test_aliases() -> None:
@@ -72,7 +72,7 @@ def test_aliases() -> None:
 
 def test_sim_is_no_effect() -> None:
     assert parse_domain("sim") == parse_domain("SIM") == parse_domain([]) == ()
-    assert describe([]) == "sim"
+    assert domain_label([]) == "sim"
 
 
 def test_domains_of_effects() -> None:
@@ -80,8 +80,8 @@ def test_domains_of_effects() -> None:
     assert parse_domain("startup_delay=0.5+acceleration=1.0") == expected
     assert parse_domain("startup_delay = 0.5 + acceleration=1") == expected
     assert parse_domain(list(expected)) == expected
-    assert describe(expected) == "startup_delay=0.5+acceleration=1"
-    assert parse_domain(describe(expected)) == expected
+    assert domain_label(expected) == "startup_delay=0.5+acceleration=1"
+    assert parse_domain(domain_label(expected)) == expected
     assert parse_domain("V1+startup_delay=2") == (*PAPER_WORLDS["V1"], StartupDelay(2.0))
 
 

@@ -20,7 +20,7 @@ from ugat_marl.effects import (
     NAMED_DOMAINS,
     PAPER_WORLDS,
     Effect,
-    describe,
+    domain_label,
     effects_on_controllers,
     in_domain,
     load_scenario,
@@ -59,14 +59,14 @@ def test_names_are_spelled_as_one_likes() -> None:
     for name, item in NAMED_DOMAINS.items():
         assert item.gap in GAP_KINDS
         assert parse_domain(name.upper()) == parse_domain(f" {name} ") == parse_domain(item.effects)
-        assert describe(name.upper()) == name
+        assert domain_label(name.upper()) == name
         assert name not in DOMAIN_ALIASES and parse_domain(f"{name}+V1")[-4:] == PAPER_WORLDS["V1"]
     for name, effects in PAPER_WORLDS.items():
         assert parse_domain(NAMED_DOMAINS[name].effects) == effects
     assert len({in_domain(load_scenario("single-v1"), name).hash for name in NAMED_DOMAINS}) == len(
         NAMED_DOMAINS
     )
-    assert describe("sim") == "sim" and describe("startup_delay=1") == "startup_delay=1"
+    assert domain_label("sim") == "sim" and domain_label("startup_delay=1") == "startup_delay=1"
 
 
 def test_no_name_is_that_of_an_effect_or_of_a_gap() -> None:

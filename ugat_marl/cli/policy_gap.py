@@ -13,7 +13,7 @@ from ugat_marl.cli.arguments import LengthS, Workers
 from ugat_marl.cli.diagnose import REPORT
 from ugat_marl.cli.evaluate import names_of
 from ugat_marl.diagnosis import FILE
-from ugat_marl.effects import describe, load_scenario
+from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory, policy_gap, read_diagnosis, write_policy_gap
 from ugat_marl.files import require_writable
@@ -91,6 +91,6 @@ class PolicyGap:
         if page.is_file():  # diagnose --no-report writes no page
             commands = commands_on_page(page)
             write_diagnosis_page(diagnosis, Network.read(scenario), page, commands)
-        title = f"{scenario.id}: average travel time in s, real: {describe(self.real)}"
+        title = f"{scenario.id}: average travel time in s, real: {domain_label(self.real)}"
         console.print(policy_gap_table(title, gaps, self.seeds))
         return 0

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import RayAddress, Workers, workers_of
 from ugat_marl.cli.evaluate import names_of
-from ugat_marl.effects import describe, load_scenario
+from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory
@@ -130,7 +130,7 @@ class Rollout:
             scenario, self.domain, options, make, self.epsilon, self.observation, self.neighbours
         )
         seeds = [derive_seed(self.seed, "rollout", episode) for episode in range(self.episodes)]
-        title = f"{self.policy} in {describe(self.domain)}"
+        title = f"{self.policy} in {domain_label(self.domain)}"
         with workers_of(self.workers, self.ray) as workers:
             log, _ = roll_outs(each, seeds, workers=workers, reporter=Bars(console), title=title)
         log.write(out)

@@ -12,7 +12,7 @@ from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, workers_of
 from ugat_marl.data import METRICS_FILE, Metrics
-from ugat_marl.effects import describe
+from ugat_marl.effects import domain_label
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig, transfer
 from ugat_marl.progress import Bars
@@ -69,5 +69,5 @@ class Train:
 
 def _names(config: TransferConfig) -> tuple[str, str]:
     """Return scenario and real domain; a path gives its last part."""
-    scenario, real = config.scenario, describe(config.real)
+    scenario, real = config.scenario, domain_label(config.real)
     return Path(scenario).name.removesuffix(".sumocfg"), Path(real).name

@@ -11,7 +11,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import LengthS, RayAddress, Workers, workers_of
-from ugat_marl.effects import describe, load_scenario
+from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import BUDGET, LEAST_BUDGET, TUNED_RULES, tune
 from ugat_marl.files import require_writable, write_whole
@@ -80,7 +80,7 @@ class Tune:
                 )
                 for name in self.rules
             ]
-        console.print(tuning_table(f"{scenario.id} in {describe(self.domain)}", found))
+        console.print(tuning_table(f"{scenario.id} in {domain_label(self.domain)}", found))
         if self.out is not None:
             write_whole(self.out, json.dumps([asdict(each) for each in found], indent=1) + "\n")
             console.print(f"table: {self.out}", soft_wrap=True)

@@ -36,7 +36,7 @@ from .domains import NAMED_DOMAINS as NAMED_DOMAINS
 from .domains import PAPER_WORLDS as PAPER_WORLDS
 from .domains import Domain as Domain
 from .domains import NamedDomain as NamedDomain
-from .domains import describe as describe
+from .domains import domain_label as domain_label
 from .domains import in_domain as in_domain
 from .domains import parse_domain as parse_domain
 from .domains import scenario_of as scenario_of

@@ -277,7 +277,7 @@ def _parts(domain: str) -> list[str]:
     return [part.strip() for part in parts]
 
 
-def describe(domain: Domain) -> str:
+def domain_label(domain: Domain) -> str:
     """Return the short name of a domain for tables."""
     if isinstance(domain, str):
         return _names().get(domain.strip().lower(), domain)

@@ -16,7 +16,7 @@ from ugat_marl.data import AgentLayout, EpisodeRecorder, Scores
 from ugat_marl.effects import (
     Domain,
     controller_effects,
-    describe,
+    domain_label,
     in_domain,
     late_greens,
     load_scenario,
@@ -71,7 +71,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.scenario = in_domain(scenario, domain)
         if options.duration_s is not None:
             self.scenario = self.scenario.with_duration(options.duration_s)
-        self.domain = describe(domain)
+        self.domain = domain_label(domain)
         self.options = options
         self.render_mode = options.render_mode
         self.network = Network.read(self.scenario)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ugat_marl.effects import Domain, describe
+from ugat_marl.effects import Domain, domain_label
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.experiments.scores import Evaluation, Result, Trial
@@ -79,7 +79,7 @@ def evaluate(
         notes: Further facts, kept with the result.
         watch: Makes callbacks that observe the environments; needs workers in this process.
     """
-    names = [describe(domain) for domain in domains]
+    names = [domain_label(domain) for domain in domains]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
     # Made once for all policies. A wrong name is an error now, not in an hour.
@@ -103,7 +103,8 @@ def evaluate(
             for _ in played:
                 advance()
     order = {
-        (name, describe(domain)): i for i, (name, domain) in enumerate(_pairs(policies, domains))
+        (name, domain_label(domain)): i
+        for i, (name, domain) in enumerate(_pairs(policies, domains))
     }
     results.sort(key=lambda r: (order[r.policy, r.domain], r.seed))
     return Evaluation(scenario.id, scenario.hash, tuple(results), dict(notes or {}))
@@ -136,9 +137,9 @@ def best_rules(
             duration_s=duration_s,
             workers=workers,
             reporter=reporter,
-            title=f"best rule in {describe(domain)}",
+            title=f"best rule in {domain_label(domain)}",
         )
-        found[describe(domain)] = trials[0].spec
+        found[domain_label(domain)] = trials[0].spec
     return found
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ugat_marl.effects import describe, load_scenario, scenario_of
+from ugat_marl.effects import domain_label, load_scenario, scenario_of
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments.comparison import Comparison, Trial
 from ugat_marl.experiments.driver import perform_all, record_of
@@ -118,7 +118,7 @@ def late_in(sim: str, seconds: int) -> str:
             "--constants without any number"
         )
     late = f"late_green=*,{seconds}"
-    return late if describe(sim) == "sim" else f"{describe(sim)}+{late}"
+    return late if domain_label(sim) == "sim" else f"{domain_label(sim)}+{late}"
 
 
 def _ugat(name: str, ugat: UgatConfig) -> Setting:
@@ -282,10 +282,10 @@ class PaperConfig:
         require_device_name(self.device)
         if not self.scenario:
             raise OptionError("scenario is empty; name one, such as single-v1")
-        names = [describe(domain) for domain in self.domains]
+        names = [domain_label(domain) for domain in self.domains]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
-        if describe(self.sim) in names:
+        if domain_label(self.sim) in names:
             raise OptionError(f"domain {self.sim!r} is the simulation itself; name real ones")
         if self.timed.match:
             raise OptionError("rewards are matched in a row of its own; leave timed.match out")
@@ -319,8 +319,8 @@ class PaperConfig:
     def targets(self, table: str) -> list[str]:
         """Return the real domains of a table."""
         default = ("V1",) if table in ("ablation", "alpha") else ("V1", "V2", "V3", "V4")
-        found = [describe(domain) for domain in self.domains or default]
-        if left := [domain for domain in found if domain != describe(self.sim)]:
+        found = [domain_label(domain) for domain in self.domains or default]
+        if left := [domain for domain in found if domain != domain_label(self.sim)]:
             return left
         raise OptionError(
             f"table {table!r} has {self.sim} alone, to which sim is set; name domains"
@@ -374,7 +374,7 @@ def compare(
     return Comparison(
         loaded.id,
         loaded.hash,
-        describe(config.sim),
+        domain_label(config.sim),
         tuple(trials),
         {"table": table, **({} if config.learner == DQN_NAME else {"learner": config.learner})},
         constants=tuple(row.name for row in rows if row.name in late),
@@ -422,7 +422,7 @@ class Planner:
             for domain in sorted({self._config.sim, target}):
                 scores = record.played(job, job.episodes, domain)
                 for seed, own in zip(job.evaluation_seeds, scores, strict=True):
-                    found.append(Trial(row.name, target, describe(domain), job.seed, seed, own))
+                    found.append(Trial(row.name, target, domain_label(domain), job.seed, seed, own))
         return found
 
     def _columns(self, row: Setting) -> list[tuple[str, Job]]:

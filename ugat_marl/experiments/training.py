@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ugat_marl.data import Run
-from ugat_marl.effects import Domain, describe, in_domain
+from ugat_marl.effects import Domain, domain_label, in_domain
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding import (
@@ -156,8 +156,8 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
     here_m, there_m = here.control.reach_m, there.control.reach_m
     if here_m != there_m:
         raise OptionError(
-            f"agents look {here_m:g} m upstream in {describe(sim)!r} and {there_m:g} m in "
-            f"{describe(real)!r}, so that counts and rewards are not the same; give both the same "
+            f"agents look {here_m:g} m upstream in {domain_label(sim)!r} and {there_m:g} m in "
+            f"{domain_label(real)!r}, so that counts and rewards are not the same; give both the same "
             "reach, such as +reach=100"
         )
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from ugat_marl.data import Run, TransitionLog, write_settings
-from ugat_marl.effects import describe, in_domain, load_scenario
+from ugat_marl.effects import domain_label, in_domain, load_scenario
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.experiments.evaluation import (
@@ -147,14 +147,14 @@ class TransferConfig:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
         if self.rule_budget is not None and self.rule_budget < LEAST_BUDGET:
             raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
-        if describe(self.real) == describe(self.sim) and self.placebo != "same-world":
+        if domain_label(self.real) == domain_label(self.sim) and self.placebo != "same-world":
             raise OptionError(
                 f"real = {self.real!r} is the simulation itself; name another domain, such as V4, "
                 'or ask for the placebo "same-world"'
             )
-        if len({describe(domain) for domain in self.further}) < len(self.further):
+        if len({domain_label(domain) for domain in self.further}) < len(self.further):
             raise OptionError(f"further holds one twice: {' '.join(self.further)}")
-        if self.corrected is not None and describe(self.corrected) == describe(self.sim):
+        if self.corrected is not None and domain_label(self.corrected) == domain_label(self.sim):
             raise OptionError(
                 f"corrected = {self.corrected!r} is the simulation itself; name the scenario that "
                 "`ugat-marl diagnose` wrote, or another domain"
@@ -191,7 +191,9 @@ class TransferConfig:
         found: list[Setting] = []
         if self.control:
             found.append(Setting(CONTROL, "further", self.sim, spec))
-        found += [Setting(f"further in {describe(d)}", "further", d, spec) for d in self.further]
+        found += [
+            Setting(f"further in {domain_label(d)}", "further", d, spec) for d in self.further
+        ]
         if (most_s := self.random_delay_s) is not None:
             name = f"{RANDOM_DELAY} 0-{most_s} s"
             found.append(Setting(name, "delays", self.sim, spec, most_delay_s=most_s))
@@ -218,7 +220,7 @@ class TransferConfig:
     @property
     def domains(self) -> list[str]:
         """Domains in which the policies are judged."""
-        only = self.real == "none" or describe(self.real) == describe(self.sim)
+        only = self.real == "none" or domain_label(self.real) == domain_label(self.sim)
         return [self.sim] if only else [self.sim, self.real]
 
     @property
@@ -282,10 +284,10 @@ def _policies(config: TransferConfig, state: State) -> dict[str, Policy]:
 
 def _say_if_from_elsewhere(log: TransitionLog, config: TransferConfig, reporter: Reporter) -> None:
     recorded = log.provenance.domain
-    if config.real != "none" and recorded != describe(config.real):
+    if config.real != "none" and recorded != domain_label(config.real):
         reporter.say(
             f"note: the real log was recorded in {recorded!r}, the policies are judged in "
-            f"{describe(config.real)!r}"
+            f"{domain_label(config.real)!r}"
         )
 
 
@@ -323,7 +325,7 @@ def judge(
             "rules searched": searched,
             "training seed": str(config.seed),
             **({} if config.learner == DQN_NAME else {"learner": config.learner}),
-            **({} if config.corrected is None else {CORRECTED: describe(config.corrected)}),
+            **({} if config.corrected is None else {CORRECTED: domain_label(config.corrected)}),
         },
         watch=watch,
     )
@@ -431,4 +433,8 @@ def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> di
         hashes["real"] = in_domain(scenario, config.real).hash
     if config.corrected is not None:  # identified by its content, so the folder may be moved
         hashes["corrected"] = in_domain(scenario, config.corrected).hash
-    return {**settings, "scenario_hash": hashes, "domains": [describe(d) for d in config.domains]}
+    return {
+        **settings,
+        "scenario_hash": hashes,
+        "domains": [domain_label(d) for d in config.domains],
+    }

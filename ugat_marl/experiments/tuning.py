@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.data import installed_version
-from ugat_marl.effects import Domain, describe, in_domain
+from ugat_marl.effects import Domain, domain_label, in_domain
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race
 from ugat_marl.experiments.scores import Trial, Tuned
@@ -83,7 +83,7 @@ def tune(
     specs = settings_of(name, budget)
     place = _place(name, scenario, domain, budget, duration_s, specs)
     if not fresh and (trials := _recall(place, specs)):
-        return Tuned(name, describe(domain), trials)
+        return Tuned(name, domain_label(domain), trials)
     trials = race(
         scenario,
         domain,
@@ -95,7 +95,7 @@ def tune(
         title=f"tuning {name}",
     )
     write_whole(place, json.dumps([asdict(trial) for trial in trials], indent=1) + "\n")
-    return Tuned(name, describe(domain), trials)
+    return Tuned(name, domain_label(domain), trials)
 
 
 def tuned_rules(

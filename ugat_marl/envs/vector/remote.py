@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Scores
-from ugat_marl.effects import Domain, describe
+from ugat_marl.effects import Domain, domain_label
 from ugat_marl.envs.agents import AgentSet
 from ugat_marl.envs.vector.arrays import Arrays, Shape, shared_memory
 from ugat_marl.envs.vector.spec import DomainOf, Spec, Wraps, sent
@@ -176,7 +176,7 @@ class RemoteEnv:
         else:
             number = 0 if self.episode is None else self.episode.number + 1
         self._domain = domain_of(self.index, number)
-        self.episode = Episode(number, episode_seed(self._root, number), describe(self._domain))
+        self.episode = Episode(number, episode_seed(self._root, number), domain_label(self._domain))
         self._history = []
         self._deaths = 0
         self._start()
