@@ -37,9 +37,9 @@ from .domains import PAPER_WORLDS as PAPER_WORLDS
 from .domains import Domain as Domain
 from .domains import NamedDomain as NamedDomain
 from .domains import domain_label as domain_label
+from .domains import domain_path as domain_path
 from .domains import in_domain as in_domain
 from .domains import parse_domain as parse_domain
-from .domains import scenario_of as scenario_of
 from .domains import spelled_out as spelled_out
 from .engine import BlockerPatience as BlockerPatience
 from .engine import QueueModel as QueueModel

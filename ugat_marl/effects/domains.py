@@ -296,7 +296,7 @@ def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
         OptionError: An effect has an impossible value, or two of them exclude each other.
         ScenarioError: A scenario named as a domain cannot be read or has other roads.
     """
-    if (path := scenario_of(domain)) is not None:
+    if (path := domain_path(domain)) is not None:
         other = load_scenario(path)
         if _signals(other) != _signals(scenario):
             raise ScenarioError(
@@ -318,7 +318,7 @@ def _checked(scenario: Scenario) -> Scenario:
     return scenario
 
 
-def scenario_of(domain: Domain) -> Path | None:
+def domain_path(domain: Domain) -> Path | None:
     """Return the path if a domain is a scenario directory or a ``.sumocfg``, else None."""
     if not isinstance(domain, str):
         return None

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ugat_marl.effects import domain_label, load_scenario, scenario_of
+from ugat_marl.effects import domain_label, domain_path, load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments.comparison import Comparison, Trial
 from ugat_marl.experiments.driver import perform_all, record_of
@@ -112,7 +112,7 @@ def late_in(sim: str, seconds: int) -> str:
     Raises:
         OptionError: The simulation is a separate scenario; no effect can be added to it by name.
     """
-    if scenario_of(sim) is not None:
+    if domain_path(sim) is not None:
         raise OptionError(
             f"sim = {sim!r} is a scenario of its own, in which no greens can be delayed: give "
             "--constants without any number"

@@ -9,11 +9,11 @@ from typing import Any
 
 from ugat_marl.effects import (
     Domain,
+    domain_path,
     effect_from,
     in_domain,
     load_scenario,
     parse_domain,
-    scenario_of,
 )
 from ugat_marl.envs.agents import AgentSet
 from ugat_marl.envs.options import EnvOptions
@@ -145,7 +145,7 @@ def sent(domain: Domain) -> Any:
     """Return a domain in values for JSON, without loss of digits."""
     if not isinstance(domain, str):
         return [effect.record() for effect in parse_domain(domain)]
-    path = scenario_of(domain)
+    path = domain_path(domain)
     return domain if path is None else str(path.resolve())
 
 
