@@ -22,10 +22,10 @@ from ugat_marl.effects import (
     Effect,
     domain_label,
     effects_on_controllers,
+    expand_domains,
     in_domain,
     load_scenario,
     parse_domain,
-    spelled_out,
 )
 from ugat_marl.effects.actuators import successors
 from ugat_marl.effects.sensors import DeadDetectors
@@ -79,9 +79,9 @@ def test_an_unknown_name_gets_the_nearest_of_all() -> None:
 
 
 def test_gaps_are_spelled_out() -> None:
-    assert spelled_out(["all"]) == ["sim", *(name for name in NAMED_DOMAINS if name != "meso")]
-    assert spelled_out(["sim", "V4", "Transition", "V4"])[:4] == ["sim", "V4", "V1", "V2"]
-    assert {NAMED_DOMAINS[name].gap for name in spelled_out(["action"])} == {"action"}
+    assert expand_domains(["all"]) == ["sim", *(name for name in NAMED_DOMAINS if name != "meso")]
+    assert expand_domains(["sim", "V4", "Transition", "V4"])[:4] == ["sim", "V4", "V1", "V2"]
+    assert {NAMED_DOMAINS[name].gap for name in expand_domains(["action"])} == {"action"}
 
 
 @pytest.mark.parametrize("arguments", [[], ["action"], ["reward", "--json"]])

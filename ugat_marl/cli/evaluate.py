@@ -11,7 +11,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import RayAddress, workers_of
-from ugat_marl.effects import NAMED_DOMAINS, load_scenario, spelled_out
+from ugat_marl.effects import NAMED_DOMAINS, expand_domains, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments import evaluate, gaps_of, policy_factory
@@ -97,7 +97,7 @@ class Evaluate:
     def _domains(self, scenario: Scenario, console: Console) -> list[str]:
         """Return the names of all domains, without those that do not fit the network."""
         found: list[str] = []
-        for name in spelled_out(self.domains):
+        for name in expand_domains(self.domains):
             if name in NAMED_DOMAINS and name not in self.domains and _may_not_fit(name):
                 try:
                     parallel_env(scenario, name, duration_s=self.duration_s)

@@ -38,9 +38,9 @@ from .domains import Domain as Domain
 from .domains import NamedDomain as NamedDomain
 from .domains import domain_label as domain_label
 from .domains import domain_path as domain_path
+from .domains import expand_domains as expand_domains
 from .domains import in_domain as in_domain
 from .domains import parse_domain as parse_domain
-from .domains import spelled_out as spelled_out
 from .engine import BlockerPatience as BlockerPatience
 from .engine import QueueModel as QueueModel
 from .engine import Reach as Reach

@@ -203,7 +203,7 @@ DOMAIN_ALIASES: dict[str, str] = {
 """Other names of the paper's domains."""
 
 
-def spelled_out(names: Sequence[str]) -> list[str]:
+def expand_domains(names: Sequence[str]) -> list[str]:
     """Return domains with ``"all"`` and names of gaps replaced by lists, each domain once.
 
     Args:
