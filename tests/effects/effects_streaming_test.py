@@ -16,10 +16,10 @@ import pytest
 from studies.blind.outside_effects import BusStops, Driveway
 from ugat_marl.effects import (
     apply_effects,
-    in_domain,
     load_scenario,
     parked_at_other_times,
     parse_domain,
+    scenario_in_domain,
 )
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OutputError, ScenarioError
@@ -118,7 +118,7 @@ def test_the_same_files_in_small_pieces(
     monkeypatch.setattr("ugat_marl.effects.documents._RUN", 1000)
     expected = json.loads(DIGESTS.read_text(encoding="utf-8"))["crossing"]
     scenario = loaded("crossing", crossing)
-    assert all(item.home for item in in_domain(scenario, "demand_level=*,1.2").routes)
+    assert all(item.home for item in scenario_in_domain(scenario, "demand_level=*,1.2").routes)
     assert made(scenario, "crossing") == expected
 
 
@@ -141,7 +141,7 @@ def test_a_long_file_is_never_in_memory(
     scenario = load_scenario(long(crossing()))
     tracemalloc.start()
     try:
-        changed = in_domain(scenario, domain)
+        changed = scenario_in_domain(scenario, domain)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -153,7 +153,7 @@ def test_what_is_kept_in_a_file_goes_with_the_scenario(
     crossing: Crossing, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("ugat_marl.files._KEPT", 1000)
-    scenario = in_domain(load_scenario(crossing(vehicles=CITY, types=TYPES)), "V4")
+    scenario = scenario_in_domain(load_scenario(crossing(vehicles=CITY, types=TYPES)), "V4")
     (route,) = scenario.routes
     assert route.path is not None
     content, path = route.path.read_bytes(), route.path
@@ -186,7 +186,7 @@ def test_a_file_cut_short_is_refused_with_its_line(
     end: str, message: str, crossing: Crossing
 ) -> None:
     with pytest.raises(ScenarioError, match=message):
-        in_domain(load_scenario(long(crossing(), end=end)), "V4")
+        scenario_in_domain(load_scenario(long(crossing(), end=end)), "V4")
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_entities_are_refused_with_their_line(start: str, crossing: Crossing) ->
     text = f"<!-- one -->\n{start}\n<routes><vType id='&a;'/></routes>"
     (directory / "demand.rou.xml").write_text(text)
     with pytest.raises(ScenarioError, match=r"demand\.rou\.xml: .* entities .* \(line 2\)"):
-        in_domain(load_scenario(directory), "V4")
+        scenario_in_domain(load_scenario(directory), "V4")
 
 
 @pytest.mark.parametrize("limit", ["files._KEPT", "effects.documents._RUN"])
@@ -208,7 +208,7 @@ def test_no_room_for_temporary_files(
     scenario = load_scenario(long(crossing()))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
     with pytest.raises(OutputError, match=r"none: cannot hold .* \(No such file.*TMPDIR"):
-        in_domain(scenario, "demand_level=*,1.15")
+        scenario_in_domain(scenario, "demand_level=*,1.15")
 
 
 def test_long_work_is_shown(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,7 +222,7 @@ def test_long_work_is_shown(crossing: Crossing, monkeypatch: pytest.MonkeyPatch)
 
     scenario = load_scenario(long(crossing()))
     with showing(Listening()):
-        in_domain(scenario, "V4")
+        scenario_in_domain(scenario, "V4")
     assert told == [("MiB of demand.rou.xml", 1)]
-    in_domain(scenario, "V4")
+    scenario_in_domain(scenario, "V4")
     assert len(told) == 1, "a library says nothing by itself"

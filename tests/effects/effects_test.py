@@ -27,10 +27,10 @@ from ugat_marl.effects import (
     apply_effects,
     domain_label,
     effect_from,
-    in_domain,
     known_effects,
     load_scenario,
     parse_domain,
+    scenario_in_domain,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.experiments import evaluate, rule_factory
@@ -238,7 +238,7 @@ def test_values_are_read_back_from_every_vehicle(
     world: str, setting: str, simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
 ) -> None:
     accel, decel, emergency, startup = PAPER[setting]
-    scenario = in_domain(build(crossing, world, EVERY_SECOND), setting)
+    scenario = scenario_in_domain(build(crossing, world, EVERY_SECOND), setting)
     own = tmp_path / "own"
     own.mkdir()
     simulator.start(launch_of(scenario, 1, own, ()))
@@ -310,7 +310,7 @@ def test_writing_down_the_defaults_changes_nothing(
     plain = trace(simulator, scenario, tmp_path / "plain")
     defaults = [Acceleration(2.6), Deceleration(4.5), EmergencyDeceleration(9), StartupDelay(0)]
     assert trace(simulator, apply_effects(scenario, defaults), tmp_path / "same") == plain
-    assert trace(simulator, in_domain(scenario, "V1"), tmp_path / "other") != plain
+    assert trace(simulator, scenario_in_domain(scenario, "V1"), tmp_path / "other") != plain
 
 
 def test_who_does_not_drive_is_left_alone(crossing: Crossing) -> None:
@@ -333,11 +333,13 @@ def test_the_original_does_not_change(crossing: Crossing) -> None:
     before = {file: file.read_bytes() for file in directory.iterdir()}
     scenario = load_scenario(directory)
     original = scenario.hash
-    derived = {name: in_domain(scenario, name) for name in (*PAPER_WORLDS, "acceleration=2.5")}
+    derived = {
+        name: scenario_in_domain(scenario, name) for name in (*PAPER_WORLDS, "acceleration=2.5")
+    }
     assert load_scenario(directory).hash == scenario.hash == original
     assert len({original, *(item.hash for item in derived.values())}) == 2 + len(PAPER_WORLDS)
     assert {file: file.read_bytes() for file in directory.iterdir()} == before
-    assert in_domain(scenario, "V2").hash == derived["V2"].hash
+    assert scenario_in_domain(scenario, "V2").hash == derived["V2"].hash
     assert derived["V1"].applied == tuple(map(str, PAPER_WORLDS["V1"]))
     assert derived["V1"].id == scenario.id
 
@@ -374,8 +376,10 @@ def test_effects_of_a_scenario_file_are_applied_when_it_is_loaded(crossing: Cros
 
 def test_a_written_scenario_is_a_domain(crossing: Crossing, tmp_path: Path) -> None:
     scenario = load_scenario(crossing())
-    corrected = in_domain(scenario, "V3").write(tmp_path / "corrected")
-    assert in_domain(scenario, str(corrected)).hash == in_domain(scenario, "V3").hash
+    corrected = scenario_in_domain(scenario, "V3").write(tmp_path / "corrected")
+    assert (
+        scenario_in_domain(scenario, str(corrected)).hash == scenario_in_domain(scenario, "V3").hash
+    )
     env = parallel_env(scenario, str(corrected), simulator="inprocess")
     reference = parallel_env(scenario, "V3", simulator="inprocess")
     rewards = []
@@ -390,7 +394,7 @@ def test_a_written_scenario_is_a_domain(crossing: Crossing, tmp_path: Path) -> N
 def test_a_domain_on_other_roads_is_refused(crossing: Crossing) -> None:
     other = dict(shipped_scenarios())["single-v1"]
     with pytest.raises(ScenarioError, match=r"has other roads or signals than scenario 'crossing0"):
-        in_domain(load_scenario(crossing()), str(other))
+        scenario_in_domain(load_scenario(crossing()), str(other))
 
 
 # --- on what is shipped, in SUMO without the suite
@@ -398,7 +402,7 @@ def test_a_domain_on_other_roads_is_refused(crossing: Crossing) -> None:
 
 @pytest.mark.parametrize("name", [name for name, _ in shipped_scenarios()])
 def test_a_shipped_scenario_in_v4_runs_in_plain_sumo(name: str, tmp_path: Path) -> None:
-    directory = in_domain(load_scenario(name), "V4").write(tmp_path / name)
+    directory = scenario_in_domain(load_scenario(name), "V4").write(tmp_path / name)
     again = load_scenario(directory)
     trips = tmp_path / "trips.xml"
     subprocess.run(
@@ -433,12 +437,12 @@ def test_the_option_for_blocked_junctions_reaches_sumo_and_no_diagnosis_looks_fo
     tmp_path: Path,
 ) -> None:
     assert "blocker_patience" not in known_effects()
-    scenario = in_domain(load_scenario("single-v1"), "blocker_patience=45")
+    scenario = scenario_in_domain(load_scenario("single-v1"), "blocker_patience=45")
     assert scenario.hash != load_scenario("single-v1").hash
     arguments = launch_of(scenario, 1, tmp_path, ()).arguments
     assert arguments[arguments.index("--ignore-junction-blocker") + 1] == "45"
     with pytest.raises(OptionError, match="blocker_patience"):
-        in_domain(load_scenario("single-v1"), "blocker_patience=0")
+        scenario_in_domain(load_scenario("single-v1"), "blocker_patience=0")
 
 
 @pytest.mark.skipif(

@@ -29,8 +29,8 @@ from ugat_marl.effects import (
     StartupDelay,
     YellowRunning,
     apply_effects,
-    in_domain,
     load_scenario,
+    scenario_in_domain,
 )
 from ugat_marl.effects.fleet import Speeds
 from ugat_marl.effects.vehicles import DRIVER_MODELS
@@ -294,7 +294,7 @@ def test_desired_speeds_of_types(
     )
     scenario = load_scenario(crossing(vehicles=many))
     drawn = {
-        name: list(factors(simulator, in_domain(scenario, text), tmp_path / name).values())
+        name: list(factors(simulator, scenario_in_domain(scenario, text), tmp_path / name).values())
         for name, text in {
             "plain": "sim", "slow": "desired_speed=0.7", "wide": "speed_spread=0.2",
             "both": "speed_spread=0.2+desired_speed=0.7", "even": "speed_spread=0",

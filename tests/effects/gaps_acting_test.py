@@ -13,7 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import ugat_marl
-from ugat_marl.effects import effects_on_controllers, in_domain, load_scenario, parse_domain
+from ugat_marl.effects import (
+    effects_on_controllers,
+    load_scenario,
+    parse_domain,
+    scenario_in_domain,
+)
 from ugat_marl.effects.actuators import ACTING, PHASE_ORDERS, successors
 from ugat_marl.envs.actuators import Actuators
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
@@ -80,7 +85,7 @@ def test_every_effect_has_an_example() -> None:
 
 @pytest.mark.parametrize("text", EXAMPLES)
 def test_the_scenario_keeps_the_effect(text: str, tmp_path: Any) -> None:
-    changed = in_domain(load_scenario("single-v1"), text)
+    changed = scenario_in_domain(load_scenario("single-v1"), text)
     assert changed.hash != load_scenario("single-v1").hash
     assert load_scenario(load_scenario(changed.write(tmp_path / "written"))).hash == changed.hash
 
@@ -100,7 +105,7 @@ def test_impossible_values(text: str, error: type[Exception], message: str) -> N
 
 def test_without_effects_there_is_nothing_to_do() -> None:
     assert Actuators.of(parse_domain("V4"), NETWORKS["single-v1"], TIMING, 10.0) is None
-    assert in_domain(load_scenario("single-v1"), "min_green=15").control.min_green_s == 15
+    assert scenario_in_domain(load_scenario("single-v1"), "min_green=15").control.min_green_s == 15
 
 
 # --- which phase may follow which

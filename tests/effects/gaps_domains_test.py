@@ -23,9 +23,9 @@ from ugat_marl.effects import (
     domain_label,
     effects_on_controllers,
     expand_domains,
-    in_domain,
     load_scenario,
     parse_domain,
+    scenario_in_domain,
 )
 from ugat_marl.effects.actuators import successors
 from ugat_marl.effects.sensors import DeadDetectors
@@ -63,9 +63,9 @@ def test_names_are_spelled_as_one_likes() -> None:
         assert name not in DOMAIN_ALIASES and parse_domain(f"{name}+V1")[-4:] == PAPER_WORLDS["V1"]
     for name, effects in PAPER_WORLDS.items():
         assert parse_domain(NAMED_DOMAINS[name].effects) == effects
-    assert len({in_domain(load_scenario("single-v1"), name).hash for name in NAMED_DOMAINS}) == len(
-        NAMED_DOMAINS
-    )
+    assert len(
+        {scenario_in_domain(load_scenario("single-v1"), name).hash for name in NAMED_DOMAINS}
+    ) == len(NAMED_DOMAINS)
     assert domain_label("sim") == "sim" and domain_label("startup_delay=1") == "startup_delay=1"
 
 
@@ -438,7 +438,7 @@ def test_an_incident_needs_a_lane_that_is_long_enough() -> None:
     short = re.sub(rb' length="[^"]*"', b' length="9.00"', scenario.network.read())
     changed = replace(scenario, network=scenario.network.edited(short))
     with pytest.raises(ScenarioError, match="no lane of 60 m"):
-        in_domain(changed, "incident")
+        scenario_in_domain(changed, "incident")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 import ugat_marl
 from ugat_marl.data import Scores
-from ugat_marl.effects import OBJECTIVES, in_domain, load_scenario, parse_domain
+from ugat_marl.effects import OBJECTIVES, load_scenario, parse_domain, scenario_in_domain
 from ugat_marl.effects.objectives import NORMS
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.envs.objectives import PERSONS, PERSONS_IN_A_CAR, Objectives, gini, hidden_measures
@@ -158,6 +158,6 @@ def test_hard_braking_is_counted() -> None:
 
 
 def test_the_scenario_keeps_the_objective(tmp_path: Path) -> None:
-    changed = in_domain(load_scenario("single-v1"), "objective=Safety")
+    changed = scenario_in_domain(load_scenario("single-v1"), "objective=Safety")
     assert changed.applied == ("objective=safety",)
     assert load_scenario(load_scenario(changed.write(tmp_path / "written"))).hash == changed.hash

@@ -20,10 +20,10 @@ from ugat_marl.effects import (
     apply_effects,
     controller_effects,
     effects_on_controllers,
-    in_domain,
     known_effects,
     load_scenario,
     parse_domain,
+    scenario_in_domain,
 )
 from ugat_marl.effects.sensors import DeadDetectors
 from ugat_marl.envs import Infos, Observations
@@ -93,7 +93,7 @@ def test_every_effect_has_an_example() -> None:
 @pytest.mark.parametrize("text", EXAMPLES)
 def test_the_scenario_keeps_the_effect(text: str, tmp_path: Path) -> None:
     scenario = load_scenario("single-v1")
-    changed = in_domain(scenario, text)
+    changed = scenario_in_domain(scenario, text)
     assert controller_effects(changed) == parse_domain(text)
     assert changed.documents == scenario.documents
     assert changed.hash != scenario.hash
@@ -108,12 +108,14 @@ def test_the_scenario_keeps_the_effect(text: str, tmp_path: Path) -> None:
 def test_effects_on_controllers_go_with_all_others_in_any_order() -> None:
     scenario = load_scenario("single-v1")
     text = "+".join(("V4", *EXAMPLES))
-    both = in_domain(scenario, text)
+    both = scenario_in_domain(scenario, text)
     assert set(map(str, controller_effects(both))) == set(EXAMPLES)
-    other = apply_effects(in_domain(scenario, "V4"), parse_domain("+".join(EXAMPLES))[::-1])
-    assert both.hash == other.hash != in_domain(scenario, "V4").hash
-    last = in_domain(scenario, "counting_noise=0.1+counting_noise=0.2")
-    assert last.hash == in_domain(scenario, "counting_noise=0.2").hash
+    other = apply_effects(
+        scenario_in_domain(scenario, "V4"), parse_domain("+".join(EXAMPLES))[::-1]
+    )
+    assert both.hash == other.hash != scenario_in_domain(scenario, "V4").hash
+    last = scenario_in_domain(scenario, "counting_noise=0.1+counting_noise=0.2")
+    assert last.hash == scenario_in_domain(scenario, "counting_noise=0.2").hash
 
 
 @pytest.mark.parametrize(

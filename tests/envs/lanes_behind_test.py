@@ -12,7 +12,7 @@ import pytest
 
 import ugat_marl
 from ugat_marl.__main__ import main
-from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments.training import simulated_worlds
 from ugat_marl.field import Site
@@ -246,7 +246,7 @@ def test_who_waits_to_enter_is_counted_within_the_reach(split: Scenario) -> None
     )
     counted: dict[float, tuple[float, float, float, float]] = {}
     for reach_m in (100.0, 300.0):
-        world = in_domain(full, f"reach={reach_m:g}")
+        world = scenario_in_domain(full, f"reach={reach_m:g}")
         env = ugat_marl.parallel_env(world, reward="waiting", observation="waiting")
         (item,) = env.network.intersections
         assert env.network.lanes["wM_0"].capacity >= reach_m / 7.5
@@ -273,13 +273,13 @@ def test_who_waits_to_enter_is_counted_within_the_reach(split: Scenario) -> None
 def test_the_queue_model_knows_no_reach(split: Scenario) -> None:
     for domain in ("queue_model=500+reach=100", "reach=100+queue_model=500"):
         with pytest.raises(ScenarioError, match="upstream of a lane"):
-            in_domain(split, domain)
+            scenario_in_domain(split, domain)
 
 
 def test_a_detection_zone_and_a_reach_exclude_each_other(split: Scenario) -> None:
     for domain in ("reach=100+detection_zone=50", "detection_zone=50+reach=100"):
         with pytest.raises(OptionError, match="upstream"):
-            in_domain(split, domain)
+            scenario_in_domain(split, domain)
 
 
 def test_both_worlds_have_the_same_reach(split: Scenario) -> None:
@@ -305,7 +305,7 @@ def test_a_table_and_a_training_say_so_before_they_begin(
 
 def test_the_field_loop_knows_no_reach(split: Scenario) -> None:
     with pytest.raises(OptionError, match="100 m upstream"):
-        Site.of(in_domain(split, "reach=100"), {})
+        Site.of(scenario_in_domain(split, "reach=100"), {})
 
 
 def test_a_scenario_may_say_how_far(split: Scenario, tmp_path: Path) -> None:

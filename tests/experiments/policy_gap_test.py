@@ -13,7 +13,7 @@ from rich.console import Console
 
 from ugat_marl.__main__ import main
 from ugat_marl.diagnosis import Diagnosis, PolicyGap, TravelTimeEstimate
-from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments import policy_gap, read_diagnosis, rule_factory, write_policy_gap
 from ugat_marl.reporting import commands_on_page, policy_gap_table, write_diagnosis_page
@@ -30,7 +30,7 @@ def gap_of(corrected: Any, real: str = "V4", seeds: tuple[int, ...] = (1, 2, 3))
 
 
 def test_a_perfect_correction_leaves_no_gap() -> None:
-    row = gap_of(in_domain(SCENARIO, "V4"))
+    row = gap_of(scenario_in_domain(SCENARIO, "V4"))
     assert row.real == row.corrected
     assert row.before == pytest.approx(abs(row.real.mean - row.sim.mean))
     assert row.before > 5
@@ -99,7 +99,7 @@ def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> 
     }
     directory.mkdir()
     if corrected:
-        in_domain(SCENARIO, corrected).write(directory / "corrected")
+        scenario_in_domain(SCENARIO, corrected).write(directory / "corrected")
     (directory / "diagnosis.json").write_text(json.dumps(record))
     return directory
 
@@ -166,7 +166,7 @@ def test_what_is_no_diagnosis_of_this_scenario_is_refused(tmp_path: Path) -> Non
 
 def test_the_correction_is_read_back(tmp_path: Path) -> None:
     diagnosis, corrected = read_diagnosis(diagnosed(tmp_path / "out"), SCENARIO)
-    assert corrected.hash == in_domain(SCENARIO, "V4").hash
+    assert corrected.hash == scenario_in_domain(SCENARIO, "V4").hash
     time = TravelTimeEstimate(100.0, None, None)
     gap = PolicyGap(time, time, time, before=1 / 3, after=0.0, shrink=None)
     write_policy_gap(tmp_path / "out", diagnosis, {"a": gap})

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ugat_marl.effects import PAPER_WORLDS, in_domain, load_scenario
+from ugat_marl.effects import PAPER_WORLDS, load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import ScenarioError
 from ugat_marl.experiments.randomised import RandomisedEnv, drawn, effect_ranges, randomised_env
@@ -41,7 +41,7 @@ def test_the_ranges_are_the_hull_of_the_worlds_the_simulation_and_the_library() 
 
 
 def test_the_ranges_hold_the_simulations_own_value() -> None:
-    brisk = in_domain(SINGLE, "acceleration=4.0")
+    brisk = scenario_in_domain(SINGLE, "acceleration=4.0")
     found = {item.name: item.high for item in effect_ranges(brisk)}
     assert found["acceleration"] == 4.0
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.__main__ import main
-from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, SimulatorError
 from ugat_marl.policies import controller_for
@@ -79,7 +79,7 @@ def running() -> Iterator[Callable[..., tuple[StartedSumo, Watched]]]:
 
 
 def test_minutes_of_single_v1_in_snow(running: Callable[..., Any]) -> None:
-    scenario = in_domain(load_scenario("single-v1"), "V4")
+    scenario = scenario_in_domain(load_scenario("single-v1"), "V4")
     policy = controller_for("largest-queue:10", parallel_env(scenario))
     site = Site.of(scenario, policy.env_options)
     sumo, street = running(scenario, site)
@@ -185,7 +185,7 @@ def test_a_street_that_goes_away_is_told(running: Callable[..., Any]) -> None:
 
 
 def test_late_greens_are_refused() -> None:
-    scenario = in_domain(load_scenario("single-v1"), "late_green=*,1")
+    scenario = scenario_in_domain(load_scenario("single-v1"), "late_green=*,1")
     with pytest.raises(OptionError, match="late"):
         StartedSumo(scenario, seed=0)
 

@@ -22,7 +22,7 @@ import torch
 
 import ugat_marl.experiments.transfers as transfer_module
 from ugat_marl.data import Metrics, Run, TransitionLog
-from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError, ScenarioError, UnknownNameError
 from ugat_marl.experiments import TransferConfig, transfer
@@ -341,7 +341,7 @@ def test_the_control_starts_from_direct_transfer(tmp_path: Path) -> None:
 def repaired(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A corrected scenario as a diagnosis writes it."""
     folder = tmp_path_factory.mktemp("diagnosis") / "corrected"
-    return in_domain(load_scenario("single-v1"), "acceleration=0.6").write(folder)
+    return scenario_in_domain(load_scenario("single-v1"), "acceleration=0.6").write(folder)
 
 
 SHORT = replace(
@@ -423,7 +423,7 @@ def test_a_correction_that_cannot_be_trained_in_is_refused_at_once(
         replace(SMALL, corrected="sim")
     with pytest.raises(UnknownNameError, match="no-such-directory"):
         transfer(replace(SMALL, corrected="no-such-directory"), tmp_path / "run")
-    fewer = in_domain(load_scenario("single-v1"), "sim").with_control(phases="programme")
+    fewer = scenario_in_domain(load_scenario("single-v1"), "sim").with_control(phases="programme")
     fewer.write(tmp_path / "fewer")
     with pytest.raises(ScenarioError, match="other agents, observations or phases"):
         transfer(replace(SMALL, corrected=str(tmp_path / "fewer")), tmp_path / "run")

@@ -13,11 +13,11 @@ import pytest
 
 import ugat_marl
 from ugat_marl.effects import (
-    in_domain,
     known_effects,
     late_greens,
     load_scenario,
     parse_domain,
+    scenario_in_domain,
     with_late_programmes,
 )
 from ugat_marl.errors import OptionError, ScenarioError
@@ -251,7 +251,7 @@ def test_what_is_not_asked_again_has_not_changed(
 def test_the_engine_is_an_effect_no_diagnosis_looks_for(tmp_path: Path) -> None:
     assert "queue_model" not in known_effects()
     scenario = load_scenario("single-v1")
-    changed = in_domain(scenario, "meso")
+    changed = scenario_in_domain(scenario, "meso")
     assert parse_domain("meso") == parse_domain("queue_model=500")
     assert changed.hash != scenario.hash and changed.documents == scenario.documents
     assert load_scenario(changed.write(tmp_path / "written")).hash == changed.hash
@@ -260,7 +260,7 @@ def test_the_engine_is_an_effect_no_diagnosis_looks_for(tmp_path: Path) -> None:
 def test_queues_do_not_drive_on_in_yellow() -> None:
     """SUMO's would, at the full rate: what agents show between two greens is red."""
     scenario = load_scenario("single-v1").with_control(yellow_s=3.0, all_red_s=2.0)
-    changed = in_domain(scenario, "meso")
+    changed = scenario_in_domain(scenario, "meso")
     assert (changed.control.yellow_s, changed.control.all_red_s) == (0.0, 5.0)
     assert Network.read(changed).intersections == Network.read(scenario).intersections
     env = ugat_marl.parallel_env(scenario, "meso", duration_s=300, simulator="inprocess")
@@ -357,22 +357,22 @@ def test_a_full_turning_lane_blocks_no_other(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("domain", ["meso+late_green=*,1", "late_green=*,1+meso"])
 def test_a_late_green_comes_on_top_of_that_of_queues(domain: str) -> None:
-    assert late_greens(in_domain(load_scenario("single-v1"), "meso")) == {"A1": 2.0}
-    assert late_greens(in_domain(load_scenario("single-v1"), domain)) == {"A1": 3.0}
+    assert late_greens(scenario_in_domain(load_scenario("single-v1"), "meso")) == {"A1": 2.0}
+    assert late_greens(scenario_in_domain(load_scenario("single-v1"), domain)) == {"A1": 3.0}
 
 
 def test_a_programme_that_jumps_is_an_error_only_where_lateness_was_asked_for(
     crossing: Callable[..., Path],
 ) -> None:
     path = crossing(edit=lambda text: text.replace("<phase ", '<phase next="0" '))
-    scenario = in_domain(load_scenario(path), "meso")
+    scenario = scenario_in_domain(load_scenario(path), "meso")
     before, after = (
         [phase.attrib for phase in item.network.parse().iter("phase")]
         for item in (scenario, with_late_programmes(scenario))
     )
     assert before == after and before
     with pytest.raises(ScenarioError, match="next="):
-        with_late_programmes(in_domain(load_scenario(path), "meso+late_green=*,1"))
+        with_late_programmes(scenario_in_domain(load_scenario(path), "meso+late_green=*,1"))
 
 
 def test_lanes_hold_all_vehicles_that_go_their_way() -> None:

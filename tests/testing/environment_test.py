@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Discrete
 from pettingzoo.test import parallel_api_test
 
 import ugat_marl
-from ugat_marl.effects import in_domain
+from ugat_marl.effects import scenario_in_domain
 from ugat_marl.errors import ActionError
 from ugat_marl.grounding import GroundedEnv, PhaseTransform
 from ugat_marl.testing import (
@@ -533,7 +533,7 @@ def test_the_suites_environments_pass(scenario: str) -> None:
     ids=lambda options: "-".join(map(str, options.values())),
 )
 def test_the_options_of_the_suites_environments_pass(options: dict[str, Any]) -> None:
-    scenario = in_domain(ugat_marl.load_scenario("mixed-v1"), options.pop("domain", "sim"))
+    scenario = scenario_in_domain(ugat_marl.load_scenario("mixed-v1"), options.pop("domain", "sim"))
     assert not failures(
         check_environment(lambda: ugat_marl.parallel_env(scenario, duration_s=60, **options))
     )

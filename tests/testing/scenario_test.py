@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import ugat_marl
-from ugat_marl.effects import in_domain
+from ugat_marl.effects import scenario_in_domain
 from ugat_marl.scenarios import Network, Scenario, shipped_scenarios
 from ugat_marl.testing import (
     SCENARIO_CHECKS,
@@ -144,7 +144,8 @@ def effects_do_nothing(folder: Path) -> ScenarioCase:
 @breaks("effects_change_it")
 def two_domains_are_the_same(folder: Path) -> ScenarioCase:
     return ScenarioCase(
-        good(), change=lambda scenario, name: in_domain(scenario, "V1" if name == "V3" else name)
+        good(),
+        change=lambda scenario, name: scenario_in_domain(scenario, "V1" if name == "V3" else name),
     )
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import LengthS
-from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory
@@ -77,7 +77,7 @@ class Field:
             raise OptionError(f"--start runs SUMO here, and not at --host {self.host}")
         if self.seed < 0 or (self.seconds is not None and not self.seconds > 0):
             raise OptionError("--seed must not be negative, and --seconds must be above 0")
-        scenario = in_domain(load_scenario(self.scenario), self.domain)
+        scenario = scenario_in_domain(load_scenario(self.scenario), self.domain)
         policy = policy_factory(self.policy)(parallel_env(scenario))
         site = Site.of(scenario, policy.env_options)
         seconds = self.seconds or scenario.settings.duration_s

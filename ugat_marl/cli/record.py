@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import LengthS, Workers
 from ugat_marl.data import require_replaceable, write_measured
-from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
@@ -61,7 +61,9 @@ class Record:
     def run(self, console: Console) -> int:
         """Record and write."""
         scenario = load_scenario(self.scenario)
-        in_domain(scenario, self.domain)  # a wrong name is an error before anything is written
+        scenario_in_domain(
+            scenario, self.domain
+        )  # a wrong name is an error before anything is written
         policy = policy_factory(self.policy)
         require_replaceable(self.out)
         require_writable(self.out / "periods.csv")

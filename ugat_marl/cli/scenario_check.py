@@ -13,7 +13,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import LengthS, Workers
-from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import (
@@ -86,7 +86,7 @@ class ScenarioCheck:
             return self._kit(console)
         if self.headroom < 0:
             raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
-        scenario = in_domain(load_scenario(self.scenario), self.domain)
+        scenario = scenario_in_domain(load_scenario(self.scenario), self.domain)
         if self.duration_s is not None:
             scenario = scenario.with_duration(self.duration_s)
         reporter = Silent() if self.json else Bars(console)

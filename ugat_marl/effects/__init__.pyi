@@ -39,8 +39,8 @@ from .domains import NamedDomain as NamedDomain
 from .domains import domain_label as domain_label
 from .domains import domain_path as domain_path
 from .domains import expand_domains as expand_domains
-from .domains import in_domain as in_domain
 from .domains import parse_domain as parse_domain
+from .domains import scenario_in_domain as scenario_in_domain
 from .engine import BlockerPatience as BlockerPatience
 from .engine import QueueModel as QueueModel
 from .engine import Reach as Reach

@@ -284,7 +284,7 @@ def domain_label(domain: Domain) -> str:
     return "+".join(map(str, domain)) or "sim"
 
 
-def in_domain(scenario: Scenario, domain: Domain) -> Scenario:
+def scenario_in_domain(scenario: Scenario, domain: Domain) -> Scenario:
     """Return the scenario with the effects of `domain`.
 
     Args:

@@ -17,9 +17,9 @@ from ugat_marl.effects import (
     Domain,
     controller_effects,
     domain_label,
-    in_domain,
     late_greens,
     load_scenario,
+    scenario_in_domain,
     with_late_programmes,
 )
 from ugat_marl.envs.actions import checked_delays, checked_phases
@@ -68,7 +68,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     }
 
     def __init__(self, scenario: Scenario, domain: Domain, options: EnvOptions) -> None:
-        self.scenario = in_domain(scenario, domain)
+        self.scenario = scenario_in_domain(scenario, domain)
         if options.duration_s is not None:
             self.scenario = self.scenario.with_duration(options.duration_s)
         self.domain = domain_label(domain)

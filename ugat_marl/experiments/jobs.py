@@ -22,7 +22,7 @@ from pydantic import TypeAdapter
 from rich.console import Console
 
 from ugat_marl.data import Run, Scores, installed_versions, remove_temporaries
-from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import AnyParallelEnv, parallel_env
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.experiments.evaluation import (
@@ -198,7 +198,7 @@ def file_names(names: Iterable[str]) -> list[str]:
 
 @functools.cache
 def _hash(scenario: str, domain: str) -> str:
-    return in_domain(load_scenario(scenario), domain).hash
+    return scenario_in_domain(load_scenario(scenario), domain).hash
 
 
 @dataclass

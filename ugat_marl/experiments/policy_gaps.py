@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ugat_marl.diagnosis import CORRECTED, FILE, Diagnosis, PolicyGap, TravelTimeEstimate
-from ugat_marl.effects import Domain, domain_label, in_domain, load_scenario
+from ugat_marl.effects import Domain, domain_label, load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments.evaluation import evaluate
 from ugat_marl.experiments.scores import Estimate, Evaluation
@@ -65,12 +65,14 @@ def policy_gap(
     """
     if not policies or not seeds:
         raise OptionError("a policy gap needs at least one policy and one seed")
-    world = in_domain(scenario, real)
+    world = scenario_in_domain(scenario, real)
     if world.hash == scenario.hash:
         raise OptionError(
             f"real = {domain_label(real)!r} is the simulation itself; there is no gap"
         )
-    repaired = corrected if isinstance(corrected, Scenario) else in_domain(scenario, corrected)
+    repaired = (
+        corrected if isinstance(corrected, Scenario) else scenario_in_domain(scenario, corrected)
+    )
     found: dict[str, Evaluation] = {}
     for name, place in (("sim", scenario), ("corrected", repaired), ("real", world)):
         found[name] = evaluate(

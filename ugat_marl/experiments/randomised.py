@@ -14,7 +14,7 @@ from typing import Any
 from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
-from ugat_marl.effects import PAPER_WORLDS, Domain, Effect, in_domain
+from ugat_marl.effects import PAPER_WORLDS, Domain, Effect, scenario_in_domain
 from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import Scenario
@@ -132,7 +132,7 @@ def randomised_env(
         options: Options of the environments, see `EnvOptions`.
         sim: The simulation, as a domain of the scenario.
     """
-    simulation = in_domain(scenario, sim)
+    simulation = scenario_in_domain(scenario, sim)
 
     def make(effects: tuple[Effect, ...]) -> TrafficEnv:
         return parallel_env(simulation, effects, **options)

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from ugat_marl.data import Run, TransitionLog, write_settings
-from ugat_marl.effects import domain_label, in_domain, load_scenario
+from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.experiments.evaluation import (
@@ -430,9 +430,9 @@ def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> di
     settings["real_log"] = hashlib.sha256(log.read_bytes()).hexdigest() if log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":
-        hashes["real"] = in_domain(scenario, config.real).hash
+        hashes["real"] = scenario_in_domain(scenario, config.real).hash
     if config.corrected is not None:  # identified by its content, so the folder may be moved
-        hashes["corrected"] = in_domain(scenario, config.corrected).hash
+        hashes["corrected"] = scenario_in_domain(scenario, config.corrected).hash
     return {
         **settings,
         "scenario_hash": hashes,

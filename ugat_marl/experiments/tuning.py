@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.data import installed_version
-from ugat_marl.effects import Domain, domain_label, in_domain
+from ugat_marl.effects import Domain, domain_label, scenario_in_domain
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race
 from ugat_marl.experiments.scores import Trial, Tuned
@@ -197,7 +197,7 @@ def _place(
     specs: Sequence[str],
 ) -> Path:
     """Return the file that keeps a result; its name is a hash of all that decides the result."""
-    world = in_domain(scenario, domain)
+    world = scenario_in_domain(scenario, domain)
     if duration_s is not None:
         world = world.with_duration(duration_s)
     sumo = installed_version("eclipse-sumo")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.data import MEASURES
-from ugat_marl.effects import in_domain, load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import OBJECTIVE_MEASURES, Observer
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.experiments import Estimate, Evaluation
@@ -607,7 +607,7 @@ def places_of(record: RunRecord) -> Places | str:
 
 @functools.lru_cache(maxsize=8)
 def _network(scenario: str, sim: str, duration_s: float | None) -> tuple[Network, str]:
-    derived = in_domain(load_scenario(scenario), sim)
+    derived = scenario_in_domain(load_scenario(scenario), sim)
     if duration_s is not None:
         derived = derived.with_duration(duration_s)
     return Network.read(derived), derived.hash

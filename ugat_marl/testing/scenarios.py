@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ugat_marl.effects import PAPER_WORLDS, in_domain, load_scenario
+from ugat_marl.effects import PAPER_WORLDS, load_scenario, scenario_in_domain
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.scenarios import (
     GREEN,
@@ -38,7 +38,7 @@ class ScenarioCase:
     """
 
     def __init__(
-        self, name: str | Path | Scenario, seed: int = 1, change: Change = in_domain
+        self, name: str | Path | Scenario, seed: int = 1, change: Change = scenario_in_domain
     ) -> None:
         self.name = name
         self.seed = seed

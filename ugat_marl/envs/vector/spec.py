@@ -11,9 +11,9 @@ from ugat_marl.effects import (
     Domain,
     domain_path,
     effect_from,
-    in_domain,
     load_scenario,
     parse_domain,
+    scenario_in_domain,
 )
 from ugat_marl.envs.agents import AgentSet
 from ugat_marl.envs.options import EnvOptions
@@ -172,7 +172,7 @@ def domain_chooser(
         return domains
     given: Any = domains
     if isinstance(given, str) or not any(map(_is_domain, given)):
-        in_domain(scenario, given)
+        scenario_in_domain(scenario, given)
         return lambda environment, episode: given
     listed: list[Any] = list(given)
     if effects := [item for item in listed if not _is_domain(item)]:
@@ -186,7 +186,7 @@ def domain_chooser(
             "ugat_marl.envs.vector.spec.in_turn(domains), which goes through a list of any length"
         )
     for domain in {str(sent(domain)): domain for domain in listed}.values():
-        in_domain(scenario, domain)
+        scenario_in_domain(scenario, domain)
     return lambda environment, episode: listed[environment]
 
 

@@ -28,9 +28,9 @@ from ugat_marl.effects import (
     detector_effects,
     detector_lights,
     domain_path,
-    in_domain,
     parked_at_other_times,
     parse_domain,
+    scenario_in_domain,
 )
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments.recording.controller import (
@@ -183,7 +183,7 @@ def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, 
 
     A scenario's documents hold the effects of its file already, except those on detectors.
     """
-    changed = in_domain(scenario, domain)  # a wrong name is an error now
+    changed = scenario_in_domain(scenario, domain)  # a wrong name is an error now
     if domain_path(domain) is not None:
         return changed, detector_effects(changed)
     return scenario, (*detector_effects(scenario), *parse_domain(domain))
