@@ -13,7 +13,7 @@ from studies.blind.outside_effects import BusStops, Driveway
 from studies.blind.places import Busy
 from studies.blind.strengths import KINDS, MODELS, SCALE, STRENGTHS, nominal_of
 from ugat_marl.diagnosis import IN_THE_LOG
-from ugat_marl.effects import EVERYWHERE, PAPER_WORLDS, Effect, effect_from, known_effects
+from ugat_marl.effects import EVERYWHERE, PAPER_WORLDS, Effect, effect_from_record, known_effects
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Scenario, edge_of
 
@@ -167,7 +167,7 @@ def draw_effect(
         record[kind.parameter] = round(value, 4)
     if kind.window_s:
         record["begin_s"], record["end_s"] = _window(kind.window(strength), scenario, generator)
-    return effect_from({**record, **(kind.fixed or {})})
+    return effect_from_record({**record, **(kind.fixed or {})})
 
 
 def _places(where: str, busy: Busy) -> list[tuple[str, ...]]:
@@ -242,12 +242,12 @@ def _outside(
         if parked is None or not ways:
             return None
         start, end = ways[int(generator.integers(len(ways)))]
-        turn = effect_from(
+        turn = effect_from_record(
             {"name": "turning", "from_edge": start, "to_edge": end, "share": 0.1 * scale}
         )
         return Sample("outside", member, strength, (parked, turn), ("parking",))
     if member in MODELS:
-        model = effect_from({"name": "driver_model", "model": member})
+        model = effect_from_record({"name": "driver_model", "model": member})
         return Sample("outside", member, "", (model,), ("driver_model",))
     name = member.removeprefix("without ")
     strength = strength if strength in KINDS[name].strengths else KINDS[name].strengths[0]

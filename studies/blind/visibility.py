@@ -28,7 +28,7 @@ from ugat_marl.diagnosis import (
     sum_of,
     whitened,
 )
-from ugat_marl.effects import Effect, effect_from, known_effects, load_scenario
+from ugat_marl.effects import Effect, effect_from_record, known_effects, load_scenario
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Network
@@ -86,7 +86,7 @@ def effect_of(hidden: Hidden) -> Effect:
     values |= dict(zip(texts, (hidden.place or "").split(">"), strict=True)) if texts else {}
     if hidden.window is not None:
         values |= dict(zip(WINDOW, hidden.window, strict=True))
-    return effect_from({"name": hidden.name} | values)
+    return effect_from_record({"name": hidden.name} | values)
 
 
 def deviations_of(study: Study, effects: Sequence[Effect]) -> float:

@@ -20,7 +20,7 @@ from ugat_marl.effects import (
     BlockerPatience,
     Incident,
     QueueModel,
-    effect_from,
+    effect_from_record,
     effects_on_controllers,
     known_effects,
 )
@@ -57,7 +57,7 @@ def test_the_example_is_a_scenario_file() -> None:
     settings = validated(tomllib.loads(example[1]), "docs/how-to/scenarios.md")
     assert settings.intersections["C1"].phases == ("GGrr", "rrGG")
     for record in settings.effects:
-        effect_from(record)
+        effect_from_record(record)
 
 
 def test_what_is_added_in_ten_lines_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,7 +120,7 @@ def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
     example = re.search(r"```toml\n(.*?)```", page, flags=re.DOTALL)
     assert example is not None
     (record,) = tomllib.loads(example[1])["effects"]
-    effect_from(record)
+    effect_from_record(record)
 
 
 def test_every_effect_on_controllers_is_documented_with_its_fields_and_ranges() -> None:
@@ -143,4 +143,4 @@ def test_every_effect_on_controllers_is_documented_with_its_fields_and_ranges() 
     example = re.search(r"```toml\n(.*?)```", page, flags=re.DOTALL)
     assert example is not None
     (record,) = tomllib.loads(example[1])["effects"]
-    effect_from(record)
+    effect_from_record(record)

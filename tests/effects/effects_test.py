@@ -26,7 +26,7 @@ from ugat_marl.effects import (
     StartupDelay,
     apply_effects,
     domain_label,
-    effect_from,
+    effect_from_record,
     known_effects,
     load_scenario,
     parse_domain,
@@ -90,7 +90,7 @@ def test_domains_of_effects() -> None:
 )
 def test_an_effect_survives_every_spelling(effect: Effect) -> None:
     assert parse_domain(str(effect)) == (effect,)
-    assert effect_from({"name": effect.name, **dataclasses.asdict(effect)}) == effect
+    assert effect_from_record({"name": effect.name, **dataclasses.asdict(effect)}) == effect
     assert type(effect) is known_effects()[effect.name]
 
 
@@ -151,7 +151,7 @@ def test_numbers_of_numpy_are_numbers() -> None:
 )
 def test_records_are_checked(record: dict[str, object], message: str) -> None:
     with pytest.raises((UnknownNameError, OptionError), match=message):
-        effect_from(record)
+        effect_from_record(record)
 
 
 # --- every vehicle of the running simulation

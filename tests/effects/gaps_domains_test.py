@@ -187,7 +187,7 @@ class Trace:
     @property
     def effects(self) -> list[Any]:
         """The effects of the domain that the scenario lists."""
-        return [ugat_marl.effects.effect_from(r) for r in self.env.scenario.settings.effects]
+        return [ugat_marl.effects.effect_from_record(r) for r in self.env.scenario.settings.effects]
 
     @property
     def truth(self) -> NDArray[np.float64]:

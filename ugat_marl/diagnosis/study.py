@@ -31,7 +31,7 @@ from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, change_between, sum_of
 from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, THRESHOLDS, Effort
-from ugat_marl.effects import Effect, effect_from
+from ugat_marl.effects import Effect, effect_from_record
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter
@@ -428,7 +428,7 @@ def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> 
         if total >= THRESHOLDS.least_clearances:
             value, count = seen.most_common(1)[0]
             if count >= THRESHOLDS.usual_share * total and abs(value - now) > 0.05:
-                found.append(effect_from({"name": name, "seconds": value}))
+                found.append(effect_from_record({"name": name, "seconds": value}))
     return tuple(found)
 
 

@@ -79,7 +79,7 @@ def effects_on_controllers() -> Mapping[str, type[Effect]]:
     return dict(_ON_CONTROLLERS)
 
 
-def effect_from(record: Mapping[str, Any], where: str = "") -> Effect:
+def effect_from_record(record: Mapping[str, Any], where: str = "") -> Effect:
     """Return an effect from its name and parameters, as in ``[[effects]]`` of a scenario file.
 
     Args:
@@ -148,7 +148,7 @@ def load_scenario(name: str | Path | Scenario) -> Scenario:
     """
     scenario = name if isinstance(name, Scenario) else read_scenario(name)
     where = f" in scenario {scenario.id!r}"
-    effects = [effect_from(record, where) for record in scenario.settings.effects]
+    effects = [effect_from_record(record, where) for record in scenario.settings.effects]
     plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
     return apply_effects(plain, effects)
 
@@ -168,4 +168,4 @@ def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:
 
 def controller_effects(scenario: Scenario) -> tuple[Effect, ...]:
     """Return the effects on controllers that were applied to a scenario."""
-    return tuple(map(effect_from, scenario.settings.effects))
+    return tuple(map(effect_from_record, scenario.settings.effects))

@@ -24,7 +24,7 @@ from ugat_marl.cli import run
 from ugat_marl.data import read_measured
 from ugat_marl.diagnosis import IN_THE_LOG, Routes
 from ugat_marl.diagnosis.hypotheses import library
-from ugat_marl.effects import effect_from, known_effects, load_scenario
+from ugat_marl.effects import effect_from_record, known_effects, load_scenario
 from ugat_marl.errors import BlindTestError, OptionError, UnknownNameError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Network, Passages, Period, Scenario
@@ -359,7 +359,7 @@ def test_what_changes_no_detection_is_not_hidden(crossing: Callable[..., Path]) 
     consequences = Consequences(3)
 
     def has(*records: dict[str, str | float], group: str = "pair") -> bool:
-        effects = tuple(effect_from(item) for item in records)
+        effects = tuple(effect_from_record(item) for item in records)
         return consequences.has(scenario, Sample(group, "", "", effects), "fixed-time:20")
 
     nobody_weaves = {"name": "lane_discipline", "strategic": 0.0}  # every approach has one lane

@@ -14,12 +14,14 @@ from studies.blind.cases import Case, Hidden, Label, write_label, write_plan
 from studies.blind.grade import Grade, grade, grade_cases, read_grades
 from studies.blind.strengths import KINDS, nominal_of
 from studies.blind.table import AIMS, confusion, markdown, rows_of, wilson, write_table
-from ugat_marl.effects import PAPER_WORLDS, effect_from, known_effects, load_scenario
+from ugat_marl.effects import PAPER_WORLDS, effect_from_record, known_effects, load_scenario
 from ugat_marl.errors import BlindTestError
 
 
 def hidden(**record: Any) -> Hidden:
-    return Hidden.of(effect_from(record), {"seconds": 1.0} if record["name"] == "headway" else None)
+    return Hidden.of(
+        effect_from_record(record), {"seconds": 1.0} if record["name"] == "headway" else None
+    )
 
 
 def label(*effects: Hidden, group: str = "single", lights: tuple[str, ...] = ("C",)) -> Label:

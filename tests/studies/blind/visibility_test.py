@@ -19,7 +19,7 @@ from studies.blind.visibility import effect_of, judge_visibility, separation
 from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, EVENT_FEATURES, FEATURES
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.effects import effect_from
+from ugat_marl.effects import effect_from_record
 from ugat_marl.errors import UnknownNameError
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ def test_chance_alone_is_not_seen(reference: Reference) -> None:
     ],
 )
 def test_a_label_says_all_about_an_effect(record: dict[str, object]) -> None:
-    effect = effect_from(record)
+    effect = effect_from_record(record)
     assert effect_of(Hidden.of(effect)) == effect
 
 
@@ -94,7 +94,7 @@ def hide(directory: Path, **effects: str) -> None:
     """A blind test in which these names are hidden, and none was found."""
     write_plan(directory, tuple(Case(case, "single-v1") for case in effects))
     for case, name in effects.items():
-        shown = Hidden.of(effect_from({"name": name, "seconds": 3.5}))
+        shown = Hidden.of(effect_from_record({"name": name, "seconds": 3.5}))
         write_label(
             directory,
             Label(

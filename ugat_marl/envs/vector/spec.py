@@ -10,7 +10,7 @@ from typing import Any
 from ugat_marl.effects import (
     Domain,
     domain_path,
-    effect_from,
+    effect_from_record,
     load_scenario,
     parse_domain,
     scenario_in_domain,
@@ -151,7 +151,7 @@ def sent(domain: Domain) -> Any:
 
 def received(domain: Any) -> Domain:
     """Return the domain from the values of `sent`."""
-    return domain if isinstance(domain, str) else [effect_from(record) for record in domain]
+    return domain if isinstance(domain, str) else [effect_from_record(record) for record in domain]
 
 
 def domain_chooser(
