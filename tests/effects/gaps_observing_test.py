@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import ugat_marl
 from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.effects import (
-    OBSERVING,
+    OBSERVATION_EFFECTS,
     Effect,
     apply_effects,
     controller_effects,
@@ -80,14 +80,16 @@ def seen(
 
 
 def test_no_diagnosis_looks_for_them() -> None:
-    ours = {kind.name for kind in OBSERVING}
+    ours = {kind.name for kind in OBSERVATION_EFFECTS}
     assert ours <= set(effects_on_controllers())
     assert not set(effects_on_controllers()) & set(known_effects())
     assert not set(effects_on_controllers()) & library()
 
 
 def test_every_effect_has_an_example() -> None:
-    assert [text.partition("=")[0] for text in EXAMPLES] == [kind.name for kind in OBSERVING]
+    assert [text.partition("=")[0] for text in EXAMPLES] == [
+        kind.name for kind in OBSERVATION_EFFECTS
+    ]
 
 
 @pytest.mark.parametrize("text", EXAMPLES)
@@ -344,4 +346,4 @@ class _Nobody:
 
 
 def test_all_are_effects() -> None:
-    assert all(issubclass(kind, Effect) for kind in OBSERVING)
+    assert all(issubclass(kind, Effect) for kind in OBSERVATION_EFFECTS)

@@ -247,7 +247,7 @@ class _Steps(Sensor):
         return replace(reading, counts=counts)
 
 
-OBSERVING: tuple[type[ControllerEffect], ...] = (
+OBSERVATION_EFFECTS: tuple[type[ControllerEffect], ...] = (
     CountingNoise, CountingError, DetectorFailure, DetectionZone, ObservationDelay, LostReadings,
     QuantisedCounts,
 )  # fmt: skip
