@@ -13,7 +13,7 @@ from ugat_marl.effects import (
     TextParameter,
     edit_scenario,
     hashed_uniform,
-    places_of,
+    network_places,
     seconds_text,
 )
 from ugat_marl.errors import BlindTestError
@@ -84,7 +84,7 @@ class Driveway(Effect):
 
     def apply(self, scenario: Scenario) -> Scenario:
         """Cut the routes of vehicles chosen by a hash of their ids."""
-        places = places_of(scenario)
+        places = network_places(scenario)
         position = _before_line(scenario, places.edges[self.edge][0])
 
         def change(root: ET.Element) -> bool:
@@ -131,5 +131,5 @@ def _lane_towards(scenario: Scenario, edge: str, other: str) -> str:
 
 
 def _before_line(scenario: Scenario, lane: str) -> float:
-    length = places_of(scenario).lanes[lane].length_m
+    length = network_places(scenario).lanes[lane].length_m
     return max(length - STOP_BEFORE_LINE_M, 0.5 * length)

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from ugat_marl.diagnosis import Routes
-from ugat_marl.effects import places_of
+from ugat_marl.effects import network_places
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Detector, Network, Scenario
 from ugat_marl.seeding import derive_seed
@@ -70,7 +70,7 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         if rates.get(f"stop:{lane}", 0.0) >= BUSY_PER_HOUR
         and network.lanes[lane].length_m >= LONG_M
     ]
-    places = places_of(scenario)
+    places = network_places(scenario)
     counted = {network.lanes[item.lane].edge for item in detectors}
     cars = Counter(item.edge for item in places.lanes.values() if item.cars)
     ways = {

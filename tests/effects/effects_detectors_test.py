@@ -22,8 +22,8 @@ from ugat_marl.effects import (
     apply_detector_effects,
     detector_lights,
     load_scenario,
+    network_places,
     parse_domain,
-    places_of,
 )
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Detector, Passages, Period
@@ -152,7 +152,7 @@ def test_the_scenario_is_left_alone() -> None:
 
 def test_detectors_belong_to_the_light_they_lead_to_or_stand_behind() -> None:
     scenario = load_scenario("grid2x2-v1")
-    places = places_of(scenario)
+    places = network_places(scenario)
     between = next(lane for lane in places.lanes if lane in places.ends and lane in places.begins)
     made = [Detector(kind, between, 1, 1, kind) for kind in ("advance", "stop", "exit")]
     found = detector_lights(scenario, made)

@@ -49,7 +49,7 @@ from .fleet import HeavyShare as HeavyShare
 from .fleet import SpeedSpread as SpeedSpread
 from .objectives import OBJECTIVES as OBJECTIVES
 from .objectives import Objective as Objective
-from .places import places_of as places_of
+from .places import network_places as network_places
 from .roads import Incident as Incident
 from .roads import LaneClosure as LaneClosure
 from .roads import LocalSpeed as LocalSpeed

@@ -30,7 +30,7 @@ from ugat_marl.effects.documents import (
     seconds_text,
     windows,
 )
-from ugat_marl.effects.places import places_of
+from ugat_marl.effects.places import network_places
 from ugat_marl.scenarios import Scenario, seconds_of
 
 TAGS = ("<vehicle", "<trip", "<flow")
@@ -214,7 +214,7 @@ def replace_departing(
     """
     routes = Routes()
     if edge != EVERYWHERE:
-        places = places_of(scenario)
+        places = network_places(scenario)
         places.check(effect.name, "edge", edge, places.edges)
         routes = Routes.of(scenario)
 

@@ -18,7 +18,7 @@ from ugat_marl.effects.base import (
     TextParameter,
     hashed_uniform,
 )
-from ugat_marl.effects.places import places_of
+from ugat_marl.effects.places import network_places
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Detector, Passages, Period, Scenario
 
@@ -37,7 +37,7 @@ def detector_lights(scenario: Scenario, detectors: Sequence[Detector]) -> dict[s
     An exit detector belongs to the light at the start of its lane, any other to the light at the
     end; if there is none, to the light at the other end. Detectors at no light are left out.
     """
-    places = places_of(scenario)
+    places = network_places(scenario)
     found: dict[str, str] = {}
     for item in detectors:
         first, second = (places.begins, places.ends)[:: 1 if item.kind == "exit" else -1]
@@ -62,7 +62,7 @@ class DetectorEffect(Effect):
         for key, text in self.texts.items():
             name = getattr(self, key)
             if text.kind == "traffic light" and name != EVERYWHERE:
-                places = places_of(scenario)
+                places = network_places(scenario)
                 places.check(self.name, text.kind, name, places.lights)
         return replace(scenario, applied=(*scenario.applied, str(self)))
 

@@ -94,7 +94,7 @@ class Places:
         return self is other
 
 
-def places_of(scenario: Scenario) -> Places:
+def network_places(scenario: Scenario) -> Places:
     """Return the places of a scenario's network.
 
     Raises:

@@ -15,7 +15,7 @@ from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, hashed_uniform
 from ugat_marl.effects.documents import edit, seconds_text
-from ugat_marl.effects.places import places_of
+from ugat_marl.effects.places import network_places
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Document, Scenario
@@ -76,7 +76,7 @@ class Incident(Effect):
         Raises:
             ScenarioError: No lane that leads to a signal is long enough.
         """
-        places = places_of(scenario)
+        places = network_places(scenario)
         lanes = [
             lane
             for lane in places.ends
@@ -138,7 +138,7 @@ class LocalSpeed(Effect):
         Raises:
             UnknownNameError: No such edge.
         """
-        places = places_of(scenario)
+        places = network_places(scenario)
         places.check(self.name, "edge", self.edge, places.edges)
         file = re.sub(r"[^\w.#-]", "_", f"local-speed.{self.edge}.add.xml")
         before = [item for item in scenario.additional if item.name == file]
@@ -195,7 +195,7 @@ def _with_blockers(
         departs: Times at which they appear, in s, in order.
         stand: Attributes of ``<stop>`` that decide how long each of them stands.
     """
-    places = places_of(scenario)
+    places = network_places(scenario)
     places.check(effect.name, "lane", lane, places.lanes)
     place = places.lanes[lane]
     if place.length_m < 2 * _LENGTH_M + 2:

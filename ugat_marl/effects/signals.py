@@ -14,7 +14,7 @@ from ugat_marl.effects.base import (
     TextParameter,
 )
 from ugat_marl.effects.documents import edit, seconds_text
-from ugat_marl.effects.places import places_of
+from ugat_marl.effects.places import network_places
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import LateGreenMemory as Held
 from ugat_marl.scenarios import Scenario, seconds_of, validated, with_late_green
@@ -54,7 +54,7 @@ class LateGreen(Effect):
             for item in own.values():
                 item.pop("late_green_s", None)
         else:
-            places = places_of(scenario)
+            places = network_places(scenario)
             places.check(self.name, "traffic light", self.place, places.lights)
             own[self.place] = {**own.get(self.place, {}), "late_green_s": self.seconds}
         settings["intersections"] = {tls: item for tls, item in own.items() if item}
@@ -98,7 +98,7 @@ def late_greens(scenario: Scenario) -> dict[str, float]:
     own = scenario.settings.intersections
     if not general and not own:
         return {}
-    found = dict.fromkeys(places_of(scenario).lights, general) if general else {}
+    found = dict.fromkeys(network_places(scenario).lights, general) if general else {}
     found |= {tls: x.late_green_s + start_s for tls, x in own.items() if x.late_green_s is not None}
     return {tls: seconds for tls, seconds in found.items() if seconds > 0}
 

@@ -14,7 +14,7 @@ from typing import ClassVar
 from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, hashed_uniform
 from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
 from ugat_marl.effects.documents import edit_scenario, is_demand, mentions
-from ugat_marl.effects.places import Places, places_of
+from ugat_marl.effects.places import Places, network_places
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Scenario, edge_of
 
@@ -47,7 +47,7 @@ class Turning(Effect):
         Raises:
             UnknownNameError: No such edge, or no way from the one to the other.
         """
-        places = places_of(scenario)
+        places = network_places(scenario)
         places.check(self.name, "edge", self.from_edge, places.edges)
         places.check(self.name, "edge", self.to_edge, places.edges)
         ahead = places.following.get(self.from_edge, ())
