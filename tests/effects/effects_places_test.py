@@ -26,8 +26,8 @@ from ugat_marl.effects import (
     known_effects,
     late_greens,
     load_scenario,
-    parked_at_other_times,
     parse_domain,
+    shift_parking,
     with_late_programmes,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
@@ -166,7 +166,7 @@ def test_parking_at_other_times_is_as_frequent_and_as_long(
     toml = lambda text: text.replace("duration_s", f"begin_s = {begin_s:g}\nduration_s")  # noqa: E731
     directory = crossing(vehicles="", toml=toml if begin_s else None)
     scenario = apply_effects(load_scenario(directory), [Parking("S_C_0", 180, 5)])
-    one, again, other = (parked_at_other_times(scenario, seed) for seed in (1, 1, 2))
+    one, again, other = (shift_parking(scenario, seed) for seed in (1, 1, 2))
     assert len(parked(scenario)) == 10  # 200 s of 180 an hour
     for day in (one, other):
         assert len(parked(day)) == 10
@@ -184,11 +184,11 @@ def test_parking_at_other_times_is_as_frequent_and_as_long(
 
 def test_only_parking_is_moved_to_other_times(crossing: Crossing) -> None:
     plain = load_scenario(crossing())
-    assert parked_at_other_times(plain, 1).hash == plain.hash
+    assert shift_parking(plain, 1).hash == plain.hash
     closed = apply_effects(plain, [LaneClosure("S_C_0", 60, 90)])
-    assert parked_at_other_times(closed, 1).hash == closed.hash
+    assert shift_parking(closed, 1).hash == closed.hash
     both = apply_effects(closed, [Parking("W_C_0", 180, 5)])
-    moved = parked_at_other_times(both, 1)
+    moved = shift_parking(both, 1)
     others = [
         {name: time for name, time in departures(item).items() if not name.startswith("parking.")}
         for item in (both, moved)

@@ -17,9 +17,9 @@ from studies.blind.outside_effects import BusStops, Driveway
 from ugat_marl.effects import (
     apply_effects,
     load_scenario,
-    parked_at_other_times,
     parse_domain,
     scenario_in_domain,
+    shift_parking,
 )
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OutputError, ScenarioError
@@ -92,7 +92,7 @@ def made(scenario: Scenario, name: str) -> dict[str, str]:
         if name != "crossing" or not domain.startswith("turning")  # there is nowhere to turn to
     }
     parked = apply_effects(scenario, parse_domain(f"parking={lane},60,20"))
-    found["parked at other times"] = digest(parked_at_other_times(parked, 3))
+    found["parked at other times"] = digest(shift_parking(parked, 3))
     found["driveway"] = digest(Driveway(edge, 0.3).apply(scenario))
     if name != "crossing":  # buses go the usual way of vehicles with routes of their own
         found["bus stops"] = digest(BusStops(edge, 10, 20).apply(scenario))

@@ -45,7 +45,7 @@ from ugat_marl.effects import (
     depart_s,
     detector_effects,
     late_greens,
-    parked_at_other_times,
+    shift_parking,
     sort_departures,
 )
 from ugat_marl.errors import MeasuredDataError, SimulatorCrashed, SimulatorError
@@ -144,7 +144,7 @@ class Replay:
             others = [item for item in effects if not item.on_departures]
             drivers = scenario if len(others) == len(effects) else _with(day, others)
             scenario, due = self._arrivals.given(scenario, drivers, period)
-        scenario = parked_at_other_times(scenario, derive_seed(seed, "parking"))
+        scenario = shift_parking(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)
             done = persistently(lambda: self._run(scenario, period, seed, directory))

@@ -54,7 +54,7 @@ from .roads import Incident as Incident
 from .roads import LaneClosure as LaneClosure
 from .roads import LocalSpeed as LocalSpeed
 from .roads import Parking as Parking
-from .roads import parked_at_other_times as parked_at_other_times
+from .roads import shift_parking as shift_parking
 from .sensors import OBSERVATION_EFFECTS as OBSERVATION_EFFECTS
 from .sensors import CountingError as CountingError
 from .sensors import CountingNoise as CountingNoise

@@ -162,7 +162,7 @@ class LocalSpeed(Effect):
         )
 
 
-def parked_at_other_times(scenario: Scenario, seed: int) -> Scenario:
+def shift_parking(scenario: Scenario, seed: int) -> Scenario:
     """Return the day with all `Parking` vehicles shifted by one random time, modulo the duration.
 
     Vehicles do not park at the same second every day; a fixed time would be a false pattern.

@@ -28,9 +28,9 @@ from ugat_marl.effects import (
     detector_effects,
     detector_lights,
     domain_path,
-    parked_at_other_times,
     parse_domain,
     scenario_in_domain,
+    shift_parking,
 )
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments.recording.controller import (
@@ -226,9 +226,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
         scenario = _renamed(scenario, derive_seed(street.seed, "record", index, "names"))
     scenario = apply_effects(scenario, street.effects)
     if not street.same_demand:
-        scenario = parked_at_other_times(
-            scenario, derive_seed(street.seed, "record", index, "parking")
-        )
+        scenario = shift_parking(scenario, derive_seed(street.seed, "record", index, "parking"))
     begin = scenario.settings.begin_s
     end = begin + scenario.decisions * scenario.control.decision_interval_s
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
