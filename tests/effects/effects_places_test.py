@@ -28,7 +28,7 @@ from ugat_marl.effects import (
     load_scenario,
     parse_domain,
     shift_parking,
-    with_late_programmes,
+    with_late_green_programmes,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.scenarios import Network, Scenario, check_demand
@@ -262,7 +262,7 @@ def test_late_green_is_a_setting(crossing: Crossing, tmp_path: Path) -> None:
     plain = load_scenario(crossing())
     scenario = apply_effects(plain, [LateGreen("*", 2)])
     assert late_greens(plain) == {}
-    assert with_late_programmes(plain) is plain
+    assert with_late_green_programmes(plain) is plain
     assert late_greens(scenario) == {"C": 2}
     own = apply_effects(scenario, [LateGreen("C", 3.5)])
     assert late_greens(own) == {"C": 3.5}
@@ -277,7 +277,7 @@ def test_late_green_is_a_setting(crossing: Crossing, tmp_path: Path) -> None:
 
 def test_a_programme_that_is_late(crossing: Crossing) -> None:
     def states(scenario: Scenario) -> list[tuple[float, str]]:
-        logic = next(iter(with_late_programmes(scenario).network.parse().iter("tlLogic")))
+        logic = next(iter(with_late_green_programmes(scenario).network.parse().iter("tlLogic")))
         return [(float(x.get("duration", "")), x.get("state", "")) for x in logic]
 
     scenario = load_scenario(crossing())

@@ -18,7 +18,7 @@ from ugat_marl.effects import (
     load_scenario,
     parse_domain,
     scenario_in_domain,
-    with_late_programmes,
+    with_late_green_programmes,
 )
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.scenarios import Network
@@ -368,11 +368,11 @@ def test_a_programme_that_jumps_is_an_error_only_where_lateness_was_asked_for(
     scenario = scenario_in_domain(load_scenario(path), "meso")
     before, after = (
         [phase.attrib for phase in item.network.parse().iter("phase")]
-        for item in (scenario, with_late_programmes(scenario))
+        for item in (scenario, with_late_green_programmes(scenario))
     )
     assert before == after and before
     with pytest.raises(ScenarioError, match="next="):
-        with_late_programmes(scenario_in_domain(load_scenario(path), "meso+late_green=*,1"))
+        with_late_green_programmes(scenario_in_domain(load_scenario(path), "meso+late_green=*,1"))
 
 
 def test_lanes_hold_all_vehicles_that_go_their_way() -> None:

@@ -67,7 +67,7 @@ from .signals import AllRedTime as AllRedTime
 from .signals import LateGreen as LateGreen
 from .signals import YellowTime as YellowTime
 from .signals import late_greens as late_greens
-from .signals import with_late_programmes as with_late_programmes
+from .signals import with_late_green_programmes as with_late_green_programmes
 from .table import apply_effects as apply_effects
 from .table import controller_effects as controller_effects
 from .table import detector_effects as detector_effects

@@ -103,7 +103,7 @@ def late_greens(scenario: Scenario) -> dict[str, float]:
     return {tls: seconds for tls, seconds in found.items() if seconds > 0}
 
 
-def with_late_programmes(scenario: Scenario) -> Scenario:
+def with_late_green_programmes(scenario: Scenario) -> Scenario:
     """Return the scenario with late green in SUMO's own programmes, for the simulator only.
 
     The phases of agents are read from the unchanged scenario. A programme has whole simulation

@@ -20,7 +20,7 @@ from ugat_marl.effects import (
     late_greens,
     load_scenario,
     scenario_in_domain,
-    with_late_programmes,
+    with_late_green_programmes,
 )
 from ugat_marl.envs.actions import checked_delays, checked_phases
 from ugat_marl.envs.actuators import Actuators
@@ -295,7 +295,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if self._simulator is None:
             self._simulator = simulator_of(self.options.simulator)
         launch = launch_of(
-            with_late_programmes(self.scenario),
+            with_late_green_programmes(self.scenario),
             seed,
             self._directory.fresh(),
             self._lanes.ids,
