@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.data import AgentLayout
-from ugat_marl.envs import UNITS, Observer
+from ugat_marl.envs import OBSERVATION_UNITS, Observer
 from ugat_marl.envs.rewards import IntersectionView, Rewarder
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Intersection, Lane, Link, Network
@@ -105,7 +105,7 @@ def test_every_observation_is_what_it_says(name: str) -> None:
 
 
 def test_all_observations_are_tested_and_have_units() -> None:
-    assert set(FEATURES) == set(UNITS)
+    assert set(FEATURES) == set(OBSERVATION_UNITS)
 
 
 def test_pressure_is_clipped_on_both_sides() -> None:
@@ -146,9 +146,11 @@ def test_vectors_are_fresh_at_each_call() -> None:
 
 
 def test_only_waiting_needs_waiting_times() -> None:
-    assert [name for name in UNITS if Observer(NETWORK, name).needs_waiting] == ["waiting"]
+    assert [name for name in OBSERVATION_UNITS if Observer(NETWORK, name).needs_waiting] == [
+        "waiting"
+    ]
     blind = replace(SEEN, waiting_s=np.empty(0))
-    for name in set(UNITS) - {"waiting"}:
+    for name in set(OBSERVATION_UNITS) - {"waiting"}:
         Observer(NETWORK, name).observe(blind, PHASES)
 
 

@@ -4,7 +4,7 @@ from .agents import AgentSet as AgentSet
 from .agents import Mask as Mask
 from .agents import groups_of as groups_of
 from .objectives import OBJECTIVE_MEASURES as OBJECTIVE_MEASURES
-from .observations import UNITS as UNITS
+from .observations import OBSERVATION_UNITS as OBSERVATION_UNITS
 from .observations import WAITING_SCALE_S as WAITING_SCALE_S
 from .observations import Observer as Observer
 from .options import EnvOptions as EnvOptions

@@ -26,7 +26,7 @@ COUNT_SCALE = 40.0
 WAITING_SCALE_S = 100.0
 """Mean waiting time per storage place that makes `waiting` 1."""
 
-UNITS: dict[str, str] = {
+OBSERVATION_UNITS: dict[str, str] = {
     "count": "vehicles per incoming lane / 40",
     "queue": "halting vehicles per incoming lane / 40",
     "pressure": "vehicles / lane capacity, incoming lane minus mean of the lanes its links lead to",

@@ -16,7 +16,7 @@ class EnvOptions:
     """Options of an environment.
 
     Attributes:
-        observation: Name of the observation; see `ugat_marl.envs.observations.UNITS`.
+        observation: Name of the observation; see `ugat_marl.envs.observations.OBSERVATION_UNITS`.
         reward: ``"queue"``, ``"pressure"``, ``"waiting"`` or a function of two `IntersectionView`.
         neighbours: Distance in roads up to which agents see features and phases of others.
         signals: ``"actions"``, or ``"programme"``: SUMO runs the network's own signal programme

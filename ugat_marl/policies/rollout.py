@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Provenance, TransitionLog, TransitionRecorder, installed_version
-from ugat_marl.envs import UNITS, Actions, AnyParallelEnv, Infos, Observations, Observer
+from ugat_marl.envs import OBSERVATION_UNITS, Actions, AnyParallelEnv, Infos, Observations, Observer
 from ugat_marl.policies.protocols import Policy
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.simulation import Snapshot
@@ -161,7 +161,7 @@ def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Prove
         observation=observer.name,
         layouts=dict(zip(observer.agents, observer.layouts, strict=True)),
         versions={name: installed_version(name) or "not installed" for name in SIMULATING},
-        units={"observation": UNITS[observer.name], "reward": str(base.options.reward)},
+        units={"observation": OBSERVATION_UNITS[observer.name], "reward": str(base.options.reward)},
     )
 
 
