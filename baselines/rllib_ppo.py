@@ -29,7 +29,7 @@ from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
 from torch import Tensor, nn
 
-from ugat_marl.envs import AnyParallelEnv, agent_indicator, groups_of, masked_observation
+from ugat_marl.envs import AnyParallelEnv, agent_groups, agent_indicator, masked_observation
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.policies import (
@@ -113,7 +113,7 @@ class RLlib(LibraryLearner):
     ) -> None:
         self.config = config or RLlibConfig()
         super().__init__(env, "baselines.rllib.ppo")
-        self._groups = groups_of(self.agents)
+        self._groups = agent_groups(self.agents)
         self._decisions = decisions_of(env)
         # RLlib logs errors that it raises as well.
         logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)

@@ -31,7 +31,7 @@ from skrl.multi_agents.torch.mappo import MAPPO, MAPPO_CFG
 from skrl.trainers.torch import SequentialTrainer
 from torch import Tensor, nn
 
-from ugat_marl.envs import AnyParallelEnv, appended_mask, groups_of
+from ugat_marl.envs import AnyParallelEnv, agent_groups, appended_mask
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.policies import (
@@ -127,7 +127,7 @@ class Skrl(LibraryLearner):
             }
             for agent in self.agents.names
         }
-        self._groups = groups_of(self.agents) if config.shared else {a: a for a in spaces}
+        self._groups = agent_groups(self.agents) if config.shared else {a: a for a in spaces}
         self._models: dict[str, dict[str, Any]] = {}  # actor and critic by group
         with kept_generators():
             seed_generators(seed, "skrl", "weights")

@@ -113,7 +113,7 @@ class AgentSet:
         return np.array([by_agent[name] for name in self.names], dtype=np.float32)
 
 
-def groups_of(agents: AgentSet) -> dict[str, str]:
+def agent_groups(agents: AgentSet) -> dict[str, str]:
     """Return the group of each agent ``<group>_<n>``, or its own name if the group is not alike."""
     sizes = zip(agents.observation_sizes, agents.action_counts, strict=True)
     kinds: dict[str, set[tuple[int, int]]] = {}
