@@ -1,7 +1,7 @@
 from .actions import checked_phases as checked_phases
 from .adapters.sb3 import AgentsVecEnv as AgentsVecEnv
+from .agents import ActionMask as ActionMask
 from .agents import AgentSet as AgentSet
-from .agents import Mask as Mask
 from .agents import agent_groups as agent_groups
 from .objectives import OBJECTIVE_MEASURES as OBJECTIVE_MEASURES
 from .observations import OBSERVATION_UNITS as OBSERVATION_UNITS

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ugat_marl.envs.types import AnyParallelEnv, Infos, Observations
 from ugat_marl.errors import ActionError, OptionError
 
-Mask = NDArray[np.bool_]
+ActionMask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class AgentSet:
             raise OptionError(f"the observation of agent {name!r} holds NaN or infinity")
         return stacked
 
-    def masks(self, infos: Infos) -> Mask:
+    def masks(self, infos: Infos) -> ActionMask:
         """Return allowed actions ``(agents, most_actions)``; an info without a mask allows all.
 
         Raises:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.data import checked_tensors, read_checkpoint, write_checkpoint
-from ugat_marl.envs import AgentSet, AnyParallelEnv, Mask
+from ugat_marl.envs import ActionMask, AgentSet, AnyParallelEnv
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
@@ -77,7 +77,9 @@ class StickyExploration:
         self._action = np.zeros(agents, dtype=np.int64)
         self._left = np.zeros(agents, dtype=np.int64)
 
-    def choose(self, greedy: NDArray[np.int64], allowed: Mask, epsilon: float) -> NDArray[np.int64]:
+    def choose(
+        self, greedy: NDArray[np.int64], allowed: ActionMask, epsilon: float
+    ) -> NDArray[np.int64]:
         """Replace some greedy actions by exploratory ones.
 
         Args:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ugat_marl.envs import AgentSet, Mask
+from ugat_marl.envs import ActionMask, AgentSet
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Replay:
         reward: NDArray[np.float32],
         terminal: NDArray[np.bool_],
         next_observation: NDArray[np.float32],
-        next_allowed: Mask,
+        next_allowed: ActionMask,
     ) -> None:
         """Store one decision of all agents; a full ring loses its oldest decision."""
         at, columns = self.added % self.capacity, self._columns
