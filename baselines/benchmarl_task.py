@@ -33,7 +33,7 @@ from torchrl.data import Composite
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad
+from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad_spaces
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.policies import (
@@ -96,7 +96,7 @@ def world_of(env: AnyParallelEnv) -> World:
     with warnings.catch_warnings():  # each call warns: "tested using PettingZoo 1.24.3"
         warnings.simplefilter("ignore")
         groups = {_GROUP: list(env.possible_agents)}
-        return World(agent_indicator(pad(env)), return_state=True, group_map=groups)
+        return World(agent_indicator(pad_spaces(env)), return_state=True, group_map=groups)
 
 
 class TrafficTask(TaskClass):

@@ -32,7 +32,7 @@ from stable_baselines3.dqn.policies import DQNPolicy as LibraryPolicy
 from stable_baselines3.dqn.policies import QNetwork
 from torch import Tensor, nn
 
-from ugat_marl.envs import AgentsVecEnv, AnyParallelEnv, agent_indicator, pad
+from ugat_marl.envs import AgentsVecEnv, AnyParallelEnv, agent_indicator, pad_spaces
 from ugat_marl.errors import EpisodeError, UnknownNameError
 from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.policies import (
@@ -226,7 +226,7 @@ class SB3(LibraryLearner):
 
     def _wrapped(self, env: AnyParallelEnv) -> VecEnv:
         by_itself = self.config.algorithm == "maskable-ppo"
-        return AgentsVecEnv([agent_indicator(pad(env))], masks_in_observation=not by_itself)
+        return AgentsVecEnv([agent_indicator(pad_spaces(env))], masks_in_observation=not by_itself)
 
     def _exploration(self) -> float:
         """Return the share of random actions.

@@ -9,7 +9,7 @@ of SuperSuit 3.11:
 - `concat_vec_envs_v1` copies the environment and never closes the copies. With worker processes it
   loses their records of rewards. It is not used here.
 - `pad_action_space_v0` silently turns an action that does not exist into action 0. Here
-  `ugat_marl.envs.wrappers.pad` raises an error instead, and masks exclude such actions.
+  `ugat_marl.envs.wrappers.pad_spaces` raises an error instead, and masks exclude such actions.
 - `agent_indicator_v0` converts every step to PettingZoo's other interface and back, and steps a
   `GroundedEnv` after the end of its episode. `ugat_marl.envs.wrappers.agent_indicator` does not.
 - It has no action masks. Here the observation ends with the mask.
@@ -27,7 +27,7 @@ import tyro
 from supersuit.vector import MarkovVectorEnv
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
-from ugat_marl.envs import AnyParallelEnv, agent_indicator, appended_mask, pad
+from ugat_marl.envs import AnyParallelEnv, agent_indicator, appended_mask, pad_spaces
 from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.policies import EpisodeCallback, load_baseline
 
@@ -51,7 +51,7 @@ class SuperSuitPPO(_sb3.SB3):
         self._kind = "baselines.supersuit.ppo"
 
     def _wrapped(self, env: AnyParallelEnv) -> Any:
-        return SB3VecEnvWrapper(MarkovVectorEnv(appended_mask(agent_indicator(pad(env)))))
+        return SB3VecEnvWrapper(MarkovVectorEnv(appended_mask(agent_indicator(pad_spaces(env)))))
 
 
 @dataclass(frozen=True)

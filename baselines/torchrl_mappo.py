@@ -25,7 +25,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
-from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad
+from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad_spaces
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
 from ugat_marl.policies import (
@@ -136,7 +136,7 @@ class TorchRLMAPPO(LibraryLearner):
         ):  # TorchRL warns of PettingZoo's version and of advantages over all agents
             warnings.simplefilter("ignore")
             world = PettingZooWrapper(
-                agent_indicator(pad(env)),
+                agent_indicator(pad_spaces(env)),
                 return_state=True,
                 group_map={_GROUP: list(self.agents.names)},
             )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ugat_marl.envs import agent_indicator, pad
+from ugat_marl.envs import agent_indicator, pad_spaces
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
 from ugat_marl.testing import ToyTraffic
 
@@ -38,7 +38,7 @@ class Noted(ToyTraffic):
 
 def many(number: int = 2, **given: Any) -> tuple[list[Noted], AgentsVecEnv]:
     inner = [Noted(**given) for _ in range(number)]
-    return inner, AgentsVecEnv([agent_indicator(pad(env)) for env in inner])
+    return inner, AgentsVecEnv([agent_indicator(pad_spaces(env)) for env in inner])
 
 
 def test_rows_are_the_agents_of_each_environment_in_turn() -> None:
@@ -49,7 +49,7 @@ def test_rows_are_the_agents_of_each_environment_in_turn() -> None:
     assert seen.shape == (6, 7 + 3) and seen.dtype == np.float32
     assert [one.seeds for one in inner] == [[7], [8]]
     assert np.array_equal(seen[:3, 7:], np.eye(3)) and np.array_equal(seen[3:, 7:], np.eye(3))
-    twin = agent_indicator(pad(ToyTraffic()))
+    twin = agent_indicator(pad_spaces(ToyTraffic()))
     expected, _ = twin.reset(seed=8)
     assert np.array_equal(seen[3:], list(expected.values()))
     actions = [0, 1, 2, 1, 0, 0]
@@ -65,7 +65,7 @@ def test_an_end_is_a_truncation_with_what_was_seen_there() -> None:
     _, env = many(1, steps=3)
     env.seed(1)
     env.reset()
-    twin = agent_indicator(pad(ToyTraffic(steps=3)))
+    twin = agent_indicator(pad_spaces(ToyTraffic(steps=3)))
     twin.reset(seed=1)
     for number in range(3):
         seen, _, over, infos = env.step(np.zeros(3, dtype=int))
@@ -80,7 +80,7 @@ def test_an_end_is_a_truncation_with_what_was_seen_there() -> None:
 
 
 def test_one_environment_may_end_before_another() -> None:
-    env = AgentsVecEnv([pad(ToyTraffic(steps=2)), pad(ToyTraffic(steps=3))])
+    env = AgentsVecEnv([pad_spaces(ToyTraffic(steps=2)), pad_spaces(ToyTraffic(steps=3))])
     env.seed(1)
     env.reset()
     ends = [env.step(np.zeros(6, dtype=int))[2].tolist() for _ in range(4)]
@@ -126,7 +126,7 @@ def test_what_does_not_fit_is_refused() -> None:
             self.agents = self.agents[:1]
             return found
 
-    env = AgentsVecEnv([pad(Leaving())])
+    env = AgentsVecEnv([pad_spaces(Leaving())])
     env.reset()
     with pytest.raises(EpisodeError, match="cross_1, tee_0 left"):
         env.step(np.zeros(3, dtype=int))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ugat_marl import parallel_env, vector_env
-from ugat_marl.envs import agent_indicator, pad
+from ugat_marl.envs import agent_indicator, pad_spaces
 from ugat_marl.errors import OptionError
 
 pytest.importorskip("stable_baselines3")
@@ -38,7 +38,7 @@ def played(env: Any, steps: int) -> list[Any]:
 
 @pytest.mark.parametrize("masks_in_observation", [False, True])
 def test_it_is_the_one_over_plain_environments(masks_in_observation: bool) -> None:
-    plain = [agent_indicator(pad(parallel_env("mixed-v1", duration_s=50))) for _ in range(2)]
+    plain = [agent_indicator(pad_spaces(parallel_env("mixed-v1", duration_s=50))) for _ in range(2)]
     one = AgentsVecEnv(plain, masks_in_observation=masks_in_observation)
     two = SimulationsVecEnv(
         vector_env("mixed-v1", 2, wrap=WRAPS, duration_s=50),

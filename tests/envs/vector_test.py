@@ -22,7 +22,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from ugat_marl import parallel_env, vector_env
 from ugat_marl.effects import StartupDelay, load_scenario
-from ugat_marl.envs import AgentSet, VectorEnv, agent_indicator, pad
+from ugat_marl.envs import AgentSet, VectorEnv, agent_indicator, pad_spaces
 from ugat_marl.envs.vector.arrays import Arrays, Shape, shared_memory
 from ugat_marl.envs.vector.gymnasium_env import GymnasiumVectorEnv
 from ugat_marl.envs.vector.remote import SERVICE
@@ -218,7 +218,7 @@ def test_wrappers_rewards_and_effects_reach_the_workers(module: Callable[[str], 
     ) as env:
         ((found,),) = together(env, 2)
     inner = parallel_env("mixed-v1", [StartupDelay(0.7)], reward=reward, duration_s=LENGTH_S)
-    plain = agent_indicator(pad(inner))
+    plain = agent_indicator(pad_spaces(inner))
     assert found == alone(plain, 2)
     plain.close()
 

@@ -18,7 +18,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.test import parallel_api_test
 
 import ugat_marl
-from ugat_marl.envs import agent_indicator, appended_mask, masked_observation, pad
+from ugat_marl.envs import agent_indicator, appended_mask, masked_observation, pad_spaces
 from ugat_marl.envs.wrappers import frame_stack, shared_observation
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
 from ugat_marl.policies import DQN
@@ -32,11 +32,11 @@ def stacked(env: Any) -> Any:
 
 
 def together(env: Any) -> Any:
-    return agent_indicator(shared_observation(stacked(pad(env))))
+    return agent_indicator(shared_observation(stacked(pad_spaces(env))))
 
 
 SINGLE: dict[str, Callable[[Any], Any]] = {
-    "pad": pad,
+    "pad": pad_spaces,
     "agent_indicator": agent_indicator,
     "shared_observation": shared_observation,
     "frame_stack": stacked,
@@ -97,7 +97,7 @@ def is_list(vector: Any, expected: list[float]) -> bool:
 
 
 def test_padding_in_closed_form() -> None:
-    env = pad(Steep())
+    env = pad_spaces(Steep())
     observations, infos = env.reset()
     assert is_list(observations["a_1"], [1, 10, 0]) and is_list(observations["b_2"], [0, 20, 30])
     assert infos["a_1"]["action_mask"].tolist() == [0, 1, 0, 0]
@@ -115,7 +115,7 @@ def test_padding_in_closed_form() -> None:
 
 @pytest.mark.parametrize("wrong", [{"a_1": 2}, {"a_1": 3}, {"a_1": -1}, {"a_1": None}, {"c": 0}])
 def test_padding_refuses_actions_that_an_agent_does_not_have(wrong: dict[str, Any]) -> None:
-    env = pad(Steep())
+    env = pad_spaces(Steep())
     env.reset()
     with pytest.raises(ActionError, match="padding"):
         env.step({"a_1": 0, "b_2": 0, **wrong})
@@ -125,13 +125,13 @@ def test_padding_refuses_actions_that_an_agent_does_not_have(wrong: dict[str, An
 
 
 def test_padding_makes_masks_where_there_are_none() -> None:
-    _, infos = pad(Steep(masks=False)).reset()
+    _, infos = pad_spaces(Steep(masks=False)).reset()
     assert infos["a_1"]["action_mask"].tolist() == [1, 1, 0, 0]
     assert infos["b_2"]["action_mask"].tolist() == [1, 1, 1, 1]
 
 
 def test_a_padded_space_samples_actions_that_exist() -> None:
-    space = pad(Steep()).action_space("a_1")
+    space = pad_spaces(Steep()).action_space("a_1")
     space.seed(0)
     assert {int(space.sample()) for _ in range(50)} == {0, 1}
     assert space.sample(mask=np.int8([0, 0, 0, 1])) == 3  # who brings a mask knows better
@@ -179,7 +179,7 @@ def test_frames_in_closed_form() -> None:
 
 
 def test_masked_observations_in_closed_form() -> None:
-    env = masked_observation(pad(Steep()))
+    env = masked_observation(pad_spaces(Steep()))
     observations, infos = env.reset()
     assert set(observations["a_1"]) == {"observations", "action_mask"}
     assert is_list(observations["a_1"]["observations"], [1, 10, 0])
@@ -215,7 +215,7 @@ def test_actions_must_be_counted_from_zero() -> None:
     env = Steep()
     env.action_spaces["a_1"] = Discrete(2, start=1)
     with pytest.raises(OptionError, match="Discrete"):
-        pad(env)
+        pad_spaces(env)
 
 
 # --- what stays ---------------------------------------------------------------------------------
@@ -256,7 +256,7 @@ def test_wrappers_stack_in_any_order(order: tuple[str, ...]) -> None:
 
 
 def test_unwrapped_shows_the_spaces_that_are_seen_and_all_else_within() -> None:
-    env = agent_indicator(pad(ToyTraffic()))
+    env = agent_indicator(pad_spaces(ToyTraffic()))
     assert env.unwrapped.observation_spaces["tee_0"] is env.observation_space("tee_0")
     assert env.unwrapped.action_spaces["tee_0"].n == 3
     assert env.unwrapped.intersection_of == ToyTraffic().intersection_of
@@ -281,9 +281,12 @@ def test_options_of_the_environment_come_through() -> None:
 # --- SuperSuit ----------------------------------------------------------------------------------
 
 COUNTERPARTS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
-    "pad": (pad, lambda env: supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env))),
+    "pad": (
+        pad_spaces,
+        lambda env: supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env)),
+    ),
     "agent_indicator": (
-        lambda env: agent_indicator(pad(env)),
+        lambda env: agent_indicator(pad_spaces(env)),
         lambda env: supersuit.agent_indicator_v0(supersuit.pad_observations_v0(env)),
     ),
     "frame_stack": (stacked, lambda env: supersuit.frame_stack_v1(env, 3)),

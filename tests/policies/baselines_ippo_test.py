@@ -14,7 +14,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 import ugat_marl
-from ugat_marl.envs import agent_indicator, pad
+from ugat_marl.envs import agent_indicator, pad_spaces
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform
 from ugat_marl.policies import Learner, NetworkPolicy, Policy, load_baseline
@@ -242,7 +242,7 @@ def test_a_central_critic_sees_the_state_and_others_their_observation() -> None:
 def test_it_is_padded_and_told_the_agent_as_by_the_wrappers() -> None:
     env = ToyTraffic()
     learner = IPPO(env, Config(**QUICK))
-    wrapped = agent_indicator(pad(env))
+    wrapped = agent_indicator(pad_spaces(env))
     vectors, _ = wrapped.reset(seed=1)
     network = learner._actor
     torch.nn.init.normal_(network.agent_bias)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ugat_marl.data import AgentLayout
-from ugat_marl.envs import AgentSet, pad, parallel_env
+from ugat_marl.envs import AgentSet, pad_spaces, parallel_env
 from ugat_marl.envs.wrappers import frame_stack
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.policies import DQN, NetworkPolicy, export_policy, learner_factory
@@ -208,7 +208,7 @@ def test_what_cannot_be_read_is_refused_with_the_way_out():
     with pytest.raises(OptionError, match=r"parallel_env, or the network 'mlp'"):
         DQN.of(ToyTraffic(), QUICK)
     env = parallel_env("single-v1")
-    for wrapped in (frame_stack(env, 2), pad(parallel_env("mixed-v1"))):
+    for wrapped in (frame_stack(env, 2), pad_spaces(parallel_env("mixed-v1"))):
         with pytest.raises(OptionError, match=r"network 'frap'"):
             DQN.of(wrapped, QUICK)
     with pytest.raises(OptionError, match=r"network = 'frap' with the structure of 'mlp'"):

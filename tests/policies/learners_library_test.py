@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from ugat_marl.envs import AgentSet, agent_indicator, appended_mask, pad, parallel_env
+from ugat_marl.envs import AgentSet, agent_indicator, appended_mask, pad_spaces, parallel_env
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies import (
     InputScale,
@@ -156,7 +156,7 @@ def test_libraries_see_scaled_numbers_and_policies_plain_ones() -> None:
     assert np.array_equal(world.state(), env.state() * learner.states.factors)
     # the network reads scaled numbers, the policy reads them as they are
     values = learner.policy().q_values(plain)
-    shown, _ = agent_indicator(pad(world)).reset()
+    shown, _ = agent_indicator(pad_spaces(world)).reset()
     for name, vector in shown.items():
         wanted = learner.network(torch.from_numpy(vector)).detach().numpy()
         assert np.allclose(values[name], wanted[: len(values[name])], atol=1e-5)
@@ -197,7 +197,7 @@ def test_returns_are_those_of_the_environment() -> None:
 def test_what_is_masked_or_does_not_exist_is_refused(action: int, agent: str) -> None:
     env = ToyTraffic()  # the tee has two phases
     with pytest.raises(ActionError, match=f"action {action} for {agent}"):
-        Still(pad(env), action).learn(pad(env), 1, 1)
+        Still(pad_spaces(env), action).learn(pad_spaces(env), 1, 1)
 
 
 def test_agents_have_to_stay() -> None:
@@ -282,7 +282,7 @@ def test_settings_are_checked(wrong: dict[str, Any]) -> None:
 
 
 def test_masks_are_appended_inside_their_bounds() -> None:
-    env = appended_mask(pad(ToyTraffic()))
+    env = appended_mask(pad_spaces(ToyTraffic()))
     observations, infos = env.reset(seed=1)
     for agent, vector in observations.items():
         assert env.observation_space(agent).contains(vector) and vector.dtype == np.float32

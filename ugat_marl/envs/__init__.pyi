@@ -25,5 +25,5 @@ from .wrappers import agent_indicator as agent_indicator
 from .wrappers import appended_mask as appended_mask
 from .wrappers import frame_stack as frame_stack
 from .wrappers import masked_observation as masked_observation
-from .wrappers import pad as pad
+from .wrappers import pad_spaces as pad_spaces
 from .wrappers import shared_observation as shared_observation

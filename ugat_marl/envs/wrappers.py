@@ -2,7 +2,7 @@
 
 They take any `ParallelEnv` whose agents observe one-dimensional boxes, act in `Discrete(n)` and
 live to the end of the episode. They can be stacked in any order; `masked_observation` comes last.
-Rewards, ends, infos and `state()` stay those of the wrapped environment; only `pad` lengthens
+Rewards, ends, infos and `state()` stay those of the wrapped environment; only `pad_spaces` lengthens
 ``action_mask`` in the infos.
 """
 
@@ -25,7 +25,7 @@ Vectors = Mapping[str, NDArray[np.float32]]
 Infos = dict[str, dict[str, Any]]
 
 
-def pad(env: AnyParallelEnv) -> Wrapper:
+def pad_spaces(env: AnyParallelEnv) -> Wrapper:
     """Give all agents equal spaces: zeros behind short observations, further actions.
 
     All agents share one `Box` of the length of the longest observation, and act in a `Discrete` of
@@ -134,7 +134,7 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
         """Step the wrapped environment and convert its observations and infos.
 
         Raises:
-            ActionError: The wrapped environment or `pad` refuses an action.
+            ActionError: The wrapped environment or `pad_spaces` refuses an action.
         """
         self._check(actions)
         observations, rewards, terminations, truncations, infos = self.env.step(actions)

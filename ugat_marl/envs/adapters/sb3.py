@@ -37,7 +37,7 @@ class AgentsVecEnv(VecEnv):
 
     Args:
         envs: Environments whose agents all have the same spaces, and stay to the end of the
-            episode; `ugat_marl.envs.wrappers.pad` makes spaces equal.
+            episode; `ugat_marl.envs.wrappers.pad_spaces` makes spaces equal.
         masks_in_observation: True to append the action mask to each observation, for policies
             without another way to see it (`ugat_marl.envs.wrappers.appended_mask` does the same for
             one environment).
