@@ -19,7 +19,7 @@ from ugat_marl.effects import Domain, domain_label, scenario_in_domain
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding import (
-    CHUNK,
+    CHECKPOINT_EPISODES,
     MATCHED_REWARD,
     NegativeControl,
     Probe,
@@ -68,14 +68,14 @@ def train_through(
         marks: Numbers of training episodes, ascending; earlier episodes of the learner count.
         seed: Root of every random choice.
         on_episode: Called after every episode.
-        on_chunk: Called after at most `CHUNK` episodes; the learner may be saved then.
+        on_chunk: Called after at most `CHECKPOINT_EPISODES` episodes; the learner may be saved then.
 
     Yields:
         The mark and the greedy policy.
     """
     for mark in marks:
         while learner.episodes < mark:
-            chunk = min(CHUNK, mark - learner.episodes)
+            chunk = min(CHECKPOINT_EPISODES, mark - learner.episodes)
             begin, own = time.perf_counter(), time.process_time()
             learner.learn(env, chunk, seed, on_episode)
             effort = Effort(chunk, time.perf_counter() - begin, time.process_time() - own)

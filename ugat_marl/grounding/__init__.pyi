@@ -19,7 +19,7 @@ from .state import State as State
 from .timed import TimedConfig as TimedConfig
 from .timed import TimedTransform as TimedTransform
 from .transform import Transform as Transform
-from .ugat import CHUNK as CHUNK
+from .ugat import CHECKPOINT_EPISODES as CHECKPOINT_EPISODES
 from .ugat import DIRECT_LEARNER as DIRECT_LEARNER
 from .ugat import Probe as Probe
 from .ugat import Ugat as Ugat

@@ -62,7 +62,7 @@ from ugat_marl.grounding.wrappers import GroundedEnv
 from ugat_marl.policies import Policy, device_of
 from ugat_marl.seeding import derive_seed
 
-CHUNK = 10
+CHECKPOINT_EPISODES = 10
 """Episodes of plain training between two checkpoints."""
 
 DIRECT_LEARNER = "direct-learner.pt"
@@ -126,7 +126,7 @@ class Ugat:
         """Train in plain E_sim for M episodes; keep the policy as direct transfer (line 1)."""
         wanted = self.config.pretrain_episodes
         while state.pretrained < wanted:
-            episodes = min(CHUNK, wanted - state.pretrained)
+            episodes = min(CHECKPOINT_EPISODES, wanted - state.pretrained)
             numbers = f"{state.pretrained + 1}-{state.pretrained + episodes}"
             self._learn(state, self.env, episodes, f"plain sim, episode {numbers}")
             state.pretrained += episodes
