@@ -8,7 +8,7 @@ from typing import Any
 
 from studies.bench.fresh_process import in_fresh_process
 from studies.bench.report import Report, Spread, require_positive
-from ugat_marl.grounding import METHODS
+from ugat_marl.grounding import UNCERTAINTY_METHODS
 from ugat_marl.progress import Reporter, Silent
 
 _PROGRAM = ["-m", "studies.bench.fitting_program"]
@@ -94,7 +94,7 @@ def _row(
     what: str, measured: dict[str, dict[str, list[float]]], name: str, relative: bool = False
 ) -> dict[str, Any]:
     row: dict[str, Any] = {"what": what}
-    for method in METHODS:
+    for method in UNCERTAINTY_METHODS:
         values = measured[method][name]
         row[method] = (
             Spread.of_ratios(values, measured["edl"][name]) if relative else Spread.of(values)

@@ -15,7 +15,7 @@ import torch
 from ugat_marl.data import TransitionLog
 from ugat_marl.envs import parallel_env
 from ugat_marl.grounding import (
-    METHODS,
+    UNCERTAINTY_METHODS,
     FitConfig,
     Fitter,
     InverseConfig,
@@ -92,10 +92,10 @@ def measure(request: Mapping[str, Any]) -> dict[str, Any]:
     torch.set_num_threads(1)
     simulated, real = recorded(request, "sim"), recorded(request, request["domain"])
     options = {name: request[name] for name in ("epochs", "off_data_weight")}
-    configs = {method: FitConfig(uncertainty=method, **options) for method in METHODS}
+    configs = {method: FitConfig(uncertainty=method, **options) for method in UNCERTAINTY_METHODS}
     for config in configs.values():  # loading on first use must not count
         measured(replace(config, epochs=1), simulated, real, request["seed"])
-    found: dict[str, list[dict[str, float]]] = {method: [] for method in METHODS}
+    found: dict[str, list[dict[str, float]]] = {method: [] for method in UNCERTAINTY_METHODS}
     for number in range(request["rounds"]):
         for method, config in configs.items():
             found[method].append(measured(config, simulated, real, request["seed"] + number))

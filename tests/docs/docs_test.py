@@ -27,7 +27,7 @@ from ugat_marl.effects import (
 from ugat_marl.effects.actuators import PHASE_ORDERS
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.files import xml_bytes
-from ugat_marl.grounding import METHODS, FitConfig
+from ugat_marl.grounding import UNCERTAINTY_METHODS, FitConfig
 from ugat_marl.scenarios import validated
 from ugat_marl.scenarios.settings import ControlSettings, IntersectionSettings, ScenarioFile
 
@@ -99,7 +99,7 @@ def test_what_is_added_in_ten_lines_works(tmp_path: Path, monkeypatch: pytest.Mo
 def test_every_uncertainty_is_documented() -> None:
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "training.md").read_text()
     table = page.partition("| `--fit.uncertainty` |")[2].partition("\n\n")[0]
-    assert tuple(re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE)) == METHODS
+    assert tuple(re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE)) == UNCERTAINTY_METHODS
     assert f"`{FitConfig().uncertainty}` (default)" in table
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.errors import OptionError
-from ugat_marl.grounding import METHODS, FitConfig, InverseConfig, InverseModel, Stack
+from ugat_marl.grounding import UNCERTAINTY_METHODS, FitConfig, InverseConfig, InverseModel, Stack
 from ugat_marl.grounding.uncertainty import (
     DropoutNet,
     EnsembleNet,
@@ -105,7 +105,7 @@ def test_the_divergence_of_a_layer_by_hand() -> None:
     assert float(divergence(weight, logit, 7)) == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", UNCERTAINTY_METHODS)
 def test_an_intersection_learns_the_same_in_company_as_alone(method: MethodName) -> None:
     """Gradients of an encoder, with more phases and inputs beside it; the head is shared."""
     config = InverseConfig(hidden=(8, 8), embedding=5)
@@ -167,7 +167,7 @@ def share(whole: torch.Tensor, part: torch.Tensor, members: int) -> torch.Tensor
     return each[:, : len(part) // members].reshape(part.shape)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", UNCERTAINTY_METHODS)
 def test_the_weights_of_a_phase_that_is_missing_change_nothing(method: MethodName) -> None:
     how = Method(method, members=2, passes=3)
     h = InverseModel(STACK, InverseConfig(hidden=(8,), embedding=5), torch_generator(0), how)
@@ -183,7 +183,7 @@ def test_the_weights_of_a_phase_that_is_missing_change_nothing(method: MethodNam
 
 
 @given(
-    st.sampled_from(METHODS),
+    st.sampled_from(UNCERTAINTY_METHODS),
     st.integers(0, 10_000),
     st.floats(-1e4, 1e4),
     st.integers(1, 4),

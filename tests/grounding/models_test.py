@@ -9,7 +9,7 @@ from torch import nn
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.errors import LogError, OptionError
-from ugat_marl.grounding import METHODS, InverseConfig, InverseModel, Stack, stack_log
+from ugat_marl.grounding import UNCERTAINTY_METHODS, InverseConfig, InverseModel, Stack, stack_log
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.networks import FARTHEST, Standardiser
 from ugat_marl.grounding.uncertainty import Method, MethodName
@@ -76,7 +76,7 @@ def test_forward_models_together_equal_each_alone(include_phase: bool) -> None:
 
 
 @pytest.mark.parametrize("include_phase", [False, True])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", UNCERTAINTY_METHODS)
 def test_inverse_models_together_equal_each_alone(include_phase: bool, method: MethodName) -> None:
     stack, here, there, _ = stacked()
     config = InverseConfig(hidden=(16, 16), embedding=8, include_phase=include_phase)

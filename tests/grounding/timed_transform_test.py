@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ugat_marl.data import AgentLayout
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding import (
-    METHODS,
+    UNCERTAINTY_METHODS,
     GateConfig,
     InverseConfig,
     PhaseTransform,
@@ -251,7 +251,7 @@ def test_nothing_is_grounded_before_the_models_are_fitted() -> None:
 # --- checkpoints
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", UNCERTAINTY_METHODS)
 def test_save_and_load_give_identical_groundings(tmp_path: Path, method: MethodName) -> None:
     one, two = transform(seed=1), TimedTransform(LAYOUTS, 2)
     one.inverse.renew(Method(method, members=3, passes=4), torch_generator(7))

@@ -10,7 +10,7 @@ import torch
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
-from ugat_marl.grounding import METHODS, GateConfig, InverseConfig, PhaseTransform
+from ugat_marl.grounding import UNCERTAINTY_METHODS, GateConfig, InverseConfig, PhaseTransform
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.uncertainty import Method, MethodName
 from ugat_marl.seeding import torch_generator
@@ -104,7 +104,7 @@ def test_save_and_load_give_the_same_actions_and_the_same_gate(tmp_path: Path) -
     assert one.gate.alpha.tolist() == two.gate.alpha.tolist()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", UNCERTAINTY_METHODS)
 def test_a_checkpoint_brings_its_method_with_it(tmp_path: Path, method: MethodName) -> None:
     one, two = transform(seed=1), transform(seed=2)
     one.inverse.renew(Method(method, members=3, passes=4), torch_generator(7))

@@ -16,7 +16,7 @@ import torch
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.grounding import (
-    METHODS,
+    UNCERTAINTY_METHODS,
     FitConfig,
     Fitter,
     GateConfig,
@@ -87,7 +87,7 @@ def weather() -> TransitionLog:
 
 @pytest.fixture(scope="module")
 def all_fits(weather: TransitionLog) -> Fits:
-    return {name: fitted(name, weather) for name in METHODS}
+    return {name: fitted(name, weather) for name in UNCERTAINTY_METHODS}
 
 
 def asked(h: InverseModel, agent: int, push: list[list[float]]) -> Any:
@@ -102,7 +102,7 @@ def asked(h: InverseModel, agent: int, push: list[list[float]]) -> Any:
     return found.action[agent], found.probability[agent, :, :k], found.u[agent]
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", UNCERTAINTY_METHODS)
 @pytest.mark.parametrize("agent", [0, 1])
 def test_every_method_finds_the_action_and_the_odds(
     method: str, agent: int, all_fits: Fits
@@ -155,7 +155,7 @@ def test_without_uncertainty_u_is_zero_and_says_nothing(all_fits: Fits) -> None:
     assert len({round(risk, 12) for risk in calibration.risk_by_coverage}) == 1
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", UNCERTAINTY_METHODS)
 def test_the_gate_works_with_every_method_and_stays_open_without_any(
     method: str, all_fits: Fits
 ) -> None:
@@ -176,7 +176,7 @@ def test_the_gate_works_with_every_method_and_stays_open_without_any(
     assert bool(np.isinf(gate.alpha).all()) == (method == "none")
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", UNCERTAINTY_METHODS)
 def test_the_same_seed_fits_the_same_and_answers_are_functions(method: MethodName) -> None:
     log, config = world(steps=40), dataclasses.replace(CONFIG, epochs=4)
     one, _ = fitted(method, log, config)

@@ -31,7 +31,7 @@ from ugat_marl.errors import OptionError
 from ugat_marl.experiments import PaperConfig, TransferConfig, transfer
 from ugat_marl.experiments.paper import Planner
 from ugat_marl.grounding import (
-    METHODS,
+    UNCERTAINTY_METHODS,
     FitConfig,
     Fitter,
     InputsConfig,
@@ -370,8 +370,8 @@ def trainings(monkeypatch: pytest.MonkeyPatch) -> list[torch.device]:
 
 
 CASES = {
-    **{f"{name}": (FitConfig(name), {}) for name in METHODS},
-    **{f"timed {name}": (FitConfig(name), {"timed": True}) for name in METHODS},
+    **{f"{name}": (FitConfig(name), {}) for name in UNCERTAINTY_METHODS},
+    **{f"timed {name}": (FitConfig(name), {"timed": True}) for name in UNCERTAINTY_METHODS},
     "smoothed": (FitConfig(pairs="smoothed"), {}),
     "nothing off the data": (FitConfig(off_data_weight=0.0), {}),
     "history and neighbours": (FitConfig(), {"inputs": "wide"}),

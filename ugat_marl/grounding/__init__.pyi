@@ -23,7 +23,7 @@ from .ugat import CHECKPOINT_EPISODES as CHECKPOINT_EPISODES
 from .ugat import DIRECT_LEARNER as DIRECT_LEARNER
 from .ugat import Probe as Probe
 from .ugat import Ugat as Ugat
-from .uncertainty import METHODS as METHODS
+from .uncertainty import UNCERTAINTY_METHODS as UNCERTAINTY_METHODS
 from .view import InputsConfig as InputsConfig
 from .view import neighbours_of as neighbours_of
 from .worlds import RecordedWorld as RecordedWorld

@@ -38,7 +38,7 @@ MOST = 100
 """Largest number of members or passes; larger ones are taken for a mistake."""
 
 MethodName = Literal["edl", "dropout", "ensemble", "none"]
-METHODS: tuple[MethodName, ...] = ("edl", "dropout", "ensemble", "none")
+UNCERTAINTY_METHODS: tuple[MethodName, ...] = ("edl", "dropout", "ensemble", "none")
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,10 @@ class Method:
     passes: int = 20
 
     def __post_init__(self) -> None:
-        if self.name not in METHODS:
-            raise OptionError(f"uncertainty is {self.name!r}; allowed: {', '.join(METHODS)}")
+        if self.name not in UNCERTAINTY_METHODS:
+            raise OptionError(
+                f"uncertainty is {self.name!r}; allowed: {', '.join(UNCERTAINTY_METHODS)}"
+            )
         for name in ("members", "passes"):
             value = getattr(self, name)
             if not isinstance(value, int) or not 1 <= value <= MOST:
