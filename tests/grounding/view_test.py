@@ -24,8 +24,8 @@ from ugat_marl.grounding import (
     InputsConfig,
     InverseConfig,
     PhaseTransform,
+    RunState,
     Stack,
-    State,
     TimedConfig,
     TimedTransform,
     Ugat,
@@ -323,7 +323,7 @@ def test_a_run_finds_the_neighbours_by_itself(
     class ResetResult(Exception):
         pass
 
-    def begun(_ugat: Ugat, state: State) -> None:
+    def begun(_ugat: Ugat, state: RunState) -> None:
         raise ResetResult(state.transform)
 
     monkeypatch.setattr(Ugat, "train", begun)

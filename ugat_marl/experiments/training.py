@@ -23,9 +23,9 @@ from ugat_marl.grounding import (
     MATCHED_REWARD,
     NegativeControl,
     Probe,
+    RunState,
     ShuffledWorld,
     SimulatedWorld,
-    State,
     Ugat,
     UgatConfig,
     World,
@@ -96,7 +96,7 @@ def train_grounded(
     placebo: NegativeControl = "none",
     probe: Probe | None = None,
     device: str = "cpu",
-) -> State:
+) -> RunState:
     """Train by UGAT, or resume the run, and return the final state.
 
     Args:
@@ -115,7 +115,7 @@ def train_grounded(
     transform = ugat.transform(env.layouts, seed, neighbours_of(env))
     if placebo == "noise":
         answer_with_noise(transform.forward, seed)
-    state = State(learner, transform)
+    state = RunState(learner, transform)
     if start is not None:
         learner.load(start)
         state.direct, state.pretrained = learner.policy(), ugat.pretrain_episodes

@@ -45,8 +45,8 @@ from ugat_marl.grounding import (
     NEGATIVE_CONTROLS,
     NegativeControl,
     RecordedWorld,
+    RunState,
     SimulatedWorld,
-    State,
     UgatConfig,
     World,
 )
@@ -273,7 +273,7 @@ def transfer(
     return table
 
 
-def _policies(config: TransferConfig, state: State) -> dict[str, Policy]:
+def _policies(config: TransferConfig, state: RunState) -> dict[str, Policy]:
     """Return direct transfer and, if there was an iteration, the policy of UGAT."""
     assert state.direct is not None  # plain training comes first
     policies = {DIRECT: state.direct}
@@ -358,7 +358,7 @@ def _train(
     env: TrafficEnv,
     worlds: tuple[SimulatedWorld, World],
     run: Run,
-) -> State:
+) -> RunState:
     def probe(policy: Policy) -> dict[str, float]:
         """Return the ATT in s after an iteration, on a seed that no result is reported on."""
         found = evaluate(

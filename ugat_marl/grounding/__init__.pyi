@@ -15,7 +15,7 @@ from .phase import on_transitions as on_transitions
 from .reports import FitReport as FitReport
 from .stacked import Stack as Stack
 from .stacked import stack_log as stack_log
-from .state import State as State
+from .state import RunState as RunState
 from .timed import TimedConfig as TimedConfig
 from .timed import TimedTransform as TimedTransform
 from .transform import Transform as Transform

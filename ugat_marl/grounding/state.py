@@ -14,7 +14,7 @@ from ugat_marl.policies import Learner, Policy
 
 
 @dataclass
-class State:
+class RunState:
     """Complete state of a run, as stored in a checkpoint.
 
     Attributes:

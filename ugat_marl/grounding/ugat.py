@@ -56,7 +56,7 @@ from ugat_marl.grounding.delays import EpisodeRewards, episode_rewards
 from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.gate import GateReport
 from ugat_marl.grounding.reports import FitReport
-from ugat_marl.grounding.state import State
+from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.worlds import SimulatedWorld, World
 from ugat_marl.grounding.wrappers import GroundedEnv
 from ugat_marl.policies import Policy, device_of
@@ -96,7 +96,7 @@ class Ugat:
     probe: Probe | None = None
     device: str = "cpu"
 
-    def train(self, state: State) -> Policy:
+    def train(self, state: RunState) -> Policy:
         """Run Algorithm 1 to its end.
 
         Args:
@@ -122,7 +122,7 @@ class Ugat:
             state.save(self.run)
         return state.learner.policy()
 
-    def _pretrain(self, state: State) -> None:
+    def _pretrain(self, state: RunState) -> None:
         """Train in plain E_sim for M episodes; keep the policy as direct transfer (line 1)."""
         wanted = self.config.pretrain_episodes
         while state.pretrained < wanted:
@@ -139,7 +139,7 @@ class Ugat:
                 self.run.log("iteration", 0, self.probe(state.direct))
             state.save(self.run)
 
-    def _roll_out(self, state: State, policy: Policy) -> None:
+    def _roll_out(self, state: RunState, policy: Policy) -> None:
         """Roll the policy out in both worlds at the same time (lines 3 and 4)."""
         worlds: tuple[World, World] = (self.sim, self.real)
         with (
@@ -162,7 +162,7 @@ class Ugat:
                     data.append(log)
                 advance()
 
-    def _rewards(self, state: State, policy: Policy) -> EpisodeRewards:
+    def _rewards(self, state: RunState, policy: Policy) -> EpisodeRewards:
         """Run the policy in E_sim under each delay; return its rewards there and in E_real.
 
         Only timed grounding with matched rewards needs this; it is not part of Algorithm 1.
@@ -175,7 +175,9 @@ class Ugat:
         simulated = np.array([episode_rewards(log, agents) for log in logs])
         return EpisodeRewards(street, simulated, before)
 
-    def _fit(self, state: State, device: torch.device, rewards: EpisodeRewards | None) -> FitReport:
+    def _fit(
+        self, state: RunState, device: torch.device, rewards: EpisodeRewards | None
+    ) -> FitReport:
         """Update f with D_real and h with D_sim (lines 5 and 6); print warnings of the fit."""
         d_real, d_sim = map(TransitionLog.concatenate, (state.real, state.simulated))
         config, seed = self.config.fit, derive_seed(self.seed, "fit", state.iteration)
@@ -192,14 +194,14 @@ class Ugat:
             self.run.reporter.say(f"{_round(state)}: {warning}")
         return report
 
-    def _prepare_gate(self, state: State, report: FitReport) -> None:
+    def _prepare_gate(self, state: RunState, report: FitReport) -> None:
         """Give the gate the trusted agents and the u to expect (lines 7 and 13)."""
         gate = state.transform.gate
         if self.config.least_accuracy is not None:
             gate.trust(report.trusted(self.config.least_accuracy))
         gate.begin(report.expected_u)
 
-    def _learn(self, state: State, env: AnyParallelEnv, episodes: int, title: str) -> None:
+    def _learn(self, state: RunState, env: AnyParallelEnv, episodes: int, title: str) -> None:
         """Let the learner train in an environment; log every episode (lines 8 to 16)."""
         with self.run.reporter.task(title, episodes) as advance:
 
@@ -209,7 +211,7 @@ class Ugat:
 
             state.learner.learn(env, episodes, self.seed, on_episode)
 
-    def _update_alpha(self, state: State) -> GateReport:
+    def _update_alpha(self, state: RunState) -> GateReport:
         """Set alpha for the next iteration (line 17); warnings are shown beside the bars."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -218,7 +220,7 @@ class Ugat:
             self.run.reporter.say(report.warning)
         return report
 
-    def _log(self, state: State, report: FitReport, gate: GateReport) -> None:
+    def _log(self, state: RunState, report: FitReport, gate: GateReport) -> None:
         """Log the numbers of an iteration."""
         numbers = {**report.as_dict(), **{f"gate/{k}": v for k, v in gate.as_dict().items()}}
         if self.probe is not None:
@@ -226,5 +228,5 @@ class Ugat:
         self.run.log("iteration", state.iteration + 1, numbers)
 
 
-def _round(state: State) -> str:
+def _round(state: RunState) -> str:
     return f"round {state.iteration + 1}"
