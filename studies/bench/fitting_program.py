@@ -22,7 +22,7 @@ from ugat_marl.grounding import (
     InverseModel,
     Stack,
     fit_inverse,
-    on_transitions,
+    inverse_accuracy,
     stack_log,
 )
 from ugat_marl.policies import Exploring, controller_for, observer_of, roll_out
@@ -59,7 +59,7 @@ def measured(
     report = fit_inverse(model, simulated, Fitter(config, seed))
     fitted = time.process_time() - began
     there = stack_log(real, stack)
-    accuracy, mean_u = on_transitions(model, there, there.weight)
+    accuracy, mean_u = inverse_accuracy(model, there, there.weight)
     calibration = report.calibration
     return {
         "fit_s": fitted,

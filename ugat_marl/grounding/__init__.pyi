@@ -11,7 +11,7 @@ from .inverse import InverseConfig as InverseConfig
 from .inverse import InverseModel as InverseModel
 from .phase import PhaseTransform as PhaseTransform
 from .phase import fit_inverse as fit_inverse
-from .phase import on_transitions as on_transitions
+from .phase import inverse_accuracy as inverse_accuracy
 from .reports import FitReport as FitReport
 from .stacked import Stack as Stack
 from .stacked import stack_log as stack_log

@@ -97,7 +97,7 @@ class PhaseTransform(Transform):
         held_out = fitter.split(d_sim, self.stack).held_out
         held_out_real = fitter.split(d_real, self.stack).held_out
         agreement, u_on_predictions = on_predictions(f, h, d_sim, held_out)
-        accuracy_on_real, u_on_real = on_transitions(h, d_real, held_out_real)
+        accuracy_on_real, u_on_real = inverse_accuracy(h, d_real, held_out_real)
         accuracy_on_means, _ = _accuracy(h, d_sim, means, held_out)
         return PhaseReport(
             agents=self.stack.agents,
@@ -347,7 +347,7 @@ def on_predictions(
 
 
 @torch.no_grad()
-def on_transitions(
+def inverse_accuracy(
     inverse: InverseModel, data: StackedTransitions, held_out: Tensor
 ) -> tuple[Floats, Floats]:
     """Return accuracy and mean u, per agent, of h on recorded transitions."""
