@@ -27,7 +27,7 @@ from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import TrafficEnv
 from ugat_marl.errors import OptionError, SimulatorCrashed
 from ugat_marl.experiments import evaluate, rule_factory
-from ugat_marl.grounding import RollOut, roll_outs
+from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.parallel import (
     RETRIES,
     LocalProcesses,
@@ -137,7 +137,7 @@ def test_processes_give_what_threads_give() -> None:
 def test_roll_outs_are_in_the_order_of_their_seeds_whoever_plays_them() -> None:
     scenario = load_scenario("single-v1")
     rule = rule_factory("largest-queue:20")
-    each = RollOut(scenario, "V4", {"duration_s": LENGTH_S}, rule, 0.3, "count")
+    each = RollOutSettings(scenario, "V4", {"duration_s": LENGTH_S}, rule, 0.3, "count")
     alone = [each.play(seed, Stop())[0] for seed in (3, 1, 2)]
     log, scores = roll_outs(each, (3, 1, 2), workers=2)
     assert log.frame.equals(TransitionLog.concatenate(alone).frame)

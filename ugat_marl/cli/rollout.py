@@ -17,7 +17,7 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory
 from ugat_marl.files import require_writable
-from ugat_marl.grounding import RollOut, roll_outs
+from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import Film, Frame, film, frames, require_video, write_video
 from ugat_marl.scenarios import Scenario
@@ -126,7 +126,7 @@ class Rollout:
     def _record(self, scenario: Scenario, out: Path, console: Console) -> None:
         options = {"duration_s": self.duration_s, "crossings": self.crossings}
         make = policy_factory(self.policy)
-        each = RollOut(
+        each = RollOutSettings(
             scenario, self.domain, options, make, self.epsilon, self.observation, self.neighbours
         )
         seeds = [derive_seed(self.seed, "rollout", episode) for episode in range(self.episodes)]

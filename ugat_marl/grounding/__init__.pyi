@@ -27,7 +27,7 @@ from .uncertainty import UNCERTAINTY_METHODS as UNCERTAINTY_METHODS
 from .view import InputsConfig as InputsConfig
 from .view import neighbours_of as neighbours_of
 from .worlds import RecordedWorld as RecordedWorld
-from .worlds import RollOut as RollOut
+from .worlds import RollOutSettings as RollOutSettings
 from .worlds import SimulatedWorld as SimulatedWorld
 from .worlds import World as World
 from .worlds import roll_outs as roll_outs

@@ -193,7 +193,7 @@ class _RollOutAlone:
 
 
 @dataclass(frozen=True)
-class RollOut:
+class RollOutSettings:
     """Common settings of roll-outs; sent to every process that runs one.
 
     Attributes:
@@ -233,7 +233,7 @@ class RollOut:
 
 
 def roll_outs(
-    each: RollOut,
+    each: RollOutSettings,
     seeds: Sequence[int],
     *,
     workers: Workers = None,
