@@ -254,7 +254,7 @@ times = st.one_of(
 def test_what_is_logged_is_what_is_read(
     rows: list[tuple[float, float]], crossing_scenario: Scenario, network: Network
 ) -> None:
-    """Whatever a simulation says, writing and reading it is `passages_as_written`, and nothing is lost."""
+    """A simulation's data, written and read, are `passages_as_written`; nothing is lost."""
     table = np.array([row for row in rows if not row[1] < row[0]], np.float64).reshape(-1, 2)
     table = table[~np.isnan(table).all(1)]
     nothing = np.full(len(table), np.nan)

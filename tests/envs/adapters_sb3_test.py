@@ -115,7 +115,7 @@ def test_attributes_methods_and_the_end() -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(OptionError, match=r"wrappers\.pad"):
+    with pytest.raises(OptionError, match=r"wrappers\.pad_spaces"):
         AgentsVecEnv([ToyTraffic()])
     with pytest.raises(OptionError, match="no environment"):
         AgentsVecEnv([])

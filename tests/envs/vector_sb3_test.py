@@ -17,7 +17,7 @@ from ugat_marl.envs import AgentsVecEnv
 from ugat_marl.envs.adapters.sb3_vector import SimulationsVecEnv
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
-WRAPS = ["ugat_marl.envs.wrappers:pad", "ugat_marl.envs.wrappers:agent_indicator"]
+WRAPS = ["ugat_marl.envs.wrappers:pad_spaces", "ugat_marl.envs.wrappers:agent_indicator"]
 
 
 def played(env: Any, steps: int) -> list[Any]:
@@ -82,5 +82,5 @@ def test_only_the_convention_of_the_library_is_taken() -> None:
     env = vector_env("grid2x2-v1", 1, autoreset="disabled")
     with pytest.raises(OptionError, match="needs 'same-step'"):
         SimulationsVecEnv(env)
-    with pytest.raises(OptionError, match=r"ugat_marl\.wrappers\.pad"):
+    with pytest.raises(OptionError, match=r"wrappers\.pad_spaces"):
         SimulationsVecEnv(vector_env("mixed-v1", 1))

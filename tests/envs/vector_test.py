@@ -212,7 +212,7 @@ def test_two_halves_are_the_whole() -> None:
 def test_wrappers_rewards_and_effects_reach_the_workers(module: Callable[[str], str]) -> None:
     own = module("def alike(before, after):\n    return float(after.vehicles.sum())\n")
     reward = __import__(own).alike
-    wrap = ["ugat_marl.envs.wrappers:pad", agent_indicator]
+    wrap = ["ugat_marl.envs.wrappers:pad_spaces", agent_indicator]
     with vector_env(
         "mixed-v1", 1, [[StartupDelay(0.7)]], wrap=wrap, reward=reward, duration_s=LENGTH_S
     ) as env:

@@ -36,7 +36,7 @@ def together(env: Any) -> Any:
 
 
 SINGLE: dict[str, Callable[[Any], Any]] = {
-    "pad": pad_spaces,
+    "pad_spaces": pad_spaces,
     "agent_indicator": agent_indicator,
     "shared_observation": shared_observation,
     "frame_stack": stacked,
@@ -281,7 +281,7 @@ def test_options_of_the_environment_come_through() -> None:
 # --- SuperSuit ----------------------------------------------------------------------------------
 
 COUNTERPARTS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
-    "pad": (
+    "pad_spaces": (
         pad_spaces,
         lambda env: supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env)),
     ),

@@ -127,7 +127,8 @@ def test_domains_a_network_does_not_allow_are_left_out(
     with console.capture() as capture:
         left = command._domains(load_scenario("single-v1"), console)
     late = {name for name, item in NAMED_DOMAINS.items() if "demand_timing=*,300" in item.effects}
-    assert late and {name for name in NAMED_DOMAINS if NAMED_DOMAINS[name].gap == "transition"} - set(left) == {
+    transitions = {name for name, named in NAMED_DOMAINS.items() if named.gap == "transition"}
+    assert late and transitions - set(left) == {
         *late, "meso",
     }  # fmt: skip
     assert all(f"{name} is left out: " in capture.get() for name in late)

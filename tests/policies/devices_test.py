@@ -24,8 +24,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 import ugat_marl.experiments.transfers as transfer_module
 from studies.bench.learning_program import Noise
 from ugat_marl.__main__ import main
-from ugat_marl.data import SETTINGS_FILE as SETTINGS_FILE
-from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.data import SETTINGS_FILE, AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import PaperConfig, TransferConfig, transfer
@@ -365,7 +364,7 @@ def trainings(monkeypatch: pytest.MonkeyPatch) -> list[torch.device]:
         found.append(device)
         return on_device(device, *modules)
 
-    monkeypatch.setattr("ugat_marl.grounding.fitting.placed", noted)
+    monkeypatch.setattr("ugat_marl.grounding.fitting.on_device", noted)
     return found
 
 

@@ -2,8 +2,8 @@
 
 They take any `ParallelEnv` whose agents observe one-dimensional boxes, act in `Discrete(n)` and
 live to the end of the episode. They can be stacked in any order; `masked_observation` comes last.
-Rewards, ends, infos and `state()` stay those of the wrapped environment; only `pad_spaces` lengthens
-``action_mask`` in the infos.
+Rewards, ends, infos and `state()` stay those of the wrapped environment; only `pad_spaces`
+lengthens ``action_mask`` in the infos.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ def train_through(
         marks: Numbers of training episodes, ascending; earlier episodes of the learner count.
         seed: Root of every random choice.
         on_episode: Called after every episode.
-        on_chunk: Called after at most `CHECKPOINT_EPISODES` episodes; the learner may be saved then.
+        on_chunk: Called after at most `CHECKPOINT_EPISODES` episodes, to save the learner.
 
     Yields:
         The mark and the greedy policy.
@@ -157,8 +157,8 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
     if here_m != there_m:
         raise OptionError(
             f"agents look {here_m:g} m upstream in {domain_label(sim)!r} and {there_m:g} m in "
-            f"{domain_label(real)!r}, so that counts and rewards are not the same; give both the same "
-            "reach, such as +reach=100"
+            f"{domain_label(real)!r}, so that counts and rewards are not the same; give both the "
+            "same reach, such as +reach=100"
         )
 
 

@@ -237,7 +237,8 @@ def with_interval(interval: Interval) -> str:
     if math.isnan(interval.low) or interval.low == interval.high:
         return number_text(interval.mean)
     to = " to " if interval.low < 0 else "–"
-    return f"{number_text(interval.mean)} ({number_text(interval.low)}{to}{number_text(interval.high)})"
+    mean, low, high = map(number_text, (interval.mean, interval.low, interval.high))
+    return f"{mean} ({low}{to}{high})"
 
 
 def share_text(value: float) -> str:

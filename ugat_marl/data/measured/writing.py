@@ -32,8 +32,8 @@ from ugat_marl.scenarios import Passages, Period
 def write_measured(measured: Measured, directory: Path, *, csv: bool = False) -> Path:
     """Write measured data. The directory appears whole or not at all.
 
-    Passages are written in the form of `passages_as_written`: times in milliseconds, within their period, one
-    vehicle at a time.
+    Passages are written in the form of `passages_as_written`: times in milliseconds, within their
+    period, one vehicle at a time.
 
     Args:
         measured: The data; their findings are not written.

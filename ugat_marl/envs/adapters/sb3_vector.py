@@ -2,7 +2,7 @@
 
 from ugat_marl.envs.adapters.sb3_vector import SimulationsVecEnv
 
-wraps = ["ugat_marl.envs.wrappers:pad", "ugat_marl.envs.wrappers:agent_indicator"]
+wraps = ["ugat_marl.envs.wrappers:pad_spaces", "ugat_marl.envs.wrappers:agent_indicator"]
 env = SimulationsVecEnv(ugat_marl.vector_env("grid4x4-v1", 4, wrap=wraps))
 MaskablePPO("MlpPolicy", env, seed=1).learn(100_000)
 """
@@ -30,8 +30,8 @@ class SimulationsVecEnv(AgentsVecEnv):
 
     Args:
         simulations: The environments. Their agents must have equal spaces
-            (``wrap="ugat_marl.envs.wrappers:pad"``), and their mode must be ``"same-step"``, the
-            only one that Stable-Baselines3 supports.
+            (``wrap="ugat_marl.envs.wrappers:pad_spaces"``). Their mode must be ``"same-step"``,
+            the only one that Stable-Baselines3 supports.
         masks_in_observation: True to append masks to observations, as for `AgentsVecEnv`.
 
     Raises:

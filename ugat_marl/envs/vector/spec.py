@@ -136,7 +136,7 @@ def imported(text: str) -> Any:
     except (ImportError, AttributeError, ValueError) as error:
         raise OptionError(
             f"{text!r} cannot be imported ({error}); write module:name, such as "
-            "ugat_marl.envs.wrappers:pad"
+            "ugat_marl.envs.wrappers:pad_spaces"
         ) from None
     return found
 
