@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,12 @@ import polars as pl
 import pytest
 import torch
 
-import ugat_marl.experiments.transfers as transfer_module
 from tests.interrupts import KillAfter
+from tests.runs import checkpoint_of, play_nothing
 from ugat_marl.__main__ import main
 from ugat_marl.data import Metrics, TransitionLog
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import TransferConfig, transfer
+from ugat_marl.experiments import Evaluation, TransferConfig, transfer
 from ugat_marl.experiments.jobs import file_names
 from ugat_marl.experiments.randomised import RandomisedEnv
 from ugat_marl.grounding import FitConfig, RandomDelays, TimedConfig, UgatConfig
@@ -42,25 +42,9 @@ SMALL = TransferConfig(
 )
 
 
-@dataclass
-class Judged:
-    """Takes the place of an evaluation, which is not under test here."""
-
-    policies: list[str]
-    domains: list[str]
-
-    def write(self, path: Path) -> None:
-        path.write_text("{}")
-
-
 @pytest.fixture(autouse=True)
 def unjudged(monkeypatch: pytest.MonkeyPatch) -> None:
-    def judge(config: TransferConfig, scenario: Any, policies: dict[str, Any], *_: Any) -> Judged:
-        del scenario
-        return Judged(list(policies), config.domains)
-
-    monkeypatch.setattr(transfer_module, "judge", judge)
-    monkeypatch.setattr(transfer_module, "evaluate", lambda *_, **__: Judged([], []))
+    play_nothing(monkeypatch)
 
 
 def weights(folder: Path, name: str) -> np.ndarray[Any, Any]:
@@ -75,7 +59,14 @@ def episodes(folder: Path, name: str) -> int:
 
 
 def jobs_of(folder: Path) -> list[Path]:
-    return list((folder / "trainings").glob("*/job.json"))
+    """Files of the jobs that are compared with UGAT."""
+    trained = (folder / "trainings").glob("*/learner.pt")
+    return [path.parent / "job.json" for path in trained]
+
+
+def trained(table: Evaluation) -> list[str]:
+    """Names of the policies of a table that are no rules."""
+    return [name for name in table.policies if not name.startswith("rule ")]
 
 
 CONTROLS: dict[str, Any] = {
@@ -89,7 +80,7 @@ CONTROLS: dict[str, Any] = {
 
 def test_without_iterations_there_is_no_ugat_to_judge(tmp_path: Path) -> None:
     plain = replace(SMALL, ugat=replace(SMALL.ugat, iterations=0))
-    assert transfer(plain, tmp_path / "run").policies == ["direct transfer"]
+    assert trained(transfer(plain, tmp_path / "run")) == ["direct transfer"]
     assert [path.name for path in (tmp_path / "run/policies").iterdir()] == ["direct-transfer.pt"]
 
 
@@ -117,7 +108,7 @@ def test_every_control_is_trained_as_long_as_it_says_where_it_says(
         "direct transfer", "UGAT", "more plain sim", "random delay 0-5 s",
         "fine-tuned on the same data", "domain randomisation", "trained in real",
     ]  # fmt: skip
-    assert found.policies == names
+    assert trained(found) == names
     assert config.episodes == 8
     for name in ("more plain sim", "random delay 0-5 s", "domain randomisation", "trained in real"):
         assert episodes(tmp_path, name) == 8
@@ -215,7 +206,7 @@ def numbers(folder: Path) -> dict[tuple[int, str], float]:
 
 def follows(folder: Path) -> float:
     """Share of the rows of D_real after which the next row begins where they ended."""
-    log = TransitionLog.read(folder / "checkpoint" / "real-000.parquet")
+    log = TransitionLog.read(checkpoint_of(folder) / "real-000.parquet")
     rows = log.transitions("signal_0")
     goes_on = rows.episode[1:] == rows.episode[:-1]
     same = (rows.next_observation[:-1] == rows.observation[1:]).all(1)
@@ -228,7 +219,7 @@ def test_with_the_same_world_nothing_real_is_ever_seen(tmp_path: Path) -> None:
     judged = transfer(replace(SMALL, placebo="same-world"), tmp_path / "judged")
     assert judged.domains == ["sim", "V4"]
     for run in ("alone", "judged"):
-        log = TransitionLog.read(tmp_path / run / "checkpoint" / "real-000.parquet")
+        log = TransitionLog.read(checkpoint_of(tmp_path / run) / "real-000.parquet")
         assert log.provenance.domain == "sim" and follows(tmp_path / run) == 1.0
     # Where a policy is judged decides nothing about its training.
     assert np.array_equal(weights(tmp_path / "alone", "ugat"), weights(tmp_path / "judged", "ugat"))
@@ -268,9 +259,9 @@ def test_timed_grounding_learns_from_a_log_of_fixed_time(crossings: bool, tmp_pa
     transfer(replace(SMALL, real_log=path, ugat=ugat), tmp_path / "run")
     begun = (rows.observation[:, -layout.phases :].argmax(1) != rows.executed).sum()
     assert begun == 2 * 9  # every 30 s but at the beginning
-    kept = TransitionLog.read(tmp_path / "run" / "checkpoint" / "real-000.parquet")
+    kept = TransitionLog.read(checkpoint_of(tmp_path / "run") / "real-000.parquet")
     assert kept.frame.equals(log.frame)
-    assert not (tmp_path / "run" / "checkpoint" / "real-001.parquet").exists()
+    assert not (checkpoint_of(tmp_path / "run") / "real-001.parquet").exists()
     found = numbers(tmp_path / "run")
     assert 0 <= found[1, "lost_time/low_s"] <= found[1, "lost_time/best_s"] <= 5
 

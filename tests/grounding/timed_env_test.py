@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 import torch
 
-import ugat_marl.experiments.transfers as transfer_module
+from tests.runs import checkpoint_of, search_few_rules
 from ugat_marl.data import Metrics, TransitionLog
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
@@ -294,12 +294,7 @@ class KillAt(Silent):
 @pytest.fixture(autouse=True)
 def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search for the best rule is not under test here."""
-    search = transfer_module.best_rules
-
-    def short(*args: Any, **options: Any) -> dict[str, str]:
-        return search(*args, **options, rules=("largest-queue:20",))
-
-    monkeypatch.setattr(transfer_module, "best_rules", short)
+    search_few_rules(monkeypatch, "largest-queue:20")
 
 
 def test_the_kind_of_grounding_decides_what_is_made(env: TrafficEnv) -> None:
@@ -347,7 +342,7 @@ def test_a_run_with_timed_grounding_resumes_where_it_was(match: bool, tmp_path: 
     assert numbers[2, "gate/alpha"] == pytest.approx(numbers[1, "gate/mean_u"])
 
     for name, delayed in (("sim", True), ("real", False)):
-        log = TransitionLog.read(tmp_path / "run" / "checkpoint" / f"{name}-000.parquet")
+        log = TransitionLog.read(checkpoint_of(tmp_path / "run") / f"{name}-000.parquet")
         held = log.transitions("signal_0")
         assert held.delay_s.any() == delayed and held.delay_s.max() <= 3
         assert held.served_features.any()

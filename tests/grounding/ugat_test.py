@@ -20,8 +20,8 @@ import polars as pl
 import pytest
 import torch
 
-import ugat_marl.experiments.transfers as transfer_module
-from ugat_marl.data import Metrics, Run, TransitionLog
+from tests.runs import checkpoint_of, search_few_rules
+from ugat_marl.data import Metrics, Run, TransitionLog, lock_folder
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError, ScenarioError, UnknownNameError
@@ -63,24 +63,16 @@ FEW_RULES = ("largest-queue:20", "programme")
 @pytest.fixture(autouse=True)
 def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search for the best rule is not under test here."""
-    search = transfer_module.best_rules
-
-    def short(*args: Any, **options: Any) -> dict[str, str]:
-        return search(*args, **options, rules=FEW_RULES)
-
-    monkeypatch.setattr(transfer_module, "best_rules", short)
+    search_few_rules(monkeypatch, *FEW_RULES)
 
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run nobody disturbs."""
     folder = tmp_path_factory.mktemp("unbroken") / "run"
-    search = transfer_module.best_rules
-    transfer_module.best_rules = lambda *a, **k: search(*a, **k, rules=FEW_RULES)
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        search_few_rules(patch, *FEW_RULES)
         transfer(SMALL, folder)
-    finally:
-        transfer_module.best_rules = search
     return folder
 
 
@@ -119,7 +111,7 @@ def test_a_run_leaves_what_it_promises(unbroken: Path) -> None:
         assert name in names, name
     episodes = [step for stage, step, name, _ in metrics.rows if (stage, name) == ("episode", "return")]  # fmt: skip  # noqa: E501
     assert episodes == list(range(12 + 2 * 2))
-    assert list((unbroken / "tensorboard").glob("events*"))
+    assert list(unbroken.glob("trainings/*/tensorboard/events*"))
     assert not np.array_equal(weights(unbroken, "ugat"), weights(unbroken, "direct-transfer"))
 
 
@@ -202,13 +194,13 @@ def test_a_killed_process_resumes(tmp_path: Path) -> None:
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
     deadline = time.monotonic() + 120
-    while not (folder / "checkpoint" / "state.json").exists():
+    while not list(folder.glob("trainings/*/checkpoint/state.json")):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    state = json.loads((folder / "checkpoint" / "state.json").read_text())
+    state = json.loads((checkpoint_of(folder) / "state.json").read_text())
     assert state["pretrained"] == 10
     done = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -247,7 +239,8 @@ def test_a_damaged_checkpoint_is_named_and_left_alone(
 ) -> None:
     folder = tmp_path / "run"
     shutil.copytree(unbroken, folder)
-    damage(folder / "checkpoint" / file)
+    damage(checkpoint_of(folder) / file)
+    (checkpoint_of(folder).parent / "scores.json").unlink()  # nothing reads on in a finished job
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     with pytest.raises(error, match=file):
         transfer(SMALL, folder, resume=True)
@@ -400,7 +393,7 @@ def test_training_in_the_corrected_sim_resumes(repaired: Path, tmp_path: Path) -
     done: list[str] = []
     with pytest.raises(Killed):
         transfer(config, tmp_path / "run", reporter=KillIn())
-    (kept,) = (tmp_path / "run" / "trainings").glob("*/learner.pt")
+    (kept,) = (tmp_path / "run" / "trainings").glob("*-scratch-*/learner.pt")
     assert kept.stat().st_size, "nothing was kept of ten episodes"
     moved = shutil.copytree(repaired, tmp_path / "elsewhere")
     transfer(replace(config, corrected=str(moved)), tmp_path / "run", resume=True)
@@ -458,11 +451,17 @@ def test_what_is_refused_leaves_the_folder_free(tmp_path: Path) -> None:
 
 
 def test_two_processes_do_not_train_in_one_folder(tmp_path: Path) -> None:
-    run = Run(tmp_path / "run", {"a": 1}, False, Silent())
+    (tmp_path / "run" / "trainings").mkdir(parents=True)
+    with (
+        contextlib.closing(lock_folder(tmp_path / "run" / "trainings")),
+        pytest.raises(OptionError, match="another process"),
+    ):
+        transfer(SMALL, tmp_path / "run")
+    run = Run(tmp_path / "job", {"a": 1}, Silent())
     with pytest.raises(OptionError, match="another process"):
-        Run(tmp_path / "run", {"a": 1}, True, Silent())
+        Run(tmp_path / "job", {"a": 1}, Silent())
     run.close()
-    Run(tmp_path / "run", {"a": 1}, True, Silent()).close()
+    Run(tmp_path / "job", {"a": 1}, Silent()).close()
 
 
 def test_a_changed_log_is_another_run(tmp_path: Path) -> None:

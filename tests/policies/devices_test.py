@@ -21,8 +21,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-import ugat_marl.experiments.transfers as transfer_module
 from studies.bench.learning_program import Noise
+from tests.runs import play_nothing
 from ugat_marl.__main__ import main
 from ugat_marl.data import SETTINGS_FILE, AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.envs import AgentSet
@@ -475,7 +475,7 @@ def test_a_run_is_the_same_elsewhere_and_goes_on_here(
     monkeypatch: pytest.MonkeyPatch,
     trainings: list[torch.device],
 ) -> None:
-    monkeypatch.setattr(transfer_module, "judge", lambda *_: Judged())
+    play_nothing(monkeypatch)
     used: list[str] = []
 
     def named(name: str) -> torch.device:
@@ -492,7 +492,8 @@ def test_a_run_is_the_same_elsewhere_and_goes_on_here(
     elsewhere = dataclasses.replace(RUN, device="cuda")
     transfer(elsewhere, tmp_path / "cuda")
     np.testing.assert_array_equal(final(tmp_path / "cuda"), final(tmp_path / "cpu"))
-    assert used == ["cpu", "cpu", "cuda", "cuda"]  # the learner's and that of f and h
+    # Of the learner, checked before anything runs and when it is made; and of f and h.
+    assert used == ["cpu"] * 3 + ["cuda"] * 3
     assert trainings == [CPU] * 3 + [standin] * 3
     told = json.loads((tmp_path / "cuda" / SETTINGS_FILE).read_text())
     assert told["settings"]["device"] == "cuda"
@@ -506,13 +507,6 @@ def test_a_run_is_the_same_elsewhere_and_goes_on_here(
             transfer(elsewhere, tmp_path / "broken")
     transfer(RUN, tmp_path / "broken", resume=True)
     np.testing.assert_array_equal(final(tmp_path / "broken"), final(tmp_path / "cpu"))
-
-
-class Judged:
-    """Takes the place of an evaluation."""
-
-    def write(self, path: Path) -> None:
-        path.write_text("{}")
 
 
 @pytest.mark.parametrize(

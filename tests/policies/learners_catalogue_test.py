@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ugat_marl.experiments.transfers as transfer_module
+from tests.runs import search_few_rules
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import TransferConfig, policy_factory, transfer
 from ugat_marl.grounding import FitConfig, UgatConfig
@@ -156,12 +156,7 @@ def test_importing_the_names_imports_no_library() -> None:
 @pytest.fixture
 def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search for the best rule is not under test here."""
-    search = transfer_module.best_rules
-
-    def short(*args: Any, **options: Any) -> dict[str, str]:
-        return search(*args, **options, rules=("largest-queue:20",))
-
-    monkeypatch.setattr(transfer_module, "best_rules", short)
+    search_few_rules(monkeypatch, "largest-queue:20")
 
 
 class KillIn(Silent):

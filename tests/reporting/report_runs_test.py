@@ -60,7 +60,7 @@ LIGHTS = ("A1", "A2", "B1", "B2")
 AGENTS = tuple(f"signal_{n}" for n in range(4))
 FILES = (
     "run.json", "settings.json", "table.json", "metrics.parquet", "queues.parquet",
-    "checkpoint/state.json",
+    "trainings/ugat/checkpoint/state.json",
 )  # fmt: skip
 
 
@@ -112,7 +112,8 @@ def make_run(directory: Path, *, seed: int = 0, real: str = "V4", **changes: Any
     ugat = UgatConfig(pretrain_episodes=14, iterations=2, grounded_episodes=5)
     config = TransferConfig("grid2x2-v1", real, seed=seed, ugat=ugat, **changes)
     directory.mkdir(parents=True)
-    (directory / "checkpoint").mkdir()
+    checkpoint = directory / "trainings" / "ugat" / "checkpoint"
+    checkpoint.mkdir(parents=True)
     scenario = load_scenario("grid2x2-v1")
     if config.duration_s is not None:
         scenario = scenario.with_duration(config.duration_s)
@@ -122,10 +123,10 @@ def make_run(directory: Path, *, seed: int = 0, real: str = "V4", **changes: Any
     write_settings(directory, asdict(config))
     evaluation(3.0 * seed, real).write(directory / "table.json")
     metrics(shift=float(seed)).write(directory / "metrics.parquet")
-    metrics(1).write(directory / "checkpoint" / "metrics.parquet")
+    metrics(1).write(checkpoint / "metrics.parquet")
     queues().write_parquet(directory / "queues.parquet")
     state = {"pretrained": 14, "iteration": 2}
-    (directory / "checkpoint" / "state.json").write_text(json.dumps(state))
+    (checkpoint / "state.json").write_text(json.dumps(state))
     return directory
 
 
@@ -264,7 +265,7 @@ def test_what_is_broken_is_named(run: Path, name: str, how: str) -> None:
     elif name != "run.json":
         assert "Missing here" in page.text and name in page.text
     if name == "metrics.parquet":
-        assert "checkpoint/metrics.parquet is shown instead" in page.text
+        assert "trainings/ugat/checkpoint/metrics.parquet is shown instead" in page.text
         assert any(picture.name == "first-gate" for picture in made.pictures)
 
 

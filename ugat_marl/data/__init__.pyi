@@ -11,6 +11,7 @@ from .measured.values import split_periods as split_periods
 from .measured.writing import require_replaceable as require_replaceable
 from .measured.writing import write_measured as write_measured
 from .runs import CHECKPOINT_FOLDER as CHECKPOINT_FOLDER
+from .runs import IDENTITY_FILE as IDENTITY_FILE
 from .runs import METRICS_FILE as METRICS_FILE
 from .runs import SETTINGS_FILE as SETTINGS_FILE
 from .runs import Metrics as Metrics
@@ -19,6 +20,7 @@ from .runs import installed_version as installed_version
 from .runs import installed_versions as installed_versions
 from .runs import lock_folder as lock_folder
 from .runs import remove_temporaries as remove_temporaries
+from .runs import write_identity as write_identity
 from .runs import write_settings as write_settings
 from .scores import MEASURES as MEASURES
 from .scores import MORE_IS_BETTER as MORE_IS_BETTER

@@ -26,6 +26,7 @@ from ugat_marl.progress import Reporter
 CHECKPOINT_FOLDER = "checkpoint"
 METRICS_FILE = "metrics.parquet"
 SETTINGS_FILE = "settings.json"
+IDENTITY_FILE = "run.json"
 _VERSIONS = ("ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch")
 _SCHEMA = {"stage": pl.String, "step": pl.Int64, "name": pl.String, "value": pl.Float64}
 
@@ -71,40 +72,27 @@ class Metrics:
 
 
 class Run:
-    """Folder of one training run.
+    """Folder of one training run. It continues from the checkpoint in the folder, if there is one.
 
     Args:
         directory: The folder.
-        identity: Values that must be equal to resume the run: settings, scenario, seed.
-        resume: True to continue from the checkpoint in the folder, if there is one.
+        identity: Values that must be equal to continue: settings, scenario, seed.
         reporter: Shows progress.
 
     Raises:
-        OptionError: The folder holds a run already, and `resume` is not set.
-        CheckpointError: The folder holds a run with another identity.
+        OptionError: Another process trains in the folder.
+        CheckpointError: The folder holds a checkpoint of a run with another identity.
     """
 
-    def __init__(
-        self, directory: Path, identity: Mapping[str, Any], resume: bool, reporter: Reporter
-    ) -> None:
+    def __init__(self, directory: Path, identity: Mapping[str, Any], reporter: Reporter) -> None:
         self.directory = directory
         self.reporter = reporter
         self.metrics = Metrics()
         self._board: Any = None
-        identity = json.loads(json.dumps(identity, sort_keys=True))
-        file = directory / "run.json"
-        require_writable(file)
+        require_writable(directory / IDENTITY_FILE)
         self._lock = lock_folder(directory)
         _remove_remains(directory)
-        if file.exists() and self.resumable:
-            if not resume:
-                raise OptionError(
-                    f"{directory} holds a run already; use --resume to go on with it, or another "
-                    "--out"
-                )
-            _refuse_other(file, identity)
-        else:
-            write_whole(file, json.dumps(identity, indent=1) + "\n")
+        write_identity(directory, identity, begun=self.resumable)
 
     @property
     def resumable(self) -> bool:
@@ -186,10 +174,29 @@ class Run:
 def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
     """Write all options of a run and the versions of its packages, for readers.
 
-    ``run.json`` holds only the values that must be equal for `--resume`.
+    ``run.json`` holds only the values that must be equal to continue the run.
     """
     content = {"settings": settings, "versions": installed_versions(*_VERSIONS)}
     write_whole(directory / SETTINGS_FILE, json.dumps(content, indent=1, default=str) + "\n")
+
+
+def write_identity(directory: Path, identity: Mapping[str, Any], *, begun: bool) -> None:
+    """Write what must be equal to continue a run, or compare it with what the folder holds.
+
+    Args:
+        directory: Folder of the run.
+        identity: Values that must be equal to continue: settings, scenario, seed.
+        begun: True if the folder holds results; a file without results is replaced.
+
+    Raises:
+        CheckpointError: The folder holds results of a run with another identity.
+    """
+    file = directory / IDENTITY_FILE
+    wanted: dict[str, Any] = json.loads(json.dumps(identity, sort_keys=True))
+    if begun and file.exists():
+        _refuse_other(file, wanted)
+    else:
+        write_whole(file, json.dumps(wanted, indent=1) + "\n")
 
 
 def lock_folder(directory: Path) -> IO[str]:
@@ -215,14 +222,14 @@ def lock_folder(directory: Path) -> IO[str]:
 
 def _refuse_other(file: Path, identity: Mapping[str, Any]) -> None:
     try:
-        found: dict[str, Any] = json.loads(file.read_text())
+        held: dict[str, Any] = json.loads(file.read_text())
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{file}: cannot be read ({error}); use another --out") from None
-    different = [key for key in {*found, *identity} if found.get(key) != identity.get(key)]
+    different = [key for key in {*held, *identity} if held.get(key) != identity.get(key)]
     if different:
         key = sorted(different)[0]
         raise CheckpointError(
-            f"{file.parent} holds another run: its {key} is {_short(found.get(key))}, asked for is "
+            f"{file.parent} holds another run: its {key} is {_short(held.get(key))}, asked for is "
             f"{_short(identity.get(key))}; repeat its options, or use another --out"
         )
 

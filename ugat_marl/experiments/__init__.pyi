@@ -58,6 +58,7 @@ from .statistics import Floats as Floats
 from .statistics import Interval as Interval
 from .statistics import PairedTest as PairedTest
 from .statistics import student_p as student_p
+from .transfers import TRAININGS as TRAININGS
 from .transfers import TransferConfig as TransferConfig
 from .transfers import transfer as transfer
 from .trial import Run as Run

@@ -6,6 +6,7 @@ shared file system.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -76,9 +77,9 @@ def perform_all(
                 waited_for = {job.name for job in (*left, *running.values())}
                 for job in [job for job in left if job.after not in waited_for]:
                     left.remove(job)
-                    own = folder.resolve() / job.name
-                    job.write(own)
-                    running[pool.submit(_perform_apart, str(own), stop)] = job
+                    place = folder.resolve() / job.name
+                    job.write(place)
+                    running[pool.submit(_perform_apart, str(place), stop)] = job
                 # The timeout lets Ctrl-C interrupt the wait.
                 finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
                 for future in finished:
@@ -97,19 +98,27 @@ def perform_all(
     return failures
 
 
-def perform_here(plan: Sequence[Job], folder: Path, reporter: Reporter) -> list[Record]:
+def perform_here(
+    plan: Sequence[Job], folder: Path, reporter: Reporter, workers: Workers = 1
+) -> list[Record]:
     """Perform jobs one after another in this process and return their records.
 
     Args:
         plan: Jobs; a job comes after the job it starts from.
         folder: Folder that holds the jobs' folders.
         reporter: Shows progress.
+        workers: Simulations at a time, or an executor, see `perform`.
+
+    Raises:
+        OptionError: Another process performs jobs in that folder.
     """
     records: list[Record] = []
-    for job in plan:
-        own = folder / job.name
-        job.write(own)
-        records.append(perform(job, own, reporter))
+    require_writable(folder / LOG)
+    with contextlib.closing(lock_folder(folder)):
+        for job in plan:
+            place = folder / job.name
+            job.write(place)
+            records.append(perform(job, place, reporter, workers))
     return records
 
 

@@ -21,9 +21,9 @@ from typing import Any
 from pydantic import TypeAdapter
 from rich.console import Console
 
-from ugat_marl.data import Run, Scores, installed_versions, remove_temporaries
+from ugat_marl.data import Run, Scores, TransitionLog, installed_versions, remove_temporaries
 from ugat_marl.effects import load_scenario, scenario_in_domain
-from ugat_marl.envs import AnyParallelEnv, parallel_env
+from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.experiments.evaluation import (
     TUNING_SEED,
@@ -34,17 +34,18 @@ from ugat_marl.experiments.evaluation import (
 )
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
 from ugat_marl.experiments.randomised import randomised_env
-from ugat_marl.experiments.settings import Setting
+from ugat_marl.experiments.settings import DIRECT, Setting
 from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
 from ugat_marl.experiments.tuning import TUNED_RULES, VERSION, tuned_rules
 from ugat_marl.files import write_whole
-from ugat_marl.grounding import RandomDelays
+from ugat_marl.grounding import Probe, RandomDelays, RecordedWorld, SimulatedWorld, World
+from ugat_marl.parallel import Workers, in_this_process
 from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.simulation import end_with_input
 
-JOB, SCORES, POLICY, LEARNER, RULE_FILE = (
-    "job.json", "scores.json", "policy.pt", "learner.pt", "rule.txt",
+JOB, SCORES, POLICY, DIRECT_POLICY, LEARNER, RULE_FILE = (
+    "job.json", "scores.json", "policy.pt", "direct-policy.pt", "learner.pt", "rule.txt",
 )  # fmt: skip
 
 EVALUATION_SEED = 1000
@@ -72,6 +73,10 @@ class Job:
         every: Episodes from one evaluation to the next; 0 for evaluations at the end only.
         last: Number of episodes at the end that are each followed by an evaluation.
         options: Options of the environments.
+        real_log: File of a transition log that replaces the roll-outs in the real domain, for
+            recipe "grounded"; None to simulate them.
+        probe_domains: Domains in which a grounded policy is measured after every iteration, only
+            for the metrics; not part of `identity`.
         rule_budget: Most episodes to tune one rule, for recipe "rule"; None to use default
             parameters.
         tuning_seeds: Number of seeds on which the best rule is chosen.
@@ -91,6 +96,8 @@ class Job:
     every: int = 0
     last: int = 1
     options: Mapping[str, str | int | float | None] = field(default_factory=dict)
+    real_log: str | None = None
+    probe_domains: tuple[str, ...] = ()
     rule_budget: int | None = None
     tuning_seeds: int = 2
     domains: tuple[str, ...] = ()
@@ -98,11 +105,23 @@ class Job:
     device: str = "cpu"
 
     @property
+    def rows(self) -> dict[int, str]:
+        """Names of the job's rows in a table, by number of training episodes.
+
+        A grounded training without `start` begins with plain training, so it gives direct transfer
+        as well.
+        """
+        names = {self.episodes: self.setting.name}
+        if self.setting.ugat is not None and self.start is None:
+            names |= {self.setting.ugat.pretrain_episodes: DIRECT}
+        return dict(sorted(names.items()))
+
+    @property
     def marks(self) -> tuple[int, ...]:
         """Numbers of training episodes after which the policy is judged, ascending."""
         late = range(max(1, self.episodes - self.last + 1), self.episodes)
         often = range(self.every, self.episodes, self.every) if self.every else ()
-        return tuple(sorted({*often, *late, self.episodes}))
+        return tuple(sorted({*often, *late, *self.rows}))
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -114,7 +133,7 @@ class Job:
             OptionError: The learner's library is not installed.
         """
         worlds = sorted({w for w in (self.sim, self.target, self.setting.world) if w})
-        found = {
+        parts: dict[str, Any] = {
             "setting": self.setting.identity,
             "seed": self.seed,
             "start": self.start,
@@ -124,11 +143,13 @@ class Job:
             "versions": installed_versions("eclipse-sumo", "torch"),
         }
         if self.setting.recipe == "rule":
-            found |= {"target": self.target, "tuning": VERSION, "rule_budget": self.rule_budget}
-            return {**found, "tuning_seeds": self.tuning_seeds}
+            parts |= {"target": self.target, "tuning": VERSION, "rule_budget": self.rule_budget}
+            return {**parts, "tuning_seeds": self.tuning_seeds}
         if self.setting.knows_target:
-            found["target"] = self.target
-        return found if self.every else {**found, "episodes": self.episodes}
+            parts["target"] = self.target
+        if self.real_log is not None:
+            parts["real_log"] = file_hash(Path(self.real_log))
+        return parts if self.every else {**parts, "episodes": self.episodes}
 
     @functools.cached_property
     def digest(self) -> str:
@@ -189,11 +210,17 @@ def file_name(name: str) -> str:
 
 def file_names(names: Iterable[str]) -> list[str]:
     """Return names of files for policies, all different: repeated names end in -2, -3 and so on."""
-    found: list[str] = []
+    files: list[str] = []
     for name in names:
-        own = [file_name(name), *(f"{file_name(name)}-{k}" for k in range(2, len(found) + 2))]
-        found.append(next(file for file in own if file not in found))
-    return found
+        stem = file_name(name)
+        candidates = [stem, *(f"{stem}-{k}" for k in range(2, len(files) + 2))]
+        files.append(next(file for file in candidates if file not in files))
+    return files
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file's content, so that the file may be moved."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @functools.cache
@@ -263,13 +290,15 @@ class Record:
         return [self.scores[mark, domain, seed] for seed in job.evaluation_seeds]
 
 
-def perform(job: Job, folder: Path, reporter: Reporter) -> Record:
+def perform(job: Job, folder: Path, reporter: Reporter, workers: Workers = 1) -> Record:
     """Do the missing training and evaluations of a job, and write them to its folder.
 
     Args:
         job: The job.
         folder: Folder of the job.
         reporter: Shows progress.
+        workers: Simulations at a time, or an executor, for roll-outs, evaluations and the search
+            for rules. Learning stays in this process.
 
     Raises:
         OptionError: An evaluation is missing, and the training has already passed it.
@@ -278,53 +307,51 @@ def perform(job: Job, folder: Path, reporter: Reporter) -> Record:
     if record.is_whole(job):
         return record
     if job.setting.recipe == "rule":
-        _judge(job, 0, rule_factory(_rule(job, folder, reporter)), record, folder, reporter)
+        factory = rule_factory(_rule(job, folder, reporter, workers))
+        _judge(job, 0, factory, record, folder, reporter, workers)
         return record
-    trained = _grounded if job.setting.ugat is not None else _plain
-    with contextlib.closing(trained(job, folder, record, reporter)) as policies:
+    if job.setting.ugat is not None:
+        trained = _grounded(job, folder, reporter, workers)
+    else:
+        trained = _plain(job, folder, record, reporter)
+    with contextlib.closing(trained) as policies:
         for mark, policy in policies:
-            _judge(job, mark, fixed_policy(policy), record, folder, reporter)
+            _judge(job, mark, fixed_policy(policy), record, folder, reporter, workers)
     return record
 
 
-def train_job(job: Job, folder: Path, reporter: Reporter) -> Policy:
-    """Train a job without judging it, and return its policy.
-
-    Args:
-        job: The job.
-        folder: Folder of the job.
-        reporter: Shows progress.
-    """
-    *_, (_, policy) = _plain(job, folder, Record(), reporter)
-    return policy
-
-
 def _judge(
-    job: Job, mark: int, factory: PolicyFactory, record: Record, folder: Path, reporter: Reporter
+    job: Job,
+    mark: int,
+    factory: PolicyFactory,
+    record: Record,
+    folder: Path,
+    reporter: Reporter,
+    workers: Workers,
 ) -> None:
     """Play the missing episodes after `mark` training episodes; write them domain by domain."""
-    scenario = load_scenario(job.scenario)
+    scenario, name = load_scenario(job.scenario), job.rows.get(mark, job.setting.name)
     for domain, seeds in record.missing(job, mark).items():
         queues = QueueRecord()
-        found = evaluate(
+        played = evaluate(
             scenario,
-            {"policy": factory},
+            {name: factory},
             [domain],
             seeds,
             duration_s=job.duration_s,
-            workers=1,
+            workers=workers if in_this_process(workers) else None,  # queues are watched here
             reporter=reporter,
             title=f"evaluating in {domain}",
             watch=queues.watch,
         )
-        record.scores |= {(mark, domain, r.seed): r.scores for r in found.results}
-        if mark == job.episodes:
+        record.scores |= {(mark, domain, r.seed): r.scores for r in played.results}
+        if mark in job.rows:
             # Before the record: it marks these episodes as played, so they are not played again.
             queues.write(folder / QUEUES, keep=True)
         record.write(folder)
 
 
-def _rule(job: Job, folder: Path, reporter: Reporter) -> str:
+def _rule(job: Job, folder: Path, reporter: Reporter, workers: Workers) -> str:
     """Return the rule that is best in the real domain, chosen on separate tuning seeds."""
     saved, rules, target = folder / RULE_FILE, job.setting.rules, job.target or job.sim
     if not saved.exists():
@@ -332,7 +359,7 @@ def _rule(job: Job, folder: Path, reporter: Reporter) -> str:
         common: dict[str, Any] = {
             "seeds": [TUNING_SEED + k for k in range(job.tuning_seeds)],
             "duration_s": job.duration_s,
-            "workers": 1,
+            "workers": workers,
             "reporter": reporter,
         }
         if job.rule_budget is not None:
@@ -386,25 +413,78 @@ def _plain(
 
 
 def _grounded(
-    job: Job, folder: Path, record: Record, reporter: Reporter
+    job: Job, folder: Path, reporter: Reporter, workers: Workers
 ) -> Generator[tuple[int, Policy], None, None]:
-    """Train by UGAT and yield the policy."""
-    del record
+    """Train by UGAT; yield direct transfer, if plain training was part of it, and the policy."""
     ugat, make = job.setting.ugat, job.setting.learner.factory(job.device)
-    assert ugat is not None and job.target is not None and job.seed is not None
+    assert ugat is not None and job.seed is not None
     scenario, options = load_scenario(job.scenario), dict[str, Any](job.options)
-    worlds = simulated_worlds(scenario, job.sim, job.target, ugat, options, workers=1)
     with (
         contextlib.closing(parallel_env(scenario, job.sim, **options)) as env,
-        contextlib.closing(Run(folder, job.identity, resume=True, reporter=reporter)) as run,
+        contextlib.closing(Run(folder, job.identity, reporter)) as run,
     ):
-        start = _start(job, folder)
         state = train_grounded(
-            ugat, make, env, worlds, job.seed, run, start=start, device=job.device
+            ugat,
+            make,
+            env,
+            worlds_of(job, env, workers),
+            job.seed,
+            run,
+            start=_start(job, folder),
+            placebo=job.setting.placebo,
+            probe=_probe(job, workers),
+            device=job.device,
         )
-    policy = state.learner.policy()
-    _save(policy, folder / POLICY)
-    yield job.episodes, policy
+    assert state.direct is not None  # plain training comes first
+    policies = {ugat.pretrain_episodes: state.direct, job.episodes: state.learner.policy()}
+    for mark in job.rows:
+        _save(policies[mark], folder / (POLICY if mark == job.episodes else DIRECT_POLICY))
+        yield mark, policies[mark]
+
+
+def worlds_of(job: Job, env: TrafficEnv, workers: Workers) -> tuple[SimulatedWorld, World]:
+    """Return the sources of D_sim and D_real of a grounded job.
+
+    Args:
+        job: A job of recipe "grounded".
+        env: The simulation, with the agents that a log must fit.
+        workers: Simulations at a time, or an executor, see `SimulatedWorld`.
+
+    Raises:
+        LogError: The job's log does not fit the simulation.
+        OptionError: The two domains cannot be compared, see `simulated_worlds`.
+    """
+    ugat, recorded = job.setting.ugat, None
+    assert ugat is not None
+    if job.real_log is not None:
+        log = TransitionLog.read(Path(job.real_log))
+        recorded = RecordedWorld(log, env, ugat.fit.held_out_every)
+    without_street = recorded is not None or job.setting.placebo == "same-world"
+    street = job.sim if without_street else job.target
+    assert street is not None
+    scenario, options = load_scenario(job.scenario), dict[str, Any](job.options)
+    sim, real = simulated_worlds(scenario, job.sim, street, ugat, options, workers)
+    return sim, recorded or real
+
+
+def _probe(job: Job, workers: Workers) -> Probe | None:
+    """Return the measurement after every iteration, on a seed that no result is reported on."""
+    if not job.probe_domains:
+        return None
+    scenario = load_scenario(job.scenario)
+
+    def probe(policy: Policy) -> dict[str, float]:
+        played = evaluate(
+            scenario,
+            {"policy": fixed_policy(policy)},
+            job.probe_domains,
+            [TUNING_SEED],
+            duration_s=job.duration_s,
+            workers=workers if in_this_process(workers) else None,
+        )
+        return {f"att_s/{d}": played.estimate("policy", d, "att_s").mean for d in played.domains}
+
+    return probe
 
 
 def _start(job: Job, folder: Path) -> Path | None:

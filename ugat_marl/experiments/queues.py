@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,6 +110,23 @@ class QueueRecord:
                 frame = both.agg(mean, pl.col("looks").sum())
         with replacing(path) as temporary:
             frame.write_parquet(temporary)
+
+
+def write_queues(path: Path, sources: Mapping[str, tuple[Path, str]]) -> None:
+    """Write the queues of several policies into one file; files that cannot be read are left out.
+
+    Args:
+        path: File to write, whole or not at all.
+        sources: For the name of each policy, a file that `QueueRecord.write` wrote and the name of
+            the policy in it.
+    """
+    frames = [pl.DataFrame(schema=_SCHEMA)]
+    for name, (source, name_there) in sources.items():
+        with contextlib.suppress(CheckpointError):
+            rows = read_queues(source).filter(policy=name_there)
+            frames.append(rows.with_columns(policy=pl.lit(name)))
+    with replacing(path) as temporary:
+        pl.concat(frames).write_parquet(temporary)
 
 
 def read_queues(path: Path) -> pl.DataFrame:

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.grounding import UgatConfig
+from ugat_marl.grounding import NEGATIVE_CONTROLS, NegativeControl, UgatConfig
 from ugat_marl.policies import (
     DQN_NAME,
     DQNConfig,
@@ -95,6 +95,8 @@ class Setting:
             has no real domain.
         learner: The algorithm that learns.
         ugat: Settings of UGAT; only for "grounded".
+        placebo: A negative control of "grounded": "same-world" records D_real in the simulation,
+            "shuffled" permutes the outcomes in D_real, "noise" replaces f by noise.
         episodes: Training episodes after those of direct transfer; None for as many as UGAT has.
         most_delay_s: Longest delay of "delays", in s.
         rules: Rules among which "rule" chooses; empty for all.
@@ -105,6 +107,7 @@ class Setting:
     world: str | None = None
     learner: LearnerSpec = field(default_factory=LearnerSpec)
     ugat: UgatConfig | None = None
+    placebo: NegativeControl = "none"
     episodes: int | None = None
     most_delay_s: int = MOST_DELAY_S
     rules: tuple[str, ...] = ()
@@ -117,6 +120,8 @@ class Setting:
                 f"setting {self.name!r} of recipe {self.recipe!r}: give ugat with recipe "
                 '"grounded", and with no other'
             )
+        if self.placebo not in NEGATIVE_CONTROLS:
+            raise UnknownNameError("placebo", self.placebo, NEGATIVE_CONTROLS)
 
     @property
     def knows_target(self) -> bool:
@@ -144,10 +149,12 @@ class Setting:
         """Part of a job's identity that the setting decides."""
         if self.recipe == "rule":
             return {"recipe": self.recipe, "rules": self.rules}
-        found: dict[str, Any] = {"recipe": self.recipe, "world": self.world}
-        found |= {"learner": self.learner.identity}
+        parts: dict[str, Any] = {"recipe": self.recipe, "world": self.world}
+        parts |= {"learner": self.learner.identity}
         if self.ugat is not None:
-            found["ugat"] = asdict(self.ugat)
+            parts["ugat"] = asdict(self.ugat)
+        if self.placebo != "none":
+            parts["placebo"] = self.placebo
         if self.recipe == "delays":
-            found["most_delay_s"] = self.most_delay_s
-        return found
+            parts["most_delay_s"] = self.most_delay_s
+        return parts

@@ -1,64 +1,65 @@
-"""Command ``train``: UGAT and the settings compared with it, judged in both domains."""
+"""Command ``train``: UGAT and the settings compared with it, judged in both domains.
+
+UGAT, each setting and the best rule of each domain are jobs, which `jobs.perform` trains, judges
+and resumes. Plain training is the first stage of UGAT's job, as line 1 of Algorithm 1. A separate
+job would divide the metrics of one training between two folders.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from ugat_marl.data import Run, TransitionLog, write_settings
+from ugat_marl.data import (
+    CHECKPOINT_FOLDER,
+    METRICS_FILE,
+    TransitionLog,
+    installed_versions,
+    write_identity,
+    write_settings,
+)
 from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
-from ugat_marl.experiments.evaluation import (
-    TUNING_SEED,
-    Watch,
-    best_rules,
-    evaluate,
-    fixed_policy,
-    rule_factory,
+from ugat_marl.experiments.driver import perform_here
+from ugat_marl.experiments.jobs import (
+    DIRECT_POLICY,
+    POLICY,
+    RULE_FILE,
+    Job,
+    Record,
+    evaluation_seeds,
+    file_hash,
+    file_names,
+    worlds_of,
 )
-from ugat_marl.experiments.jobs import Job, evaluation_seeds, file_names, train_job
-from ugat_marl.experiments.queues import QUEUES, QueueRecord
-from ugat_marl.experiments.scores import Evaluation
+from ugat_marl.experiments.queues import QUEUES, write_queues
+from ugat_marl.experiments.scores import Evaluation, Result
 from ugat_marl.experiments.settings import (
     CONTROL,
     CORRECTED,
-    DIRECT,
     FINE_TUNED,
     GROUNDED_NAME,
     ORACLE,
     RANDOM_DELAY,
     RANDOMISED,
+    RULE,
     LearnerSpec,
     Setting,
 )
-from ugat_marl.experiments.training import simulated_worlds, train_grounded
-from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES, tuned_rules
-from ugat_marl.grounding import (
-    DIRECT_LEARNER,
-    NEGATIVE_CONTROLS,
-    NegativeControl,
-    RecordedWorld,
-    RunState,
-    SimulatedWorld,
-    UgatConfig,
-    World,
-)
+from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES
+from ugat_marl.files import write_whole
+from ugat_marl.grounding import DIRECT_LEARNER, NEGATIVE_CONTROLS, NegativeControl, UgatConfig
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
     DQN_NAME,
     STANDARD_RULES,
     DQNConfig,
-    LearnerFactory,
-    NetworkPolicy,
-    Policy,
-    PolicyFactory,
     require_device_name,
     require_known,
 )
@@ -66,7 +67,7 @@ from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
 TRAININGS = "trainings"
-"""Folder in a run's folder; it holds the jobs of the settings compared with UGAT."""
+"""Folder in a run's folder; it holds the folders of the jobs."""
 
 ADDED = ("control", "further", "randomised", "random_delay_s", "fine_tuned", "oracle")
 """Options that add policies to the table and change no other policy."""
@@ -188,24 +189,22 @@ class TransferConfig:
     def settings(self) -> list[Setting]:
         """Settings trained in addition to direct transfer and UGAT."""
         seen, spec = self.ugat.iterations * self.ugat.real_rollouts, self.spec
-        found: list[Setting] = []
+        rows: list[Setting] = []
         if self.control:
-            found.append(Setting(CONTROL, "further", self.sim, spec))
-        found += [
-            Setting(f"further in {domain_label(d)}", "further", d, spec) for d in self.further
-        ]
+            rows.append(Setting(CONTROL, "further", self.sim, spec))
+        rows += [Setting(f"further in {domain_label(d)}", "further", d, spec) for d in self.further]
         if (most_s := self.random_delay_s) is not None:
             name = f"{RANDOM_DELAY} 0-{most_s} s"
-            found.append(Setting(name, "delays", self.sim, spec, most_delay_s=most_s))
+            rows.append(Setting(name, "delays", self.sim, spec, most_delay_s=most_s))
         if self.fine_tuned:
-            found.append(Setting(FINE_TUNED, "further", None, spec, episodes=seen))
+            rows.append(Setting(FINE_TUNED, "further", None, spec, episodes=seen))
         if self.randomised:
-            found.append(Setting(RANDOMISED, "randomised", None, spec))
+            rows.append(Setting(RANDOMISED, "randomised", None, spec))
         if self.corrected is not None:
-            found.append(Setting(CORRECTED, "scratch", self.corrected, spec))
+            rows.append(Setting(CORRECTED, "scratch", self.corrected, spec))
         if self.oracle:
-            found.append(Setting(ORACLE, "scratch", None, spec))
-        return found
+            rows.append(Setting(ORACLE, "scratch", None, spec))
+        return rows
 
     @property
     def env_options(self) -> dict[str, Any]:
@@ -237,49 +236,170 @@ def transfer(
     reporter: Reporter | None = None,
     workers: Workers = None,
 ) -> Evaluation:
-    """Train by UGAT, evaluate, and write all results to `directory`.
+    """Perform the jobs of a run, and write its table and its results to `directory`.
 
     Args:
         config: Options of the run.
-        directory: Folder of the run. It receives ``table.json``, ``metrics.parquet``,
-            ``policies``, TensorBoard files, checkpoints and the data of `ugat-marl report`.
+        directory: Folder of the run. It receives ``table.json``, ``queues.parquet``,
+            ``metrics.parquet``, ``policies`` and the options. The jobs' folders are in
+            ``trainings``: with checkpoints, TensorBoard files and records.
         resume: Continue the run in the folder.
         reporter: Shows progress.
         workers: Simulations at a time, or an executor, for roll-outs and the search for rules; the
             policies are evaluated on this machine.
+
+    Raises:
+        OptionError: The folder holds a run already, and `resume` is not set; or another process
+            trains there.
+        CheckpointError: The folder holds a run with other options.
     """
     reporter = reporter or Silent()
-    make = config.spec.factory(config.device)  # impossible options are an error now, not later
     scenario = load_scenario(config.scenario)
     with contextlib.closing(parallel_env(scenario, config.sim, **config.env_options)) as env:
-        worlds = _worlds(config, scenario, env, reporter, workers)
-        jobs = _jobs(config, scenario, env)
-        run = Run(directory, _identity(config, scenario, env), resume, reporter)
-        write_settings(directory, asdict(config))
-        with contextlib.closing(run):
-            state = _train(config, make, scenario, env, worlds, run)
-            policies = _policies(config, state)
-            for job in jobs:
-                folder = directory / TRAININGS / job.name
-                job.write(folder)
-                policies[job.setting.name] = train_job(job, folder, reporter)
-    for file, trained in zip(file_names(policies), policies.values(), strict=True):
-        if isinstance(trained, NetworkPolicy):
-            trained.save(directory / "policies" / f"{file}.pt")
-    queues = QueueRecord()
-    table = judge(config, scenario, policies, reporter, queues.watch, workers)
-    queues.write(directory / QUEUES)
+        _check(config, scenario, env, reporter)  # an error now, not in an hour
+        identity = _identity(config, scenario, env)
+    plan = planned_jobs(config)
+    folder = directory / TRAININGS
+    begun = any(folder.glob(f"*/{CHECKPOINT_FOLDER}"))
+    if begun and not resume:
+        raise OptionError(
+            f"{directory} holds a run already; use --resume to go on with it, or another --out"
+        )
+    write_identity(directory, identity, begun=begun)
+    write_settings(directory, asdict(config))
+    records = perform_here(plan, folder, reporter, workers)
+    return _write_results(config, scenario, directory, plan, records)
+
+
+def planned_jobs(config: TransferConfig) -> list[Job]:
+    """Return the jobs of a run: UGAT with its plain training, the other settings, and the rules.
+
+    Settings that begin with direct transfer start from the learner that the first job keeps after
+    plain training.
+    """
+    ugat = _grounded_job(config)
+    real, common = ugat.target, replace(ugat, real_log=None, probe_domains=(), target=None)
+    others = [
+        replace(
+            common,
+            setting=setting,
+            target=real if setting.knows_target else None,
+            episodes=config.episodes
+            if setting.episodes is None
+            else config.ugat.pretrain_episodes + setting.episodes,
+            start=f"{ugat.name}/{DIRECT_LEARNER}" if setting.begins_with_direct else None,
+        )
+        for setting in config.settings
+    ]
+    rule = replace(
+        common,
+        setting=Setting(RULE, "rule"),
+        seed=None,
+        episodes=0,
+        rule_budget=config.rule_budget,
+    )
+    return [ugat, *others, *(replace(rule, target=domain) for domain in config.domains)]
+
+
+def _grounded_job(config: TransferConfig) -> Job:
+    """Return the job of UGAT with its plain training."""
+    setting = Setting(
+        GROUNDED_NAME[config.ugat.grounding],
+        "grounded",
+        learner=config.spec,
+        ugat=config.ugat,
+        placebo=config.placebo,
+    )
+    return Job(
+        setting,
+        config.scenario,
+        sim=config.sim,
+        target=None if config.real == "none" else config.real,
+        seed=config.seed,
+        episodes=config.episodes,
+        options=config.env_options,
+        real_log=None if config.real_log is None else str(config.real_log),
+        probe_domains=tuple(config.domains),
+        tuning_seeds=config.tuning_seeds,
+        domains=tuple(config.domains),
+        evaluation_seeds=evaluation_seeds(config.evaluation_seeds),
+        device=config.device,
+    )
+
+
+def _write_results(
+    config: TransferConfig,
+    scenario: Scenario,
+    directory: Path,
+    plan: Sequence[Job],
+    records: Sequence[Record],
+) -> Evaluation:
+    """Write table, queues, metrics and policies of finished jobs; return the table."""
+    folder = directory / TRAININGS
+    rows: dict[str, tuple[Job, int, Record]] = {}
+    rules: dict[str, str] = {}
+    for job, record in zip(plan, records, strict=True):
+        for mark, name in job.rows.items():
+            if job.setting.recipe == "rule":
+                rules[domain_label(job.target or job.sim)] = (
+                    folder / job.name / RULE_FILE
+                ).read_text()
+                name = f"rule {rules[domain_label(job.target or job.sim)]}"
+            rows.setdefault(name, (job, mark, record))  # one rule may be the best of both domains
+    trained = {name: row for name, row in rows.items() if row[0].seed is not None}
+    for file, (job, mark, _) in zip(file_names(trained), trained.values(), strict=True):
+        policy = folder / job.name / (POLICY if mark == job.episodes else DIRECT_POLICY)
+        write_whole(directory / "policies" / f"{file}.pt", policy.read_bytes())
+    write_whole(directory / METRICS_FILE, (folder / plan[0].name / METRICS_FILE).read_bytes())
+    write_queues(
+        directory / QUEUES,
+        {n: (folder / job.name / QUEUES, job.rows[mark]) for n, (job, mark, _) in rows.items()},
+    )
+    results = tuple(
+        Result(name, domain_label(domain), seed, scores)
+        for name, (job, mark, record) in rows.items()
+        for domain in job.domains
+        for seed, scores in zip(job.evaluation_seeds, record.played(job, mark, domain), strict=True)
+    )
+    table = Evaluation(scenario.id, scenario.hash, results, _notes(config, rules))
     table.write(directory / "table.json")
     return table
 
 
-def _policies(config: TransferConfig, state: RunState) -> dict[str, Policy]:
-    """Return direct transfer and, if there was an iteration, the policy of UGAT."""
-    assert state.direct is not None  # plain training comes first
-    policies = {DIRECT: state.direct}
-    if config.ugat.iterations:
-        policies[GROUNDED_NAME[config.ugat.grounding]] = state.learner.policy()
-    return policies
+def _notes(config: TransferConfig, rules: Mapping[str, str]) -> dict[str, str]:
+    """Return further facts of the table; `rules` are the best ones, by name of the domain."""
+    if config.rule_budget is None:
+        searched = ", ".join(STANDARD_RULES)
+    else:
+        searched = f"{', '.join(TUNED_RULES)}; each tuned with up to {config.rule_budget} episodes"
+    return {
+        **{f"best rule in {domain}": rule for domain, rule in rules.items()},
+        "rules searched": searched,
+        "training seed": str(config.seed),
+        **({} if config.learner == DQN_NAME else {"learner": config.learner}),
+        **({} if config.corrected is None else {CORRECTED: domain_label(config.corrected)}),
+    }
+
+
+def _check(config: TransferConfig, scenario: Scenario, env: TrafficEnv, reporter: Reporter) -> None:
+    """Raise an error if a job of the run could not be performed.
+
+    Args:
+        config: Options of the run.
+        scenario: The network and its traffic.
+        env: The simulation.
+        reporter: Receives a note if the real log is from another domain.
+    """
+    config.spec.factory(config.device)
+    for world in worlds_of(_grounded_job(config), env, None):
+        world.close()
+    if config.real_log is not None:
+        _say_if_from_elsewhere(TransitionLog.read(config.real_log), config, reporter)
+    for option in ("corrected", *(["real"] if config.fine_tuned or config.oracle else [])):
+        if (domain := getattr(config, option)) is not None:
+            _require_same_agents(config, scenario, env, option, domain)
+    for domain in config.further:
+        _require_same_agents(config, scenario, env, "further", domain)
 
 
 def _say_if_from_elsewhere(log: TransitionLog, config: TransferConfig, reporter: Reporter) -> None:
@@ -289,123 +409,6 @@ def _say_if_from_elsewhere(log: TransitionLog, config: TransferConfig, reporter:
             f"note: the real log was recorded in {recorded!r}, the policies are judged in "
             f"{domain_label(config.real)!r}"
         )
-
-
-def judge(
-    config: TransferConfig,
-    scenario: Scenario,
-    policies: Mapping[str, Policy],
-    reporter: Reporter,
-    watch: Watch | None = None,
-    workers: Workers = None,
-) -> Evaluation:
-    """Evaluate policies and the best rule of each domain; `workers` search for the rules."""
-    seeds = [TUNING_SEED + k for k in range(config.tuning_seeds)]
-    options: Any = {"duration_s": config.duration_s, "reporter": reporter, "workers": workers}
-    if config.rule_budget is None:
-        rules = best_rules(scenario, config.domains, seeds=seeds, **options)
-        searched = ", ".join(STANDARD_RULES)
-    else:
-        rules = tuned_rules(scenario, config.domains, config.rule_budget, seeds=seeds, **options)
-        searched = f"{', '.join(TUNED_RULES)}; each tuned with up to {config.rule_budget} episodes"
-    factories: dict[str, PolicyFactory] = {
-        name: fixed_policy(policy) for name, policy in policies.items()
-    }
-    for rule in rules.values():
-        factories.setdefault(f"rule {rule}", rule_factory(rule))
-    return evaluate(
-        scenario,
-        factories,
-        config.domains,
-        evaluation_seeds(config.evaluation_seeds),
-        duration_s=config.duration_s,
-        reporter=reporter,
-        notes={
-            **{f"best rule in {domain}": rule for domain, rule in rules.items()},
-            "rules searched": searched,
-            "training seed": str(config.seed),
-            **({} if config.learner == DQN_NAME else {"learner": config.learner}),
-            **({} if config.corrected is None else {CORRECTED: domain_label(config.corrected)}),
-        },
-        watch=watch,
-    )
-
-
-def _worlds(
-    config: TransferConfig,
-    scenario: Scenario,
-    env: TrafficEnv,
-    reporter: Reporter,
-    workers: Workers,
-) -> tuple[SimulatedWorld, World]:
-    """Return the sources of D_sim and D_real; raise an error if the log does not fit."""
-    recorded: RecordedWorld | None = None
-    if config.real_log is not None:
-        log = TransitionLog.read(config.real_log)
-        recorded = RecordedWorld(log, env, config.ugat.fit.held_out_every)
-        _say_if_from_elsewhere(log, config, reporter)
-    street = config.sim if recorded or config.placebo == "same-world" else config.real
-    sim, real = simulated_worlds(
-        scenario, config.sim, street, config.ugat, config.env_options, workers
-    )
-    return sim, recorded or real
-
-
-def _train(
-    config: TransferConfig,
-    make: LearnerFactory,
-    scenario: Scenario,
-    env: TrafficEnv,
-    worlds: tuple[SimulatedWorld, World],
-    run: Run,
-) -> RunState:
-    def probe(policy: Policy) -> dict[str, float]:
-        """Return the ATT in s after an iteration, on a seed that no result is reported on."""
-        found = evaluate(
-            scenario,
-            {"policy": fixed_policy(policy)},
-            config.domains,
-            [TUNING_SEED],
-            duration_s=config.duration_s,
-        )
-        return {f"att_s/{d}": found.estimate("policy", d, "att_s").mean for d in found.domains}
-
-    return train_grounded(
-        config.ugat,
-        make,
-        env,
-        worlds,
-        config.seed,
-        run,
-        placebo=config.placebo,
-        probe=probe,
-        device=config.device,
-    )
-
-
-def _jobs(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> list[Job]:
-    """Return the jobs of `config.settings`; raise an error if a domain has other agents."""
-    for option in ("corrected", *(["real"] if config.fine_tuned or config.oracle else [])):
-        if (domain := getattr(config, option)) is not None:
-            _require_same_agents(config, scenario, env, option, domain)
-    for domain in config.further:
-        _require_same_agents(config, scenario, env, "further", domain)
-    return [
-        Job(
-            setting=setting,
-            scenario=config.scenario,
-            sim=config.sim,
-            target=config.real if setting.knows_target else None,
-            seed=config.seed,
-            episodes=config.episodes
-            if setting.episodes is None
-            else config.ugat.pretrain_episodes + setting.episodes,
-            start=f"../{DIRECT_LEARNER}" if setting.begins_with_direct else None,
-            options=config.env_options,
-            device=config.device,
-        )
-        for setting in config.settings
-    ]
 
 
 def _require_same_agents(
@@ -427,7 +430,7 @@ def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> di
     for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", "device", "corrected", *ADDED):
         settings.pop(other)
     log = config.real_log  # identified by its content, so the file may be moved
-    settings["real_log"] = hashlib.sha256(log.read_bytes()).hexdigest() if log else None
+    settings["real_log"] = file_hash(log) if log else None
     hashes = {"sim": env.scenario.hash}
     if config.real != "none":
         hashes["real"] = scenario_in_domain(scenario, config.real).hash
@@ -437,4 +440,5 @@ def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> di
         **settings,
         "scenario_hash": hashes,
         "domains": [domain_label(d) for d in config.domains],
+        "versions": installed_versions("eclipse-sumo", "torch"),
     }

@@ -21,7 +21,7 @@ import polars as pl
 
 from ugat_marl.data import CHECKPOINT_FOLDER, METRICS_FILE, SETTINGS_FILE, Metrics
 from ugat_marl.errors import OptionError, UgatMarlError
-from ugat_marl.experiments import QUEUES, Evaluation, read_queues, result_of
+from ugat_marl.experiments import QUEUES, TRAININGS, Evaluation, read_queues, result_of
 from ugat_marl.reporting.formats import commands_in
 
 RUN, JOB, TABLE, SCORES = "run.json", "job.json", "table.json", "scores.json"
@@ -258,10 +258,9 @@ def _run(directory: Path, name: str) -> RunRecord:
             TABLE, Evaluation.read, "the run is under way, or was stopped; no final table"
         )
     grounded = not job or isinstance(settings.get("ugat"), dict)
+    checkpoint = CHECKPOINT_FOLDER if job else _checkpoint_of_run(directory)
     without = "nobody knows where and when vehicles stood"
     queues = reader.read(QUEUES, read_queues, without) if evaluation is not None else None
-    if job and queues is not None:
-        queues = queues.with_columns(policy=pl.lit(str(settings.get("name", "unknown"))))
     return RunRecord(
         name=name,
         directory=directory,
@@ -270,11 +269,11 @@ def _run(directory: Path, name: str) -> RunRecord:
         hashes=_texts(_hashes(directory, kept)),
         versions=_texts(kept.get("versions")),
         evaluation=evaluation,
-        metrics=_metrics(reader) if grounded else None,
-        state=_state(reader) if grounded else None,
+        metrics=_metrics(reader, checkpoint) if grounded else None,
+        state=_state(reader, checkpoint) if grounded else None,
         queues=queues,
         missing=tuple(reader.missing),
-        written=_written(directory),
+        written=_written(directory, checkpoint),
     )
 
 
@@ -290,33 +289,37 @@ def _texts(value: Any) -> dict[str, str]:
     return {str(k): str(v) for k, v in value.items()} if isinstance(value, dict) else {}
 
 
-def _metrics(reader: _Reader) -> Metrics | None:
+def _checkpoint_of_run(directory: Path) -> str:
+    """Return the folder of the checkpoint of the grounded training, relative to the run's."""
+    places = sorted(directory.glob(f"{TRAININGS}/*/{CHECKPOINT_FOLDER}"))
+    return str(places[0].relative_to(directory)) if places else CHECKPOINT_FOLDER
+
+
+def _metrics(reader: _Reader, checkpoint: str) -> Metrics | None:
     """Return the metrics of the run or, without them, those of its last checkpoint."""
     without = "no learning curves, nothing of the gate"
-    found = reader.read(METRICS_FILE, Metrics.read, without)
-    if found is None and (reader.directory / CHECKPOINT_FOLDER / METRICS_FILE).is_file():
-        name = f"{CHECKPOINT_FOLDER}/{METRICS_FILE}"
-        found = reader.read(name, Metrics.read, without)
-        if found is not None:
+    metrics = reader.read(METRICS_FILE, Metrics.read, without)
+    if metrics is None and (reader.directory / checkpoint / METRICS_FILE).is_file():
+        name = f"{checkpoint}/{METRICS_FILE}"
+        metrics = reader.read(name, Metrics.read, without)
+        if metrics is not None:
             reader.missing[-1] = reader.missing[-1].replace(without, f"{name} is shown instead")
-    return found
+    return metrics
 
 
-def _state(reader: _Reader) -> dict[str, int] | None:
-    if not (reader.directory / CHECKPOINT_FOLDER).is_dir():
+def _state(reader: _Reader, checkpoint: str) -> dict[str, int] | None:
+    if not (reader.directory / checkpoint).is_dir():
         return None
-    found = reader.read(
-        f"{CHECKPOINT_FOLDER}/state.json", _object, "how far it had come is unknown"
-    )
-    if found is None:
+    state = reader.read(f"{checkpoint}/state.json", _object, "how far it had come is unknown")
+    if state is None:
         return None
-    return {k: v for k, v in found.items() if isinstance(v, int)}
+    return {k: v for k, v in state.items() if isinstance(v, int)}
 
 
-def _written(directory: Path) -> float:
+def _written(directory: Path, checkpoint: str) -> float:
     """Return the time of the newest of the files that tell the state, in s since 1970."""
     times: list[float] = []
-    for name in (RUN, JOB, TABLE, SCORES, METRICS_FILE, f"{CHECKPOINT_FOLDER}/state.json"):
+    for name in (RUN, JOB, TABLE, SCORES, METRICS_FILE, f"{checkpoint}/state.json"):
         with contextlib.suppress(OSError):
             times.append((directory / name).stat().st_mtime)
     return max(times, default=math.nan)
