@@ -131,7 +131,7 @@ def test_a_killed_job_goes_on_and_ends_with_the_same_numbers(
             episodes=8,
             every=0,
         )
-        title = "grounded, round 2"
+        title = "grounded, iteration 2"
     whole = perform(job, tmp_path / "whole", Silent())
     with pytest.raises(KeyboardInterrupt):
         perform(job, tmp_path / "killed", KillAfter(title, 1 if grounded else 11))

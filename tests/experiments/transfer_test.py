@@ -237,7 +237,7 @@ def test_a_run_with_noise_for_f_says_so_and_resumes(tmp_path: Path) -> None:
     transfer(config, tmp_path / "unbroken")
     assert numbers(tmp_path / "unbroken")[2, "forward/ratio"] > 1.2
     with pytest.raises(KeyboardInterrupt):
-        transfer(config, tmp_path / "run", reporter=KillAfter("grounded, round 2", 2))
+        transfer(config, tmp_path / "run", reporter=KillAfter("grounded, iteration 2", 2))
     transfer(config, tmp_path / "run", resume=True)
     one, two = (pl.read_parquet(tmp_path / n / "metrics.parquet") for n in ("run", "unbroken"))
     assert one.equals(two)

@@ -315,7 +315,7 @@ def test_a_run_with_timed_grounding_resumes_where_it_was(match: bool, tmp_path: 
     small = replace(SMALL, ugat=replace(SMALL.ugat, timed=timed))
     transfer(small, tmp_path / "unbroken")
     with pytest.raises(Killed):
-        transfer(small, tmp_path / "run", reporter=KillAt("fitting f and h, round 2"))
+        transfer(small, tmp_path / "run", reporter=KillAt("fitting f and h, iteration 2"))
     other = replace(small, ugat=replace(small.ugat, grounding="phase"))
     with pytest.raises(CheckpointError, match="holds another run"):
         transfer(other, tmp_path / "run", resume=True)

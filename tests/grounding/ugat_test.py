@@ -137,9 +137,9 @@ def test_alpha_can_start_at_what_the_first_fit_expects(tmp_path: Path) -> None:
     "moment",
     [
         "plain sim, episode 11-12",
-        "roll-outs, round 1",
-        "fitting f and h, round 2",
-        "grounded, round 2",
+        "roll-outs, iteration 1",
+        "fitting f and h, iteration 2",
+        "grounded, iteration 2",
     ],
 )
 def test_resuming_gives_the_numbers_of_an_unbroken_run(
@@ -178,7 +178,7 @@ def test_a_run_with_dropout_resumes(tmp_path: Path) -> None:
     """Its thinned networks are part of the checkpoint, and are not those of a fresh grounding."""
     config = short_of("dropout")
     with pytest.raises(Killed):
-        transfer(config, tmp_path / "run", reporter=KillAt("fitting f and h, round 2"))
+        transfer(config, tmp_path / "run", reporter=KillAt("fitting f and h, iteration 2"))
     transfer(config, tmp_path / "run", resume=True)
     transfer(config, tmp_path / "unbroken")
     one, two = (pl.read_parquet(tmp_path / n / "metrics.parquet") for n in ("run", "unbroken"))

@@ -49,7 +49,7 @@ def att(found: Comparison, setting: str, domain: str | None = None) -> float:
 
 
 def accepted(table_name: str, setting: str, runs: Path) -> float:
-    """Share of the grounded actions that the gate let pass, over seeds and rounds."""
+    """Share of the grounded actions that the gate let pass, over seeds and iterations."""
     (row,) = [own for own in CONFIG.settings(table_name) if own.name == setting]
     values = [
         value

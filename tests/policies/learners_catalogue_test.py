@@ -183,7 +183,7 @@ def test_ugat_trains_a_baseline_and_takes_it_up_again(tmp_path: Path) -> None:
         assert NetworkPolicy.load(path).hidden == (16,)
         assert policy_factory(str(path))  # as evaluate reads it
     with pytest.raises(KeyboardInterrupt):
-        transfer(SMALL, tmp_path / "broken", reporter=KillIn("grounded, round 2"))
+        transfer(SMALL, tmp_path / "broken", reporter=KillIn("grounded, iteration 2"))
     for other in ({"learner": "dqn", "learner_settings": ()}, {"learner_settings": ("hidden=8",)}):
         with pytest.raises(CheckpointError, match="another run"):
             transfer(replace(SMALL, **other), tmp_path / "broken", resume=True)

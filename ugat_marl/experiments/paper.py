@@ -219,7 +219,7 @@ class PaperConfig:
         seeds: Number of trainings of every setting, each with its own seed.
         first_seed: First training seed; the others follow it.
         episodes: Episodes of plain training before the first iteration.
-        iterations: Rounds of roll-outs, fits and grounded training.
+        iterations: Repetitions of roll-outs, fits and grounded training.
         grounded_episodes: Episodes of grounded training per iteration.
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.

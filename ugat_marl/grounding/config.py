@@ -28,7 +28,7 @@ class UgatConfig:
         grounding: Kind of the grounded action: "phase" is another phase, as in the paper; "timed"
             is the policy's own phase with a green that begins later.
         pretrain_episodes: M, episodes in plain sim before the first iteration.
-        iterations: I, rounds of rolling out, fitting and grounded training.
+        iterations: I, repetitions of rolling out, fitting and grounded training.
         grounded_episodes: E, episodes of training in the grounded sim per iteration.
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.

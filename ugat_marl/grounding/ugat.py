@@ -114,7 +114,7 @@ class Ugat:
             rewards = self._rewards(state, policy) if self.config.matches else None
             report = self._fit(state, device, rewards)  # lines 5 and 6
             self._prepare_gate(state, report)  # line 7
-            title = f"grounded, {_round(state)}"
+            title = f"grounded, {_iteration(state)}"
             self._learn(state, grounded_env, self.config.grounded_episodes, title)  # lines 8 to 16
             gate = self._update_alpha(state)  # line 17
             self._log(state, report, gate)
@@ -143,7 +143,7 @@ class Ugat:
         """Roll the policy out in both worlds at the same time (lines 3 and 4)."""
         worlds: tuple[World, World] = (self.sim, self.real)
         with (
-            self.run.reporter.task(f"roll-outs, {_round(state)}", len(worlds)) as advance,
+            self.run.reporter.task(f"roll-outs, {_iteration(state)}", len(worlds)) as advance,
             concurrent.futures.ThreadPoolExecutor(len(worlds)) as pool,
         ):
             running = [
@@ -169,7 +169,7 @@ class Ugat:
         """
         agents = state.transform.stack.agents
         number = self.sim.roll_outs_under_delays
-        with self.run.reporter.task(f"under delays, {_round(state)}", number) as advance:
+        with self.run.reporter.task(f"under delays, {_iteration(state)}", number) as advance:
             logs = self.sim.under_delays(policy, state.iteration, self.seed, advance)
         *before, street = [episode_rewards(log, agents) for log in state.real]
         simulated = np.array([episode_rewards(log, agents) for log in logs])
@@ -182,7 +182,7 @@ class Ugat:
         d_real, d_sim = map(TransitionLog.concatenate, (state.real, state.simulated))
         config, seed = self.config.fit, derive_seed(self.seed, "fit", state.iteration)
         most_epochs = 3 * config.epochs  # f, a model of the simulation, and h
-        title = f"fitting f and h, {_round(state)}"
+        title = f"fitting f and h, {_iteration(state)}"
         with self.run.reporter.task(title, most_epochs) as advance:
 
             def on_epoch(model: str, _epoch: int, loss: float) -> None:
@@ -191,7 +191,7 @@ class Ugat:
             fitter = Fitter(config, seed, on_epoch, device)
             report = state.transform.fit(d_real, d_sim, fitter, rewards)
         for warning in report.warnings:
-            self.run.reporter.say(f"{_round(state)}: {warning}")
+            self.run.reporter.say(f"{_iteration(state)}: {warning}")
         return report
 
     def _prepare_gate(self, state: RunState, report: FitReport) -> None:
@@ -228,5 +228,5 @@ class Ugat:
         self.run.log("iteration", state.iteration + 1, numbers)
 
 
-def _round(state: RunState) -> str:
-    return f"round {state.iteration + 1}"
+def _iteration(state: RunState) -> str:
+    return f"iteration {state.iteration + 1}"
