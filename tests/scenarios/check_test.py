@@ -170,8 +170,8 @@ def test_a_scenario_to_mend_is_an_exit_code(capsys: pytest.CaptureFixture[str]) 
 def test_headroom_is_measured_on_request(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ugat_marl.experiments.trial.DOMAINS", ("sim", "V4"))
-    monkeypatch.setattr("ugat_marl.experiments.trial.HOLDS_S", (10, 20, 30, 40))
+    monkeypatch.setattr("ugat_marl.experiments.scenario_check.DOMAINS", ("sim", "V4"))
+    monkeypatch.setattr("ugat_marl.experiments.scenario_check.HOLDS_S", (10, 20, 30, 40))
     words = ["scenario", "check", "single-v1", "--headroom", "1", "--duration-s", "200"]
     assert main([*words, "--no-simulate"]) == 0
     text = capsys.readouterr().out

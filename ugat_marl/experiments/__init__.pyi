@@ -39,6 +39,13 @@ from .policy_gaps import write_policy_gap as write_policy_gap
 from .queues import QUEUES as QUEUES
 from .queues import read_queues as read_queues
 from .recording.days import record as record
+from .scenario_check import Run as Run
+from .scenario_check import as_json as as_json
+from .scenario_check import is_full as is_full
+from .scenario_check import left_outside as left_outside
+from .scenario_check import measured_headroom as measured_headroom
+from .scenario_check import problems as problems
+from .scenario_check import try_out as try_out
 from .scores import Estimate as Estimate
 from .scores import Evaluation as Evaluation
 from .scores import Tuned as Tuned
@@ -61,13 +68,6 @@ from .statistics import student_p as student_p
 from .transfers import TRAININGS as TRAININGS
 from .transfers import TransferConfig as TransferConfig
 from .transfers import transfer as transfer
-from .trial import Run as Run
-from .trial import as_json as as_json
-from .trial import is_full as is_full
-from .trial import left_outside as left_outside
-from .trial import measured_headroom as measured_headroom
-from .trial import problems as problems
-from .trial import try_out as try_out
 from .tuning import BUDGET as BUDGET
 from .tuning import LEAST_BUDGET as LEAST_BUDGET
 from .tuning import TUNED_RULES as TUNED_RULES

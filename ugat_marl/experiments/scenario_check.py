@@ -1,4 +1,4 @@
-"""Trial of a scenario: traffic must enter and pass, and controllers must differ."""
+"""Check of a scenario: traffic must enter and pass, and controllers must differ."""
 
 from __future__ import annotations
 
