@@ -12,7 +12,7 @@ import pytest
 
 from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario
-from ugat_marl.experiments import Run, left_outside, problems
+from ugat_marl.experiments import RuleEpisode, left_outside, problems
 from ugat_marl.progress import Silent
 from ugat_marl.reporting import draw_network
 from ugat_marl.reporting.phase_diagrams import STYLES
@@ -102,18 +102,21 @@ def test_what_no_phase_serves_is_named(single: Scenario) -> None:
 def test_a_short_episode_and_a_full_road_are_named(single: Scenario) -> None:
     facts = survey(single.with_duration(60))
     assert "shorter than the shortest useful one" in problems(facts, ())[0]
-    runs = [Run("programme", 100, 1000, 800, 700, 200), Run("rule", 90, 1000, 980, 900, 20)]
+    runs = [
+        RuleEpisode("programme", 100, 1000, 800, 700, 200),
+        RuleEpisode("rule", 90, 1000, 980, 900, 20),
+    ]
     (text,) = problems(survey(single), runs)
     assert "20 of 1000 vehicles cannot enter even under rule" in text
-    runs[1] = Run("rule", 90, 1000, 995, 900, 5)
+    runs[1] = RuleEpisode("rule", 90, 1000, 995, 900, 5)
     assert problems(survey(single), runs) == []
 
 
 def test_phases_a_rule_cannot_work_with_are_named() -> None:
     mixed = load_scenario("mixed-v1")
     runs = [
-        Run("programme", 90, 1000, 1000, 900, 0),
-        Run("largest-queue:20", 270, 1000, 1000, 9, 0),
+        RuleEpisode("programme", 90, 1000, 1000, 900, 0),
+        RuleEpisode("largest-queue:20", 270, 1000, 1000, 9, 0),
     ]
     (text,) = problems(survey(mixed.with_control(phases="conflict-free")), runs)
     assert "takes 270 s where the programme takes 90 s" in text
@@ -136,7 +139,7 @@ def test_roads_where_vehicles_wait_outside_are_named(single: Scenario) -> None:
     outside = left_outside(crowded, 1)
     assert set(outside) == {full}
     assert outside[full] > 300
-    runs = [Run("programme", 100, 1000, 500, 100, 500)]
+    runs = [RuleEpisode("programme", 100, 1000, 500, 100, 500)]
     (text,) = problems(survey(crowded), runs, outside)
     assert f"they wait at {full} ({outside[full]})" in text
 

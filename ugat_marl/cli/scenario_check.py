@@ -19,13 +19,13 @@ from ugat_marl.errors import OptionError
 from ugat_marl.experiments import (
     HOLDS_S,
     Row,
-    Run,
+    RuleEpisode,
     as_json,
     is_full,
     left_outside,
     measured_headroom,
+    play_check_rules,
     problems,
-    try_out,
 )
 from ugat_marl.progress import Bars, Silent
 from ugat_marl.scenarios import SHORT_M, IntersectionFacts, Survey, survey
@@ -91,7 +91,9 @@ class ScenarioCheck:
             scenario = scenario.with_duration(self.duration_s)
         reporter = Silent() if self.json else Bars(console)
         facts = survey(scenario, reporter)
-        runs = try_out(scenario, self.seed, self.workers, reporter) if self.simulate else ()
+        runs = (
+            play_check_rules(scenario, self.seed, self.workers, reporter) if self.simulate else ()
+        )
         rows = None
         if self.headroom:
             rows = measured_headroom(scenario, self.headroom, self.workers, reporter)
@@ -131,7 +133,7 @@ class ScenarioCheck:
 def show(
     console: Console,
     facts: Survey,
-    runs: Sequence[Run],
+    runs: Sequence[RuleEpisode],
     rows: Sequence[Row] | None,
     wrong: Sequence[str],
 ) -> None:
@@ -230,7 +232,7 @@ def _approaches(agents: Sequence[IntersectionFacts]) -> Table:
     return table
 
 
-def _runs(runs: Sequence[Run]) -> Table:
+def _runs(runs: Sequence[RuleEpisode]) -> Table:
     table = _table(
         "An episode in sim", "rule", "ATT [s]", "due", "entered", "arrived", "left outside"
     )

@@ -39,13 +39,13 @@ from .policy_gaps import write_policy_gap as write_policy_gap
 from .queues import QUEUES as QUEUES
 from .queues import read_queues as read_queues
 from .recording.days import record as record
-from .scenario_check import Run as Run
+from .scenario_check import RuleEpisode as RuleEpisode
 from .scenario_check import as_json as as_json
 from .scenario_check import is_full as is_full
 from .scenario_check import left_outside as left_outside
 from .scenario_check import measured_headroom as measured_headroom
+from .scenario_check import play_check_rules as play_check_rules
 from .scenario_check import problems as problems
-from .scenario_check import try_out as try_out
 from .scores import Estimate as Estimate
 from .scores import Evaluation as Evaluation
 from .scores import Tuned as Tuned

@@ -27,8 +27,8 @@ MOST_BACKLOG = 0.01
 
 
 @dataclass(frozen=True)
-class Run:
-    """Result of an episode under a rule, in sim.
+class RuleEpisode:
+    """Episode under a rule, in sim.
 
     Attributes:
         rule: The rule.
@@ -47,9 +47,9 @@ class Run:
     backlog: int
 
 
-def try_out(
+def play_check_rules(
     scenario: Scenario, seed: int, workers: int | None, reporter: Reporter
-) -> tuple[Run, ...]:
+) -> tuple[RuleEpisode, ...]:
     """Play one episode under each of `RULES`."""
     found = evaluate(
         scenario,
@@ -66,7 +66,9 @@ def try_out(
 
     measures = ("due", "departed", "throughput", "backlog")
     return tuple(
-        Run(rule, round(value(rule, "att_s"), 1), *(int(value(rule, name)) for name in measures))
+        RuleEpisode(
+            rule, round(value(rule, "att_s"), 1), *(int(value(rule, name)) for name in measures)
+        )
         for rule in RULES
     )
 
@@ -80,7 +82,7 @@ def measured_headroom(
     )
 
 
-def is_full(runs: Sequence[Run]) -> bool:
+def is_full(runs: Sequence[RuleEpisode]) -> bool:
     """Return True if too many vehicles stay outside under every rule."""
     return bool(runs) and all(run.backlog > MOST_BACKLOG * run.due for run in runs)
 
@@ -107,13 +109,13 @@ def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
 
 
 def problems(
-    facts: Survey, runs: Sequence[Run], outside: Mapping[str, int] | None = None
+    facts: Survey, runs: Sequence[RuleEpisode], outside: Mapping[str, int] | None = None
 ) -> list[str]:
     """Return the faults to repair before training, each with a remedy.
 
     Args:
         facts: Survey of the scenario.
-        runs: Results of `try_out`.
+        runs: Results of `play_check_rules`.
         outside: Result of `left_outside`; None if it was not called.
     """
     found: list[str] = []
@@ -152,7 +154,7 @@ def problems(
     return found
 
 
-def _unsuited(facts: Survey, runs: Sequence[Run]) -> str:
+def _unsuited(facts: Survey, runs: Sequence[RuleEpisode]) -> str:
     """Return a message if phases serve lanes in part and a rule is far behind the programme."""
     lanes = sum(len(item.partly_served) for item in facts.intersections)
     att_s = {run.rule: run.att_s for run in runs}
@@ -170,7 +172,7 @@ def _unsuited(facts: Survey, runs: Sequence[Run]) -> str:
 
 def as_json(
     facts: Survey,
-    runs: Sequence[Run],
+    runs: Sequence[RuleEpisode],
     rows: Sequence[Row] | None,
     wrong: Sequence[str],
     outside: Mapping[str, int] | None = None,
