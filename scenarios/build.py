@@ -45,7 +45,7 @@ def build(name: str, into: Path) -> list[Path]:
 def measure(name: str, seeds: list[int], workers: int | None) -> Path:
     """Write the headroom of scenario `name` between the markers of its README."""
     # Building needs no simulation; only this does.
-    from ugat_marl.experiments import headroom, markdown
+    from ugat_marl.experiments import headroom_markdown, measure_headroom
     from ugat_marl.scenarios import read_scenario
 
     readme = HERE / name / "README.md"
@@ -53,7 +53,9 @@ def measure(name: str, seeds: list[int], workers: int | None) -> Path:
     if BEGIN not in text or END not in text:
         raise ScenarioError(f"{readme}: has no lines {BEGIN.strip()!r} and {END.strip()!r}")
     before, _, rest = text.partition(BEGIN)
-    table = markdown(headroom(read_scenario(HERE / name), seeds=seeds, workers=workers))
+    table = headroom_markdown(
+        measure_headroom(read_scenario(HERE / name), seeds=seeds, workers=workers)
+    )
     caption = f"Means over the seeds {', '.join(map(str, seeds))}:\n\n"
     write_whole(readme, f"{before}{BEGIN}{caption}{table}{END}{rest.partition(END)[2]}")
     return readme

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import struct
 import xml.etree.ElementTree as ET
@@ -12,7 +13,7 @@ import pytest
 
 from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario
-from ugat_marl.experiments import RuleEpisode, left_outside, problems
+from ugat_marl.experiments import RuleEpisode, left_outside, measure_headroom, problems
 from ugat_marl.progress import Silent
 from ugat_marl.reporting import draw_network
 from ugat_marl.reporting.phase_diagrams import STYLES
@@ -173,8 +174,8 @@ def test_a_scenario_to_mend_is_an_exit_code(capsys: pytest.CaptureFixture[str]) 
 def test_headroom_is_measured_on_request(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ugat_marl.experiments.scenario_check.DOMAINS", ("sim", "V4"))
-    monkeypatch.setattr("ugat_marl.experiments.scenario_check.HOLDS_S", (10, 20, 30, 40))
+    two = functools.partial(measure_headroom, domains=("sim", "V4"))
+    monkeypatch.setattr("ugat_marl.cli.scenario_check.measure_headroom", two)
     words = ["scenario", "check", "single-v1", "--headroom", "1", "--duration-s", "200"]
     assert main([*words, "--no-simulate"]) == 0
     text = capsys.readouterr().out

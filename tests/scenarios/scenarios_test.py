@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.experiments import Row, headroom, markdown
+from ugat_marl.experiments import HeadroomRow, headroom_markdown, measure_headroom
 from ugat_marl.scenarios import (
     Network,
     Plan,
@@ -275,7 +275,7 @@ def test_readme_states_headroom_of_at_least_15_percent(name: str) -> None:
 
 
 def test_headroom_is_there_when_measured() -> None:
-    rows = headroom(read_scenario("single-v1"), ["sim", "V4"], (20, 40), [100], workers=2)
+    rows = measure_headroom(read_scenario("single-v1"), ["sim", "V4"], (20, 40), [100], workers=2)
     assert [row.best_hold_s for row in rows] == [20, 40]
     assert rows[0].lost == 0
     assert rows[1].lost == pytest.approx(rows[1].att_s[0] / rows[1].att_s[1] - 1)
@@ -285,15 +285,15 @@ def test_headroom_is_there_when_measured() -> None:
 
 
 def test_headroom_table_marks_the_best_hold() -> None:
-    row = Row("V4", (100.0, 80.0), 90.0, 20, 0.25, 0.975, 3.0)
-    assert markdown([row], (10, 20)).splitlines()[-1] == (
+    row = HeadroomRow("V4", (100.0, 80.0), 90.0, 20, 0.25, 0.975, 3.0)
+    assert headroom_markdown([row], (10, 20)).splitlines()[-1] == (
         "| V4 | 100.0 | **80.0** | 90.0 | 25% | 97.5% | 3 |"
     )
 
 
 def test_headroom_of_nothing_is_refused() -> None:
     with pytest.raises(OptionError, match="at least one"):
-        headroom(read_scenario("single-v1"), ["sim"], (), [0])
+        measure_headroom(read_scenario("single-v1"), ["sim"], (), [0])
 
 
 def plan(there: list[str], beyond: list[str]) -> Plan:

@@ -18,12 +18,12 @@ from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import (
     HOLDS_S,
-    Row,
+    HeadroomRow,
     RuleEpisode,
     as_json,
     is_full,
     left_outside,
-    measured_headroom,
+    measure_headroom,
     play_check_rules,
     problems,
 )
@@ -96,7 +96,9 @@ class ScenarioCheck:
         )
         rows = None
         if self.headroom:
-            rows = measured_headroom(scenario, self.headroom, self.workers, reporter)
+            rows = measure_headroom(
+                scenario, seeds=range(self.headroom), workers=self.workers, reporter=reporter
+            )
         outside = left_outside(scenario, self.seed) if is_full(runs) else {}
         wrong = problems(facts, runs, outside)
         if self.json:
@@ -134,7 +136,7 @@ def show(
     console: Console,
     facts: Survey,
     runs: Sequence[RuleEpisode],
-    rows: Sequence[Row] | None,
+    rows: Sequence[HeadroomRow] | None,
     wrong: Sequence[str],
 ) -> None:
     """Print everything as tables that fit 80 columns."""
@@ -242,7 +244,7 @@ def _runs(runs: Sequence[RuleEpisode]) -> Table:
     return table
 
 
-def _headroom(rows: Sequence[Row]) -> Table:
+def _headroom(rows: Sequence[HeadroomRow]) -> Table:
     """Return the table of headroom: in each domain, the loss of the rule that is best in sim."""
     holds = [f"{hold_s} s" for hold_s in HOLDS_S]
     table = _table(

@@ -9,7 +9,8 @@ interrupted ones. `train`, the tables of the UGAT paper, the learning curves of 
 - `transfers`, `paper`, `learning_curves`, `baseline`: the trainings of each command.
 - `evaluation`, `scores`, `comparison`, `statistics`, `gaps`: episodes of policies, their scores
   and intervals.
-- `tuning`, `headroom`, `scenario_check`: the tuning of rules, and the check of scenarios with them.
+- `tuning`, `transfer_headroom`, `scenario_check`: the tuning of rules, and the check of scenarios
+  with them.
 - `recording`: measured data of a domain.
 - `queues`: halting vehicles per intersection and minute.
 - `policy_gaps`: travel times before and after a diagnosis.

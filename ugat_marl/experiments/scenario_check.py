@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ugat_marl.experiments.evaluation import evaluate, rule_factory
-from ugat_marl.experiments.headroom import DOMAINS, HOLDS_S, Row, headroom
+from ugat_marl.experiments.transfer_headroom import HeadroomRow
 from ugat_marl.files import chunks_of, scan_xml
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario, Survey, departures, run_program, sumo_program
@@ -70,15 +70,6 @@ def play_check_rules(
             rule, round(value(rule, "att_s"), 1), *(int(value(rule, name)) for name in measures)
         )
         for rule in RULES
-    )
-
-
-def measured_headroom(
-    scenario: Scenario, seeds: int, workers: int | None, reporter: Reporter
-) -> list[Row]:
-    """Return the ATT of the largest-queue rule with long and short holds in every domain."""
-    return headroom(
-        scenario, DOMAINS, HOLDS_S, tuple(range(seeds)), workers=workers, reporter=reporter
     )
 
 
@@ -173,7 +164,7 @@ def _unsuited(facts: Survey, runs: Sequence[RuleEpisode]) -> str:
 def as_json(
     facts: Survey,
     runs: Sequence[RuleEpisode],
-    rows: Sequence[Row] | None,
+    rows: Sequence[HeadroomRow] | None,
     wrong: Sequence[str],
     outside: Mapping[str, int] | None = None,
 ) -> dict[str, object]:

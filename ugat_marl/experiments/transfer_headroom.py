@@ -22,7 +22,7 @@ SEEDS = (0, 1, 2, 3, 4)
 
 
 @dataclass(frozen=True)
-class Row:
+class HeadroomRow:
     """Results in one domain, means over the seeds.
 
     Attributes:
@@ -45,7 +45,7 @@ class Row:
     backlog: float
 
 
-def headroom(
+def measure_headroom(
     scenario: Scenario,
     domains: Sequence[Domain] = DOMAINS,
     holds_s: Sequence[int] = HOLDS_S,
@@ -53,7 +53,7 @@ def headroom(
     *,
     workers: Workers = None,
     reporter: Reporter | None = None,
-) -> list[Row]:
+) -> list[HeadroomRow]:
     """Return the ATT of the largest-queue rule in every domain for every hold.
 
     Args:
@@ -86,13 +86,13 @@ def headroom(
     def mean(name: str, domain: str, measure: str) -> float:
         return float(found.values(name, domain, measure).mean())
 
-    rows: list[Row] = []
+    rows: list[HeadroomRow] = []
     for domain in found.domains:
         att_s = {hold_s: mean(rule, domain, "att_s") for hold_s, rule in rules.items()}
         best = min(att_s, key=lambda hold_s: att_s[hold_s])
         reference = rows[0].best_hold_s if rows else best
         rows.append(
-            Row(
+            HeadroomRow(
                 domain,
                 tuple(att_s.values()),
                 mean("programme", domain, "att_s"),
@@ -105,7 +105,7 @@ def headroom(
     return rows
 
 
-def markdown(rows: Sequence[Row], holds_s: Sequence[int] = HOLDS_S) -> str:
+def headroom_markdown(rows: Sequence[HeadroomRow], holds_s: Sequence[int] = HOLDS_S) -> str:
     """Return the rows as a Markdown table; the best hold of each domain is bold."""
     head = ["ATT [s]", *(f"held {hold_s} s" for hold_s in holds_s), "own programme"]
     head += [f"lost by the rule best in {rows[0].domain}", "arrived", "never got in"]
