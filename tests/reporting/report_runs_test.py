@@ -33,8 +33,8 @@ from ugat_marl.experiments import (
     Record,
     Setting,
     TransferConfig,
-    binned,
-    joined,
+    means_by_step,
+    means_by_stretch,
     transfer,
 )
 from ugat_marl.experiments.scores import Result
@@ -542,18 +542,18 @@ def test_nested_settings_come_back_too() -> None:
 
 
 def test_stretches_of_episodes_have_students_interval() -> None:
-    rows = binned([[(k, float(k)) for k in range(8)]])
+    rows = means_by_stretch([[(k, float(k)) for k in range(8)]])
     assert [row[0] for row in rows] == [2.0, 6.0]
     own = Interval.of(np.arange(4.0))
     assert rows[0][1:] == (own.mean, own.low, own.high)
-    two = binned([[(k, 1.0) for k in range(8)], [(k, 3.0) for k in range(8)]])
+    two = means_by_stretch([[(k, 1.0) for k in range(8)], [(k, 3.0) for k in range(8)]])
     over = Interval.of(np.array([1.0, 3.0]))
     assert two[0][1:] == (over.mean, over.low, over.high)
-    assert binned([]) == []
+    assert means_by_stretch([]) == []
 
 
 def test_steps_are_joined_over_series() -> None:
-    rows = joined([[(0, 1.0), (1, np.inf)], [(0, 3.0)]])
+    rows = means_by_step([[(0, 1.0), (1, np.inf)], [(0, 3.0)]])
     assert rows[0][1] == 2.0 and rows[0][2] < 1.0
     assert np.isnan(rows[1][1])  # what is infinite once is no mean
 

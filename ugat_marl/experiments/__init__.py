@@ -12,6 +12,7 @@ interrupted ones. `train`, the tables of the UGAT paper, the learning curves of 
 - `tuning`, `transfer_headroom`, `scenario_check`: the tuning of rules, and the check of scenarios
   with them.
 - `recording`: measured data of a domain.
+- `training_curves`: means of what trainings log.
 - `queues`: halting vehicles per intersection and minute.
 - `policy_gaps`: travel times before and after a diagnosis.
 - `randomised`: worlds drawn at random.

@@ -58,8 +58,8 @@ from .statistics import Floats as Floats
 from .statistics import Interval as Interval
 from .statistics import PairedTest as PairedTest
 from .statistics import student_p as student_p
-from .series import joined as joined
-from .series import binned as binned
+from .training_curves import means_by_step as means_by_step
+from .training_curves import means_by_stretch as means_by_stretch
 from .transfer_headroom import HOLDS_S as HOLDS_S
 from .transfer_headroom import HeadroomRow as HeadroomRow
 from .transfer_headroom import headroom_markdown as headroom_markdown

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Metrics
-from ugat_marl.experiments import Comparison, Evaluation, Interval, binned, joined
+from ugat_marl.experiments import Comparison, Evaluation, Interval, means_by_step, means_by_stretch
 from ugat_marl.reporting.figures import (
     TOP,
     WIDTH,
@@ -63,7 +63,7 @@ def learning_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | N
         The picture; None if no return was logged.
     """
     series = [rows for record in records if (rows := record.series("episode", "return"))]
-    rows = binned(series)
+    rows = means_by_stretch(series)
     if not rows:
         return None
     picture, axes = _plot(
@@ -90,7 +90,7 @@ def travel_time_picture(records: Sequence[RunRecord], name: str) -> NamedFigure 
     domains: dict[str, list[tuple[float, float, float, float]]] = {}
     for domain in _domains(records):
         series = [record.series("iteration", f"att_s/{domain}") for record in records]
-        if rows := joined([one for one in series if one]):
+        if rows := means_by_step([one for one in series if one]):
             domains[domain] = rows
     if not domains:
         return None
@@ -112,7 +112,9 @@ def gate_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | None:
         "gate/alpha": "threshold α (none: ∞)",
     }
     curves = {
-        key: joined([rows for record in records if (rows := record.series("iteration", key))])
+        key: means_by_step(
+            [rows for record in records if (rows := record.series("iteration", key))]
+        )
         for key in labels
     }
     if not curves["gate/acceptance"]:

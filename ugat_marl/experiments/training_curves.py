@@ -9,7 +9,7 @@ import numpy as np
 
 from ugat_marl.experiments.statistics import Interval
 
-Row = tuple[float, float, float, float]
+CurvePoint = tuple[float, float, float, float]
 """Episode or iteration, mean, lower and upper end of the interval."""
 
 _STRETCHES = 20
@@ -18,18 +18,18 @@ _LEAST = 4
 """Smallest number of episodes in a stretch."""
 
 
-def binned(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
+def means_by_stretch(series: Sequence[Sequence[tuple[int, float]]]) -> list[CurvePoint]:
     """Return the middle, the mean and Student's 95 % interval of each stretch of episodes.
 
     For one series, the interval is over the episodes of the stretch; for several, over the series.
     """
     if not series:
         return []
-    last = max(one[-1][0] for one in series) + 1
+    last = max(points[-1][0] for points in series) + 1
     size = max(_LEAST, math.ceil(last / _STRETCHES))
-    rows: list[Row] = []
+    rows: list[CurvePoint] = []
     for start in range(0, last, size):
-        parts = [[v for x, v in one if start <= x < start + size] for one in series]
+        parts = [[v for x, v in points if start <= x < start + size] for points in series]
         parts = [part for part in parts if part]
         values = parts[0] if len(series) == 1 and parts else [float(np.mean(p)) for p in parts]
         if values and (len(values) > 1 or len(series) > 1 or last < 2 * size):
@@ -37,14 +37,14 @@ def binned(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
     return rows
 
 
-def joined(series: Sequence[Sequence[tuple[int, float]]]) -> list[Row]:
+def means_by_step(series: Sequence[Sequence[tuple[int, float]]]) -> list[CurvePoint]:
     """Return mean and Student's 95 % interval over the series at each step.
 
     With one series the ends of the interval are nan.
     """
     steps: dict[int, list[float]] = {}
-    for one in series:
-        for step, value in one:
+    for points in series:
+        for step, value in points:
             steps.setdefault(step, []).append(value)
     return [(step, *_interval(values)) for step, values in sorted(steps.items())]
 
