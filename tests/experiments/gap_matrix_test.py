@@ -13,7 +13,7 @@ from ugat_marl.cli.evaluate import Evaluate
 from ugat_marl.data import Scores
 from ugat_marl.effects import NAMED_DOMAINS, load_scenario
 from ugat_marl.envs import OBJECTIVE_MEASURES
-from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
+from ugat_marl.experiments import Evaluation, domains_by_gap, gap_matrix
 from ugat_marl.experiments.scores import Result
 from ugat_marl.reporting import gap_matrix_table, objective_tables
 from ugat_marl.scenarios import validated
@@ -58,7 +58,7 @@ def shown(*tables: object) -> str:
 
 def test_each_cell_is_the_mean_over_domains_and_seeds() -> None:
     found = planted()
-    assert gaps_of(found) == {
+    assert domains_by_gap(found) == {
         "observation": ["zone-50"], "transition": ["V1", "V4"], "reward": ["want-safety"],
     }  # fmt: skip
     matrix = gap_matrix(found)

@@ -14,7 +14,7 @@ from ugat_marl.cli.arguments import RayAddress, workers_of
 from ugat_marl.effects import NAMED_DOMAINS, expand_domains, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.experiments import evaluate, gaps_of, policy_factory
+from ugat_marl.experiments import domains_by_gap, evaluate, policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import gap_matrix_table, measures_table, objective_tables
@@ -83,7 +83,7 @@ class Evaluate:
                 workers=workers,
                 reporter=Bars(console),
             )
-        if len(domains) > MOST_IN_DETAIL and gaps_of(found):
+        if len(domains) > MOST_IN_DETAIL and domains_by_gap(found):
             console.print(gap_matrix_table(found))
         else:
             console.print(measures_table(found))

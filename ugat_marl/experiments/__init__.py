@@ -7,8 +7,8 @@ interrupted ones. `train`, the tables of the UGAT paper, the learning curves of 
 
 - `settings`, `jobs`, `driver`, `training`: a setting, a job, many jobs, one training.
 - `transfers`, `paper`, `learning_curves`, `baseline`: the trainings of each command.
-- `evaluation`, `scores`, `comparison`, `statistics`, `gaps`: episodes of policies, their scores
-  and intervals.
+- `evaluation`, `scores`, `comparison`, `statistics`, `gap_costs`: episodes of policies, their
+  scores and intervals.
 - `tuning`, `transfer_headroom`, `scenario_check`: the tuning of rules, and the check of scenarios
   with them.
 - `recording`: measured data of a domain.

@@ -13,8 +13,8 @@ from .evaluation import best_rules as best_rules
 from .evaluation import evaluate as evaluate
 from .evaluation import policy_factory as policy_factory
 from .evaluation import rule_factory as rule_factory
-from .gaps import gap_matrix as gap_matrix
-from .gaps import gaps_of as gaps_of
+from .gap_costs import domains_by_gap as domains_by_gap
+from .gap_costs import gap_matrix as gap_matrix
 from .jobs import EVALUATION_SEED as EVALUATION_SEED
 from .jobs import RULE_FILE as RULE_FILE
 from .jobs import Job as Job

@@ -10,13 +10,13 @@ from rich.table import Table
 from rich.text import Text
 
 from ugat_marl.envs import OBJECTIVE_MEASURES
-from ugat_marl.experiments import Evaluation, gap_matrix, gaps_of
+from ugat_marl.experiments import Evaluation, domains_by_gap, gap_matrix
 from ugat_marl.reporting.tables import number_text
 
 
 def gap_matrix_table(found: Evaluation) -> RenderableType:
     """Return the cost of each gap for each controller, then travel times by domain."""
-    gaps = gaps_of(found)
+    gaps = domains_by_gap(found)
     first = found.domains[0]
     table = _table(f"{found.scenario}: what each gap costs each controller")
     table.add_column("policy", max_width=16, overflow="fold")

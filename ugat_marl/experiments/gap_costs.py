@@ -30,9 +30,9 @@ class Cell:
     worst_cost: float
 
 
-def gaps_of(found: Evaluation) -> dict[str, list[str]]:
+def domains_by_gap(evaluation: Evaluation) -> dict[str, list[str]]:
     """Return the names of the evaluation's domains by gap, without gaps that have no domain."""
-    others = found.domains[1:]
+    others = evaluation.domains[1:]
     listed = {
         gap: [name for name in others if name in NAMED_DOMAINS and NAMED_DOMAINS[name].gap == gap]
         for gap in GAP_KINDS
@@ -40,21 +40,21 @@ def gaps_of(found: Evaluation) -> dict[str, list[str]]:
     return {gap: names for gap, names in listed.items() if names}
 
 
-def gap_matrix(found: Evaluation) -> dict[str, Mapping[str, Cell]]:
+def gap_matrix(evaluation: Evaluation) -> dict[str, Mapping[str, Cell]]:
     """Return the cost of each gap to each controller."""
-    gaps = gaps_of(found)
+    gaps = domains_by_gap(evaluation)
     return {
-        policy: {gap: _cell(found, policy, gap, names) for gap, names in gaps.items()}
-        for policy in found.policies
+        policy: {gap: _cell(evaluation, policy, gap, names) for gap, names in gaps.items()}
+        for policy in evaluation.policies
     }
 
 
-def _cell(found: Evaluation, policy: str, gap: str, domains: Sequence[str]) -> Cell:
+def _cell(evaluation: Evaluation, policy: str, gap: str, domains: Sequence[str]) -> Cell:
     costs = np.array(
         [
-            _above_best(found, policy, name)
+            _above_best(evaluation, policy, name)
             if gap == "reward"
-            else _above_first(found, policy, name)
+            else _above_first(evaluation, policy, name)
             for name in domains
         ]
     )
@@ -63,14 +63,16 @@ def _cell(found: Evaluation, policy: str, gap: str, domains: Sequence[str]) -> C
     return Cell(Estimate.of(costs.mean(axis=0)), domains[worst], float(means[worst]))
 
 
-def _above_first(found: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
+def _above_first(evaluation: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
     """Return the travel time minus that in the first domain, seed by seed, in s."""
-    first = found.values(policy, found.domains[0], "att_s")
-    return found.values(policy, domain, "att_s") - first
+    first = evaluation.values(policy, evaluation.domains[0], "att_s")
+    return evaluation.values(policy, domain, "att_s") - first
 
 
-def _above_best(found: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
+def _above_best(evaluation: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
     """Return 100 · (cost / cost of the best controller there - 1), seed by seed, in %."""
-    best = min(found.policies, key=lambda name: float(found.values(name, domain, "cost").mean()))
-    least = found.values(best, domain, "cost")
-    return 100.0 * (found.values(policy, domain, "cost") / np.maximum(least, 1e-9) - 1.0)
+    best = min(
+        evaluation.policies, key=lambda name: float(evaluation.values(name, domain, "cost").mean())
+    )
+    least = evaluation.values(best, domain, "cost")
+    return 100.0 * (evaluation.values(policy, domain, "cost") / np.maximum(least, 1e-9) - 1.0)
