@@ -450,7 +450,7 @@ def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
 
 def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
     make_job(tmp_path, "direct-0", ("sim", "V4"), Setting("direct transfer", "direct"))
-    rows = [("policy", d, m, "A1", 3.0 + m, 6) for d in ("sim", "V4") for m in range(5)]
+    rows = [("direct transfer", d, m, "A1", 3.0 + m, 6) for d in ("sim", "V4") for m in range(5)]
     schema = ["policy", "domain", "minute", "intersection", "queue", "looks"]
     pl.DataFrame(rows, schema=schema, orient="row").write_parquet(
         tmp_path / "direct-0" / "queues.parquet"
