@@ -41,8 +41,8 @@ from ugat_marl.policies import (
     LibraryLearner,
     TrainingEnv,
     check_settings,
-    kept_generators,
     linear,
+    preserve_random_state,
     seed_generators,
 )
 from ugat_marl.seeding import derive_seed
@@ -193,7 +193,7 @@ class BenchMARL(LibraryLearner):
         super().__init__(env, f"baselines.benchmarl.{config.algorithm}")
         if getattr(env, "state_space", None) is None:
             raise OptionError("a value of the whole network needs env.state_space and env.state()")
-        with kept_generators():
+        with preserve_random_state():
             self._experiment = self._made(env, derive_seed(seed, "benchmarl", "weights"))
         self._loss: Any = self._experiment.losses[_GROUP]
         self._buffer: Any = self._experiment.replay_buffers[_GROUP]

@@ -38,9 +38,9 @@ from ugat_marl.policies import (
     TrainingEnv,
     check_settings,
     decisions_of,
-    kept_generators,
     linear,
     linear_layers,
+    preserve_random_state,
     seed_generators,
 )
 from ugat_marl.seeding import derive_seed
@@ -117,7 +117,7 @@ class RLlib(LibraryLearner):
         self._decisions = decisions_of(env)
         # RLlib logs errors that it raises as well.
         logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
-        with kept_generators(), warnings.catch_warnings():
+        with preserve_random_state(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             config_of_library = self._library_config(env, derive_seed(seed, "rllib", "weights"))
             seed_generators(seed, "rllib", "weights")

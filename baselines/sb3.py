@@ -41,8 +41,8 @@ from ugat_marl.policies import (
     TrainingEnv,
     check_settings,
     decisions_of,
-    kept_generators,
     linear_layers,
+    preserve_random_state,
     roll_out_length,
     seed_generators,
 )
@@ -176,7 +176,7 @@ class SB3(LibraryLearner):
         self.config = config or SB3Config()
         super().__init__(env, f"baselines.sb3.{self.config.algorithm}")
         self._decisions = decisions_of(env)
-        with kept_generators():
+        with preserve_random_state():
             seed_generators(seed, "sb3", "weights")
             self._model: Any = self._made(env)
 

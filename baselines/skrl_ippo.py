@@ -40,9 +40,9 @@ from ugat_marl.policies import (
     TrainingEnv,
     check_settings,
     decisions_of,
-    kept_generators,
     linear_layers,
     perceptron,
+    preserve_random_state,
     roll_out_length,
     seed_generators,
 )
@@ -129,7 +129,7 @@ class Skrl(LibraryLearner):
         }
         self._groups = agent_groups(self.agents) if config.shared else {a: a for a in spaces}
         self._models: dict[str, dict[str, Any]] = {}  # actor and critic by group
-        with kept_generators():
+        with preserve_random_state():
             seed_generators(seed, "skrl", "weights")
             for agent, own in spaces.items():
                 if self._groups[agent] not in self._models:

@@ -33,9 +33,9 @@ from ugat_marl.policies import (
     LibraryLearner,
     TrainingEnv,
     check_settings,
-    kept_generators,
     linear_layers,
     perceptron,
+    preserve_random_state,
     seed_generators,
 )
 
@@ -90,7 +90,7 @@ class TorchRLMAPPO(LibraryLearner):
         if state is None:
             raise OptionError("a centralised critic needs env.state_space and env.state()")
         agents, hidden = self.agents, config.hidden
-        with kept_generators():
+        with preserve_random_state():
             seed_generators(seed, "torchrl", "weights")
             width = agents.widest_observation + len(agents)
             self._actor = perceptron(width, hidden, agents.most_actions)

@@ -18,10 +18,10 @@ from ugat_marl.policies import (
     TrainingEnv,
     check_settings,
     decisions_of,
-    kept_generators,
     linear_layers,
     observation_mask,
     perceptron,
+    preserve_random_state,
     roll_out_length,
     seed_generators,
 )
@@ -243,7 +243,7 @@ def test_global_generators_are_lent_only() -> None:
     seed_generators(1, "a")
     first = drawn()
     seed_generators(1, "a")
-    with kept_generators():
+    with preserve_random_state():
         assert drawn() == first
         seed_generators(1, "b")
         assert drawn() != first

@@ -70,7 +70,7 @@ class LibraryLearner(abc.ABC):
                 f"the environment's agents are {AgentSet.of(env)}, this learner's {self.agents}; "
                 "make a new learner for it"
             )
-        with one_thread(), kept_generators():
+        with one_thread(), preserve_random_state():
             if episodes > 0:
                 self._train(TrainingEnv(env, self, seed, on_episode), episodes, seed)
         return self.policy()
@@ -355,7 +355,7 @@ def roll_out_length(decisions: int, least: int) -> int:
 
 
 @contextlib.contextmanager
-def kept_generators() -> Iterator[None]:
+def preserve_random_state() -> Iterator[None]:
     """Restore the global random generators at the end, because libraries draw from them."""
     before = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     try:
