@@ -11,10 +11,10 @@ from ugat_marl.policies import (
     DQN_NAME,
     DQNConfig,
     LearnerFactory,
+    baseline_settings,
     learner_factory,
     library_of,
     require_known,
-    settings_of,
 )
 
 DIRECT, UGAT, TIMED = "direct transfer", "UGAT", "UGAT, timed"
@@ -77,7 +77,7 @@ class LearnerSpec:
         """
         if self.name == DQN_NAME:
             return {"name": self.name, "settings": asdict(self.dqn)}
-        settings = settings_of(self.name, self.settings)
+        settings = baseline_settings(self.name, self.settings)
         return {"name": self.name, "settings": settings, "library": library_of(self.name)}
 
 

@@ -7,12 +7,12 @@ from .export import export_policy as export_policy
 from .learners.catalogue import BASELINES as BASELINES
 from .learners.catalogue import DQN_NAME as DQN_NAME
 from .learners.catalogue import LearnerFactory as LearnerFactory
+from .learners.catalogue import baseline_settings as baseline_settings
 from .learners.catalogue import is_installed as is_installed
 from .learners.catalogue import learner_factory as learner_factory
 from .learners.catalogue import library_of as library_of
 from .learners.catalogue import load_baseline as load_baseline
 from .learners.catalogue import require_known as require_known
-from .learners.catalogue import settings_of as settings_of
 from .learners.dqn import DQN as DQN
 from .learners.dqn_config import DQNConfig as DQNConfig
 from .learners.library import LibraryLearner as LibraryLearner

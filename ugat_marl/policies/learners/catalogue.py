@@ -127,7 +127,7 @@ def learner_factory(
     return lambda env, seed: make(env, config, seed)
 
 
-def settings_of(name: str, given: Sequence[str] = ()) -> dict[str, Any]:
+def baseline_settings(name: str, given: Sequence[str] = ()) -> dict[str, Any]:
     """Return all settings of a baseline.
 
     Args:
