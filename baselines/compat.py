@@ -27,7 +27,7 @@ from rich.table import Table
 
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, UgatMarlError
-from ugat_marl.policies import BASELINES, learner_factory, library_of
+from ugat_marl.policies import BASELINES, learner_factory, learner_library
 from ugat_marl.testing import ToyTraffic
 
 EPISODES = 3
@@ -100,7 +100,7 @@ class Compat:
                     failed = True
                     errors.append(f"{name}, {column}: {text}")
             cells = [short(found[column]) for column in COLUMNS]
-            table.add_row(name, library_of(name), *cells)
+            table.add_row(name, learner_library(name), *cells)
         console = Console()
         console.width = max(console.width, 110)
         console.print(table)

@@ -17,7 +17,7 @@ from ugat_marl.experiments.jobs import RULE_FILE, Job, Record, evaluation_seeds
 from ugat_marl.experiments.settings import RULE, LearnerSpec, Setting
 from ugat_marl.experiments.tuning import LEAST_BUDGET
 from ugat_marl.parallel import Workers
-from ugat_marl.policies import BASELINES, DQN_NAME, library_of
+from ugat_marl.policies import BASELINES, DQN_NAME, learner_library
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario
 
@@ -59,7 +59,7 @@ class Curve:
         decisions = record.episodes * scenario.decisions
         return cls(
             job.setting.name,
-            library_of(job.setting.learner.name),
+            learner_library(job.setting.learner.name),
             job.seed,
             {m: fmean(s.att_s for s in record.played(job, m, domain)) for m in job.marks},
             decisions / record.seconds if record.seconds else 0.0,

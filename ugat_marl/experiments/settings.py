@@ -13,7 +13,7 @@ from ugat_marl.policies import (
     LearnerFactory,
     baseline_settings,
     learner_factory,
-    library_of,
+    learner_library,
     require_known,
 )
 
@@ -78,7 +78,7 @@ class LearnerSpec:
         if self.name == DQN_NAME:
             return {"name": self.name, "settings": asdict(self.dqn)}
         settings = baseline_settings(self.name, self.settings)
-        return {"name": self.name, "settings": settings, "library": library_of(self.name)}
+        return {"name": self.name, "settings": settings, "library": learner_library(self.name)}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from .learners.catalogue import LearnerFactory as LearnerFactory
 from .learners.catalogue import baseline_settings as baseline_settings
 from .learners.catalogue import is_installed as is_installed
 from .learners.catalogue import learner_factory as learner_factory
-from .learners.catalogue import library_of as library_of
+from .learners.catalogue import learner_library as learner_library
 from .learners.catalogue import load_baseline as load_baseline
 from .learners.catalogue import require_known as require_known
 from .learners.dqn import DQN as DQN

@@ -157,7 +157,7 @@ def require_known(name: str) -> None:
         raise UnknownNameError("learner", name, (DQN_NAME, *BASELINES))
 
 
-def library_of(name: str) -> str:
+def learner_library(name: str) -> str:
     """Return a learner's library with its version; "" for the suite's own learners."""
     library = _library(name)
     return library and f"{library} {installed_version(library) or '-'}"
