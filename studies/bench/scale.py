@@ -14,7 +14,7 @@ from studies.bench.fresh_process import in_fresh_process
 from studies.bench.memory import growth_of
 from studies.bench.report import Report, Spread, Target, require_positive
 from ugat_marl.errors import MeasurementError, OptionError
-from ugat_marl.policies import is_installed, require_known
+from ugat_marl.policies import is_installed, require_known_learner
 from ugat_marl.progress import Reporter, Silent
 
 _PROGRAM = ["-m", "studies.bench.scale_program"]
@@ -103,7 +103,7 @@ class ScaleBench:
     def __post_init__(self) -> None:
         numbers = {name: getattr(self, name) for name in ("rounds", "decisions", "environments")}
         require_positive("scale", **numbers, sides=len(self.sides), episodes=self.episodes)
-        require_known(self.learner)
+        require_known_learner(self.learner)
         for part in self.parts:
             if part not in PARTS:
                 raise OptionError(f"bench scale: parts holds {part!r}; allowed: {', '.join(PARTS)}")

@@ -14,7 +14,7 @@ from ugat_marl.policies import (
     baseline_settings,
     learner_factory,
     learner_library,
-    require_known,
+    require_known_learner,
 )
 
 DIRECT, UGAT, TIMED = "direct transfer", "UGAT", "UGAT, timed"
@@ -53,7 +53,7 @@ class LearnerSpec:
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
     def __post_init__(self) -> None:
-        require_known(self.name)
+        require_known_learner(self.name)
 
     def factory(self, device: str = "cpu") -> LearnerFactory:
         """Return a factory of fresh learners.

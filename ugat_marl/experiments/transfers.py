@@ -61,7 +61,7 @@ from ugat_marl.policies import (
     STANDARD_RULES,
     DQNConfig,
     require_device_name,
-    require_known,
+    require_known_learner,
 )
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
@@ -165,7 +165,7 @@ class TransferConfig:
         self._refuse_impossible_controls()
 
     def _refuse_impossible_controls(self) -> None:
-        require_known(self.learner)
+        require_known_learner(self.learner)
         require_device_name(self.device)
         if self.placebo not in NEGATIVE_CONTROLS:
             raise UnknownNameError("placebo", self.placebo, NEGATIVE_CONTROLS)

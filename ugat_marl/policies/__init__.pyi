@@ -12,7 +12,7 @@ from .learners.catalogue import is_installed as is_installed
 from .learners.catalogue import learner_factory as learner_factory
 from .learners.catalogue import learner_library as learner_library
 from .learners.catalogue import load_baseline as load_baseline
-from .learners.catalogue import require_known as require_known
+from .learners.catalogue import require_known_learner as require_known_learner
 from .learners.dqn import DQN as DQN
 from .learners.dqn_config import DQNConfig as DQNConfig
 from .learners.library import LibraryLearner as LibraryLearner

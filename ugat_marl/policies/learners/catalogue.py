@@ -114,7 +114,7 @@ def learner_factory(
     """
     from ugat_marl.policies.devices import device_of
 
-    require_known(name)
+    require_known_learner(name)
     place = device_of(device)
     if name == DQN_NAME:
         if settings:
@@ -147,7 +147,7 @@ def _baseline_config(name: str, settings: Sequence[str]) -> Any:
     return _configured(kind, baseline.settings, settings, name)
 
 
-def require_known(name: str) -> None:
+def require_known_learner(name: str) -> None:
     """Refuse the name of a learner that does not exist.
 
     Raises:
