@@ -14,7 +14,7 @@ from studies.bench.fresh_process import in_fresh_process
 from studies.bench.memory import growth_of
 from studies.bench.report import Report, Spread, Target, require_positive
 from ugat_marl.errors import MeasurementError, OptionError
-from ugat_marl.policies import is_installed, require_known_learner
+from ugat_marl.policies import learner_is_installed, require_known_learner
 from ugat_marl.progress import Reporter, Silent
 
 _PROGRAM = ["-m", "studies.bench.scale_program"]
@@ -134,7 +134,7 @@ class ScaleBench:
             if part == "ray" and find_spec("ray") is None:
                 notes.append("Ray is not installed (pip install 'ugat-marl[ray]'): not measured.")
                 continue
-            if part == "learner" and not is_installed(self.learner):
+            if part == "learner" and not learner_is_installed(self.learner):
                 notes.append(f"The library of {self.learner} is not installed: not measured.")
                 continue
             figures += measured[part](reporter)

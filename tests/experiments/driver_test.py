@@ -27,7 +27,7 @@ from ugat_marl.experiments.driver import LOG
 from ugat_marl.experiments.jobs import JOB, LEARNER, SCORES, evaluation_seeds, perform
 from ugat_marl.experiments.paper import TABLES, settings_of
 from ugat_marl.grounding import FitConfig, UgatConfig
-from ugat_marl.policies import BASELINES, DQN_NAME, DQNConfig, is_installed
+from ugat_marl.policies import BASELINES, DQN_NAME, DQNConfig, learner_is_installed
 from ugat_marl.progress import Silent
 
 QUICK = LearnerSpec(dqn=DQNConfig(warmup_decisions=5, epsilon_decay_decisions=50))
@@ -156,7 +156,7 @@ def test_more_episodes_train_only_those_and_fewer_are_refused(tmp_path: Path) ->
 
 @pytest.mark.parametrize("name", [DQN_NAME, *BASELINES])
 def test_every_learner_can_have_a_job(name: str, tmp_path: Path) -> None:
-    if not is_installed(name):
+    if not learner_is_installed(name):
         pytest.skip(f"the library of {name} is not installed")
     job = replace(
         PLAIN,

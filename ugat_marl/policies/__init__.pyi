@@ -8,8 +8,8 @@ from .learners.catalogue import BASELINES as BASELINES
 from .learners.catalogue import DQN_NAME as DQN_NAME
 from .learners.catalogue import LearnerFactory as LearnerFactory
 from .learners.catalogue import baseline_settings as baseline_settings
-from .learners.catalogue import is_installed as is_installed
 from .learners.catalogue import learner_factory as learner_factory
+from .learners.catalogue import learner_is_installed as learner_is_installed
 from .learners.catalogue import learner_library as learner_library
 from .learners.catalogue import load_baseline as load_baseline
 from .learners.catalogue import require_known_learner as require_known_learner

@@ -163,7 +163,7 @@ def learner_library(name: str) -> str:
     return library and f"{library} {installed_version(library) or '-'}"
 
 
-def is_installed(name: str) -> bool:
+def learner_is_installed(name: str) -> bool:
     """Return true if the libraries of a learner are installed; the check imports them."""
     if name in BASELINES:
         try:
