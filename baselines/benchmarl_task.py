@@ -41,7 +41,7 @@ from ugat_marl.policies import (
     LibraryLearner,
     TrainingEnv,
     check_settings,
-    linear,
+    linear_from_weights,
     preserve_random_state,
     seed_generators,
 )
@@ -286,7 +286,9 @@ class BenchMARL(LibraryLearner):
         found = weights.flatten_keys(".")
         names = [str(key).removesuffix(".weight") for key in found.sorted_keys if ".weight" in key]
         ordered = sorted(names, key=lambda name: int(name.rpartition(".")[2]))
-        layers = [linear(found[f"{name}.weight"], found[f"{name}.bias"]) for name in ordered]
+        layers = [
+            linear_from_weights(found[f"{name}.weight"], found[f"{name}.bias"]) for name in ordered
+        ]
         return [layers]
 
     def _networks(self) -> Mapping[str, Tensor]:

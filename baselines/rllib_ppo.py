@@ -38,7 +38,7 @@ from ugat_marl.policies import (
     TrainingEnv,
     check_settings,
     decisions_of,
-    linear,
+    linear_from_weights,
     linear_layers,
     preserve_random_state,
     seed_generators,
@@ -218,7 +218,7 @@ class RLlib(LibraryLearner):
         module = self._learner.module[self._groups[self.agents.names[row]]].unwrapped()
         first, *rest = [*linear_layers(module.encoder.actor_encoder), *linear_layers(module.pi)]
         size = self.agents.observation_sizes[row]
-        own = linear(first.weight[:, :size], first.bias + first.weight[:, size + row])
+        own = linear_from_weights(first.weight[:, :size], first.bias + first.weight[:, size + row])
         return [own, *rest]
 
     def _networks(self) -> Mapping[str, Tensor]:

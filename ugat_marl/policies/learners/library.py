@@ -292,7 +292,7 @@ def perceptron(n_in: int, hidden: Sequence[int], n_out: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
+def linear_from_weights(weight: Tensor, bias: Tensor) -> nn.Linear:
     """Make a layer with copies of weights ``(n_out, n_in)`` and bias; draw no random number."""
     layer: Any = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
     layer.weight.data.copy_(weight.detach())
