@@ -37,7 +37,7 @@ from ugat_marl.policies import (
     LibraryLearner,
     TrainingEnv,
     check_settings,
-    decisions_of,
+    decisions_per_episode,
     linear_from_weights,
     linear_layers,
     preserve_random_state,
@@ -114,7 +114,7 @@ class RLlib(LibraryLearner):
         self.config = config or RLlibConfig()
         super().__init__(env, "baselines.rllib.ppo")
         self._groups = agent_groups(self.agents)
-        self._decisions = decisions_of(env)
+        self._decisions = decisions_per_episode(env)
         # RLlib logs errors that it raises as well.
         logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
         with preserve_random_state(), warnings.catch_warnings():

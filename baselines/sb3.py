@@ -40,7 +40,7 @@ from ugat_marl.policies import (
     LibraryLearner,
     TrainingEnv,
     check_settings,
-    decisions_of,
+    decisions_per_episode,
     linear_layers,
     preserve_random_state,
     roll_out_length,
@@ -175,7 +175,7 @@ class SB3(LibraryLearner):
     def __init__(self, env: AnyParallelEnv, config: SB3Config | None = None, seed: int = 0) -> None:
         self.config = config or SB3Config()
         super().__init__(env, f"baselines.sb3.{self.config.algorithm}")
-        self._decisions = decisions_of(env)
+        self._decisions = decisions_per_episode(env)
         with preserve_random_state():
             seed_generators(seed, "sb3", "weights")
             self._model: Any = self._made(env)

@@ -39,7 +39,7 @@ from ugat_marl.policies import (
     LibraryLearner,
     TrainingEnv,
     check_settings,
-    decisions_of,
+    decisions_per_episode,
     linear_layers,
     perceptron,
     preserve_random_state,
@@ -116,7 +116,7 @@ class Skrl(LibraryLearner):
         super().__init__(env, f"baselines.skrl.{'mappo' if config.centralised else 'ippo'}")
         if getattr(env, "state_space", None) is None:
             raise OptionError("skrl asks environments for their state; this one has none")
-        self._decisions = decisions_of(env)
+        self._decisions = decisions_per_episode(env)
         masked = appended_mask(env)
         state: Any = getattr(env, "state_space")  # noqa: B009 - not every environment has one
         spaces = {

@@ -17,7 +17,7 @@ from ugat_marl.policies import (
     LibraryLearner,
     TrainingEnv,
     check_settings,
-    decisions_of,
+    decisions_per_episode,
     linear_layers,
     observation_mask,
     perceptron,
@@ -232,8 +232,8 @@ def test_roll_outs_divide_an_episode(decisions: int, least: int, wanted: int) ->
 
 
 def test_decisions_are_known_or_counted() -> None:
-    assert decisions_of(ToyTraffic(steps=17)) == 17
-    assert decisions_of(parallel_env("single-v1", duration_s=120)) == 12
+    assert decisions_per_episode(ToyTraffic(steps=17)) == 17
+    assert decisions_per_episode(parallel_env("single-v1", duration_s=120)) == 12
 
 
 def test_global_generators_are_lent_only() -> None:

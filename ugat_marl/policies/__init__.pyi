@@ -18,7 +18,7 @@ from .learners.dqn_config import DQNConfig as DQNConfig
 from .learners.library import LibraryLearner as LibraryLearner
 from .learners.library import TrainingEnv as TrainingEnv
 from .learners.library import check_settings as check_settings
-from .learners.library import decisions_of as decisions_of
+from .learners.library import decisions_per_episode as decisions_per_episode
 from .learners.library import linear_from_weights as linear_from_weights
 from .learners.library import linear_layers as linear_layers
 from .learners.library import perceptron as perceptron

@@ -330,7 +330,7 @@ def check_settings(config: Any, *shares: str) -> None:
         raise OptionError("discount = 1: must be below 1, since traffic has no end")
 
 
-def decisions_of(env: AnyParallelEnv) -> int:
+def decisions_per_episode(env: AnyParallelEnv) -> int:
     """Return the number of decisions of an episode.
 
     The scenario gives it; without a scenario, one episode of random actions is counted. Libraries
