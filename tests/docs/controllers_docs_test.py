@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ugat_marl.policies import RULE_NAMES, RULES, STANDARD_RULES, parse_spec
+from ugat_marl.policies import RULE_NAMES, RULES, STANDARD_RULES, parse_rule
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rules.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|$", PAGE, flags=re.MULTILINE))
@@ -33,7 +33,7 @@ def test_the_row_says_names_defaults_and_what_tuning_tries(name: str) -> None:
 def test_the_commands_name_rules_that_exist() -> None:
     (line,) = re.findall(r"--policies ([^-]\S*(?: [a-z]\S*)*) --domains", PAGE)
     for spec in line.split():
-        parse_spec(spec)
+        parse_rule(spec)
 
 
 def test_the_cost_of_the_search_is_the_one_on_the_page() -> None:

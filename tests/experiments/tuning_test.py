@@ -32,7 +32,7 @@ from ugat_marl.experiments.evaluation import race
 from ugat_marl.experiments.jobs import EVALUATION_SEED
 from ugat_marl.experiments.scores import Result, Trial
 from ugat_marl.experiments.tuning import rungs, settings_of
-from ugat_marl.policies import RULES, STANDARD_RULES, format_spec, parse_spec
+from ugat_marl.policies import RULES, STANDARD_RULES, format_spec, parse_rule
 from ugat_marl.progress import Silent
 from ugat_marl.reporting import tuning_table
 
@@ -57,7 +57,7 @@ class Streets:
         for spec in policies:
             for seed in seeds:
                 self.played.append((spec, domains[0], seed))
-                values = parse_spec(spec)[1]
+                values = parse_rule(spec)[1]
                 best = 50.0 if domains[0] == "sim" else 20.0
                 att_s = 100 + abs((values or (35.0,))[0] - best) + self.luck.get((spec, seed), 0.0)
                 results.append(Result(spec, domains[0], seed, replace(BASE, att_s=att_s)))

@@ -20,7 +20,7 @@ from ugat_marl.policies import (
     Policy,
     controller_for,
     format_spec,
-    parse_spec,
+    parse_rule,
 )
 from ugat_marl.policies.rules.approaches import covering_phases
 from ugat_marl.policies.rules.catalogue import example_of
@@ -217,27 +217,27 @@ def test_spellings():
     made = controller_for("largest-queue:37.5", env())
     assert isinstance(made, LargestQueue)
     assert made.hold_s == 37.5
-    assert parse_spec("fixed-time") == ("fixed-time", (30.0,))
-    assert parse_spec("max-pressure:10") == ("max-pressure", (10.0,))
-    assert parse_spec("actuated:60") == ("actuated", (60.0, 3.0))
-    assert parse_spec("actuated:60:2") == ("actuated", (60.0, 2.0))
-    assert parse_spec("programme") == ("programme", ())
+    assert parse_rule("fixed-time") == ("fixed-time", (30.0,))
+    assert parse_rule("max-pressure:10") == ("max-pressure", (10.0,))
+    assert parse_rule("actuated:60") == ("actuated", (60.0, 3.0))
+    assert parse_rule("actuated:60:2") == ("actuated", (60.0, 2.0))
+    assert parse_rule("programme") == ("programme", ())
     assert isinstance(controller_for("programme", env()), ProgrammeControl)
     with pytest.raises(UnknownNameError, match="Did you mean 'largest-queue'"):
         controller_for("larges-queue:30", env())
     for spec in ("fixed-time:soon", "max-pressure:0", "largest-queue:", "largest-queue:nan"):
         with pytest.raises(OptionError, match="seconds above 0"):
-            parse_spec(spec)
+            parse_rule(spec)
     with pytest.raises(OptionError, match="headway that ends a green.*'actuated:40:3'"):
-        parse_spec("actuated:40:-1")
+        parse_rule("actuated:40:-1")
     with pytest.raises(OptionError, match="vehicles an hour and lane above 0.*'webster:1800'"):
-        parse_spec("webster:much")
+        parse_rule("webster:much")
     with pytest.raises(OptionError, match="random takes no number; write 'random'"):
-        parse_spec("random:3")
+        parse_rule("random:3")
     with pytest.raises(
         OptionError, match="takes time of a phase in seconds; write 'fixed-time:30'"
     ):
-        parse_spec("fixed-time:30:4")
+        parse_rule("fixed-time:30:4")
     with pytest.raises(OptionError, match="held -1 s"):
         LargestQueue(streets(), -1)
 
@@ -245,12 +245,12 @@ def test_spellings():
 @pytest.mark.parametrize("name", RULE_NAMES)
 def test_the_written_out_defaults_and_all_that_tuning_tries_are_spellings(name: str):
     rule = RULES[name]
-    assert parse_spec(example_of(name)) == parse_spec(name)
+    assert parse_rule(example_of(name)) == parse_rule(name)
     for place, parameter in enumerate(rule.parameters):
         for value in parameter.choices:
             values = [p.default for p in rule.parameters]
             values[place] = value
-            assert parse_spec(format_spec(name, values)) == (name, tuple(values))
+            assert parse_rule(format_spec(name, values)) == (name, tuple(values))
 
 
 def test_several_intersections_are_held_apart():

@@ -28,7 +28,7 @@ from ugat_marl.policies import (
     PolicyFactory,
     StepCallback,
     controller_for,
-    parse_spec,
+    parse_rule,
     roll_out,
     stop_callback,
 )
@@ -243,7 +243,7 @@ class TrainedPolicy:
 
 def rule_factory(spec: str) -> PolicyFactory:
     """Return a factory for a controller such as ``"largest-queue:30"``, and check its spelling."""
-    parse_spec(spec)
+    parse_rule(spec)
     return RuleFactory(spec)
 
 

@@ -15,7 +15,7 @@ from ugat_marl.policies.rules.catalogue import (
     controller_for,
     example_of,
     format_spec,
-    parse_spec,
+    parse_rule,
 )
 from ugat_marl.policies.rules.green_wave import GreenWave
 from ugat_marl.policies.rules.open_loop import FixedTime, ProgrammeControl, Random
@@ -51,6 +51,6 @@ __all__ = [
     "covering_phases",
     "example_of",
     "format_spec",
-    "parse_spec",
+    "parse_rule",
     "webster_plan",
 ]

@@ -140,11 +140,11 @@ def controller_for(spec: str, env: AnyParallelEnv) -> Policy:
         UnknownNameError: No rule has this name.
         OptionError: A parameter is not a number above 0, or there are too many.
     """
-    name, values = parse_spec(spec)
+    name, values = parse_rule(spec)
     return RULES[name].make(ControlledNetwork.of(env), *values)
 
 
-def parse_spec(spec: str) -> tuple[str, tuple[float, ...]]:
+def parse_rule(spec: str) -> tuple[str, tuple[float, ...]]:
     """Return the name and the parameters of a spelling, with defaults filled in.
 
     Raises:
