@@ -32,7 +32,7 @@ from ugat_marl.experiments.evaluation import race
 from ugat_marl.experiments.jobs import EVALUATION_SEED
 from ugat_marl.experiments.scores import Result, Trial
 from ugat_marl.experiments.tuning import rungs, settings_of
-from ugat_marl.policies import RULES, STANDARD_RULES, format_spec, parse_rule
+from ugat_marl.policies import RULES, STANDARD_RULES, format_rule, parse_rule
 from ugat_marl.progress import Silent
 from ugat_marl.reporting import tuning_table
 
@@ -126,7 +126,7 @@ def test_a_small_budget_thins_the_settings_out_evenly() -> None:
     assert settings_of("fixed-time", 5) == ["fixed-time:30", "fixed-time:40", "fixed-time:60"]
     assert settings_of("fixed-time", 2) == ["fixed-time:30", "fixed-time:50"]
     for name, rule in RULES.items():  # the usual setting is never thinned out
-        usual = format_spec(name, [parameter.default for parameter in rule.parameters])
+        usual = format_rule(name, [parameter.default for parameter in rule.parameters])
         assert all(usual in settings_of(name, budget) for budget in (2, 5, 8, 16, 24, 100))
     both = len(RULES["actuated"].parameters[0].choices) * len(
         RULES["actuated"].parameters[1].choices

@@ -19,7 +19,7 @@ from ugat_marl.policies import (
     FixedTime,
     Policy,
     controller_for,
-    format_spec,
+    format_rule,
     parse_rule,
 )
 from ugat_marl.policies.rules.approaches import covering_phases
@@ -250,7 +250,7 @@ def test_the_written_out_defaults_and_all_that_tuning_tries_are_spellings(name: 
         for value in parameter.choices:
             values = [p.default for p in rule.parameters]
             values[place] = value
-            assert parse_rule(format_spec(name, values)) == (name, tuple(values))
+            assert parse_rule(format_rule(name, values)) == (name, tuple(values))
 
 
 def test_several_intersections_are_held_apart():

@@ -24,7 +24,7 @@ from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race
 from ugat_marl.experiments.scores import Trial, Tuned
 from ugat_marl.files import user_cache, write_whole
 from ugat_marl.parallel import Workers
-from ugat_marl.policies import RULE_NAMES, RULES, format_spec
+from ugat_marl.policies import RULE_NAMES, RULES, format_rule
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario
 
@@ -170,12 +170,12 @@ def settings_of(name: str, budget: int) -> list[str]:
     """Return the spellings to race within a budget: the default, and others spread evenly."""
     rule = RULES[name]
     values = itertools.product(*(parameter.choices for parameter in rule.parameters))
-    specs = [format_spec(name, list(each)) for each in values]
+    specs = [format_rule(name, list(each)) for each in values]
     many = len(specs)
     while many > 1 and sum(_fields(many)) > budget:
         many -= 1
     kept = [(2 * k + 1) * len(specs) // (2 * many) for k in range(many)]
-    usual = specs.index(format_spec(name, [parameter.default for parameter in rule.parameters]))
+    usual = specs.index(format_rule(name, [parameter.default for parameter in rule.parameters]))
     kept[min(range(many), key=lambda k: abs(kept[k] - usual))] = usual
     return [specs[k] for k in kept]
 

@@ -14,7 +14,7 @@ from ugat_marl.policies.rules.catalogue import (
     Rule,
     controller_for,
     example_of,
-    format_spec,
+    format_rule,
     parse_rule,
 )
 from ugat_marl.policies.rules.green_wave import GreenWave
@@ -50,7 +50,7 @@ __all__ = [
     "controller_for",
     "covering_phases",
     "example_of",
-    "format_spec",
+    "format_rule",
     "parse_rule",
     "webster_plan",
 ]

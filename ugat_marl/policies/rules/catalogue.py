@@ -174,9 +174,9 @@ def parse_rule(spec: str) -> tuple[str, tuple[float, ...]]:
 
 def example_of(name: str) -> str:
     """Return the spelling of a rule with its defaults written out."""
-    return format_spec(name, [parameter.default for parameter in RULES[name].parameters])
+    return format_rule(name, [parameter.default for parameter in RULES[name].parameters])
 
 
-def format_spec(name: str, values: tuple[float, ...] | list[float]) -> str:
+def format_rule(name: str, values: tuple[float, ...] | list[float]) -> str:
     """Return the spelling of a rule with these parameters."""
     return ":".join([name, *(f"{value:g}" for value in values)])
