@@ -25,7 +25,7 @@ from ugat_marl.grounding import (
     inverse_accuracy,
     stack_log,
 )
-from ugat_marl.policies import Exploring, controller_for, observer_of, roll_out
+from ugat_marl.policies import Exploring, make_rule, observer_of, roll_out
 from ugat_marl.seeding import torch_generator
 
 RULE = "largest-queue:20"
@@ -37,7 +37,7 @@ ANSWERS = 200
 def recorded(request: Mapping[str, Any], domain: str) -> TransitionLog:
     """Return roll-outs of the rule with random phases in between."""
     options: dict[str, Any] = {"duration_s": request["duration_s"]}
-    rule = controller_for(RULE, parallel_env(request["scenario"], domain, **options))
+    rule = make_rule(RULE, parallel_env(request["scenario"], domain, **options))
     env = parallel_env(request["scenario"], domain, **options, **rule.env_options)
     logs: list[TransitionLog] = []
     for number in range(request["episodes"]):

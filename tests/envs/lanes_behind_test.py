@@ -18,7 +18,7 @@ from ugat_marl.experiments.training import simulated_worlds
 from ugat_marl.field import Site
 from ugat_marl.files import Document
 from ugat_marl.grounding import UgatConfig
-from ugat_marl.policies import controller_for
+from ugat_marl.policies import make_rule
 from ugat_marl.scenarios import NO_UPSTREAM_LANES, Network, Scenario, sumo_program, survey
 from ugat_marl.scenarios.junctions import Upstream, behind_of
 
@@ -94,7 +94,7 @@ def test_who_waits_behind_is_counted(split: Scenario) -> None:
 
 def test_a_rule_serves_them(split: Scenario) -> None:
     env = ugat_marl.parallel_env(split, observation="movements")
-    rule = controller_for("largest-queue:10", env)
+    rule = make_rule("largest-queue:10", env)
     observations, infos = env.reset(seed=1)
     while env.agents:
         observations, _, _, _, infos = env.step(rule.act(observations, infos))

@@ -22,7 +22,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, SimulatorError
-from ugat_marl.policies import controller_for
+from ugat_marl.policies import make_rule
 from ugat_marl.scenarios import GREEN
 
 pytest.importorskip("traci")
@@ -80,7 +80,7 @@ def running() -> Iterator[Callable[..., tuple[StartedSumo, Watched]]]:
 
 def test_minutes_of_single_v1_in_snow(running: Callable[..., Any]) -> None:
     scenario = scenario_in_domain(load_scenario("single-v1"), "V4")
-    policy = controller_for("largest-queue:10", parallel_env(scenario))
+    policy = make_rule("largest-queue:10", parallel_env(scenario))
     site = Site.of(scenario, policy.env_options)
     sumo, street = running(scenario, site)
     loop = FieldLoop(site, policy, street)
@@ -108,8 +108,8 @@ def test_a_policy_sees_in_the_field_what_it_sees_in_an_environment(
 ) -> None:
     scenario = load_scenario(crossing())  # no clearance and no minimum green: both begin alike
     env = parallel_env(scenario, observation="movements")
-    here = Remembering(controller_for("fixed-time:20", env))
-    there = Remembering(controller_for("fixed-time:20", env))
+    here = Remembering(make_rule("fixed-time:20", env))
+    there = Remembering(make_rule("fixed-time:20", env))
     options = {"observation": "movements"}
     site = Site.of(scenario, options)
     _, street = running(scenario, site)
@@ -142,7 +142,7 @@ def test_areas_count_where_they_lie_and_other_lanes_are_missing(
     directory = crossing(toml=with_areas)
     (directory / "areas.add.xml").write_text(AREAS.replace("NUL", str(tmp_path / "areas.xml")))
     scenario = load_scenario(directory)
-    policy = controller_for("random", parallel_env(scenario))
+    policy = make_rule("random", parallel_env(scenario))
     site = Site.of(scenario, policy.env_options)
     _, street = running(scenario, site, detectors="areas")
     assert set(street.read()) == {"S_C_0"}
@@ -169,7 +169,7 @@ def test_nobody_at_the_port_is_said_so() -> None:
 
 def test_a_street_that_goes_away_is_told(running: Callable[..., Any]) -> None:
     scenario = load_scenario("single-v1")
-    policy = controller_for("random", parallel_env(scenario))
+    policy = make_rule("random", parallel_env(scenario))
     site = Site.of(scenario, policy.env_options)
     sumo, street = running(scenario, site)
     loop = FieldLoop(site, policy, street)

@@ -29,7 +29,7 @@ from ugat_marl.grounding.delays import (
     matching_delays,
 )
 from ugat_marl.grounding.reports import Floats
-from ugat_marl.policies import controller_for
+from ugat_marl.policies import make_rule
 
 LAYOUTS = {"b_0": AgentLayout(2, 2), "a_0": AgentLayout(2, 2)}
 SIGHT: dict[str, Any] = {"duration_s": 3600, "observation": "movements"}
@@ -154,7 +154,7 @@ def test_chance_is_seldom_taken_for_a_delay_and_a_delay_seldom_for_chance(agents
 def test_a_planted_delay_is_found() -> None:
     make = partial(parallel_env, "single-v1", **SIGHT)
     env = make()
-    policy, agents = controller_for("largest-queue:20", env), env.possible_agents
+    policy, agents = make_rule("largest-queue:20", env), env.possible_agents
     env.close()
     sim = SimulatedWorld(make, "sim", 1, 0.3, 4)
     logs = sim.under_delays(policy, 0, 3, list)

@@ -33,7 +33,7 @@ from ugat_marl.policies import (
     DQNConfig,
     Exploring,
     NetworkPolicy,
-    controller_for,
+    make_rule,
     observer_of,
     roll_out,
 )
@@ -257,7 +257,7 @@ def test_a_run_of_another_scenario_is_refused(unbroken: Path) -> None:
 
 def recorded(path: Path, scenario: str = "single-v1", observation: str = "count") -> Path:
     probe = parallel_env(scenario, "V4", duration_s=100)
-    rule = controller_for("largest-queue:20", probe)
+    rule = make_rule("largest-queue:20", probe)
     env = parallel_env(scenario, "V4", duration_s=100, **rule.env_options)
     logs: list[TransitionLog] = []
     for seed in (1, 2):

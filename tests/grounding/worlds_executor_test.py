@@ -12,7 +12,7 @@ import pytest
 from ugat_marl.envs import parallel_env
 from ugat_marl.experiments import TransferConfig, transfer
 from ugat_marl.grounding import SimulatedWorld
-from ugat_marl.policies import DQN, DQNConfig, Stopped, controller_for
+from ugat_marl.policies import DQN, DQNConfig, Stopped, make_rule
 
 MAKE = partial(parallel_env, "single-v1", "V4", duration_s=120, observation="movements")
 
@@ -21,7 +21,7 @@ MAKE = partial(parallel_env, "single-v1", "V4", duration_s=120, observation="mov
 @pytest.mark.parametrize("rule", [None, "largest-queue:20"])  # which remembers its episode
 def test_an_executor_plays_the_same(most_delay_s: int, rule: str | None) -> None:
     env = MAKE()
-    policy = DQN.of(env, DQNConfig(), 3).policy() if rule is None else controller_for(rule, env)
+    policy = DQN.of(env, DQNConfig(), 3).policy() if rule is None else make_rule(rule, env)
     env.close()
     here = SimulatedWorld(MAKE, "real", 3, 0.3, most_delay_s)
     with ThreadPoolExecutor(2) as pool:
@@ -45,7 +45,7 @@ def test_it_can_be_stopped() -> None:
         world = SimulatedWorld(MAKE, "real", 2, 0.0, workers=pool)
         world.stop()
         with pytest.raises(Stopped):
-            world.collect(controller_for("fixed-time", env), 0, 7)
+            world.collect(make_rule("fixed-time", env), 0, 7)
 
 
 def test_a_run_plays_its_roll_outs_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

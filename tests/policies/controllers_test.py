@@ -18,8 +18,8 @@ from ugat_marl.policies import (
     ControlledNetwork,
     FixedTime,
     Policy,
-    controller_for,
     format_rule,
+    make_rule,
     parse_rule,
 )
 from ugat_marl.policies.rules.approaches import covering_phases
@@ -132,7 +132,7 @@ def test_a_phase_that_stays_best_goes_on_and_ties_do_not_switch():
     "spec", [*(name for name in RULE_NAMES if name != "programme"), "fixed-time:10"]
 )
 def test_masked_phases_are_not_chosen(spec: str):
-    controller = controller_for(spec, env())
+    controller = make_rule(spec, env())
     controller.reset(1)
     for mask in ((0, 1, 1), (1, 0, 0), (0, 0, 1), (0, 1, 0)):
         seen = observe({"n_0": 9, "w_0": 3}, {"n_0": 9, "w_0": 3})
@@ -183,7 +183,7 @@ def test_random_depends_on_the_seed_only_and_is_uniform_over_the_allowed():
 
 
 def test_environment_options_say_what_each_controller_needs():
-    options = {name: dict(controller_for(name, env()).env_options) for name in RULE_NAMES}
+    options = {name: dict(make_rule(name, env()).env_options) for name in RULE_NAMES}
     movements = {"observation": "movements"}
     assert options == {
         "actuated": movements,
@@ -199,12 +199,12 @@ def test_environment_options_say_what_each_controller_needs():
         "sotl": movements,
         "webster": movements,
     }
-    assert controller_for("programme", env()).act(observe(), ALL) == {AGENT: 0}
+    assert make_rule("programme", env()).act(observe(), ALL) == {AGENT: 0}
 
 
 @pytest.mark.parametrize("spec", [*STANDARD_RULES, *RULE_NAMES])
 def test_every_controller_is_a_policy_that_can_be_sent_to_a_worker(spec: str):
-    controller = controller_for(spec, env())
+    controller = make_rule(spec, env())
     assert isinstance(controller, Policy)
     copy = pickle.loads(pickle.dumps(controller))  # noqa: S301
     for each in (controller, copy):
@@ -214,7 +214,7 @@ def test_every_controller_is_a_policy_that_can_be_sent_to_a_worker(spec: str):
 
 
 def test_spellings():
-    made = controller_for("largest-queue:37.5", env())
+    made = make_rule("largest-queue:37.5", env())
     assert isinstance(made, LargestQueue)
     assert made.hold_s == 37.5
     assert parse_rule("fixed-time") == ("fixed-time", (30.0,))
@@ -222,9 +222,9 @@ def test_spellings():
     assert parse_rule("actuated:60") == ("actuated", (60.0, 3.0))
     assert parse_rule("actuated:60:2") == ("actuated", (60.0, 2.0))
     assert parse_rule("programme") == ("programme", ())
-    assert isinstance(controller_for("programme", env()), ProgrammeControl)
+    assert isinstance(make_rule("programme", env()), ProgrammeControl)
     with pytest.raises(UnknownNameError, match="Did you mean 'largest-queue'"):
-        controller_for("larges-queue:30", env())
+        make_rule("larges-queue:30", env())
     for spec in ("fixed-time:soon", "max-pressure:0", "largest-queue:", "largest-queue:nan"):
         with pytest.raises(OptionError, match="seconds above 0"):
             parse_rule(spec)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.envs import TrafficEnv, parallel_env
-from ugat_marl.policies import Exploring, controller_for, observer_of, roll_out
+from ugat_marl.policies import Exploring, make_rule, observer_of, roll_out
 
 
 class Always:
@@ -52,7 +52,7 @@ def test_one_episode_is_played_and_recorded(env: TrafficEnv) -> None:
 
 
 def test_what_is_recorded_can_differ_from_what_the_policy_sees() -> None:
-    rule = controller_for("largest-queue:20", parallel_env("grid2x2-v1", duration_s=100))
+    rule = make_rule("largest-queue:20", parallel_env("grid2x2-v1", duration_s=100))
     env = parallel_env("grid2x2-v1", duration_s=100, **rule.env_options)
     plain = parallel_env("grid2x2-v1", duration_s=100)
     try:
@@ -90,7 +90,7 @@ def test_exploration_has_its_rate_and_keeps_to_the_mask() -> None:
 
 def test_a_log_names_agents_as_the_environment_that_will_read_it() -> None:
     """On unequal intersections names depend on who is seen; a log follows its own observer."""
-    rule = controller_for("largest-queue:20", parallel_env("mixed-v1", duration_s=50))
+    rule = make_rule("largest-queue:20", parallel_env("mixed-v1", duration_s=50))
     env = parallel_env("mixed-v1", duration_s=50, **rule.env_options)
     reader = parallel_env("mixed-v1", duration_s=50, neighbours=1)
     try:

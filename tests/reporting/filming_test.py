@@ -13,7 +13,7 @@ from PIL import Image
 from ugat_marl.__main__ import main
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, OutputError
-from ugat_marl.policies import controller_for, roll_out
+from ugat_marl.policies import make_rule, roll_out
 from ugat_marl.reporting import film, frames, require_video, write_video
 from ugat_marl.reporting import video as filming
 from ugat_marl.reporting.video import Filmed, between
@@ -21,7 +21,7 @@ from ugat_marl.simulation import ProcessSimulator
 
 
 def made(rule: str = "max-pressure:20", duration_s: float = 300) -> tuple[TrafficEnv, Any]:
-    policy = controller_for(rule, parallel_env("single-v1", duration_s=duration_s))
+    policy = make_rule(rule, parallel_env("single-v1", duration_s=duration_s))
     return parallel_env("single-v1", duration_s=duration_s, **policy.env_options), policy
 
 

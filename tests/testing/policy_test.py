@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ugat_marl
-from ugat_marl.policies import DQN, RULE_NAMES, controller_for
+from ugat_marl.policies import DQN, RULE_NAMES, make_rule
 from ugat_marl.testing import POLICY_CHECKS, ToyTraffic, check_policy, failures
 
 BROKEN: list[tuple[str, type[Good]]] = []
@@ -197,8 +197,8 @@ def test_the_controllers_pass(name: str) -> None:
     scenario = ugat_marl.load_scenario("mixed-v1")
     options: dict[str, Any] = {"duration_s": 300}
     env = ugat_marl.parallel_env(scenario, **options)
-    options |= controller_for(name, env).env_options
-    policy = controller_for(name, ugat_marl.parallel_env(scenario, **options))
+    options |= make_rule(name, env).env_options
+    policy = make_rule(name, ugat_marl.parallel_env(scenario, **options))
     assert not failures(check_policy(policy, lambda: ugat_marl.parallel_env(scenario, **options)))
 
 

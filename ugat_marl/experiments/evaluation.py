@@ -27,7 +27,7 @@ from ugat_marl.policies import (
     Policy,
     PolicyFactory,
     StepCallback,
-    controller_for,
+    make_rule,
     parse_rule,
     roll_out,
     stop_callback,
@@ -203,7 +203,7 @@ class RuleFactory:
 
     def __call__(self, env: TrafficEnv) -> Policy:
         """Return the controller for an environment."""
-        return controller_for(self.spec, env)
+        return make_rule(self.spec, env)
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ from .rules.approaches import ControlledNetwork as ControlledNetwork
 from .rules.catalogue import RULE_NAMES as RULE_NAMES
 from .rules.catalogue import RULES as RULES
 from .rules.catalogue import STANDARD_RULES as STANDARD_RULES
-from .rules.catalogue import controller_for as controller_for
 from .rules.catalogue import format_rule as format_rule
+from .rules.catalogue import make_rule as make_rule
 from .rules.catalogue import parse_rule as parse_rule
 from .rules.open_loop import FixedTime as FixedTime

@@ -12,9 +12,9 @@ from ugat_marl.policies.rules.catalogue import (
     STANDARD_RULES,
     Parameter,
     Rule,
-    controller_for,
     example_of,
     format_rule,
+    make_rule,
     parse_rule,
 )
 from ugat_marl.policies.rules.green_wave import GreenWave
@@ -47,7 +47,7 @@ __all__ = [
     "Rule",
     "SelfOrganising",
     "Webster",
-    "controller_for",
+    "make_rule",
     "covering_phases",
     "example_of",
     "format_rule",

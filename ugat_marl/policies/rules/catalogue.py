@@ -128,7 +128,7 @@ STANDARD_RULES = (
 """Rules that the search for the best rule of a domain tries."""
 
 
-def controller_for(spec: str, env: AnyParallelEnv) -> Policy:
+def make_rule(spec: str, env: AnyParallelEnv) -> Policy:
     """Make a rule from its spelling, such as ``"largest-queue:30"``.
 
     Args:
