@@ -35,7 +35,7 @@ from ugat_marl.policies import (
     flatten_parameters,
     observation_mask,
     one_thread,
-    reading_unscaled,
+    parameters_for_unscaled,
 )
 from ugat_marl.policies import EpisodeCallback as Callback
 from ugat_marl.seeding import derive_seed, torch_generator
@@ -185,7 +185,7 @@ class IPPO:
         Its class is DQN's, with logits in place of Q, so all commands of `ugat-marl` read its
         files.
         """
-        parameters = reading_unscaled(self._actor, torch.from_numpy(self._seen.factors))
+        parameters = parameters_for_unscaled(self._actor, torch.from_numpy(self._seen.factors))
         hidden, shared = self.config.hidden, self.config.shared
         return NetworkPolicy(self.agents, hidden, parameters, self.env_options, shared)
 

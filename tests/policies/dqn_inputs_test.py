@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ugat_marl.envs import AgentSet
-from ugat_marl.policies import BatchedMLP, SharedMLP, reading_unscaled
+from ugat_marl.policies import BatchedMLP, SharedMLP, parameters_for_unscaled
 from ugat_marl.policies.learners.scaling import LEAST, input_factors
 
 
@@ -41,7 +41,7 @@ def test_a_network_read_out_takes_plain_numbers(shared: bool) -> None:
 
     inner, outer = network(1), network(2)
     factors = torch.rand((5,) if shared else (3, 5)) * 10
-    torch.nn.utils.vector_to_parameters(reading_unscaled(inner, factors), outer.parameters())
+    torch.nn.utils.vector_to_parameters(parameters_for_unscaled(inner, factors), outer.parameters())
     plain = torch.rand(3, 7, 5)
     scaled = plain * (factors if shared else factors[:, None])
     assert torch.allclose(outer(plain), inner(scaled), atol=1e-5)

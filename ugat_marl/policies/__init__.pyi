@@ -35,7 +35,7 @@ from .networks.batched import SharedMLP as SharedMLP
 from .networks.batched import one_thread as one_thread
 from .networks.batched import size_mask as size_mask
 from .networks.q_network import flatten_parameters as flatten_parameters
-from .networks.q_network import reading_unscaled as reading_unscaled
+from .networks.q_network import parameters_for_unscaled as parameters_for_unscaled
 from .protocols import EpisodeCallback as EpisodeCallback
 from .protocols import Learner as Learner
 from .protocols import Policy as Policy

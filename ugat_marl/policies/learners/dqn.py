@@ -30,8 +30,8 @@ from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.policies.networks.q_network import (
     flatten_parameters,
     greedy_actions,
+    parameters_for_unscaled,
     q_network,
-    reading_unscaled,
 )
 from ugat_marl.policies.networks.structure import Structure, structure_in
 from ugat_marl.policies.protocols import EpisodeCallback
@@ -262,7 +262,7 @@ class DQN:
         weights, options = self._target_weights, self.env_options
         if self.config.network in _SCALED:
             factors = self._inputs[0, 0] if self._is_one_network else self._inputs[:, 0]
-            weights = reading_unscaled(self._target, factors.to(self.device))
+            weights = parameters_for_unscaled(self._target, factors.to(self.device))
         ceiling = None
         if self.config.ceiling is not None and self._replay.added:
             ceiling = ceilings(self._replay.recent(CEILING_DECISIONS), self.config.ceiling)

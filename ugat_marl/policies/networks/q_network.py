@@ -85,7 +85,7 @@ def flatten_parameters(module: nn.Module) -> nn.Parameter:
     return flat
 
 
-def reading_unscaled(network: nn.Module, factors: Tensor) -> Tensor:
+def parameters_for_unscaled(network: nn.Module, factors: Tensor) -> Tensor:
     """Return parameters with which the network reads unscaled observations.
 
     The new network computes for x what `network` computes for ``x * factors``.
