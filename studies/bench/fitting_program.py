@@ -25,7 +25,7 @@ from ugat_marl.grounding import (
     inverse_accuracy,
     stack_log,
 )
-from ugat_marl.policies import Exploring, make_rule, observer_of, roll_out
+from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
 from ugat_marl.seeding import torch_generator
 
 RULE = "largest-queue:20"
@@ -42,7 +42,9 @@ def recorded(request: Mapping[str, Any], domain: str) -> TransitionLog:
     logs: list[TransitionLog] = []
     for number in range(request["episodes"]):
         seed = request["seed"] + number
-        log = roll_out(env, Exploring(rule, EPSILON), seed, record=observer_of(env, "count")).log
+        log = roll_out(
+            env, EpsilonGreedy(rule, EPSILON), seed, record=observer_of(env, "count")
+        ).log
         assert log is not None, "recording was asked for"
         logs.append(log)
     env.close()

@@ -31,7 +31,7 @@ from ugat_marl.grounding.uncertainty import MethodName
 from ugat_marl.policies import (
     DQN,
     DQNConfig,
-    Exploring,
+    EpsilonGreedy,
     NetworkPolicy,
     make_rule,
     observer_of,
@@ -261,7 +261,9 @@ def recorded(path: Path, scenario: str = "single-v1", observation: str = "count"
     env = parallel_env(scenario, "V4", duration_s=100, **rule.env_options)
     logs: list[TransitionLog] = []
     for seed in (1, 2):
-        log = roll_out(env, Exploring(rule, 0.3), seed, record=observer_of(env, observation)).log
+        log = roll_out(
+            env, EpsilonGreedy(rule, 0.3), seed, record=observer_of(env, observation)
+        ).log
         assert log is not None
         logs.append(log)
     env.close()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.envs import TrafficEnv, parallel_env
-from ugat_marl.policies import Exploring, make_rule, observer_of, roll_out
+from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
 
 
 class Always:
@@ -73,7 +73,7 @@ def test_what_is_recorded_can_differ_from_what_the_policy_sees() -> None:
 
 
 def test_exploration_has_its_rate_and_keeps_to_the_mask() -> None:
-    policy = Exploring(Always(), 0.5)
+    policy = EpsilonGreedy(Always(), 0.5)
     policy.reset(1)
     agents = [f"signal_{i}" for i in range(4)]
     observations = {agent: np.zeros(1, np.float32) for agent in agents}

@@ -17,7 +17,7 @@ from ugat_marl.grounding.stacked import Stack, stack_log
 from ugat_marl.grounding.wrappers import RandomDelays
 from ugat_marl.parallel import Stop, Workers, as_done, persistently
 from ugat_marl.policies import (
-    Exploring,
+    EpsilonGreedy,
     Policy,
     PolicyFactory,
     observer_of,
@@ -90,7 +90,7 @@ class SimulatedWorld:
             return TransitionLog.concatenate(logs)
         if self._env is None:
             self._env = _delayed(self._make_env, self._most_delay_s)
-        env, exploring = self._env, Exploring(policy, self._epsilon)
+        env, exploring = self._env, EpsilonGreedy(policy, self._epsilon)
         return TransitionLog.concatenate([_recorded(env, exploring, s, self._stop) for s in seeds])
 
     def under_delays(
@@ -187,7 +187,7 @@ class _RollOutAlone:
         env = _delayed(self.make_env, self.most_delay_s, always_s)
         own = copy.deepcopy(self.policy)  # policies with memory must not share it between threads
         try:
-            return _recorded(env, Exploring(own, self.epsilon), seed, stop)
+            return _recorded(env, EpsilonGreedy(own, self.epsilon), seed, stop)
         finally:
             env.close()
 
@@ -221,7 +221,7 @@ class RollOutSettings:
         options = {**self.options, **policy.env_options}
         env = parallel_env(self.scenario, self.domain, **options)
         observer = observer_of(env, self.observation, self.neighbours)
-        exploring = Exploring(policy, self.epsilon)
+        exploring = EpsilonGreedy(policy, self.epsilon)
         try:
             played = persistently(
                 lambda: roll_out(env, exploring, seed, record=observer, on_step=stop_callback(stop))

@@ -40,7 +40,7 @@ from .protocols import EpisodeCallback as EpisodeCallback
 from .protocols import Learner as Learner
 from .protocols import Policy as Policy
 from .protocols import PolicyFactory as PolicyFactory
-from .rollout import Exploring as Exploring
+from .rollout import EpsilonGreedy as EpsilonGreedy
 from .rollout import StepCallback as StepCallback
 from .rollout import Stopped as Stopped
 from .rollout import observer_of as observer_of

@@ -165,7 +165,7 @@ def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Prove
     )
 
 
-class Exploring:
+class EpsilonGreedy:
     """Policy that replaces each agent's action by a random permitted phase with chance ε.
 
     Roll-outs for D_sim and D_real need actions that the policy would not take; otherwise f and h
