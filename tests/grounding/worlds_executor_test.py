@@ -12,7 +12,7 @@ import pytest
 from ugat_marl.envs import parallel_env
 from ugat_marl.experiments import TransferConfig, transfer
 from ugat_marl.grounding import SimulatedWorld
-from ugat_marl.policies import DQN, DQNConfig, Stopped, make_rule
+from ugat_marl.policies import DQN, DQNConfig, RollOutStopped, make_rule
 
 MAKE = partial(parallel_env, "single-v1", "V4", duration_s=120, observation="movements")
 
@@ -44,7 +44,7 @@ def test_it_can_be_stopped() -> None:
     with ThreadPoolExecutor(1) as pool:
         world = SimulatedWorld(MAKE, "real", 2, 0.0, workers=pool)
         world.stop()
-        with pytest.raises(Stopped):
+        with pytest.raises(RollOutStopped):
             world.collect(make_rule("fixed-time", env), 0, 7)
 
 
@@ -53,10 +53,10 @@ def test_a_run_plays_its_roll_outs_there(tmp_path: Path, monkeypatch: pytest.Mon
 
     def refused(*given: Any) -> Any:
         asked.append(given)
-        raise Stopped
+        raise RollOutStopped
 
     monkeypatch.setattr("ugat_marl.experiments.transfers.simulated_worlds", refused)
     config = TransferConfig("single-v1", duration_s=60)
-    with ThreadPoolExecutor(1) as pool, pytest.raises(Stopped):
+    with ThreadPoolExecutor(1) as pool, pytest.raises(RollOutStopped):
         transfer(config, tmp_path, workers=pool)
     assert asked[0][-1] is pool

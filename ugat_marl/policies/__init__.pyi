@@ -41,8 +41,8 @@ from .protocols import Learner as Learner
 from .protocols import Policy as Policy
 from .protocols import PolicyFactory as PolicyFactory
 from .rollout import EpsilonGreedy as EpsilonGreedy
+from .rollout import RollOutStopped as RollOutStopped
 from .rollout import StepCallback as StepCallback
-from .rollout import Stopped as Stopped
 from .rollout import observer_of as observer_of
 from .rollout import roll_out as roll_out
 from .rollout import stop_callback as stop_callback

@@ -39,16 +39,16 @@ StepCallback = Callable[[int], None]
 """Called with the number of decisions made so far."""
 
 
-class Stopped(Exception):
+class RollOutStopped(Exception):
     """A roll-out ended early: another thread failed, or the user interrupted."""
 
 
 def stop_callback(stop: threading.Event) -> StepCallback:
-    """Return a callback that raises `Stopped` after `stop` is set."""
+    """Return a callback that raises `RollOutStopped` after `stop` is set."""
 
     def check(_step: int) -> None:
         if stop.is_set():
-            raise Stopped
+            raise RollOutStopped
 
     return check
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ugat_marl.envs import Picture, TrafficEnv
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import replacing
-from ugat_marl.policies import Policy, Stopped, roll_out
+from ugat_marl.policies import Policy, RollOutStopped, roll_out
 from ugat_marl.simulation import (
     HALTING_MPS,
     Launch,
@@ -167,9 +167,9 @@ def film(
 
     def on_step(step: int) -> None:
         if step * env.decision_interval_s >= begin_s + length_s:
-            raise Stopped
+            raise RollOutStopped
 
-    with contextlib.suppress(Stopped):
+    with contextlib.suppress(RollOutStopped):
         roll_out(env, policy, seed, on_step=on_step)
     return Film(title, env.domain, env, filmed.scenes)
 
