@@ -37,7 +37,7 @@ class Light:
     """
 
     def __init__(self, phases: Sequence[str], timing: SignalTiming, shown: str) -> None:
-        if len(shown) != len(phases[0]) or not set(shown) <= signals.STATES:
+        if len(shown) != len(phases[0]) or not set(shown) <= signals.SIGNAL_LETTERS:
             raise OptionError(
                 f"the light shows {shown!r}, its phases are like {phases[0]!r}; the street must "
                 "be the scenario's own network"

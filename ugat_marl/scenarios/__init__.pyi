@@ -59,7 +59,7 @@ from .scenario import shipped_scenarios as shipped_scenarios
 from .settings import seconds_of as seconds_of
 from .settings import validated as validated
 from .signals import GREEN as GREEN
-from .signals import STATES as STATES
+from .signals import SIGNAL_LETTERS as SIGNAL_LETTERS
 from .signals import YELLOW as YELLOW
 from .signals import LateGreenMemory as LateGreenMemory
 from .signals import Segment as Segment

@@ -30,7 +30,7 @@ from ugat_marl.scenarios.phases import (
     programme_phases,
 )
 from ugat_marl.scenarios.scenario import Scenario
-from ugat_marl.scenarios.signals import GREEN, STATES, check_phases
+from ugat_marl.scenarios.signals import GREEN, SIGNAL_LETTERS, check_phases
 
 VEHICLE_SPACE_M = 7.5
 """Space of a queued default vehicle: 5 m length plus 2.5 m gap."""
@@ -299,8 +299,10 @@ def _check_programme(
                 + (f"it controls {width} links" if len(state) < width else f"state 0 has {letters}")
                 + "; write one letter per link into every <phase> of the <tlLogic>"
             )
-        if unknown := sorted(set(state) - STATES):
-            raise ScenarioError(f"{what} has unknown letters {unknown}; allowed: {sorted(STATES)}")
+        if unknown := sorted(set(state) - SIGNAL_LETTERS):
+            raise ScenarioError(
+                f"{what} has unknown letters {unknown}; allowed: {sorted(SIGNAL_LETTERS)}"
+            )
         _check_greens(state, links, foes, f"{where}: state {index} of its programme")
     return letters
 

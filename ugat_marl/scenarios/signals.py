@@ -16,7 +16,7 @@ from ugat_marl.errors import OptionError, ScenarioError
 
 GREEN = frozenset("Gg")
 YELLOW = frozenset("yYu")
-STATES = frozenset("rugGyYoOs")
+SIGNAL_LETTERS = frozenset("rugGyYoOs")
 """SUMO's letters: red, red-yellow, green (minor g, major G), yellow, off, right on red (s)."""
 
 Segment = tuple[float, str]
@@ -365,8 +365,10 @@ def check_phases(phases: Sequence[str], links: int, source: str) -> None:
                 f"{where} has {len(phase)} letters, but the traffic light controls {links} links; "
                 "give one letter per link"
             )
-        if unknown := sorted(set(phase) - STATES):
-            raise ScenarioError(f"{where} has unknown letters {unknown}; allowed: {sorted(STATES)}")
+        if unknown := sorted(set(phase) - SIGNAL_LETTERS):
+            raise ScenarioError(
+                f"{where} has unknown letters {unknown}; allowed: {sorted(SIGNAL_LETTERS)}"
+            )
         if set(phase) & YELLOW:
             raise ScenarioError(
                 f"{where} has yellow; list green phases only, yellow is put in between them"

@@ -28,7 +28,7 @@ from ugat_marl.data.measured.tables import (
 from ugat_marl.data.measured.values import Finding, Measured, split_periods
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import (
-    STATES,
+    SIGNAL_LETTERS,
     Detector,
     DetectorKind,
     Network,
@@ -429,13 +429,13 @@ def _check_states(path: Path, frame: pl.DataFrame, widths: Mapping[str, int]) ->
                 f"has {len(state)} letters, but traffic light {tls!r} has {widths[tls]} links",
                 "write one letter per link, in the order of the network's linkIndex",
             )
-        if strange := sorted(set(state) - STATES):
+        if strange := sorted(set(state) - SIGNAL_LETTERS):
             refuse(
                 path,
                 frame.filter(rows),
                 "state",
                 f"of traffic light {tls!r} has letters SUMO does not know ({''.join(strange)})",
-                f"allowed: {' '.join(sorted(STATES))}",
+                f"allowed: {' '.join(sorted(SIGNAL_LETTERS))}",
             )
 
 
