@@ -19,7 +19,7 @@ from ugat_marl.scenarios import (
     SignalState,
     SignalTiming,
     begins_when_asked,
-    delayed_log,
+    late_green_log,
     with_late_green,
 )
 from ugat_marl.scenarios.signals import (
@@ -398,9 +398,9 @@ def test_fractions_of_a_step_are_paid_with_the_next_green() -> None:
 
 def test_a_log_of_a_street_can_be_late() -> None:
     log = ((0.0, "Gr"), (30.0, "yr"), (33.0, "rG"), (34.0, "ry"), (37.0, "Gr"))
-    assert delayed_log(log, 2, 1) == (
+    assert late_green_log(log, 2, 1) == (
         (0.0, "Gr"), (30.0, "yr"), (33.0, "rr"), (39.0, "Gr"),
     )  # fmt: skip
-    assert delayed_log(log, 0, 1) == log
-    assert delayed_log(log[:1], 2, 1) == log[:1]
-    assert delayed_log((), 2, 1) == ()
+    assert late_green_log(log, 0, 1) == log
+    assert late_green_log(log[:1], 2, 1) == log[:1]
+    assert late_green_log((), 2, 1) == ()

@@ -61,7 +61,7 @@ from ugat_marl.scenarios import (
     SignalLog,
     another_day,
     as_vehicles,
-    delayed_log,
+    late_green_log,
     sumo_program,
 )
 from ugat_marl.seeding import derive_seed
@@ -236,7 +236,7 @@ def replay_document(scenario: Scenario, period: Period, begin_s: float) -> Docum
     for tls, log in sorted(period.signals.items()):
         if not log:
             raise MeasuredDataError(f"period {period.id!r}: no signals of traffic light {tls!r}")
-        late = delayed_log(log, late_s.get(tls, 0.0), step)
+        late = late_green_log(log, late_s.get(tls, 0.0), step)
         item = ET.SubElement(
             root,
             "tlLogic",

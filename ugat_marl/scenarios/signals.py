@@ -318,7 +318,7 @@ def _commanded(
     return LateGreenMemory(commanded, "".join(shown), tuple(waiting), tuple(owed))
 
 
-def delayed_log(
+def late_green_log(
     log: Sequence[tuple[float, str]], late_s: float, step_s: float
 ) -> tuple[tuple[float, str], ...]:
     """Apply `with_late_green` to the log of a light.
