@@ -18,7 +18,7 @@ from ugat_marl.scenarios import (
     Segment,
     SignalState,
     SignalTiming,
-    begins_when_asked,
+    green_begins_at_once,
     late_green_log,
     with_late_green,
 )
@@ -204,7 +204,7 @@ def test_whether_every_green_begins_when_it_is_asked_for(
     for decision in range(1, 60):
         state, _ = advance(PHASES, state, decision % 2, interval_s, timing)
         in_time = in_time and (state.phase, state.clearing) == (decision % 2, False)
-    assert in_time == begins_when_asked(timing, interval_s)
+    assert in_time == green_begins_at_once(timing, interval_s)
 
 
 def test_a_change_by_hand() -> None:

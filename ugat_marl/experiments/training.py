@@ -34,7 +34,7 @@ from ugat_marl.grounding import (
 )
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import EpisodeCallback, Learner, LearnerFactory, NetworkPolicy, Policy
-from ugat_marl.scenarios import Scenario, begins_when_asked
+from ugat_marl.scenarios import Scenario, green_begins_at_once
 
 
 class Effort(NamedTuple):
@@ -145,7 +145,7 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
     here, there = (scenario_in_domain(scenario, world) for world in (sim, real))
     for world in (here, there) if timed else ():
         timing, interval_s = world.timing, world.control.decision_interval_s
-        if not begins_when_asked(timing, interval_s):
+        if not green_begins_at_once(timing, interval_s):
             raise OptionError(
                 "timed grounding delays a green in the decision that asks for it, and here some "
                 f"begin later: decision_interval_s = {interval_s:g} must be "

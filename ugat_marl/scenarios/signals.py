@@ -81,7 +81,7 @@ def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) ->
     return wait < within_s - _INSTANT_S
 
 
-def begins_when_asked(timing: SignalTiming, interval_s: float) -> bool:
+def green_begins_at_once(timing: SignalTiming, interval_s: float) -> bool:
     """Return True if every green begins within the decision that requests it.
 
     This holds if the clearance is shorter than an interval and the minimum green fits into the rest
