@@ -25,8 +25,8 @@ from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.scenarios import (
     Document,
     Scenario,
+    parse_time,
     read_scenario,
-    seconds_of,
     shipped_scenarios,
     validated,
 )
@@ -354,13 +354,13 @@ def test_without_the_wheel_the_error_says_how_to_install(monkeypatch: pytest.Mon
     [("0", 0), ("12.5", 12.5), ("1:02:03", 3723), ("1:00:00:00", 86400), ("-1", -1)],
 )
 def test_times_as_sumo_writes_them(text: str, seconds: float) -> None:
-    assert seconds_of(text) == seconds
+    assert parse_time(text) == seconds
 
 
 @pytest.mark.parametrize("text", ["", "soon", "1:2", "1:2:3:4:5", "1::2"])
 def test_what_is_no_time(text: str) -> None:
     with pytest.raises(ValueError):  # noqa: PT011 - any message: the caller names file and key
-        seconds_of(text)
+        parse_time(text)
 
 
 @pytest.mark.parametrize(

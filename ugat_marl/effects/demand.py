@@ -31,7 +31,7 @@ from ugat_marl.effects.documents import (
     windows,
 )
 from ugat_marl.effects.places import network_places
-from ugat_marl.scenarios import Scenario, seconds_of
+from ugat_marl.scenarios import Scenario, parse_time
 
 TAGS = ("<vehicle", "<trip", "<flow")
 """Texts of demand; a document without any of them has no demand."""
@@ -182,7 +182,7 @@ class DemandTiming(Effect):
                 begin += self.seconds
             if item.tag == "flow":
                 if end := item.get("end"):
-                    until = seconds_of(end) + self.seconds
+                    until = parse_time(end) + self.seconds
                     if until <= earliest:
                         return []
                     item.set("end", seconds_text(until))
@@ -339,7 +339,7 @@ def _scaled_window(
     begin = depart_s(item)
     if math.isnan(begin):
         return [item]
-    end = seconds_of(item.get("end", "")) if item.get("end") else math.inf
+    end = parse_time(item.get("end", "")) if item.get("end") else math.inf
     if math.isinf(end):
         number = float(item.get("number", "inf"))
         by_rate = any(key in item.attrib for key in _RATES)

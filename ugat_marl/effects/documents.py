@@ -14,7 +14,7 @@ from itertools import islice
 from typing import IO
 
 from ugat_marl.files import Draft, child_texts, scratch, xml_bytes
-from ugat_marl.scenarios import Document, Scenario, seconds_of
+from ugat_marl.scenarios import Document, Scenario, parse_time
 
 DEFAULTS_FILE = "default-types.add.xml"
 """File with SUMO's default vehicle types, so that effects can change them."""
@@ -150,7 +150,7 @@ def depart_s(item: Root) -> float:
     """Return the departure of a vehicle or trip, or the begin of a flow, in s; NaN if triggered."""
     text = item.get("begin", "0") if item.tag.lower().endswith("flow") else item.get("depart", "")
     try:
-        return seconds_of(text)
+        return parse_time(text)
     except ValueError:
         return math.nan
 

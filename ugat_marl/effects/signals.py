@@ -17,7 +17,7 @@ from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import LateGreenMemory as Held
-from ugat_marl.scenarios import Scenario, seconds_of, validated, with_late_green
+from ugat_marl.scenarios import Scenario, parse_time, validated, with_late_green
 
 QUEUE_START_S = 2.0
 """Start-up time in s that the mesoscopic model lacks, because its queues move at once."""
@@ -149,7 +149,7 @@ def _delay(logic: ET.Element, late_s: float, step_s: float, scenario: str) -> No
             f"scenario {scenario!r}: late green in the programme of traffic light "
             f"{logic.get('id')!r}, whose phases name their successors (next=...), is not possible"
         )
-    cycle = [(seconds_of(item.get("duration", "0")), item.get("state", "")) for item in phases]
+    cycle = [(parse_time(item.get("duration", "0")), item.get("state", "")) for item in phases]
     held, _ = with_late_green(cycle, late_s, step_s, Held.after(cycle[-1][1]))
     for phase, segment in zip(phases, cycle, strict=True):
         held, shown = with_late_green([segment], late_s, step_s, held)
@@ -161,7 +161,7 @@ def _delay(logic: ET.Element, late_s: float, step_s: float, scenario: str) -> No
         phase.set("state", shown[-1][1] if shown else segment[1])
         for key in ("duration", "minDur", "maxDur"):
             if key in phase.attrib:
-                left = max(seconds_of(phase.get(key, "0")) - lost, step_s)
+                left = max(parse_time(phase.get(key, "0")) - lost, step_s)
                 phase.set(key, seconds_text(left))
 
 

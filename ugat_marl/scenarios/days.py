@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ugat_marl.files import parse_xml, xml_bytes
 from ugat_marl.scenarios.routes import as_vehicles
 from ugat_marl.scenarios.scenario import Document, Scenario
-from ugat_marl.scenarios.settings import seconds_of
+from ugat_marl.scenarios.settings import parse_time
 from ugat_marl.seeding import numpy_generator
 
 JITTER_S = 120.0
@@ -119,7 +119,7 @@ def _vehicles(routes: tuple[bytes, ...]) -> _Vehicles:
                 types.append(item)
             elif item.tag == "vehicle":
                 names.append(item.get("id", ""))
-                depart.append(seconds_of(item.get("depart", "0")))
+                depart.append(parse_time(item.get("depart", "0")))
                 kinds.append(item.get("type", ""))
                 heads.append(_attributes(item))
                 tails.append("".join(ET.tostring(part, "unicode").strip() for part in item))

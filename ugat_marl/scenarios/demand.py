@@ -11,7 +11,7 @@ from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.network import Network
 from ugat_marl.scenarios.routes import OwnEdges
 from ugat_marl.scenarios.scenario import Document, Scenario
-from ugat_marl.scenarios.settings import seconds_of
+from ugat_marl.scenarios.settings import parse_time
 
 _ROUTED = ("from", "to", "via", "edges")
 _NO_TIME = frozenset({"triggered", "containerTriggered", "split", "now", "begin"})
@@ -138,7 +138,7 @@ def _end_s(item: Tag, document: Document) -> float:
 
 def _seconds(text: str, key: str, item: Tag, document: Document) -> float:
     try:
-        return seconds_of(text)
+        return parse_time(text)
     except ValueError:
         raise ScenarioError(
             f"{_at(document, item)}: {key}={text!r} of {_who(item)} is not a time; "

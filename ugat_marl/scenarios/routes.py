@@ -14,7 +14,7 @@ from ugat_marl.files import Tag, replacing
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.programs import sumo_program
 from ugat_marl.scenarios.scenario import Document, Scenario
-from ugat_marl.scenarios.settings import seconds_of
+from ugat_marl.scenarios.settings import parse_time
 
 
 class OwnEdges:
@@ -81,7 +81,7 @@ def departures(
         for tag in document.scan(reporter):
             if tag.name == "vehicle":
                 name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
-                depart = seconds_of(text) if text[:1].isdigit() else begin
+                depart = parse_time(text) if text[:1].isdigit() else begin
                 if depart >= end:  # vehicles are sorted by departure
                     break
             elif tag.name == "route" and "id" not in tag.attributes:

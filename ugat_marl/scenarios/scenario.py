@@ -24,7 +24,7 @@ from ugat_marl.scenarios.settings import (
     ControlSettings,
     ScenarioFile,
     may_be_given,
-    seconds_of,
+    parse_time,
     validated,
 )
 from ugat_marl.scenarios.signals import SignalTiming
@@ -224,7 +224,7 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
     def seconds(key: str, default: str) -> float:
         text = value(key, default)
         try:
-            return seconds_of(text)
+            return parse_time(text)
         except ValueError:
             raise ScenarioError(f"{path}: {key} = {text!r} is not a time in seconds") from None
 

@@ -130,7 +130,7 @@ def may_be_given(option: str) -> bool:
     return option not in _SET_BY_THE_SUITE and not words & _INPUT_AND_OUTPUT
 
 
-def seconds_of(text: str) -> float:
+def parse_time(text: str) -> float:
     """Return the seconds of a time as SUMO writes it: ``seconds``, ``h:m:s`` or ``days:h:m:s``.
 
     Raises:
