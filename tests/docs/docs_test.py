@@ -28,7 +28,7 @@ from ugat_marl.effects.actuators import PHASE_ORDERS
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.files import xml_bytes
 from ugat_marl.grounding import UNCERTAINTY_METHODS, FitConfig
-from ugat_marl.scenarios import validated
+from ugat_marl.scenarios import validate_settings
 from ugat_marl.scenarios.settings import ControlSettings, IntersectionSettings, ScenarioFile
 
 PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "scenarios.md").read_text()
@@ -54,7 +54,7 @@ def test_the_defaults_on_the_page_are_those_of_the_code() -> None:
 def test_the_example_is_a_scenario_file() -> None:
     example = re.search(r"```toml\n(.*?)```", PAGE, flags=re.DOTALL)
     assert example is not None
-    settings = validated(tomllib.loads(example[1]), "docs/how-to/scenarios.md")
+    settings = validate_settings(tomllib.loads(example[1]), "docs/how-to/scenarios.md")
     assert settings.intersections["C1"].phases == ("GGrr", "rrGG")
     for record in settings.effects:
         effect_from_record(record)

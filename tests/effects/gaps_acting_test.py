@@ -22,7 +22,7 @@ from ugat_marl.effects import (
 from ugat_marl.effects.actuators import ACTING, PHASE_ORDERS, successors
 from ugat_marl.envs.actuators import Actuators
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
-from ugat_marl.scenarios import Network, signals, validated
+from ugat_marl.scenarios import Network, signals, validate_settings
 from ugat_marl.testing.episodes import play, random_actions
 
 NETWORKS = {name: Network.read(load_scenario(name)) for name in ("single-v1", "mixed-v1")}
@@ -163,7 +163,7 @@ def test_phases_without_a_barrier_are_refused() -> None:
     scenario = load_scenario("single-v1")
     one_street = {"A1": {"phases": ["GGGGrrrrrrGGGGrrrrrr", "GGGGGGrrrrGrrrrrrrrr"]}}
     given_here = scenario.settings.model_dump() | {"intersections": one_street}
-    changed = replace(scenario, settings=validated(given_here, "here"))
+    changed = replace(scenario, settings=validate_settings(given_here, "here"))
     with pytest.raises(ScenarioError, match="'A1' have no barrier.*use 'cyclic'"):
         ugat_marl.parallel_env(changed, "phase_order=barrier-both")
     ugat_marl.parallel_env(changed, "phase_order=cyclic")

@@ -16,7 +16,7 @@ from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, domains_by_gap, gap_matrix
 from ugat_marl.experiments.scores import Result
 from ugat_marl.reporting import gap_matrix_table, objective_tables
-from ugat_marl.scenarios import validated
+from ugat_marl.scenarios import validate_settings
 
 BASE = Scores(100.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 5.0)
 
@@ -113,7 +113,7 @@ def test_domains_a_network_does_not_allow_are_left_out(
     found = load_scenario("single-v1")
     phases = ["GGGGrrrrrrGGGGrrrrrr", "GGGGGGrrrrGrrrrrrrrr"]
     given = found.settings.model_dump() | {"intersections": {"A1": {"phases": phases}}}
-    replace(found, settings=validated(given, "here")).write(scenario)
+    replace(found, settings=validate_settings(given, "here")).write(scenario)
     console = Console(width=200)
     with console.capture() as capture:
         left = Evaluate(str(scenario), domains=("sim", "action"))._domains(

@@ -28,7 +28,7 @@ from ugat_marl.scenarios import (
     parse_time,
     read_scenario,
     shipped_scenarios,
-    validated,
+    validate_settings,
 )
 from ugat_marl.scenarios.scenario import scenario_toml
 from ugat_marl.scenarios.settings import may_be_given
@@ -51,7 +51,7 @@ def test_the_crossing_is_read(crossing: Crossing) -> None:
 
 
 def test_defaults_are_the_ones_documented(tmp_path: Path) -> None:
-    settings = validated(MINIMAL, "here")
+    settings = validate_settings(MINIMAL, "here")
     control = settings.control
     assert (settings.begin_s, settings.duration_s, settings.step_length_s) == (0, 3600, 1)
     assert (control.decision_interval_s, control.yellow_s, control.all_red_s) == (10, 3, 2)
@@ -162,7 +162,7 @@ def test_decisions(duration: float, interval: float, step: float, decisions: int
         "step_length_s": step,
         "control": {"decision_interval_s": interval},
     }
-    scenario = Scenario("x", Document("n"), (), (), validated(settings, "here"))
+    scenario = Scenario("x", Document("n"), (), (), validate_settings(settings, "here"))
     assert scenario.decisions == decisions
 
 
@@ -197,9 +197,11 @@ def test_written_and_read_again_it_is_the_same(crossing: Crossing, tmp_path: Pat
 def test_any_text_survives_the_way_through_toml(
     description: str, lights: dict[str, dict[str, list[str]]]
 ) -> None:
-    settings = validated({**MINIMAL, "description": description, "intersections": lights}, "here")
+    settings = validate_settings(
+        {**MINIMAL, "description": description, "intersections": lights}, "here"
+    )
     text = scenario_toml(settings.model_dump(mode="json"), ("acceleration=1",))
-    assert validated(tomllib.loads(text), "again") == settings
+    assert validate_settings(tomllib.loads(text), "again") == settings
 
 
 def test_a_derived_scenario_runs_in_plain_sumo(crossing: Crossing, tmp_path: Path) -> None:
@@ -390,8 +392,8 @@ def test_which_options_of_sumo_a_scenario_may_set(option: str, allowed: bool) ->
     assert may_be_given(option) is allowed
     raw = {**MINIMAL, "sumo": {option: "1"}}
     if allowed:
-        assert validated(raw, "here").sumo == {option: "1"}
+        assert validate_settings(raw, "here").sumo == {option: "1"}
     else:
         message = f"here: sumo.{option} is set by the suite and cannot be given; leave it out"
         with pytest.raises(ScenarioError, match=re.escape(message)):
-            validated(raw, "here")
+            validate_settings(raw, "here")

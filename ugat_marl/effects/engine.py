@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, NumberParameter
-from ugat_marl.scenarios import Scenario, validated
+from ugat_marl.scenarios import Scenario, validate_settings
 
 HEADWAY_S = 1.4
 """Net headway of moving queues in s, for drivers with `tau` = 1 s; SUMO multiplies it by `tau`.
@@ -102,6 +102,6 @@ def _changed(
     settings["control"] = {**settings["control"], **control}
     return replace(
         scenario,
-        settings=validated(settings, f"scenario {scenario.id!r}"),
+        settings=validate_settings(settings, f"scenario {scenario.id!r}"),
         applied=(*scenario.applied, str(effect)),
     )

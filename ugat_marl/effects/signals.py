@@ -17,7 +17,7 @@ from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import LateGreenMemory as Held
-from ugat_marl.scenarios import Scenario, parse_time, validated, with_late_green
+from ugat_marl.scenarios import Scenario, parse_time, validate_settings, with_late_green
 
 QUEUE_START_S = 2.0
 """Start-up time in s that the mesoscopic model lacks, because its queues move at once."""
@@ -60,7 +60,7 @@ class LateGreen(Effect):
         settings["intersections"] = {tls: item for tls, item in own.items() if item}
         return replace(
             scenario,
-            settings=validated(settings, f"scenario {scenario.id!r}"),
+            settings=validate_settings(settings, f"scenario {scenario.id!r}"),
             applied=(*scenario.applied, str(self)),
         )
 

@@ -25,7 +25,7 @@ from ugat_marl.scenarios.settings import (
     ScenarioFile,
     may_be_given,
     parse_time,
-    validated,
+    validate_settings,
 )
 from ugat_marl.scenarios.signals import SignalTiming
 
@@ -93,12 +93,12 @@ class Scenario:
         """Return the scenario with other signal timing (keywords of `ControlSettings`)."""
         control = {**self.control.model_dump(), **changes}
         settings = {**self.settings.model_dump(), "control": control}
-        return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
+        return replace(self, settings=validate_settings(settings, f"scenario {self.id!r}"))
 
     def with_duration(self, duration_s: float) -> Scenario:
         """Return the scenario with another duration."""
         settings = {**self.settings.model_dump(), "duration_s": duration_s}
-        return replace(self, settings=validated(settings, f"scenario {self.id!r}"))
+        return replace(self, settings=validate_settings(settings, f"scenario {self.id!r}"))
 
     def write(self, directory: Path) -> Path:
         """Write a scenario directory that SUMO and `read_scenario` can use.
@@ -175,7 +175,7 @@ def _load_directory(directory: Path) -> Scenario:
         raise ScenarioError(f"{file}: not valid TOML: {error}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{file}: cannot be read: {error}") from None
-    settings = validated(raw, str(file))
+    settings = validate_settings(raw, str(file))
 
     def document(name: str, key: str) -> Document:
         path = directory / name
@@ -233,7 +233,7 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
         raise ScenarioError(f"{path}: end ({end:g} s) is not after begin ({begin:g} s)")
     network = documents("net-file", "a network")[0]
     routes, additional = documents("route-files", "vehicles"), documents("additional-files")
-    settings = validated(
+    settings = validate_settings(
         {
             "description": f"SUMO configuration {path.name}",
             "network": network.name,

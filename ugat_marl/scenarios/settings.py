@@ -76,7 +76,7 @@ class ScenarioFile(pydantic.BaseModel):
     sumo: dict[str, str] = {}
 
 
-def validated(raw: Mapping[str, Any], source: str) -> ScenarioFile:
+def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
     """Check the content of a scenario file.
 
     Args:
