@@ -28,7 +28,7 @@ from ugat_marl.experiments import (
     problems,
 )
 from ugat_marl.progress import Bars, Silent
-from ugat_marl.scenarios import SHORT_M, IntersectionFacts, Survey, survey
+from ugat_marl.scenarios import SHORT_LANE_M, IntersectionFacts, Survey, survey
 from ugat_marl.testing import (
     Result,
     check_determinism,
@@ -163,7 +163,7 @@ def show(
     console.print(_approaches(agents))
     if short := sum(len(item.short_lanes) for item in agents):
         say(
-            f"lanes at lights that are shorter than {SHORT_M:g} m: {short}. Agents see nobody "
+            f"lanes at lights that are shorter than {SHORT_LANE_M:g} m: {short}. Agents see nobody "
             "upstream of them; reach_m = 100 under [control], or the effect reach=100, counts those"
         )
     if runs:

@@ -21,7 +21,7 @@ from .importers.sumo_files import from_sumo as from_sumo
 from .importers.turning_shares import from_turns as from_turns
 from .importers.turning_shares import poisson_arrivals as poisson_arrivals
 from .importers.turning_shares import weighted_choice as weighted_choice
-from .inspection import SHORT_M as SHORT_M
+from .inspection import SHORT_LANE_M as SHORT_LANE_M
 from .inspection import IntersectionFacts as IntersectionFacts
 from .inspection import Survey as Survey
 from .inspection import survey as survey

@@ -17,7 +17,7 @@ from ugat_marl.scenarios.routes import departures
 from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import GREEN
 
-SHORT_M = 50.0
+SHORT_LANE_M = 50.0
 """Length below which a lane at a light shows little of a queue."""
 
 SATURATION_VPH = 1800.0
@@ -80,7 +80,7 @@ class IntersectionFacts:
         partly_served: Lanes that some phase serves in one direction only. A vehicle that waits for
             the other direction blocks them.
         lanes_behind: Short incoming lanes that are counted together with their upstream lanes.
-        short_lanes: Lanes shorter than `SHORT_M` whose upstream vehicles are not counted.
+        short_lanes: Lanes shorter than `SHORT_LANE_M` whose upstream vehicles are not counted.
         always_green: Number of links that are green in every phase.
         right_on_red: Number of links that may go on red after a stop.
         u_turns: Number of links that turn around.
@@ -182,10 +182,10 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
 
 
 def _short(scenario: Scenario, network: Network) -> set[str]:
-    """Return the lanes that would get more upstream lanes with a reach of `SHORT_M`."""
-    if scenario.control.reach_m >= SHORT_M or "mesosim" in scenario.settings.sumo:
+    """Return the lanes that would get more upstream lanes with a reach of `SHORT_LANE_M`."""
+    if scenario.control.reach_m >= SHORT_LANE_M or "mesosim" in scenario.settings.sumo:
         return set()
-    farther = Network.read(scenario.with_control(reach_m=SHORT_M))
+    farther = Network.read(scenario.with_control(reach_m=SHORT_LANE_M))
     return {
         name
         for name, lane in farther.lanes.items()
