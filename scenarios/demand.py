@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Plan, Road, poisson_arrivals, weighted_choice
+from ugat_marl.scenarios import Road, RoadPlan, poisson_arrivals, weighted_choice
 from ugat_marl.seeding import numpy_generator
 
 
 def draw_demand(
-    plan: Plan, demand: Mapping[str, Any], vehicles: Mapping[str, Any], duration_s: float
+    plan: RoadPlan, demand: Mapping[str, Any], vehicles: Mapping[str, Any], duration_s: float
 ) -> bytes:
     """The route file for table ``demand`` of a `source.toml`.
 
@@ -59,7 +59,7 @@ def draw_demand(
 
 
 def _walk(
-    plan: Plan, first: Road, turns: Mapping[str, Any], random: np.random.Generator
+    plan: RoadPlan, first: Road, turns: Mapping[str, Any], random: np.random.Generator
 ) -> list[str]:
     """Edge ids from an entry to an exit, passing no junction twice."""
     while True:

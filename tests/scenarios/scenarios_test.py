@@ -20,7 +20,7 @@ from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments import HeadroomRow, headroom_markdown, measure_headroom
 from ugat_marl.scenarios import (
     Network,
-    Plan,
+    RoadPlan,
     build_network,
     plain_xml,
     read_plan,
@@ -296,7 +296,7 @@ def test_headroom_of_nothing_is_refused() -> None:
         measure_headroom(read_scenario("single-v1"), ["sim"], (), [0])
 
 
-def plan(there: list[str], beyond: list[str]) -> Plan:
+def plan(there: list[str], beyond: list[str]) -> RoadPlan:
     """Two roads in a row, ``A_j`` and ``j_B``, and one south."""
     table = {
         "junctions": {"j": [0, 0]},

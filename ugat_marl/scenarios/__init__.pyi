@@ -9,8 +9,8 @@ from .importers.making import RoadSource as RoadSource
 from .importers.making import VehicleSource as VehicleSource
 from .importers.making import make_scenario as make_scenario
 from .importers.osm import from_osm as from_osm
-from .importers.plan import Plan as Plan
 from .importers.plan import Road as Road
+from .importers.plan import RoadPlan as RoadPlan
 from .importers.plan import arterial as arterial
 from .importers.plan import build_network as build_network
 from .importers.plan import plain_xml as plain_xml

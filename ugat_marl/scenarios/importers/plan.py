@@ -62,7 +62,7 @@ class Road:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RoadPlan:
     """Nodes and roads by id, from which the network is made."""
 
     nodes: dict[str, Node]
@@ -112,7 +112,7 @@ class Plan:
         return found
 
 
-def read_plan(source: Mapping[str, Any]) -> Plan:
+def read_plan(source: Mapping[str, Any]) -> RoadPlan:
     """Return the plan in a parsed `source.toml`: its table ``grid`` or ``junctions``/``roads``."""
     if "grid" in source:
         return grid(**source["grid"])
@@ -129,7 +129,7 @@ def read_plan(source: Mapping[str, Any]) -> Plan:
             Road(there, here, tuple(entry["back"])),
         ):
             roads[road.id] = road
-    return Plan(nodes, roads)
+    return RoadPlan(nodes, roads)
 
 
 def grid(
@@ -139,7 +139,7 @@ def grid(
     entry_m: float,
     east_west: Sequence[str],
     north_south: Sequence[str],
-) -> Plan:
+) -> RoadPlan:
     """Return a grid: junctions A1 (south-west), B1, ..., A2, ...; ends west1, east1, southA, ...
 
     Args:
@@ -174,7 +174,7 @@ def grid(
         south = Node(f"south{letter}", x, -entry_m, False)
         north = Node(f"north{letter}", x, height + entry_m, False)
         add([south, *inner, north], tuple(north_south))
-    return Plan(nodes, roads)
+    return RoadPlan(nodes, roads)
 
 
 def _column(number: int) -> str:
@@ -183,7 +183,7 @@ def _column(number: int) -> str:
     return (_column(rest - 1) if rest else "") + chr(ord("A") + last)
 
 
-def plain_xml(plan: Plan, speed_mps: float) -> dict[str, bytes]:
+def plain_xml(plan: RoadPlan, speed_mps: float) -> dict[str, bytes]:
     """Return the three plain-XML documents of netconvert, by the option that takes them."""
     nodes, edges, connections = ET.Element("nodes"), ET.Element("edges"), ET.Element("connections")
     for node in plan.nodes.values():
@@ -283,7 +283,7 @@ def _check(spacing_m: float, speed_mps: float) -> None:
         raise OptionError(f"--speed-mps {speed_mps:g} is not within 1 to 60 m/s")
 
 
-def _drawn(plan: Plan, speed_mps: float, description: str) -> RoadSource:
+def _drawn(plan: RoadPlan, speed_mps: float, description: str) -> RoadSource:
     def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         del reporter
         write_whole(folder / NETWORK, build_network(plain_xml(plan, speed_mps), _NETCONVERT))
