@@ -17,7 +17,7 @@ from demand import draw_demand
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
-from ugat_marl.scenarios import build_network, plain_xml, read_plan
+from ugat_marl.scenarios import build_network, plain_xml, read_road_plan
 
 HERE = Path(__file__).resolve().parent
 BEGIN, END = "<!-- headroom: begin -->\n", "<!-- headroom: end -->\n"
@@ -28,7 +28,7 @@ def build(name: str, into: Path) -> list[Path]:
     source = _read(HERE / name / "source.toml")
     settings = _read(HERE / name / "scenario.toml")
     vehicles = _read(HERE / "vehicles.toml")
-    plan = read_plan(source)
+    plan = read_road_plan(source)
     files = {
         settings["network"]: build_network(
             plain_xml(plan, source["speed_mps"]), source["netconvert"]

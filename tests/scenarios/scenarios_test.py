@@ -23,7 +23,7 @@ from ugat_marl.scenarios import (
     RoadPlan,
     build_network,
     plain_xml,
-    read_plan,
+    read_road_plan,
     read_scenario,
     shipped_scenarios,
 )
@@ -307,7 +307,7 @@ def plan(there: list[str], beyond: list[str]) -> RoadPlan:
             {"between": ["C", "j"], "there": ["rl"], "back": [""]},
         ],
     }
-    return read_plan(table)
+    return read_road_plan(table)
 
 
 def test_builder_connects_lanes_by_turn() -> None:

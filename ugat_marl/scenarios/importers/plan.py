@@ -112,7 +112,7 @@ class RoadPlan:
         return found
 
 
-def read_plan(source: Mapping[str, Any]) -> RoadPlan:
+def read_road_plan(source: Mapping[str, Any]) -> RoadPlan:
     """Return the plan in a parsed `source.toml`: its table ``grid`` or ``junctions``/``roads``."""
     if "grid" in source:
         return grid(**source["grid"])
