@@ -17,7 +17,7 @@ from demand import draw_demand
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
-from ugat_marl.scenarios import build_network, plain_xml, read_road_plan
+from ugat_marl.scenarios import build_network, netconvert_documents, read_road_plan
 
 HERE = Path(__file__).resolve().parent
 BEGIN, END = "<!-- headroom: begin -->\n", "<!-- headroom: end -->\n"
@@ -31,7 +31,7 @@ def build(name: str, into: Path) -> list[Path]:
     plan = read_road_plan(source)
     files = {
         settings["network"]: build_network(
-            plain_xml(plan, source["speed_mps"]), source["netconvert"]
+            netconvert_documents(plan, source["speed_mps"]), source["netconvert"]
         ),
         settings["routes"][0]: draw_demand(
             plan, source["demand"], vehicles, settings["duration_s"]

@@ -22,7 +22,7 @@ from ugat_marl.scenarios import (
     Network,
     RoadPlan,
     build_network,
-    plain_xml,
+    netconvert_documents,
     read_road_plan,
     read_scenario,
     shipped_scenarios,
@@ -336,4 +336,4 @@ def test_builder_refuses_impossible_lanes(
 def test_builder_passes_on_what_netconvert_says() -> None:
     found = plan(["sr"], [""])
     with pytest.raises(ScenarioError, match="no-such-option"):
-        build_network(plain_xml(found, 13.9), {"no-such-option": 1})
+        build_network(netconvert_documents(found, 13.9), {"no-such-option": 1})

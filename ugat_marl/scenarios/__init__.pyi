@@ -13,7 +13,7 @@ from .importers.plan import Road as Road
 from .importers.plan import RoadPlan as RoadPlan
 from .importers.plan import arterial as arterial
 from .importers.plan import build_network as build_network
-from .importers.plan import plain_xml as plain_xml
+from .importers.plan import netconvert_documents as netconvert_documents
 from .importers.plan import read_road_plan as read_road_plan
 from .importers.plan import rectangle as rectangle
 from .importers.sumo_files import from_routes as from_routes

@@ -183,7 +183,7 @@ def _column(number: int) -> str:
     return (_column(rest - 1) if rest else "") + chr(ord("A") + last)
 
 
-def plain_xml(plan: RoadPlan, speed_mps: float) -> dict[str, bytes]:
+def netconvert_documents(plan: RoadPlan, speed_mps: float) -> dict[str, bytes]:
     """Return the three plain-XML documents of netconvert, by the option that takes them."""
     nodes, edges, connections = ET.Element("nodes"), ET.Element("edges"), ET.Element("connections")
     for node in plan.nodes.values():
@@ -210,7 +210,7 @@ def build_network(documents: Mapping[str, bytes], options: Mapping[str, Any]) ->
     """Return the ``.net.xml`` that netconvert makes, without its comment with date and paths.
 
     Args:
-        documents: The documents of `plain_xml`.
+        documents: The documents of `netconvert_documents`.
         options: Further options of netconvert, without the leading dashes.
 
     Raises:
@@ -286,7 +286,9 @@ def _check(spacing_m: float, speed_mps: float) -> None:
 def _drawn(plan: RoadPlan, speed_mps: float, description: str) -> RoadSource:
     def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         del reporter
-        write_whole(folder / NETWORK, build_network(plain_xml(plan, speed_mps), _NETCONVERT))
+        write_whole(
+            folder / NETWORK, build_network(netconvert_documents(plan, speed_mps), _NETCONVERT)
+        )
         return RoadFiles(
             description,
             "Drawn by the suite and built by SUMO's netconvert: every approach has a lane for left "
