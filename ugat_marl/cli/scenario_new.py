@@ -16,7 +16,7 @@ from ugat_marl.progress import Bars
 from ugat_marl.scenarios import (
     RoadSource,
     VehicleSource,
-    arterial,
+    arterial_roads,
     from_cityflow,
     from_counts,
     from_od,
@@ -135,7 +135,7 @@ class ScenarioNew:
         if self.grid is not None:
             return rectangle(self.grid, self.spacing_m, self.speed_mps)
         if self.arterial is not None:
-            return arterial(self.arterial, self.spacing_m, self.speed_mps)
+            return arterial_roads(self.arterial, self.spacing_m, self.speed_mps)
         if self.osm is not None:
             return from_osm(self.osm, guess=self.guess_signals)
         if self.cityflow is not None:

@@ -11,7 +11,7 @@ from .importers.making import make_scenario as make_scenario
 from .importers.osm import from_osm as from_osm
 from .importers.plan import Road as Road
 from .importers.plan import RoadPlan as RoadPlan
-from .importers.plan import arterial as arterial
+from .importers.plan import arterial_roads as arterial_roads
 from .importers.plan import build_network as build_network
 from .importers.plan import netconvert_documents as netconvert_documents
 from .importers.plan import read_road_plan as read_road_plan

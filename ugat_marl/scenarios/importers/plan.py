@@ -257,7 +257,7 @@ def rectangle(text: str, spacing_m: float, speed_mps: float) -> RoadSource:
     return _drawn(plan, speed_mps, f"A grid of {words}")
 
 
-def arterial(count: int, spacing_m: float, speed_mps: float) -> RoadSource:
+def arterial_roads(count: int, spacing_m: float, speed_mps: float) -> RoadSource:
     """Return a source of a main road from west to east with side streets.
 
     Args:
