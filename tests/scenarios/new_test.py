@@ -24,9 +24,9 @@ from ugat_marl.progress import Advance, Reporter, Silent
 from ugat_marl.scenarios import (
     Network,
     check_demand,
+    grid_roads,
     make_scenario,
     read_scenario,
-    rectangle,
     shipped_scenarios,
 )
 from ugat_marl.scenarios.importers.long_files import scan
@@ -481,7 +481,7 @@ def test_roads_of_any_source_are_checked(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="no vehicle departs"):
         make_scenario(
             tmp_path / "a",
-            rectangle("1x1", 300, 13.9),
+            grid_roads("1x1", 300, 13.9),
             nobody,
             settings={},
             command="",

@@ -24,8 +24,8 @@ from ugat_marl.scenarios import (
     from_routes,
     from_sumo,
     from_turns,
+    grid_roads,
     make_scenario,
-    rectangle,
 )
 
 ROADS = ("grid", "arterial", "osm", "sumo", "cityflow")
@@ -133,7 +133,7 @@ class ScenarioNew:
                 f"give one of {_listed(ROADS)}"
             )
         if self.grid is not None:
-            return rectangle(self.grid, self.spacing_m, self.speed_mps)
+            return grid_roads(self.grid, self.spacing_m, self.speed_mps)
         if self.arterial is not None:
             return arterial_roads(self.arterial, self.spacing_m, self.speed_mps)
         if self.osm is not None:

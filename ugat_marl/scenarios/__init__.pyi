@@ -13,9 +13,9 @@ from .importers.plan import Road as Road
 from .importers.plan import RoadPlan as RoadPlan
 from .importers.plan import arterial_roads as arterial_roads
 from .importers.plan import build_network as build_network
+from .importers.plan import grid_roads as grid_roads
 from .importers.plan import netconvert_documents as netconvert_documents
 from .importers.plan import read_road_plan as read_road_plan
-from .importers.plan import rectangle as rectangle
 from .importers.sumo_files import from_routes as from_routes
 from .importers.sumo_files import from_sumo as from_sumo
 from .importers.turning_shares import from_turns as from_turns

@@ -234,7 +234,7 @@ def build_network(documents: Mapping[str, bytes], options: Mapping[str, Any]) ->
         return output.read_bytes()
 
 
-def rectangle(text: str, spacing_m: float, speed_mps: float) -> RoadSource:
+def grid_roads(text: str, spacing_m: float, speed_mps: float) -> RoadSource:
     """Return a source of a grid of roads.
 
     Args:
