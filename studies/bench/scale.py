@@ -333,14 +333,14 @@ class ScaleBench:
 
     def _grid(self, folder: Path, side: int, reporter: Reporter) -> Path:
         # Only two parts need grids, and these modules load slowly.
-        from ugat_marl.scenarios import from_turns, grid_roads, make_scenario
+        from ugat_marl.scenarios import from_turning_shares, grid_roads, make_scenario
 
         target = folder / f"grid{side}x{side}"
         length_s = 10.0 * (self.settled + self.decisions + 1)
         make_scenario(
             target,
             grid_roads(f"{side}x{side}", 300.0, 13.9),
-            from_turns(self.vph, (0.2, 0.65, 0.15), 0.0, length_s, self.seed),
+            from_turning_shares(self.vph, (0.2, 0.65, 0.15), 0.0, length_s, self.seed),
             settings={"duration_s": length_s},
             command="",
             force=False,

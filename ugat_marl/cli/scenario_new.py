@@ -23,7 +23,7 @@ from ugat_marl.scenarios import (
     from_osm,
     from_routes,
     from_sumo,
-    from_turns,
+    from_turning_shares,
     grid_roads,
     make_scenario,
 )
@@ -163,7 +163,7 @@ class ScenarioNew:
             return from_routes(self.routes, link=self.link)
         begin_s, length_s = self.begin_s or 0.0, self.duration_s or 3600.0
         if self.vph is not None:
-            return from_turns(self.vph, self.turns, begin_s, length_s, self.seed)
+            return from_turning_shares(self.vph, self.turns, begin_s, length_s, self.seed)
         if self.counts is not None:
             return from_counts(self.counts, begin_s, length_s, self.seed)
         if self.od is not None:

@@ -18,7 +18,7 @@ from .importers.plan import netconvert_documents as netconvert_documents
 from .importers.plan import read_road_plan as read_road_plan
 from .importers.sumo_files import from_routes as from_routes
 from .importers.sumo_files import from_sumo as from_sumo
-from .importers.turning_shares import from_turns as from_turns
+from .importers.turning_shares import from_turning_shares as from_turning_shares
 from .importers.turning_shares import poisson_arrivals as poisson_arrivals
 from .importers.turning_shares import weighted_choice as weighted_choice
 from .inspection import SHORT_LANE_M as SHORT_LANE_M

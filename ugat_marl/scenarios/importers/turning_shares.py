@@ -191,7 +191,7 @@ def _attributes(values: Mapping[str, str]) -> str:
     return "".join(f" {key}={quoteattr(value)}" for key, value in values.items())
 
 
-def from_turns(
+def from_turning_shares(
     vph: float, shares: tuple[float, float, float], begin_s: float, length_s: float, seed: int
 ) -> VehicleSource:
     """Return a source of vehicles that `walked` draws by turning shares, from `begin_s` on."""
