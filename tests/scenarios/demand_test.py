@@ -14,8 +14,8 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import (
     Demand,
     Network,
-    as_vehicles,
     check_demand,
+    demand_as_vehicles,
     shipped_scenarios,
     survey,
 )
@@ -69,7 +69,7 @@ def test_triggered_departures_are_no_times(crossing: Crossing) -> None:
 def test_what_needs_no_router_is_known(vehicles: str, routed: bool, crossing: Crossing) -> None:
     directory = crossing(vehicles=vehicles)
     assert check(directory).routed is routed
-    assert (as_vehicles(load_scenario(directory)).routes[0].path is not None) is routed
+    assert (demand_as_vehicles(load_scenario(directory)).routes[0].path is not None) is routed
 
 
 def test_an_episode_need_not_know_what_comes_long_after_it(crossing: Crossing) -> None:

@@ -60,7 +60,7 @@ from ugat_marl.scenarios import (
     Scenario,
     SignalLog,
     another_day,
-    as_vehicles,
+    demand_as_vehicles,
     late_green_log,
     sumo_program,
 )
@@ -110,7 +110,7 @@ class Replay:
     ) -> None:
         self._given = scenario, network, detectors, owner
         self.answering = answering
-        self._scenario = as_vehicles(scenario)
+        self._scenario = demand_as_vehicles(scenario)
         self._network = network
         self._detectors = tuple(detectors)
         self._owner = dict(owner)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.files import parse_xml, xml_bytes
-from ugat_marl.scenarios.routes import as_vehicles
+from ugat_marl.scenarios.routes import demand_as_vehicles
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
 from ugat_marl.seeding import numpy_generator
@@ -61,10 +61,10 @@ def another_day(scenario: Scenario, seed: int) -> Scenario:
     change them, so two models can be compared on the same day.
 
     Args:
-        scenario: Any scenario; `as_vehicles` turns its trips and flows into vehicles.
+        scenario: Any scenario; `demand_as_vehicles` turns its trips and flows into vehicles.
         seed: Number of the day, a non-negative integer.
     """
-    scenario = as_vehicles(scenario)
+    scenario = demand_as_vehicles(scenario)
     vehicles = _vehicles(tuple(document.read() for document in scenario.routes))
     generator = numpy_generator(seed, "another day")
     begin = scenario.settings.begin_s

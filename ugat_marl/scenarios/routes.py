@@ -41,7 +41,7 @@ class OwnEdges:
         return self._holds and not self._waiting
 
 
-def as_vehicles(scenario: Scenario) -> Scenario:
+def demand_as_vehicles(scenario: Scenario) -> Scenario:
     """Return the same demand as single vehicles with routes; duarouter resolves trips and flows.
 
     Raises:
@@ -56,7 +56,7 @@ def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
     """Yield the edges of every vehicle that departs within the scenario's time.
 
     Args:
-        scenario: Any scenario; `as_vehicles` turns its trips and flows into vehicles.
+        scenario: Any scenario; `demand_as_vehicles` turns its trips and flows into vehicles.
     """
     for _, depart, edges in departures(scenario, routed=False):
         if edges and depart >= scenario.settings.begin_s:
@@ -71,12 +71,12 @@ def departures(
     Args:
         scenario: Scenario that has passed `check_demand`.
         routed: True if its route files hold only single vehicles with their own edges. Otherwise
-            `as_vehicles` routes them first.
+            `demand_as_vehicles` routes them first.
         reporter: Shows progress if a file is long.
     """
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
-    for document in scenario.routes if routed else as_vehicles(scenario).routes:
+    for document in scenario.routes if routed else demand_as_vehicles(scenario).routes:
         name, depart = "", 0.0
         for tag in document.scan(reporter):
             if tag.name == "vehicle":

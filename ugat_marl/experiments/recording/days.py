@@ -52,7 +52,7 @@ from ugat_marl.scenarios import (
     SignalLog,
     Split,
     another_day,
-    as_vehicles,
+    demand_as_vehicles,
 )
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import loops_document, read_loops, standard_detectors
@@ -145,7 +145,7 @@ def record(
         )
     if duration_s is not None:
         scenario = scenario.with_duration(duration_s)
-    base, effects = _world(as_vehicles(scenario), domain)
+    base, effects = _world(demand_as_vehicles(scenario), domain)
     if duration_s is not None:  # the domain may be another scenario
         base = base.with_duration(duration_s)
     network = Network.read(base)
@@ -156,7 +156,7 @@ def record(
     )  # a wrong detector is an error now
     fixed, watched = own_programmes(base, network, policy)
     street = _Street(
-        as_vehicles(base),
+        demand_as_vehicles(base),
         effects,
         detectors,
         fixed,
