@@ -17,7 +17,7 @@ from ugat_marl.diagnosis.replay import Arrivals, Due, Replay, by_lane_left, corr
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.effects import Effect, load_scenario, parse_domain
 from ugat_marl.experiments import policy_factory, record
-from ugat_marl.scenarios import Network, Passages, Period, Scenario, another_day
+from ugat_marl.scenarios import Network, Passages, Period, Scenario, draw_day
 from ugat_marl.simulation import standard_detectors
 
 LIMIT = 10.0
@@ -115,7 +115,7 @@ def test_vehicles_depart_so_that_they_come_when_others_came(
     crossing: tuple[Scenario, Network, DetectorLayout],
 ) -> None:
     scenario, network, layout = crossing
-    day = another_day(scenario, 3)
+    day = draw_day(scenario, 3)
     came = {"advance:S_C_0": [60.0, 75.0, 99.0], "stop:S_C_0": [65.0, 80.0, 105.0]}
     period = a_period(passages(came))
     found, due = Arrivals(layout, network).given(day, day, period)
@@ -131,7 +131,7 @@ def test_vehicles_depart_so_that_they_come_when_others_came(
 
 def test_more_came_than_the_model_has(crossing: tuple[Scenario, Network, DetectorLayout]) -> None:
     scenario, network, layout = crossing
-    day = another_day(scenario, 3)
+    day = draw_day(scenario, 3)
     times = np.linspace(20.0, 180.0, 60).tolist()
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
     found, _ = Arrivals(layout, network).given(day, day, period)
@@ -186,7 +186,7 @@ def test_detectors_that_missed_vehicles_do_not_keep_them_away(
     crossing: tuple[Scenario, Network, DetectorLayout],
 ) -> None:
     scenario, network, layout = crossing
-    day = another_day(scenario, 3)
+    day = draw_day(scenario, 3)
     times = np.linspace(5.0, 195.0, 40)
     few = {"advance:S_C_0": times[::2].tolist(), "stop:S_C_0": (times + 3).tolist()}
     found, due = Arrivals(layout, network).given(day, day, a_period(passages(few)))

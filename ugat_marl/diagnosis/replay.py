@@ -59,8 +59,8 @@ from ugat_marl.scenarios import (
     Period,
     Scenario,
     SignalLog,
-    another_day,
     demand_as_vehicles,
+    draw_day,
     late_green_log,
     sumo_program,
 )
@@ -173,7 +173,7 @@ class Replay:
         with self._lock:
             found = self._days.get(seed)
             if found is None:
-                found = self._days[seed] = another_day(self._scenario, seed)
+                found = self._days[seed] = draw_day(self._scenario, seed)
                 if len(self._days) > _DAYS:
                     self._days.popitem(last=False)
             return found

@@ -1,5 +1,5 @@
 from . import signals as signals
-from .days import another_day as another_day
+from .days import draw_day as draw_day
 from .demand import Demand as Demand
 from .demand import check_demand as check_demand
 from .importers.cityflow import from_cityflow as from_cityflow

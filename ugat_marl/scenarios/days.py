@@ -54,7 +54,7 @@ class _Vehicles:
     speeds: NDArray[np.float64]
 
 
-def another_day(scenario: Scenario, seed: int) -> Scenario:
+def draw_day(scenario: Scenario, seed: int) -> Scenario:
     """Draw another day: a Poisson number of copies of every vehicle, departures jittered.
 
     The same seed gives the same vehicles, names and speedFactors. Effects applied afterwards do not

@@ -51,8 +51,8 @@ from ugat_marl.scenarios import (
     Scenario,
     SignalLog,
     Split,
-    another_day,
     demand_as_vehicles,
+    draw_day,
 )
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import loops_document, read_loops, standard_detectors
@@ -222,7 +222,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
     """Record one day, from its vehicles to the measured data."""
     scenario = street.base
     if not street.same_demand:
-        scenario = another_day(scenario, derive_seed(street.seed, "record", index, "demand"))
+        scenario = draw_day(scenario, derive_seed(street.seed, "record", index, "demand"))
         scenario = _renamed(scenario, derive_seed(street.seed, "record", index, "names"))
     scenario = apply_effects(scenario, street.effects)
     if not street.same_demand:
