@@ -65,7 +65,7 @@ from ugat_marl.scenarios import (
     sumo_program,
 )
 from ugat_marl.seeding import derive_seed
-from ugat_marl.simulation import launch_of, loops_document, one_line, read_loops, read_trips
+from ugat_marl.simulation import launch_of, loops_document, one_line_message, read_loops, read_trips
 
 _DAYS = 64
 """Largest number of days of vehicles that are kept in memory."""
@@ -196,7 +196,7 @@ class Replay:
         command = [str(sumo_program("sumo")), *launch.arguments, "--end", repr(period.end_s)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
-            said = one_line(done.stderr) or f"exit code {done.returncode}"
+            said = one_line_message(done.stderr) or f"exit code {done.returncode}"
             # a negative exit code means that a signal of the system ended SUMO
             kind = SimulatorCrashed if done.returncode < 0 else SimulatorError
             raise kind(f"SUMO failed in a replay of period {period.id!r}: {said}")

@@ -6,7 +6,7 @@ from .detectors import read_loops as read_loops
 from .detectors import standard_detectors as standard_detectors
 from .host import Host as Host
 from .host import Worker as Worker
-from .host import one_line as one_line
+from .host import one_line_message as one_line_message
 from .process import ProcessSimulator as ProcessSimulator
 from .process import simulator_of as simulator_of
 from .simulator import Launch as Launch

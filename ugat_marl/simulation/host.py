@@ -275,7 +275,7 @@ class Worker:
 
     def _words(self) -> str:
         self._said.seek(0)
-        return one_line(self._said.read().decode(errors="replace"))[-2000:]
+        return one_line_message(self._said.read().decode(errors="replace"))[-2000:]
 
 
 class _WarmParent:
@@ -387,7 +387,7 @@ class _WarmParent:
                 del self._current[self._service]
 
 
-def one_line(text: str) -> str:
+def one_line_message(text: str) -> str:
     """Return SUMO's output as one line, without its standard phrases."""
     lines = [line.strip().removeprefix("Error: ") for line in text.splitlines()]
     return " ".join(line for line in lines if line and line != "Quitting (on error).")

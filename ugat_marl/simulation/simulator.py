@@ -28,7 +28,7 @@ from ugat_marl.scenarios import (
     UpstreamLanes,
     edge_of,
 )
-from ugat_marl.simulation.host import one_line
+from ugat_marl.simulation.host import one_line_message
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes, refuse_in_queues
 from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
 from ugat_marl.simulation.trips import measuring_options, read_trips
@@ -462,7 +462,7 @@ def _add_those_behind(
 def _errors_of(directory: Path) -> str:
     """Return SUMO's error log as one line."""
     path = directory / _ERRORS
-    return one_line(path.read_text(errors="replace")) if path.exists() else ""
+    return one_line_message(path.read_text(errors="replace")) if path.exists() else ""
 
 
 def simulates_here() -> bool:
