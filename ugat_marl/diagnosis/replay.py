@@ -65,7 +65,13 @@ from ugat_marl.scenarios import (
     sumo_program,
 )
 from ugat_marl.seeding import derive_seed
-from ugat_marl.simulation import launch_of, loops_document, one_line_message, read_loops, read_trips
+from ugat_marl.simulation import (
+    detectors_document,
+    launch_of,
+    one_line_message,
+    read_loops,
+    read_trips,
+)
 
 _DAYS = 64
 """Largest number of days of vehicles that are kept in memory."""
@@ -185,7 +191,7 @@ class Replay:
         begin = settings.begin_s + step * round((begin - settings.begin_s) / step)
         loops = directory / "loops.xml"
         signals = replay_document(scenario, period, begin)
-        detectors = loops_document(self._detectors, dict(self._network.lanes), loops)
+        detectors = detectors_document(self._detectors, dict(self._network.lanes), loops)
         scenario = replace(
             scenario,
             additional=(*scenario.additional, signals, detectors),

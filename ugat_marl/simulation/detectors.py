@@ -45,7 +45,7 @@ def standard_detectors(network: Network) -> tuple[Detector, ...]:
     )
 
 
-def loops_document(
+def detectors_document(
     detectors: Sequence[Detector], lanes: dict[str, Lane] | None, file: Path
 ) -> Document:
     """Return an additional file with the loops of the detectors, which write to `file`.
@@ -81,7 +81,7 @@ def read_loops(
 
     Args:
         file: SUMO's output.
-        detectors: The detectors of `loops_document`.
+        detectors: The detectors of `detectors_document`.
         begin_s: Begin, on the scenario's clock.
         end_s: End, on the scenario's clock.
 

@@ -55,7 +55,7 @@ from ugat_marl.scenarios import (
     draw_day,
 )
 from ugat_marl.seeding import derive_seed
-from ugat_marl.simulation import loops_document, read_loops, standard_detectors
+from ugat_marl.simulation import detectors_document, read_loops, standard_detectors
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def _renamed(scenario: Scenario, seed: int) -> Scenario:
 
 def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scenario:
     """Return the scenario with detectors, and with the other outputs that a recording needs."""
-    extra = [loops_document(street.detectors, None, directory / "loops.xml")]
+    extra = [detectors_document(street.detectors, None, directory / "loops.xml")]
     if street.watched:
         extra.append(switch_document(street.watched, directory / "signals.xml"))
     settings = scenario.settings
