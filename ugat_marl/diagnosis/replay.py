@@ -69,7 +69,7 @@ from ugat_marl.simulation import (
     detectors_document,
     launch_of,
     one_line_message,
-    read_loops,
+    read_passages,
     read_trips,
 )
 
@@ -207,7 +207,7 @@ class Replay:
             kind = SimulatorCrashed if done.returncode < 0 else SimulatorError
             raise kind(f"SUMO failed in a replay of period {period.id!r}: {said}")
         trips = read_trips(directory / "trips.xml")
-        seen = read_loops(loops, self._detectors, period.begin_s, period.end_s)
+        seen = read_passages(loops, self._detectors, period.begin_s, period.end_s)
         travel = float(np.mean(trips.travel_time_s)) if len(trips.travel_time_s) else np.nan
         return Day(replace(period, passages=seen), travel)
 

@@ -2,7 +2,7 @@ from .channel import Channel as Channel
 from .channel import ChannelClosed as ChannelClosed
 from .channel import Message as Message
 from .detectors import detectors_document as detectors_document
-from .detectors import read_loops as read_loops
+from .detectors import read_passages as read_passages
 from .detectors import standard_detectors as standard_detectors
 from .host import Host as Host
 from .host import Worker as Worker

@@ -74,7 +74,7 @@ def detectors_document(
     return Document("loops.add.xml", None, xml_bytes(root))
 
 
-def read_loops(
+def read_passages(
     file: Path, detectors: Sequence[Detector], begin_s: float, end_s: float
 ) -> dict[str, Passages]:
     """Read the passages over detectors between two times; detectors without passages are left out.

@@ -55,7 +55,7 @@ from ugat_marl.scenarios import (
     draw_day,
 )
 from ugat_marl.seeding import derive_seed
-from ugat_marl.simulation import detectors_document, read_loops, standard_detectors
+from ugat_marl.simulation import detectors_document, read_passages, standard_detectors
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
         commanded = play(
             watched, street.policy, derive_seed(street.seed, "record", index, "simulation"), stop
         )
-        passages = read_loops(directory / "loops.xml", street.detectors, begin, end)
+        passages = read_passages(directory / "loops.xml", street.detectors, begin, end)
         shown = switches(directory / "signals.xml", end) if street.watched else {}
         vehicles = None
         if street.lanes or street.trajectories:
