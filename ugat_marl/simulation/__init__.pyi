@@ -15,7 +15,7 @@ from .simulator import SignalPlans as SignalPlans
 from .simulator import Simulator as Simulator
 from .simulator import VehiclePositions as VehiclePositions
 from .simulator import launch_of as launch_of
-from .simulator import simulates_here as simulates_here
+from .simulator import simulation_runs_here as simulation_runs_here
 from .snapshots import HALTING_MPS as HALTING_MPS
 from .snapshots import Snapshot as Snapshot
 from .snapshots import Trips as Trips

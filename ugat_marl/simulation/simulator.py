@@ -465,6 +465,6 @@ def _errors_of(directory: Path) -> str:
     return one_line_message(path.read_text(errors="replace")) if path.exists() else ""
 
 
-def simulates_here() -> bool:
+def simulation_runs_here() -> bool:
     """Return True if libsumo runs a simulation in this process."""
     return bool(libsumo.simulation.isLoaded())

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 
 from ugat_marl.envs import AnyParallelEnv
-from ugat_marl.simulation import simulates_here
+from ugat_marl.simulation import simulation_runs_here
 from ugat_marl.testing.episodes import (
     EnvironmentCase,
     MakeEnv,
@@ -550,10 +550,10 @@ DECLARED = (
 
 def nothing_starts_before_reset(case: EnvironmentCase) -> None:
     """The constructor of an environment starts neither SUMO nor a process."""
-    before, simulated = descendants(), simulates_here()
+    before, simulated = descendants(), simulation_runs_here()
     case.make()
     require(
-        simulates_here() == simulated and descendants() <= before,
+        simulation_runs_here() == simulated and descendants() <= before,
         "making the environment started a simulation or a process; start it in reset(), since "
         "environments are made to look at their spaces, and copied to other processes",
     )
