@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-START = "from ugat_marl.simulation.worker import end_with_input; end_with_input(); "
+START = "from ugat_marl.simulation.worker import exit_when_input_ends; exit_when_input_ends(); "
 
 
 def started(program: str) -> subprocess.Popen[bytes]:

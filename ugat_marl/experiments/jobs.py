@@ -42,7 +42,7 @@ from ugat_marl.grounding import Probe, RandomDelays, RecordedWorld, SimulatedWor
 from ugat_marl.parallel import Workers, in_this_process
 from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory
 from ugat_marl.progress import Bars, Reporter
-from ugat_marl.simulation import end_with_input
+from ugat_marl.simulation import exit_when_input_ends
 
 JOB, SCORES, POLICY, DIRECT_POLICY, LEARNER, RULE_FILE = (
     "job.json", "scores.json", "policy.pt", "direct-policy.pt", "learner.pt", "rule.txt",
@@ -509,7 +509,7 @@ def _world(job: Job) -> AnyParallelEnv:
 
 def main(folder: Path) -> int:
     """Perform the job in a folder and return the exit code."""
-    end_with_input()
+    exit_when_input_ends()
     remove_temporaries(folder)
     try:
         job = TypeAdapter(Job).validate_json((folder / JOB).read_bytes())

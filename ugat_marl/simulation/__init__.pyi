@@ -20,4 +20,4 @@ from .snapshots import HALTING_MPS as HALTING_MPS
 from .snapshots import Snapshot as Snapshot
 from .snapshots import Trips as Trips
 from .trips import read_trips as read_trips
-from .worker import end_with_input as end_with_input
+from .worker import exit_when_input_ends as exit_when_input_ends

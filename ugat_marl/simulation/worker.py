@@ -35,7 +35,7 @@ _MOST_DESCRIPTORS = 8
 """Largest number of open files with an order."""
 
 
-def end_with_input() -> None:
+def exit_when_input_ends() -> None:
     """End this process with exit code 1 when standard input ends, because its starter has ended.
 
     The thread reads the descriptor, not `sys.stdin`: the lock of `sys.stdin` could block the exit.
