@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AgentSet, parallel_env
 from ugat_marl.errors import OptionError, SimulatorError
-from ugat_marl.field import DecisionLog, FieldLoop, LaneCount, Limits, Site
+from ugat_marl.field import DecisionLog, FieldLoop, LaneCount, Site, TrustLimits
 from ugat_marl.field.safety import fixed_time
 from ugat_marl.field.watchdog import Watchdog
 from ugat_marl.policies import DQN
@@ -29,7 +29,7 @@ GRID = load_scenario("grid2x2-v1")
 SITE = Site.of(GRID, {})
 LIGHT = SITE.lights[0]
 LANE = SITE.sees[LIGHT][0]
-QUICK = Limits(return_after=2)
+QUICK = TrustLimits(return_after=2)
 Counts = dict[str, LaneCount]
 
 
@@ -156,7 +156,7 @@ def test_a_count_that_can_be_believed_is_used(count: LaneCount) -> None:
 def test_standing_vehicles_are_checked_where_the_policy_sees_them() -> None:
     site = Site.of(GRID, {"observation": "queue"})
     for halting in (math.nan, -1.0, 2.5):
-        watchdog = Watchdog({LANE: 10.0}, site.halting, Limits())
+        watchdog = Watchdog({LANE: 10.0}, site.halting, TrustLimits())
         (reason,) = watchdog.faults({LANE: LaneCount(0.0, 2.0, halting)}, 0.0).values()
         assert reason.startswith("absurd: ")
     assert not watchdog.faults({LANE: LaneCount(0.0, 2.0, 2.0)}, 0.0)
@@ -236,7 +236,7 @@ TWO = {"a": 20.0, "b": 20.0}
 
 
 def test_a_count_frozen_while_others_move_is_found_after_its_time_and_not_before() -> None:
-    watchdog = Watchdog(TWO, False, Limits(frozen_after_s=300))
+    watchdog = Watchdog(TWO, False, TrustLimits(frozen_after_s=300))
     found = held(watchdog, lambda now: {"a": 3.0 if now >= 100 else now % 30, "b": now % 40 / 4})
     assert min(found) == 410
     assert max(found) == 3590
@@ -248,29 +248,29 @@ def test_only_green_counts_against_a_queue_that_stands() -> None:
     def counts(now: int) -> dict[str, float]:
         return {"a": 3.0, "b": now % 40 / 4}
 
-    starved = Watchdog(TWO, False, Limits(frozen_after_s=300))
+    starved = Watchdog(TWO, False, TrustLimits(frozen_after_s=300))
     assert not held(starved, counts, lambda now: "a")
-    half = Watchdog(TWO, False, Limits(frozen_after_s=300))
+    half = Watchdog(TWO, False, TrustLimits(frozen_after_s=300))
     found = held(half, counts, lambda now: "a" if now % 20 else "")
     assert min(found) == 620
 
 
 def test_a_full_lane_may_stand_for_long() -> None:
-    assert not held(Watchdog(TWO, False, Limits()), lambda now: {"a": 16.0, "b": now % 40 / 4})
-    assert held(Watchdog(TWO, False, Limits()), lambda now: {"a": 15.0, "b": now % 40 / 4})
+    assert not held(Watchdog(TWO, False, TrustLimits()), lambda now: {"a": 16.0, "b": now % 40 / 4})
+    assert held(Watchdog(TWO, False, TrustLimits()), lambda now: {"a": 15.0, "b": now % 40 / 4})
 
 
 def test_a_feed_frozen_as_a_whole_is_found_even_at_red_and_an_empty_night_is_not() -> None:
-    watchdog = Watchdog(TWO, False, Limits(frozen_after_s=300))
+    watchdog = Watchdog(TWO, False, TrustLimits(frozen_after_s=300))
     found = held(watchdog, lambda now: {"a": 3.0, "b": 0.0}, lambda now: "ab")
     assert min(found) == 310
     assert found[310]["a"] == "frozen: no count has changed for 310 s, as on lane a"
     assert set(found[310]) == {"a", "b"}
-    assert not held(Watchdog(TWO, False, Limits()), lambda now: {"a": 0.0, "b": 0.0})
+    assert not held(Watchdog(TWO, False, TrustLimits()), lambda now: {"a": 0.0, "b": 0.0})
 
 
 def test_a_lane_that_comes_back_with_the_count_it_had_is_not_frozen() -> None:
-    watchdog = Watchdog(TWO, False, Limits(frozen_after_s=300))
+    watchdog = Watchdog(TWO, False, TrustLimits(frozen_after_s=300))
     found = held(
         watchdog,
         lambda now: {"b": now % 40 / 4} | ({} if 200 <= now < 1000 else {"a": 3.0}),
@@ -288,7 +288,7 @@ def test_the_loop_tells_which_lanes_had_green() -> None:
     for lane, faulty in ((served, True), (starved, False)):
         street = MadeUpStreet()
         policy = Scripted(lambda actions: dict.fromkeys(actions, 0))
-        loop = FieldLoop(SITE, policy, street, Limits(frozen_after_s=100))
+        loop = FieldLoop(SITE, policy, street, TrustLimits(frozen_after_s=100))
         street.spoil = lambda counts, lane=lane, street=street: {
             **counts,
             lane: LaneCount(street.time_s, 4.0),
@@ -299,7 +299,7 @@ def test_the_loop_tells_which_lanes_had_green() -> None:
 
 
 def test_a_lane_that_fell_silent_is_found_but_not_one_that_never_counted() -> None:
-    watchdog = Watchdog(dict.fromkeys("abc", 20.0), False, Limits(silent_after_s=1800))
+    watchdog = Watchdog(dict.fromkeys("abc", 20.0), False, TrustLimits(silent_after_s=1800))
     found = held(
         watchdog, lambda now: {"a": 1.0 if now < 100 else 0.0, "b": 0.0, "c": float(now % 40)}
     )
@@ -308,7 +308,7 @@ def test_a_lane_that_fell_silent_is_found_but_not_one_that_never_counted() -> No
 
 
 def test_a_night_in_which_nobody_comes_any_more_is_no_fault() -> None:
-    watchdog = Watchdog(TWO, False, Limits(silent_after_s=600))
+    watchdog = Watchdog(TWO, False, TrustLimits(silent_after_s=600))
     assert not held(watchdog, lambda now: {"a": now % 40 / 4 if now < 900 else 0.0, "b": 0.0})
 
 
@@ -379,7 +379,7 @@ def test_a_slow_policy_misses_its_deadline_and_is_not_asked_while_it_is_busy() -
 
 def test_slow_detectors_leave_the_policy_no_time() -> None:
     street = MadeUpStreet()
-    loop = FieldLoop(SITE, Scripted(), street, Limits(answer_ms=50, reserve_ms=10))
+    loop = FieldLoop(SITE, Scripted(), street, TrustLimits(answer_ms=50, reserve_ms=10))
 
     def slow(counts: Counts) -> Counts:
         time.sleep(0.045)
@@ -402,7 +402,7 @@ def test_lights_keep_green_and_clearance_through_every_hand_over(
     script: list[tuple[str, int]], shift: int
 ) -> None:
     street, policy = MadeUpStreet(), Scripted()
-    loop = FieldLoop(SITE, policy, street, Limits(return_after=shift % 3, green_s=10.0))
+    loop = FieldLoop(SITE, policy, street, TrustLimits(return_after=shift % 3, green_s=10.0))
     for fault, choice in script:
         street.spoil = {"missing": replaced(None), "all": failing}.get(fault, lambda c: c)
         policy.does = (
@@ -577,7 +577,7 @@ def test_policies_the_field_cannot_serve_are_refused(options: dict[str, Any], sa
 )
 def test_impossible_limits_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(OptionError):
-        Limits(**wrong)
+        TrustLimits(**wrong)
 
 
 def test_a_street_without_one_of_the_lights_is_refused() -> None:

@@ -19,11 +19,11 @@ from ugat_marl.field import (
     CountSource,
     DecisionLog,
     FieldLoop,
-    Limits,
     Site,
     StartedSumo,
     Summary,
     TraciStreet,
+    TrustLimits,
 )
 from ugat_marl.progress import Bars
 
@@ -67,7 +67,7 @@ class Field:
     seconds: LengthS = None
     detectors: CountSource = "lanes"
     log: Log = None
-    limits: Limits = field(default_factory=Limits)
+    limits: TrustLimits = field(default_factory=TrustLimits)
 
     def run(self, console: Console) -> int:
         """Drive the lights and print a summary."""

@@ -8,4 +8,4 @@ from .street import LaneCount as LaneCount
 from .street import StartedSumo as StartedSumo
 from .street import Street as Street
 from .street import TraciStreet as TraciStreet
-from .watchdog import Limits as Limits
+from .watchdog import TrustLimits as TrustLimits

@@ -24,7 +24,7 @@ from ugat_marl.field.answering import Answering, Late, NoAnswer
 from ugat_marl.field.safety import Light, Trust, fixed_time, merged
 from ugat_marl.field.site import Site
 from ugat_marl.field.street import LaneCount, Street
-from ugat_marl.field.watchdog import Limits, Watchdog
+from ugat_marl.field.watchdog import TrustLimits, Watchdog
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import Policy
 from ugat_marl.scenarios import GREEN, Segment
@@ -164,11 +164,11 @@ class FieldLoop:
         site: Site,
         policy: Policy,
         street: Street,
-        limits: Limits | None = None,
+        limits: TrustLimits | None = None,
         log: DecisionLog | None = None,
     ) -> None:
         self._site, self._street, self._log = site, street, log
-        self._limits = limits = limits or Limits()
+        self._limits = limits = limits or TrustLimits()
         shown = street.shown()
         if lacking := [light for light in site.lights if light not in shown]:
             raise OptionError(f"the street has no traffic light {lacking[0]!r}; it has {[*shown]}")

@@ -15,7 +15,7 @@ _FULL = 0.8
 
 
 @dataclass(frozen=True)
-class Limits:
+class TrustLimits:
     """Limits beyond which counts and policy are not trusted.
 
     Attributes:
@@ -63,7 +63,7 @@ class Watchdog:
         limits: Limits of trust.
     """
 
-    def __init__(self, capacity: Mapping[str, float], halting: bool, limits: Limits) -> None:
+    def __init__(self, capacity: Mapping[str, float], halting: bool, limits: TrustLimits) -> None:
         self._capacity = capacity
         self._halting = halting
         self._limits = limits
