@@ -19,9 +19,9 @@ from ugat_marl.field import (
     CountSource,
     DecisionLog,
     FieldLoop,
+    LoopSummary,
     Site,
     StartedSumo,
-    Summary,
     TraciStreet,
     TrustLimits,
 )
@@ -105,7 +105,7 @@ class Field:
         return 0
 
 
-def _told(summary: Summary, lights: int) -> str:
+def _told(summary: LoopSummary, lights: int) -> str:
     low, high, most = (summary.latency_ms(q) for q in (0.5, 0.95, 1.0))
     reasons = ", ".join(f"{kind} {count}" for kind, count in summary.reasons.most_common())
     return (

@@ -1,7 +1,7 @@
 from .loop import Decision as Decision
 from .loop import DecisionLog as DecisionLog
 from .loop import FieldLoop as FieldLoop
-from .loop import Summary as Summary
+from .loop import LoopSummary as LoopSummary
 from .site import Site as Site
 from .street import CountSource as CountSource
 from .street import LaneCount as LaneCount

@@ -111,7 +111,7 @@ class DecisionLog:
 
 
 @dataclass
-class Summary:
+class LoopSummary:
     """Counts of a run: decisions, latencies, faults.
 
     Attributes:
@@ -181,12 +181,14 @@ class FieldLoop:
         self._trust = Trust(site.lights, limits.return_after)
         interval, clearance = site.decision_interval_s, site.timing.clearance_s
         self._plan = fixed_time(site.network, interval, clearance, limits.green_s)
-        self.summary = Summary()
+        self.summary = LoopSummary()
         self._answer = _answer_of(policy, site)
         self._asked = Answering()
         self._warm_up(policy)
 
-    def run(self, seconds: float, on_decision: Callable[[Decision], None] | None = None) -> Summary:
+    def run(
+        self, seconds: float, on_decision: Callable[[Decision], None] | None = None
+    ) -> LoopSummary:
         """Drive the street for `seconds`, rounded up to whole decisions.
 
         Raises:
