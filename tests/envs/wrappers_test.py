@@ -24,7 +24,13 @@ from ugat_marl.errors import ActionError, EpisodeError, OptionError
 from ugat_marl.policies import DQN
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.scenarios import Scenario
-from ugat_marl.testing import ToyTraffic, check_determinism, check_environment, failures, report
+from ugat_marl.testing import (
+    ToyTraffic,
+    check_determinism,
+    check_environment,
+    failed_checks,
+    report,
+)
 
 
 def stacked(env: Any) -> Any:
@@ -333,14 +339,14 @@ def test_a_wrapped_toy_conforms(wrapper: str) -> None:
         return ALL[wrapper](ToyTraffic())
 
     results = check_environment(make) + check_determinism(make)
-    assert not failures(results), report(results).plain
+    assert not failed_checks(results), report(results).plain
     api(make())
     api(masked_observation(make()))
 
 
 def test_masked_observations_conform_but_for_being_dictionaries() -> None:
     results = check_environment(lambda: masked_observation(together(ToyTraffic())))
-    assert {result.name for result in failures(results)} == VECTOR_RULES, report(results).plain
+    assert {result.name for result in failed_checks(results)} == VECTOR_RULES, report(results).plain
 
 
 @pytest.fixture(scope="module")
@@ -358,7 +364,7 @@ def test_a_wrapped_road_network_conforms(name: str, scenarios: dict[str, Scenari
         return together(ugat_marl.parallel_env(scenarios[name], duration_s=60))
 
     results = check_environment(make)
-    assert not failures(results), report(results).plain
+    assert not failed_checks(results), report(results).plain
     env = make()
     sizes = {(env.observation_space(a).shape, env.action_space(a).n) for a in env.possible_agents}
     assert len(sizes) == 1

@@ -18,7 +18,7 @@ from ugat_marl.envs import agent_indicator, pad_spaces
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform
 from ugat_marl.policies import Learner, NetworkPolicy, Policy, load_baseline
-from ugat_marl.testing import ToyTraffic, check_policy, failures
+from ugat_marl.testing import ToyTraffic, check_policy, failed_checks
 
 FILE = Path(__file__).resolve().parents[2] / "baselines" / "ippo.py"
 if not FILE.is_file():
@@ -308,7 +308,7 @@ def test_it_keeps_the_protocols_and_its_policies_conform(tmp_path: Path) -> None
     learner = IPPO(env, Config(**QUICK))
     policy = learner.learn(env, 1, 1)
     assert isinstance(learner, Learner) and isinstance(policy, Policy)
-    assert not failures(check_policy(policy, ToyTraffic))
+    assert not failed_checks(check_policy(policy, ToyTraffic))
     before = policy.parameters
     learner.learn(env, 1, 1)
     assert np.array_equal(policy.parameters, before)

@@ -30,7 +30,7 @@ from ugat_marl.policies import (
     load_baseline,
 )
 from ugat_marl.policies.learners.catalogue import baselines_folder
-from ugat_marl.testing import ToyTraffic, check_policy, failures
+from ugat_marl.testing import ToyTraffic, check_policy, failed_checks
 
 if not baselines_folder().is_dir():
     pytest.skip("baselines/ is neither here nor in the package", allow_module_level=True)
@@ -229,7 +229,7 @@ def test_it_keeps_the_protocols_and_its_policies_conform(name: str, tmp_path: Pa
     learner = made(name, env)
     policy = learner.learn(env, 1, 1)
     assert isinstance(learner, Learner) and isinstance(policy, Policy)
-    assert not failures(check_policy(policy, ToyTraffic))
+    assert not failed_checks(check_policy(policy, ToyTraffic))
     before = policy.parameters
     learner.learn(env, 6, 1)
     assert np.array_equal(policy.parameters, before)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import ugat_marl
-from ugat_marl.testing import DETERMINISM_CHECKS, ToyTraffic, check_determinism, failures
+from ugat_marl.testing import DETERMINISM_CHECKS, ToyTraffic, check_determinism, failed_checks
 from ugat_marl.testing.episodes import play, random_actions, require_same
 
 BROKEN: list[tuple[str, type[ToyTraffic]]] = []
@@ -134,12 +134,14 @@ def test_every_check_has_a_broken_environment() -> None:
 
 
 def test_the_toy_environment_passes() -> None:
-    assert not failures(check_determinism(ToyTraffic))
+    assert not failed_checks(check_determinism(ToyTraffic))
 
 
 @pytest.mark.parametrize("scenario", ["single-v1", "grid2x2-v1", "mixed-v1"])
 def test_the_suites_environments_pass(scenario: str) -> None:
-    assert not failures(check_determinism(lambda: ugat_marl.parallel_env(scenario, duration_s=150)))
+    assert not failed_checks(
+        check_determinism(lambda: ugat_marl.parallel_env(scenario, duration_s=150))
+    )
 
 
 def test_every_way_to_run_sumo_gives_the_same_episode() -> None:
@@ -157,7 +159,7 @@ def test_two_environments_in_one_process_are_caught() -> None:
     results = check_determinism(
         lambda: ugat_marl.parallel_env("single-v1", duration_s=100, simulator="inprocess")
     )
-    (failed,) = failures(results)
+    (failed,) = failed_checks(results)
     assert failed.name == "live_environments_are_independent"
     assert 'use simulator="process"' in failed.message
 

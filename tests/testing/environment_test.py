@@ -22,7 +22,7 @@ from ugat_marl.testing import (
     EnvironmentCase,
     ToyTraffic,
     check_environment,
-    failures,
+    failed_checks,
     report,
 )
 
@@ -501,7 +501,7 @@ def test_every_check_has_a_broken_environment() -> None:
 
 
 def test_the_toy_environment_passes() -> None:
-    assert not failures(check_environment(ToyTraffic))
+    assert not failed_checks(check_environment(ToyTraffic))
     parallel_api_test(ToyTraffic(), num_cycles=30)
 
 
@@ -518,7 +518,9 @@ def test_the_toy_environment_loses_no_vehicle() -> None:
 
 @pytest.mark.parametrize("scenario", ["single-v1", "grid2x2-v1", "mixed-v1"])
 def test_the_suites_environments_pass(scenario: str) -> None:
-    assert not failures(check_environment(lambda: ugat_marl.parallel_env(scenario, duration_s=150)))
+    assert not failed_checks(
+        check_environment(lambda: ugat_marl.parallel_env(scenario, duration_s=150))
+    )
 
 
 @pytest.mark.parametrize(
@@ -534,7 +536,7 @@ def test_the_suites_environments_pass(scenario: str) -> None:
 )
 def test_the_options_of_the_suites_environments_pass(options: dict[str, Any]) -> None:
     scenario = scenario_in_domain(ugat_marl.load_scenario("mixed-v1"), options.pop("domain", "sim"))
-    assert not failures(
+    assert not failed_checks(
         check_environment(lambda: ugat_marl.parallel_env(scenario, duration_s=60, **options))
     )
 
@@ -548,7 +550,7 @@ def grounded() -> GroundedEnv:
 
 
 def test_a_grounded_environment_passes() -> None:
-    assert not failures(check_environment(grounded))
+    assert not failed_checks(check_environment(grounded))
 
 
 def test_one_check_can_be_made_alone() -> None:

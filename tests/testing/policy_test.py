@@ -10,7 +10,7 @@ import pytest
 
 import ugat_marl
 from ugat_marl.policies import DQN, RULE_NAMES, make_rule
-from ugat_marl.testing import POLICY_CHECKS, ToyTraffic, check_policy, failures
+from ugat_marl.testing import POLICY_CHECKS, ToyTraffic, check_policy, failed_checks
 
 BROKEN: list[tuple[str, type[Good]]] = []
 
@@ -183,7 +183,7 @@ def test_every_check_has_a_broken_policy() -> None:
 
 
 def test_a_good_policy_passes() -> None:
-    assert not failures(check_policy(Good(), ToyTraffic))
+    assert not failed_checks(check_policy(Good(), ToyTraffic))
 
 
 def test_what_a_failing_policy_does_not_show_is_not_checked() -> None:
@@ -199,8 +199,10 @@ def test_the_controllers_pass(name: str) -> None:
     env = ugat_marl.parallel_env(scenario, **options)
     options |= make_rule(name, env).env_options
     policy = make_rule(name, ugat_marl.parallel_env(scenario, **options))
-    assert not failures(check_policy(policy, lambda: ugat_marl.parallel_env(scenario, **options)))
+    assert not failed_checks(
+        check_policy(policy, lambda: ugat_marl.parallel_env(scenario, **options))
+    )
 
 
 def test_a_learned_policy_passes() -> None:
-    assert not failures(check_policy(DQN.of(ToyTraffic(), seed=2).policy(), ToyTraffic))
+    assert not failed_checks(check_policy(DQN.of(ToyTraffic(), seed=2).policy(), ToyTraffic))

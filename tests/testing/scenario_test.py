@@ -18,7 +18,7 @@ from ugat_marl.testing import (
     SCENARIO_CHECKS,
     ScenarioCase,
     check_scenario,
-    failures,
+    failed_checks,
     report,
     run_checks,
 )
@@ -186,7 +186,7 @@ def test_every_check_has_a_broken_scenario() -> None:
 
 @pytest.mark.parametrize("name", dict(shipped_scenarios()))
 def test_the_shipped_scenarios_pass(name: str) -> None:
-    assert not failures(check_scenario(name))
+    assert not failed_checks(check_scenario(name))
 
 
 def test_an_unknown_scenario_is_one_failure_with_its_nearest_name() -> None:

@@ -34,7 +34,7 @@ from ugat_marl.testing import (
     check_determinism,
     check_environment,
     check_scenario,
-    failures,
+    failed_checks,
     report,
 )
 
@@ -129,7 +129,7 @@ class ScenarioCheck:
                 results += check()
                 advance()
         console.print(report(results))
-        return 1 if failures(results) else 0
+        return 1 if failed_checks(results) else 0
 
 
 def show(

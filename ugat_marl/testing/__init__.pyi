@@ -11,7 +11,7 @@ from .policies import check_policy as check_policy
 from .results import ConformanceError as ConformanceError
 from .results import NotChecked as NotChecked
 from .results import Result as Result
-from .results import failures as failures
+from .results import failed_checks as failed_checks
 from .results import report as report
 from .results import run_checks as run_checks
 from .scenarios import SCENARIO_CHECKS as SCENARIO_CHECKS

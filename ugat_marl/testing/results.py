@@ -101,7 +101,7 @@ def require(condition: object, message: str) -> None:
         raise ConformanceError(message)
 
 
-def failures(results: Sequence[Result]) -> list[Result]:
+def failed_checks(results: Sequence[Result]) -> list[Result]:
     """Return the checks that did not pass, including those that could not be made."""
     return [result for result in results if not result.passed]
 
