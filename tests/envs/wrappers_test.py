@@ -28,8 +28,8 @@ from ugat_marl.testing import (
     ToyTraffic,
     check_determinism,
     check_environment,
+    check_report,
     failed_checks,
-    report,
 )
 
 
@@ -339,14 +339,16 @@ def test_a_wrapped_toy_conforms(wrapper: str) -> None:
         return ALL[wrapper](ToyTraffic())
 
     results = check_environment(make) + check_determinism(make)
-    assert not failed_checks(results), report(results).plain
+    assert not failed_checks(results), check_report(results).plain
     api(make())
     api(masked_observation(make()))
 
 
 def test_masked_observations_conform_but_for_being_dictionaries() -> None:
     results = check_environment(lambda: masked_observation(together(ToyTraffic())))
-    assert {result.name for result in failed_checks(results)} == VECTOR_RULES, report(results).plain
+    assert {result.name for result in failed_checks(results)} == VECTOR_RULES, check_report(
+        results
+    ).plain
 
 
 @pytest.fixture(scope="module")
@@ -364,7 +366,7 @@ def test_a_wrapped_road_network_conforms(name: str, scenarios: dict[str, Scenari
         return together(ugat_marl.parallel_env(scenarios[name], duration_s=60))
 
     results = check_environment(make)
-    assert not failed_checks(results), report(results).plain
+    assert not failed_checks(results), check_report(results).plain
     env = make()
     sizes = {(env.observation_space(a).shape, env.action_space(a).n) for a in env.possible_agents}
     assert len(sizes) == 1

@@ -23,7 +23,7 @@ from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.policies import DQN, NetworkPolicy, export_policy
 from ugat_marl.policies.export import FORMATS, NumpyPolicy, layers_of
 from ugat_marl.policies.learners.dqn import DQNConfig
-from ugat_marl.testing import ToyTraffic, check_policy, failed_checks, report
+from ugat_marl.testing import ToyTraffic, check_policy, check_report, failed_checks
 
 PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "export.md").read_text(encoding="utf-8")
 AGENTS = AgentSet(("a_0", "b_0", "a_1", "c_0"), (7, 5, 7, 2), (3, 2, 3, 6))
@@ -169,7 +169,7 @@ def test_an_exported_policy_is_a_policy(tmp_path: Path) -> None:
     policy.env_options = {}
     loaded = NumpyPolicy.load(exported(policy, ".npz", tmp_path))
     results = check_policy(loaded, ToyTraffic)
-    assert not failed_checks(results), report(results).plain
+    assert not failed_checks(results), check_report(results).plain
 
 
 def test_numpy_policies_do_not_load_torch(tmp_path: Path) -> None:

@@ -22,8 +22,8 @@ from ugat_marl.testing import (
     EnvironmentCase,
     ToyTraffic,
     check_environment,
+    check_report,
     failed_checks,
-    report,
 )
 
 BROKEN: list[tuple[str, type[ToyTraffic]]] = []
@@ -583,7 +583,7 @@ def test_an_episode_without_end_is_given_up() -> None:
 
 def test_the_report_names_what_failed() -> None:
     results = check_environment(dict(BROKEN)["values_are_plain"])
-    text = report(results).plain
+    text = check_report(results).plain
     assert "FAILED  values are plain\n          after step" in text
     assert text.endswith(f"{len(results) - 1} of {len(results)} checks passed")
     assert os.linesep not in results[0].message

@@ -17,9 +17,9 @@ from ugat_marl.scenarios import Network, Scenario, shipped_scenarios
 from ugat_marl.testing import (
     SCENARIO_CHECKS,
     ScenarioCase,
+    check_report,
     check_scenario,
     failed_checks,
-    report,
     run_checks,
 )
 
@@ -192,4 +192,4 @@ def test_the_shipped_scenarios_pass(name: str) -> None:
 def test_an_unknown_scenario_is_one_failure_with_its_nearest_name() -> None:
     results = check_scenario("grid2x2")
     assert [result.passed for result in results].count(False) == 1
-    assert "Did you mean 'grid2x2-v1'?" in report(results).plain
+    assert "Did you mean 'grid2x2-v1'?" in check_report(results).plain

@@ -33,9 +33,9 @@ from ugat_marl.testing import (
     Result,
     check_determinism,
     check_environment,
+    check_report,
     check_scenario,
     failed_checks,
-    report,
 )
 
 CONFORMANCE_S = 300.0
@@ -128,7 +128,7 @@ class ScenarioCheck:
             ):
                 results += check()
                 advance()
-        console.print(report(results))
+        console.print(check_report(results))
         return 1 if failed_checks(results) else 0
 
 

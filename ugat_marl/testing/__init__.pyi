@@ -11,8 +11,8 @@ from .policies import check_policy as check_policy
 from .results import ConformanceError as ConformanceError
 from .results import NotChecked as NotChecked
 from .results import Result as Result
+from .results import check_report as check_report
 from .results import failed_checks as failed_checks
-from .results import report as report
 from .results import run_checks as run_checks
 from .scenarios import SCENARIO_CHECKS as SCENARIO_CHECKS
 from .scenarios import ScenarioCase as ScenarioCase

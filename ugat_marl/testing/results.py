@@ -106,7 +106,7 @@ def failed_checks(results: Sequence[Result]) -> list[Result]:
     return [result for result in results if not result.passed]
 
 
-def report(results: Sequence[Result]) -> Text:
+def check_report(results: Sequence[Result]) -> Text:
     """Return one line per check and a count, for `rich` to print (`.plain` is the text)."""
     words = {
         True: ("ok     ", "green"),
