@@ -30,7 +30,7 @@ from ugat_marl.experiments import (
 from ugat_marl.progress import Bars, Silent
 from ugat_marl.scenarios import SHORT_LANE_M, IntersectionFacts, Survey, survey
 from ugat_marl.testing import (
-    Result,
+    CheckResult,
     check_determinism,
     check_environment,
     check_report,
@@ -119,7 +119,7 @@ class ScenarioCheck:
             return parallel_env(scenario, self.domain, duration_s=length_s, **options)
 
         make()
-        results: list[Result] = []
+        results: list[CheckResult] = []
         with Bars(console).task(f"checking {scenario.id}", 3) as advance:
             for check in (
                 lambda: check_scenario(self.scenario),

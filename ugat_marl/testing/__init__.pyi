@@ -8,9 +8,9 @@ from .episodes import Moment as Moment
 from .policies import POLICY_CHECKS as POLICY_CHECKS
 from .policies import PolicyCase as PolicyCase
 from .policies import check_policy as check_policy
+from .results import CheckResult as CheckResult
 from .results import ConformanceError as ConformanceError
 from .results import NotChecked as NotChecked
-from .results import Result as Result
 from .results import check_report as check_report
 from .results import failed_checks as failed_checks
 from .results import run_checks as run_checks

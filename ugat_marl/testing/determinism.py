@@ -15,7 +15,7 @@ from ugat_marl.testing.episodes import (
     replaying,
     require_same,
 )
-from ugat_marl.testing.results import ConformanceError, Result, require, run_checks
+from ugat_marl.testing.results import CheckResult, ConformanceError, require, run_checks
 
 _SEED_ALL = "draw every random number, SUMO's too, from the seed given to reset()"
 
@@ -134,7 +134,7 @@ DETERMINISM_CHECKS = (
 """All checks of determinism; each takes an `EnvironmentCase`."""
 
 
-def check_determinism(make_env: MakeEnv, seed: int = 1) -> list[Result]:
+def check_determinism(make_env: MakeEnv, seed: int = 1) -> list[CheckResult]:
     """Check that episodes are reproducible to the bit.
 
     The checks play about a dozen whole episodes, so use an environment with short episodes.

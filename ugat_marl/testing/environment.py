@@ -24,7 +24,14 @@ from ugat_marl.testing.episodes import (
     proceed,
     random_actions,
 )
-from ugat_marl.testing.results import ConformanceError, Listening, Result, require, run_checks, said
+from ugat_marl.testing.results import (
+    CheckResult,
+    ConformanceError,
+    Listening,
+    require,
+    run_checks,
+    said,
+)
 
 COMMON = "__common__"
 """The only key of infos that is not an agent."""
@@ -677,7 +684,7 @@ ENVIRONMENT_CHECKS = (an_episode_runs, *LIFE, *DECLARED, *BEHAVIOUR)
 """All checks of an environment; each takes an `EnvironmentCase`."""
 
 
-def check_environment(make_env: MakeEnv, seed: int = 1) -> list[Result]:
+def check_environment(make_env: MakeEnv, seed: int = 1) -> list[CheckResult]:
     """Check an environment: one of the suite, a wrapped one, or a third-party one.
 
     The checks play about three whole episodes, so use an environment with short episodes.

@@ -13,7 +13,7 @@ import numpy as np
 from ugat_marl.policies import Policy
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.testing.episodes import EnvironmentCase, MakeEnv, Moment, allowed_actions, different
-from ugat_marl.testing.results import ConformanceError, NotChecked, Result, require, run_checks
+from ugat_marl.testing.results import CheckResult, ConformanceError, NotChecked, require, run_checks
 
 Answers = list[Mapping[str, Any]]
 
@@ -242,7 +242,7 @@ POLICY_CHECKS = (
 """All checks of a policy; each takes a `PolicyCase`."""
 
 
-def check_policy(policy: Policy, make_env: MakeEnv, seed: int = 1) -> list[Result]:
+def check_policy(policy: Policy, make_env: MakeEnv, seed: int = 1) -> list[CheckResult]:
     """Check a policy.
 
     Args:

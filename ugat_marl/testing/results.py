@@ -23,7 +23,7 @@ class NotChecked(ConformanceError):
 
 
 @dataclass(frozen=True)
-class Result:
+class CheckResult:
     """Outcome of one check.
 
     Attributes:
@@ -70,19 +70,19 @@ class Listening:
         return isinstance(error, Exception)
 
 
-def run_checks(checks: Sequence[Callable[[AnyCase], None]], case: AnyCase) -> list[Result]:
+def run_checks(checks: Sequence[Callable[[AnyCase], None]], case: AnyCase) -> list[CheckResult]:
     """Run every check on one case, even if earlier ones failed, and return their results."""
-    results: list[Result] = []
+    results: list[CheckResult] = []
     for check in checks:
         with Listening() as heard:
             check(case)
         case.tidy()
         if heard.error is None:
-            results.append(Result(check.__name__, True))
+            results.append(CheckResult(check.__name__, True))
         elif isinstance(heard.error, NotChecked):
-            results.append(Result(check.__name__, None, str(heard.error)))
+            results.append(CheckResult(check.__name__, None, str(heard.error)))
         else:
-            results.append(Result(check.__name__, False, said(heard.error)))
+            results.append(CheckResult(check.__name__, False, said(heard.error)))
     return results
 
 
@@ -101,12 +101,12 @@ def require(condition: object, message: str) -> None:
         raise ConformanceError(message)
 
 
-def failed_checks(results: Sequence[Result]) -> list[Result]:
+def failed_checks(results: Sequence[CheckResult]) -> list[CheckResult]:
     """Return the checks that did not pass, including those that could not be made."""
     return [result for result in results if not result.passed]
 
 
-def check_report(results: Sequence[Result]) -> Text:
+def check_report(results: Sequence[CheckResult]) -> Text:
     """Return one line per check and a count, for `rich` to print (`.plain` is the text)."""
     words = {
         True: ("ok     ", "green"),

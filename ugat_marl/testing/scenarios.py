@@ -22,7 +22,7 @@ from ugat_marl.scenarios import (
     read_scenario,
 )
 from ugat_marl.testing.episodes import begin, proceed, random_actions
-from ugat_marl.testing.results import NotChecked, Result, require, run_checks
+from ugat_marl.testing.results import CheckResult, NotChecked, require, run_checks
 
 Change = Callable[[Scenario, str], Scenario]
 """Function that puts a scenario into a domain."""
@@ -263,7 +263,7 @@ SCENARIO_CHECKS = (
 """All checks of a scenario; each takes a `ScenarioCase`."""
 
 
-def check_scenario(name: str | Path | Scenario, seed: int = 1) -> list[Result]:
+def check_scenario(name: str | Path | Scenario, seed: int = 1) -> list[CheckResult]:
     """Check a scenario.
 
     The checks simulate a tenth of an episode in `sim` and one decision in each of V1 to V4.
