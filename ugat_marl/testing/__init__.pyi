@@ -4,7 +4,7 @@ from .environment import ENVIRONMENT_CHECKS as ENVIRONMENT_CHECKS
 from .environment import check_environment as check_environment
 from .episodes import EnvironmentCase as EnvironmentCase
 from .episodes import Episode as Episode
-from .episodes import Moment as Moment
+from .episodes import StepReturn as StepReturn
 from .policies import POLICY_CHECKS as POLICY_CHECKS
 from .policies import PolicyCase as PolicyCase
 from .policies import check_policy as check_policy

@@ -7,7 +7,7 @@ from ugat_marl.testing.episodes import (
     EnvironmentCase,
     Episode,
     MakeEnv,
-    Moment,
+    StepReturn,
     begin,
     different,
     proceed,
@@ -76,7 +76,7 @@ def live_environments_are_independent(case: EnvironmentCase) -> None:
 def _in_lock_step(case: EnvironmentCase, seeds: tuple[int, ...]) -> list[Episode]:
     envs = [case.make() for _ in seeds]
     chosen = [random_actions(case.seed) for _ in seeds]
-    moments: list[list[Moment]] = [
+    moments: list[list[StepReturn]] = [
         [begin(env, seed)] for env, seed in zip(envs, seeds, strict=True)
     ]
     while any(env.agents for env in envs):

@@ -18,7 +18,7 @@ from ugat_marl.simulation import simulation_runs_here
 from ugat_marl.testing.episodes import (
     EnvironmentCase,
     MakeEnv,
-    Moment,
+    StepReturn,
     begin,
     different,
     proceed,
@@ -179,12 +179,12 @@ def executed_actions_are_told(case: EnvironmentCase) -> None:
             )
 
 
-def _told(case: EnvironmentCase, moment: Moment) -> list[str]:
+def _told(case: EnvironmentCase, moment: StepReturn) -> list[str]:
     """Return the agents that have an info; another check finds agents without one."""
     return [agent for agent in case.fresh.possible_agents if agent in moment.infos]
 
 
-def _entry(moment: Moment, agent: str, key: str) -> Any:
+def _entry(moment: StepReturn, agent: str, key: str) -> Any:
     info = moment.infos.get(agent)
     return info.get(key) if isinstance(info, Mapping) else None
 
@@ -240,7 +240,7 @@ def values_are_plain(case: EnvironmentCase) -> None:
 
 def results_are_fresh(case: EnvironmentCase) -> None:
     """The environment neither returns an object twice nor changes it later."""
-    previous: Moment | None = None
+    previous: StepReturn | None = None
     for moment, when in _moments(case):
         for name, part in moment.given.items():
             where = different(moment.parts[name], part)
@@ -294,7 +294,7 @@ def _shares_an_array(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     )
 
 
-def _moments(case: EnvironmentCase) -> Iterator[tuple[Moment, str]]:
+def _moments(case: EnvironmentCase) -> Iterator[tuple[StepReturn, str]]:
     for index, moment in enumerate(case.episode.moments):
         yield moment, _when(index)
 

@@ -25,7 +25,7 @@ PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
 
 
 @dataclass(frozen=True)
-class Moment:
+class StepReturn:
     """Values that `reset` or one `step` returned.
 
     Attributes:
@@ -60,7 +60,7 @@ class Episode:
         scores: Scores that the environment gave; None if it has none.
     """
 
-    moments: tuple[Moment, ...]
+    moments: tuple[StepReturn, ...]
     scores: Any = None
 
     @property
@@ -189,20 +189,20 @@ def play(
     return Episode(tuple(moments), scores() if callable(scores) else None)
 
 
-def begin(env: AnyParallelEnv, seed: int | None) -> Moment:
+def begin(env: AnyParallelEnv, seed: int | None) -> StepReturn:
     """Reset the environment and return the moment."""
     given = env.reset() if seed is None else env.reset(seed=seed)
     return _moment(env, ("observations", "infos"), given, None)
 
 
-def proceed(env: AnyParallelEnv, actions: Actions) -> Moment:
+def proceed(env: AnyParallelEnv, actions: Actions) -> StepReturn:
     """Step the environment and return the moment."""
     return _moment(env, PARTS, env.step(dict(actions)), dict(actions))
 
 
 def _moment(
     env: AnyParallelEnv, names: tuple[str, ...], given: Any, actions: Actions | None
-) -> Moment:
+) -> StepReturn:
     what = "reset" if actions is None else "step"
     if not isinstance(given, tuple) or len(given) != len(names):
         raise ConformanceError(f"{what}() must return the tuple ({', '.join(names)})")
@@ -212,10 +212,10 @@ def _moment(
                 f"{what}() returned {name} as {type(part).__name__}; return a dict by agent"
             )
     parts = dict(zip(names, given, strict=True))
-    return Moment(copy.deepcopy(parts), parts, tuple(env.agents), actions)
+    return StepReturn(copy.deepcopy(parts), parts, tuple(env.agents), actions)
 
 
-def _all_over(moment: Moment) -> bool:
+def _all_over(moment: StepReturn) -> bool:
     """Return True if all agents are done, even if the environment still lists them."""
     ended, cut = moment.parts["terminations"], moment.parts["truncations"]
     return all(ended.get(agent) or cut.get(agent) for agent in moment.agents)

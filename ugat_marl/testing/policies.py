@@ -12,7 +12,13 @@ import numpy as np
 
 from ugat_marl.policies import Policy
 from ugat_marl.seeding import numpy_generator
-from ugat_marl.testing.episodes import EnvironmentCase, MakeEnv, Moment, allowed_actions, different
+from ugat_marl.testing.episodes import (
+    EnvironmentCase,
+    MakeEnv,
+    StepReturn,
+    allowed_actions,
+    different,
+)
 from ugat_marl.testing.results import CheckResult, ConformanceError, NotChecked, require, run_checks
 
 Answers = list[Mapping[str, Any]]
@@ -38,7 +44,7 @@ class PolicyCase(EnvironmentCase):
         self._speechless = False
 
     @property
-    def questions(self) -> Sequence[Moment]:
+    def questions(self) -> Sequence[StepReturn]:
         """Moments of the episode at which a policy acts: all but the last."""
         return self.episode.moments[:-1]
 
