@@ -14,7 +14,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.policies import make_rule, roll_out
-from ugat_marl.reporting import film, frames, require_video, write_video
+from ugat_marl.reporting import film, film_frames, require_video, write_video
 from ugat_marl.reporting import video as filming
 from ugat_marl.reporting.video import Filmed, between
 from ugat_marl.simulation import ProcessSimulator
@@ -61,9 +61,9 @@ def test_two_policies_stand_side_by_side(tmp_path: Path) -> None:
         env, policy = made(rule)
         films.append(film(env, policy, 3, 100, 20, rule))
         env.close()
-    pictures = list(frames(films, 300))
+    pictures = list(film_frames(films, 300))
     assert len(pictures) == 20
-    single = next(frames(films[:1], 300))
+    single = next(film_frames(films[:1], 300))
     assert pictures[0].shape == (single.shape[0], 2 * single.shape[1], 3)
     assert (pictures[0] != pictures[-1]).any()
     left, right = np.split(pictures[-1], 2, axis=1)

@@ -19,7 +19,7 @@ from ugat_marl.experiments import policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import Film, Frame, film, frames, require_video, write_video
+from ugat_marl.reporting import Film, Frame, film, film_frames, require_video, write_video
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed
 
@@ -148,7 +148,7 @@ class Rollout:
         with Bars(console).task(f"writing {video.name}", count) as advance:
 
             def counted() -> Iterator[Frame]:
-                for picture in frames(films, self.film.size):
+                for picture in film_frames(films, self.film.size):
                     yield picture
                     advance()
 

@@ -29,6 +29,6 @@ from .training_page import write_pictures as write_pictures
 from .video import Film as Film
 from .video import Frame as Frame
 from .video import film as film
-from .video import frames as frames
+from .video import film_frames as film_frames
 from .video import require_video as require_video
 from .video import write_video as write_video

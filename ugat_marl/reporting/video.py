@@ -174,7 +174,7 @@ def film(
     return Film(title, env.domain, env, filmed.scenes)
 
 
-def frames(films: Sequence[Film], size_px: int) -> Iterator[Frame]:
+def film_frames(films: Sequence[Film], size_px: int) -> Iterator[Frame]:
     """Yield the frames of one film, or of several films in one picture.
 
     Films of wide networks stand below each other, other films side by side.
