@@ -14,7 +14,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.policies import make_rule, roll_out
-from ugat_marl.reporting import film, film_frames, require_video, write_video
+from ugat_marl.reporting import film_episode, film_frames, require_video, write_video
 from ugat_marl.reporting import video as filming
 from ugat_marl.reporting.video import Filmed, between
 from ugat_marl.simulation import ProcessSimulator
@@ -59,7 +59,7 @@ def test_two_policies_stand_side_by_side(tmp_path: Path) -> None:
     films = []
     for rule in ("fixed-time:30", "max-pressure:20"):
         env, policy = made(rule)
-        films.append(film(env, policy, 3, 100, 20, rule))
+        films.append(film_episode(env, policy, 3, 100, 20, rule))
         env.close()
     pictures = list(film_frames(films, 300))
     assert len(pictures) == 20
@@ -83,7 +83,7 @@ def test_what_cannot_be_filmed_is_said_first() -> None:
     env, policy = made()
     for begin_s, length_s in ((250, 100), (-1, 10), (0, 0)):
         with pytest.raises(OptionError, match="the episode has 300 s"):
-            film(env, policy, 3, begin_s, length_s, "x")
+            film_episode(env, policy, 3, begin_s, length_s, "x")
     env.close()
 
 

@@ -19,7 +19,7 @@ from ugat_marl.experiments import policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import Film, Frame, film, film_frames, require_video, write_video
+from ugat_marl.reporting import Film, Frame, film_episode, film_frames, require_video, write_video
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed
 
@@ -165,6 +165,6 @@ class Rollout:
         env = parallel_env(scenario, self.domain, **options)
         seed = derive_seed(self.seed, "rollout", 0)
         try:
-            return film(env, policy, seed, self.film.from_s, self.film.length_s, name)
+            return film_episode(env, policy, seed, self.film.from_s, self.film.length_s, name)
         finally:
             env.close()

@@ -28,7 +28,7 @@ from .training_page import runs_page as runs_page
 from .training_page import write_pictures as write_pictures
 from .video import Film as Film
 from .video import Frame as Frame
-from .video import film as film
+from .video import film_episode as film_episode
 from .video import film_frames as film_frames
 from .video import require_video as require_video
 from .video import write_video as write_video

@@ -140,7 +140,7 @@ def between(plans: SignalPlans, begin_s: float, end_s: float) -> dict[str, list[
     return found
 
 
-def film(
+def film_episode(
     env: TrafficEnv, policy: Policy, seed: int, begin_s: float, length_s: float, title: str
 ) -> Film:
     """Play an episode up to the end of a stretch and keep a scene of every second in it.
