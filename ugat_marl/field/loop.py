@@ -1,7 +1,7 @@
 """Field loop: once per decision it reads counts, checks them, decides and sets the lights.
 
-A decision is ready within `Limits.answer_ms`. If the policy has not answered by then, the lights
-follow the fixed-time plan. Every answer goes through the signal machines of
+A decision is ready within `TrustLimits.answer_ms`. If the policy has not answered by then, the
+lights follow the fixed-time plan. Every answer goes through the signal machines of
 `ugat_marl.field.safety`.
 """
 

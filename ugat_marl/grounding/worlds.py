@@ -40,7 +40,7 @@ class World(Protocol):
         ...
 
     def stop(self) -> None:
-        """End a `collect` that runs in another thread; it raises `Stopped`."""
+        """End a `collect` that runs in another thread; it raises `RollOutStopped`."""
         ...
 
     def close(self) -> None:

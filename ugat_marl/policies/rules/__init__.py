@@ -47,10 +47,10 @@ __all__ = [
     "Rule",
     "SelfOrganising",
     "Webster",
-    "make_rule",
     "covering_phases",
     "example_of",
     "format_rule",
+    "make_rule",
     "parse_rule",
     "webster_plan",
 ]
