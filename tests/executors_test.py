@@ -23,6 +23,7 @@ from ugat_marl.data import TransitionLog
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import DetectorLayout
 from ugat_marl.diagnosis.replay import Replay
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import TrafficEnv
 from ugat_marl.errors import OptionError, SimulatorCrashed
@@ -42,6 +43,8 @@ from ugat_marl.parallel import (
 from ugat_marl.policies import Policy
 from ugat_marl.scenarios import Network, Period
 from ugat_marl.simulation import standard_detectors
+
+THRESHOLDS = Thresholds()
 
 LENGTH_S = 100.0
 
@@ -153,8 +156,8 @@ def engine_of(data: Path, workers: Any) -> Engine:
     layout = DetectorLayout.of(network, detectors)
     shown = ((0.0, "Gr"), (30.0, "rG"), (60.0, "Gr"), (90.0, "rG"))
     periods = [Period("day1", 0.0, 120.0, "fit", {"C": shown}, {})]
-    replay = Replay(scenario, network, detectors, layout.owner)
-    return Engine(scenario, layout, replay, periods, 3, workers=workers)
+    replay = Replay(scenario, network, detectors, layout.owner, THRESHOLDS)
+    return Engine(scenario, layout, replay, periods, 3, THRESHOLDS, workers=workers)
 
 
 @pytest.mark.slow

@@ -15,10 +15,13 @@ from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout
 from ugat_marl.diagnosis.replay import Arrivals, Due, Replay, by_lane_left, corrected, unhindered
 from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect, load_scenario, parse_domain
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Network, Passages, Period, Scenario, draw_day
 from ugat_marl.simulation import standard_detectors
+
+THRESHOLDS = Thresholds()
 
 LIMIT = 10.0
 
@@ -35,44 +38,50 @@ def seen(times: Sequence[float], speeds: Sequence[float]) -> Passages:
 
 def test_who_comes_freely_came_when_he_was_seen() -> None:
     times = [3.0, 50.0, 90.0]
-    found = unhindered(seen(times, [9.0, 10.0, 11.0]), LIMIT, a_period())
+    found = unhindered(seen(times, [9.0, 10.0, 11.0]), LIMIT, a_period(), THRESHOLDS)
     assert found.tolist() == times
 
 
 def test_who_came_through_a_queue_is_spread_between_free_neighbours_and_never_later() -> None:
     # Free at 20 and at 60; three between them in a queue: evenly at 30, 40, 50, but the first
     # was seen at 25 and cannot have come after that.
-    found = unhindered(seen([20.0, 25.0, 45.0, 58.0, 60.0], [9, 1, 2, 3, 9]), LIMIT, a_period())
+    found = unhindered(
+        seen([20.0, 25.0, 45.0, 58.0, 60.0], [9, 1, 2, 3, 9]), LIMIT, a_period(), THRESHOLDS
+    )
     assert found.tolist() == [20.0, 25.0, 40.0, 50.0, 60.0]
 
 
 def test_a_queue_at_the_ends_is_spread_to_the_ends_of_the_period() -> None:
-    found = unhindered(seen([80.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=300.0))
+    found = unhindered(seen([80.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=300.0), THRESHOLDS)
     np.testing.assert_allclose(found, [80.0, 190.0])  # 100 and 200 would be later than seen
-    found = unhindered(seen([180.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=240.0))
+    found = unhindered(seen([180.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=240.0), THRESHOLDS)
     np.testing.assert_allclose(found, [80.0, 160.0])
 
 
 def test_who_drives_on_behind_a_queue_belongs_to_it() -> None:
-    close = unhindered(seen([20.0, 40.0, 42.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0))
+    close = unhindered(
+        seen([20.0, 40.0, 42.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0), THRESHOLDS
+    )
     np.testing.assert_allclose(close, [20.0, 40.0, 42.0])  # both spread: 40 and 60, cut to seen
-    far = unhindered(seen([20.0, 40.0, 46.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0))
+    far = unhindered(
+        seen([20.0, 40.0, 46.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0), THRESHOLDS
+    )
     np.testing.assert_allclose(far, [20.0, 33.0, 46.0])  # the last came freely
 
 
 def test_without_speeds_time_on_the_detector_tells() -> None:
     one = dataclasses.replace(seen([20.0, 39.0, 60.0], [9, 1, 9]), speed_mps=np.full(3, np.nan))
-    assert unhindered(one, LIMIT, a_period()).tolist() == [20.0, 39.0, 60.0]
+    assert unhindered(one, LIMIT, a_period(), THRESHOLDS).tolist() == [20.0, 39.0, 60.0]
     one = dataclasses.replace(seen([20.0, 50.0, 60.0], [9, 1, 9]), speed_mps=np.full(3, np.nan))
-    assert unhindered(one, LIMIT, a_period()).tolist() == [20.0, 40.0, 60.0]
+    assert unhindered(one, LIMIT, a_period(), THRESHOLDS).tolist() == [20.0, 40.0, 60.0]
 
 
 def test_a_long_zone_is_left_later() -> None:
     # 5 m of vehicle and 15 m of zone at 10 m/s: 2 s, and nobody was held up.
     on = np.array([150.0, 190.0])
     free = Passages(on, on + 2.0, on * np.nan, on * np.nan)
-    assert unhindered(free, LIMIT, a_period(), 15.0).tolist() == [150.0, 190.0]
-    assert unhindered(free, LIMIT, a_period()).tolist() != [150.0, 190.0]
+    assert unhindered(free, LIMIT, a_period(), THRESHOLDS, 15.0).tolist() == [150.0, 190.0]
+    assert unhindered(free, LIMIT, a_period(), THRESHOLDS).tolist() != [150.0, 190.0]
 
 
 def test_who_changes_lanes_is_counted_where_he_left() -> None:
@@ -118,7 +127,7 @@ def test_vehicles_depart_so_that_they_come_when_others_came(
     day = draw_day(scenario, 3)
     came = {"advance:S_C_0": [60.0, 75.0, 99.0], "stop:S_C_0": [65.0, 80.0, 105.0]}
     period = a_period(passages(came))
-    found, due = Arrivals(layout, network).given(day, day, period)
+    found, due = Arrivals(layout, network, THRESHOLDS).given(day, day, period)
     position = {item.id: item.position_m for item in layout.detectors}["advance:S_C_0"]
     way = position / network.lanes["S_C_0"].speed_mps
     rows = departs(found)
@@ -134,7 +143,7 @@ def test_more_came_than_the_model_has(crossing: tuple[Scenario, Network, Detecto
     day = draw_day(scenario, 3)
     times = np.linspace(20.0, 180.0, 60).tolist()
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
-    found, _ = Arrivals(layout, network).given(day, day, period)
+    found, _ = Arrivals(layout, network, THRESHOLDS).given(day, day, period)
     names = [item.get("id") for item in found.routes[0].parse().iter("vehicle")]
     assert len(names) == len(set(names)) == 60
 
@@ -145,7 +154,7 @@ def test_effects_on_demand_leave_what_is_simulated_alone(
     scenario, network, layout = crossing
     times = np.linspace(20.0, 180.0, 8).tolist()
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
-    replay = Replay(scenario, network, layout.detectors, layout.owner, answering=True)
+    replay = Replay(scenario, network, layout.detectors, layout.owner, THRESHOLDS, answering=True)
     plain, more = (replay.simulate(parse_domain(x), period, 1) for x in ("sim", "demand_level=*,3"))
     for name, item in plain.period.passages.items():
         np.testing.assert_array_equal(item.on_s, more.period.passages[name].on_s)
@@ -162,8 +171,10 @@ def test_effects_on_demand_cost_no_simulation(
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
 
     def engine() -> Engine:
-        replay = Replay(scenario, network, layout.detectors, layout.owner, answering=True)
-        return Engine(scenario, layout, replay, [period], 5, cache=tmp_path)
+        replay = Replay(
+            scenario, network, layout.detectors, layout.owner, THRESHOLDS, answering=True
+        )
+        return Engine(scenario, layout, replay, [period], 5, THRESHOLDS, cache=tmp_path)
 
     first = engine()
     more = parse_domain("demand_level=*,3+headway=1.5")
@@ -189,7 +200,7 @@ def test_detectors_that_missed_vehicles_do_not_keep_them_away(
     day = draw_day(scenario, 3)
     times = np.linspace(5.0, 195.0, 40)
     few = {"advance:S_C_0": times[::2].tolist(), "stop:S_C_0": (times + 3).tolist()}
-    found, due = Arrivals(layout, network).given(day, day, a_period(passages(few)))
+    found, due = Arrivals(layout, network, THRESHOLDS).given(day, day, a_period(passages(few)))
     assert len(departs(found)["S_C"]) >= 38
     assert due.given["S_C"].sum() >= 36
 
@@ -220,10 +231,12 @@ def test_days_under_signals_that_answered_others_are_like_the_measured_one(data:
     assert is_actuated(measured.periods, layout.intersections[0])
 
     def distance(answering: bool) -> float:
-        replay = Replay(scenario, network, measured.detectors, layout.owner, answering=answering)
-        engine = Engine(scenario, layout, replay, measured.periods, 5)
+        replay = Replay(
+            scenario, network, measured.detectors, layout.owner, THRESHOLDS, answering=answering
+        )
+        engine = Engine(scenario, layout, replay, measured.periods, 5, THRESHOLDS)
         days = [day.tally for day in engine.replicates(NOTHING, range(16))]
-        reference = Reference(Pools.of(layout), days)
+        reference = Reference(Pools.of(layout, THRESHOLDS), days)
         return reference.distance(engine.measured(measured.periods)).parts["network"]
 
     assert distance(True) < 0.5 * distance(False)

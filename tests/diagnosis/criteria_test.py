@@ -8,7 +8,10 @@ from numpy.typing import ArrayLike
 
 from ugat_marl.diagnosis import Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.verify import Criteria, fhwa, geh, hourly, representative
+
+THRESHOLDS = Thresholds()
 
 STOP = BIN_FEATURES.index("count_stop")
 
@@ -46,7 +49,7 @@ def test_the_typical_day_is_the_one_nearest_to_the_mean() -> None:
 
 
 def test_the_typical_day_itself_meets_all_four() -> None:
-    assert fhwa(MEASURED, [day([100, 110])], 1) == Criteria(1.0, 1.0, 1.0, 1.0)
+    assert fhwa(MEASURED, [day([100, 110])], 1, THRESHOLDS) == Criteria(1.0, 1.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -59,33 +62,38 @@ def test_the_typical_day_itself_meets_all_four() -> None:
     ],
 )
 def test_criteria_by_hand(simulated: list[float], expected: Criteria) -> None:
-    assert fhwa(MEASURED, [day(simulated)], 1) == expected
+    assert fhwa(MEASURED, [day(simulated)], 1, THRESHOLDS) == expected
 
 
 def test_of_several_simulated_days_the_mean_counts() -> None:
-    assert fhwa(MEASURED, [day([60, 70]), day([140, 150])], 1) == Criteria(1.0, 1.0, 1.0, 1.0)
+    assert fhwa(MEASURED, [day([60, 70]), day([140, 150])], 1, THRESHOLDS) == Criteria(
+        1.0, 1.0, 1.0, 1.0
+    )
 
 
 def test_each_detector_is_judged_by_its_own_days() -> None:
     measured = [day([90], [10]), day([100], [10]), day([110], [10])]
-    found = fhwa(measured, [day([100], [11])], 1)
+    found = fhwa(measured, [day([100], [11])], 1, THRESHOLDS)
     assert found == Criteria(0.5, 0.5, 0.5, 0.5)
 
 
 def test_what_was_not_counted_every_day_is_left_out() -> None:
     measured = [day([90], [5], known=False), day([100], [6]), day([110], [7])]
-    assert fhwa(measured, [day([300], [6])], 1) == Criteria(1.0, 1.0, 1.0, 1.0)
+    assert fhwa(measured, [day([300], [6])], 1, THRESHOLDS) == Criteria(1.0, 1.0, 1.0, 1.0)
 
 
 def test_two_days_are_too_few_and_so_is_nothing_counted() -> None:
-    assert fhwa(MEASURED[:2], [day([100, 110])], 1) is None
+    assert fhwa(MEASURED[:2], [day([100, 110])], 1, THRESHOLDS) is None
     empty = [day([0, 0])] * 3
-    assert fhwa(empty, empty, 1) is None
+    assert fhwa(empty, empty, 1, THRESHOLDS) is None
 
 
 def test_counts_of_an_hour_are_compared_by_the_hour() -> None:
     measured = [day([c, 0, 0, 0]) for c in (90, 100, 110)]
     spread = day([25, 25, 25, 25])
-    by_hour, by_quarter = fhwa(measured, [spread], 12), fhwa(measured, [spread], 1)
+    by_hour, by_quarter = (
+        fhwa(measured, [spread], 12, THRESHOLDS),
+        fhwa(measured, [spread], 1, THRESHOLDS),
+    )
     assert by_hour == Criteria(1.0, 1.0, 1.0, 1.0)
     assert by_quarter is not None and by_quarter.within_2_sigma == 0.0

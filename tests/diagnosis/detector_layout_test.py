@@ -10,10 +10,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane, tally
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Detector, Network, Passages, Period, SignalLog
 from ugat_marl.simulation import standard_detectors
+
+THRESHOLDS = Thresholds()
 
 
 def greens(
@@ -163,7 +166,7 @@ def test_features_of_anything_are_finite(log: SignalLog, seen: dict[str, Passage
     )
     layout = DetectorLayout(("C",), lanes, ((0, "out_0", ("x",)),), (), {})
     period = Period("day1", 0.0, 600.0, "fit", {"C": log}, seen)
-    found = tally(layout, period, layout.greens(period))
+    found = tally(layout, period, layout.greens(period), THRESHOLDS)
     assert np.isfinite(found.sums).all()
     assert np.isfinite(found.bins).all()
     assert (found.sums[..., 1] >= 0).all()

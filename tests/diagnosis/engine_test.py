@@ -16,10 +16,13 @@ from ugat_marl.diagnosis import engine as module
 from ugat_marl.diagnosis.engine import Engine, OutOfTime, Replicate
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
 from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
-from ugat_marl.effects import Effect, apply_detector_effects, load_scenario, parse_domain
+from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.effects import Effect, load_scenario, apply_detector_effects, parse_domain
 from ugat_marl.errors import SimulatorError
 from ugat_marl.scenarios import Network, Passages, Period, Scenario
 from ugat_marl.simulation import standard_detectors
+
+THRESHOLDS = Thresholds()
 
 LOG = ((0.0, "Gr"), (30.0, "rG"), (60.0, "Gr"), (90.0, "rG"), (120.0, "Gr"))
 PERIODS = (
@@ -81,6 +84,7 @@ def an_engine(
         streets,
         periods,
         seed,
+        THRESHOLDS,
         cache=cache,
         deadline=deadline,
         workers=3,
@@ -135,11 +139,15 @@ def test_simulated_days_tell_no_more_than_the_measured_ones(
         def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
             return Day(day, 50.0)
 
-    made = Engine(scenario, layout, SameDay(layout), [measured], 3, cache=tmp_path, workers=1)
+    made = Engine(
+        scenario, layout, SameDay(layout), [measured], 3, THRESHOLDS, cache=tmp_path, workers=1
+    )
     (simulated,) = made.replicates((), [0])
     (seen,) = made.measured([measured])
     assert np.allclose(simulated.tally.sums, seen.sums)
-    with_all = Engine(scenario, layout, SameDay(layout), [day], 3, cache=tmp_path, workers=1)
+    with_all = Engine(
+        scenario, layout, SameDay(layout), [day], 3, THRESHOLDS, cache=tmp_path, workers=1
+    )
     (other,) = with_all.replicates((), [0])
     assert np.allclose(other.tally.sums, simulated.tally.sums) == (speeds and lengths)
 

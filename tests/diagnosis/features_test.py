@@ -17,7 +17,10 @@ from ugat_marl.diagnosis.features import (
     IncomingLane,
     tally,
 )
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period, SignalLog
+
+THRESHOLDS = Thresholds()
 
 NAN = float("nan")
 LIMIT_MPS = 14.0
@@ -77,7 +80,7 @@ def counted(
 ) -> Tally:
     layout = layout or a_layout()
     period = a_period(seen, log, end=end)
-    return tally(layout, period, layout.greens(period))
+    return tally(layout, period, layout.greens(period), THRESHOLDS)
 
 
 def of(found: Tally, name: str, place: int = 0) -> tuple[float, float]:

@@ -14,12 +14,14 @@ from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
 from ugat_marl.diagnosis.fit import Fitter, uncertainty
 from ugat_marl.diagnosis.hypotheses import Members
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect
+
+THRESHOLDS = Thresholds()
 
 Array = NDArray[np.float64]
 
-POOLS = Pools({"network": np.ones((1, 1))})
+POOLS = Pools({"network": np.ones((1, 1))}, THRESHOLDS)
 WIDTH = 20
 HEADWAY = Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05)
 GAP = Hypothesis("min_gap", (), ("metres",), ((3.5,),), (2.5,), 0.2)
@@ -46,6 +48,7 @@ class World(Engine):
     usual = Usual()
 
     def __init__(self) -> None:
+        self._thresholds = THRESHOLDS
         self.asked: list[tuple[str, ...]] = []
 
     def replicates(
@@ -78,7 +81,7 @@ def a_fitter(
     base_days = played(world)
     base = Reference(POOLS, list(base_days.values()))
     data = [day(number, truth, street) for number in range(5)]
-    return Fitter(world, POOLS, base, base_days, data, days=days, price=14.0, speeds=True)
+    return Fitter(world, POOLS, base, base_days, data, days=days, speeds=True)
 
 
 def start(*members: tuple[Hypothesis, float]) -> Members:
@@ -264,7 +267,7 @@ def a_fitter_of_windows(truth: tuple[float, float]) -> Fitter:
     base_days = played(world)
     data = [with_surge(number, 0.5 * surge(*truth), 18) for number in range(5)]
     base = Reference(POOLS, list(base_days.values()))
-    return Fitter(world, POOLS, base, base_days, data, days=8, price=14.0, speeds=True)
+    return Fitter(world, POOLS, base, base_days, data, days=8, speeds=True)
 
 
 def window_of(members: Members) -> tuple[float, float]:

@@ -14,6 +14,9 @@ from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Detector
 from ugat_marl.diagnosis.locate import locate
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.diagnosis.thresholds import Thresholds
+
+THRESHOLDS = Thresholds()
 
 Array = NDArray[np.float64]
 
@@ -51,7 +54,7 @@ def days(
 
 @pytest.fixture(scope="module")
 def reference() -> Reference:
-    return Reference(Pools.of(SITE), days(1, 150))
+    return Reference(Pools.of(SITE, THRESHOLDS), days(1, 150))
 
 
 def found(reference: Reference, data: list[Tally], alpha: float = 0.05) -> list[Disagreement]:

@@ -14,12 +14,14 @@ from ugat_marl.diagnosis.features import BIN_FEATURES, EVENT_FEATURES, FEATURES
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.residual import Directed, Directions, MatchedFilters, Null
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
+
+THRESHOLDS = Thresholds()
 
 Array = NDArray[np.float64]
 
-NETWORK = Pools({"network": np.ones((1, 1))})
-SEVERAL = Pools({"network": np.ones((1, 3)), "lane": np.eye(3)})
+NETWORK = Pools({"network": np.ones((1, 1))}, THRESHOLDS)
+SEVERAL = Pools({"network": np.ones((1, 3)), "lane": np.eye(3)}, THRESHOLDS)
 ROWS = [row for row, (name, _, _) in enumerate(FEATURES) if name not in EVENT_FEATURES]
 WIDTH = len(ROWS)
 WEIGHT = 50.0

@@ -21,8 +21,11 @@ from ugat_marl.diagnosis.features import (
 from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.diagnosis.places import PlaceFinder, _later
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.effects import Domain, apply_detector_effects, load_scenario, parse_domain
+from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.effects import Domain, load_scenario, apply_detector_effects, parse_domain
 from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period
+
+THRESHOLDS = Thresholds()
 
 ARMS = ("a", "b", "c", "d")
 RATE_PER_HOUR = {"a": 500.0, "b": 320.0, "c": 420.0, "d": 260.0}
@@ -115,18 +118,18 @@ def street(
 
 
 def tallies(periods: Sequence[Period]) -> list[Tally]:
-    return [tally(SITE, period, SITE.greens(period)) for period in periods]
+    return [tally(SITE, period, SITE.greens(period), THRESHOLDS) for period in periods]
 
 
 @pytest.fixture(scope="module")
 def reference() -> Reference:
-    return Reference(Pools.of(SITE), tallies([street(seed) for seed in range(40)]))
+    return Reference(Pools.of(SITE, THRESHOLDS), tallies([street(seed) for seed in range(40)]))
 
 
 def proposed(
     reference: Reference, data: Sequence[Period], allowed: frozenset[str] | None = None
 ) -> list[Hypothesis]:
-    place_finder = PlaceFinder(SITE, ROUTES, allowed or library())
+    place_finder = PlaceFinder(SITE, ROUTES, allowed or library(), THRESHOLDS)
     return place_finder.hypotheses(reference, reference.distance(tallies(data)), data)
 
 
@@ -311,8 +314,10 @@ def test_the_traffic_light_that_starts_late() -> None:
         sums[INDEX["lost"]] = np.stack([40 * values, np.full(4, 40.0)], axis=-1)
         return Tally(sums, np.zeros((len(BIN_FEATURES), 4, 1)))
 
-    reference = Reference(Pools.of(layout), [day(seed, 0.0) for seed in range(50)])
-    place_finder = PlaceFinder(layout, Routes({}, {}, {}, {}), {"late_green", "signal_clock"})
+    reference = Reference(Pools.of(layout, THRESHOLDS), [day(seed, 0.0) for seed in range(50)])
+    place_finder = PlaceFinder(
+        layout, Routes({}, {}, {}, {}), {"late_green", "signal_clock"}, THRESHOLDS
+    )
     distance = reference.distance([day(100 + seed, 1.5) for seed in range(5)])
     found = place_finder.hypotheses(reference, distance, [replace(street(1), passages={})])
     for name in ("late_green", "signal_clock"):
@@ -345,9 +350,9 @@ def test_lanes_are_examined_for_parking_that_traffic_avoids_or_queues_on(
         sums = np.stack([40 * values, np.full_like(values, 40.0)], axis=-1)
         return Tally(sums, np.zeros((len(BIN_FEATURES), 5, 1)))
 
-    reference = Reference(Pools.of(layout), [day(seed, {}) for seed in range(50)])
+    reference = Reference(Pools.of(layout, THRESHOLDS), [day(seed, {}) for seed in range(50)])
     distance = reference.distance([day(100 + seed, moved) for seed in range(5)])
-    place_finder = PlaceFinder(layout, Routes({}, {}, {}, {}), {"parking"})
+    place_finder = PlaceFinder(layout, Routes({}, {}, {}, {}), {"parking"}, THRESHOLDS)
     found = place_finder.hypotheses(reference, distance, [replace(street(1), passages={})])
     parked = [str(dict(item.fixed)["lane"]) for item in found]
     assert len(parked) == len(set(parked)) <= 4, "two edges, two lanes of each"
@@ -369,9 +374,9 @@ def test_routes_are_counted_per_hour(data: Path) -> None:
 
 def test_parking_is_tried_on_every_lane_of_a_small_site() -> None:
     allowed = library([])
-    found = PlaceFinder(SITE, ROUTES, allowed).everywhere()
+    found = PlaceFinder(SITE, ROUTES, allowed, THRESHOLDS).everywhere()
     assert [dict(item.fixed)["lane"] for item in found] == [f"{arm}_in_0" for arm in ARMS]
     assert {item.name for item in found} == {"parking"}
-    assert PlaceFinder(SITE, ROUTES, allowed - {"parking"}).everywhere() == []
+    assert PlaceFinder(SITE, ROUTES, allowed - {"parking"}, THRESHOLDS).everywhere() == []
     many = replace(SITE, lanes=SITE.lanes * 7)
-    assert PlaceFinder(many, ROUTES, allowed).everywhere() == []
+    assert PlaceFinder(many, ROUTES, allowed, THRESHOLDS).everywhere() == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,14 +14,14 @@ from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
 from ugat_marl.diagnosis.propose import Direction, between, propose
 from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Pools, Whitener
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 
 Array = NDArray[np.float64]
 
-POOLS = Pools({"network": np.ones((1, 1))})
+THRESHOLDS = Thresholds(price=14.0)
+POOLS = Pools({"network": np.ones((1, 1))}, THRESHOLDS)
 WIDTH = 30
 NO_TIME = np.zeros((len(BIN_FEATURES), 1))
-PRICE = 14.0
 
 NAMES = ("headway", "min_gap", "acceleration", "deceleration", "imperfection", "startup_delay",
          "desired_speed", "heavy_share")  # fmt: skip
@@ -97,7 +98,7 @@ def test_planted_combinations_are_recovered_exactly(
     reference: Reference, planted: dict[str, float]
 ) -> None:
     among = directions()
-    best = propose(among, whitener(reference, planted, among), PRICE)[0]
+    best = propose(among, whitener(reference, planted, among), THRESHOLDS)[0]
     expected = {
         name: NOMINAL[NAMES.index(name)]
         + strength * (LEVEL[NAMES.index(name)] - NOMINAL[NAMES.index(name)])
@@ -105,7 +106,7 @@ def test_planted_combinations_are_recovered_exactly(
     }
     assert values(best) == pytest.approx(expected, abs=2e-3)
     # The ridge leaves next to nothing; what remains is the price.
-    assert best.expected == pytest.approx(PRICE * len(planted), abs=1.0)
+    assert best.expected == pytest.approx(THRESHOLDS.price * len(planted), abs=1.0)
 
 
 def test_effects_that_hide_each_other_are_proposed_together(reference: Reference) -> None:
@@ -118,16 +119,18 @@ def test_effects_that_hide_each_other_are_proposed_together(reference: Reference
     }
     among[1] = Direction(other.hypothesis, other.level, hidden, other.variance, other.origin)
     target = whitener(reference, {"headway": 1.0, "min_gap": 1.0}, among)
-    best = propose(among, target, PRICE)[0]
+    best = propose(among, target, THRESHOLDS)[0]
     assert set(values(best)) == {"headway", "min_gap"}
-    assert best.expected == pytest.approx(2 * PRICE, abs=1.0)
+    assert best.expected == pytest.approx(2 * THRESHOLDS.price, abs=1.0)
 
 
 def test_a_price_keeps_spurious_effects_out(reference: Reference) -> None:
     among = directions()
     sizes: list[int] = []
     for seed in range(40):
-        best = propose(among, whitener(reference, {"headway": 0.8}, among, noise=seed), PRICE)[0]
+        best = propose(among, whitener(reference, {"headway": 0.8}, among, noise=seed), THRESHOLDS)[
+            0
+        ]
         assert "headway" in values(best)
         sizes.append(len(best.members))
     assert np.mean(np.array(sizes) > 1) <= 0.05
@@ -138,20 +141,20 @@ def test_of_nothing_but_noise_nothing_is_worth_its_price(reference: Reference) -
     tempted = 0
     for seed in range(100, 140):
         target = whitener(reference, {}, among, noise=seed)
-        found = propose(among, target, PRICE)
+        found = propose(among, target, THRESHOLDS)
         tempted += bool(found) and found[0].expected < float(target.measured @ target.measured)
     assert tempted <= 2
 
 
 def test_no_effect_works_backwards(reference: Reference) -> None:
     among = directions()[:3]
-    found = propose(among, whitener(reference, {"headway": -0.8}, among), PRICE)
+    found = propose(among, whitener(reference, {"headway": -0.8}, among), THRESHOLDS)
     assert all("headway" not in values(item) for item in found)
 
 
 def test_rays_are_followed_only_so_far(reference: Reference) -> None:
     among = directions()[:1]
-    best = propose(among, whitener(reference, {"headway": 5.0}, among), PRICE)[0]
+    best = propose(among, whitener(reference, {"headway": 5.0}, among), THRESHOLDS)[0]
     assert values(best)["headway"] == pytest.approx(1.0 + THRESHOLDS.farthest * 0.5)
 
 
@@ -162,10 +165,10 @@ def test_two_strengths_of_one_hypothesis_never_stand_in_one_model(reference: Ref
         Direction(first.hypothesis, (1.9,), directions(9)[0].difference, first.variance, (1.0,))
     )
     target = whitener(reference, {"headway": 0.8, "min_gap": 0.6}, among)
-    for item in propose(among, target, 0.0):
+    for item in propose(among, target, replace(THRESHOLDS, price=0.0)):
         names = [hypothesis.name for hypothesis, _ in item.members]
         assert len(names) == len(set(names))
-    assert len(propose(among, target, 0.0)) == 3  # each alone, and both
+    assert len(propose(among, target, replace(THRESHOLDS, price=0.0))) == 3  # each alone, and both
 
 
 def test_a_hypothesis_without_numbers_is_there_or_not(reference: Reference) -> None:
@@ -177,14 +180,14 @@ def test_a_hypothesis_without_numbers_is_there_or_not(reference: Reference) -> N
         reference.blocks["network"].mean[0, :WIDTH] + among[2].difference["network"][0, :WIDTH]
     )
     target = Whitener(reference, [day(values_)] * 5, 0.0)
-    best = propose(among, target, PRICE)[0]
+    best = propose(among, target, THRESHOLDS)[0]
     assert [(hypothesis.name, found) for hypothesis, found in best.members] == [
         ("driver_model", ())
     ]
 
 
 def test_no_rays_no_proposals(reference: Reference) -> None:
-    assert propose([], whitener(reference, {}, []), PRICE) == []
+    assert propose([], whitener(reference, {}, []), THRESHOLDS) == []
 
 
 def test_many_rays_are_searched_in_good_time(reference: Reference) -> None:
@@ -210,7 +213,7 @@ def test_many_rays_are_searched_in_good_time(reference: Reference) -> None:
         * 5,
         0.0,
     )
-    best = propose(among, target, PRICE)[0]
+    best = propose(among, target, THRESHOLDS)[0]
     assert {dict(h.fixed)["place"] for h, _ in best.members} == {"7", "50"}
 
 

@@ -15,8 +15,10 @@ from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Members
 from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.select import pruned
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.progress import Advance, Silent
+
+THRESHOLDS = Thresholds()
 
 HEADWAY = (Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05), (1.5,))
 DEMAND = (Hypothesis("demand_level", (), ("factor",), ((1.2,),), (1.0,), 0.02), (0.95,))
@@ -34,6 +36,7 @@ class Ledger:
     luck: dict[tuple[str, ...], float] = field(default_factory=dict)
     tested: list[tuple[str, ...]] = field(default_factory=list)
     refined: dict[tuple[str, ...], Members] = field(default_factory=dict)
+    thresholds: Thresholds = THRESHOLDS
 
     def simulate(self, members: Members, days: int | None = None) -> Fitted:
         cost = self.costs[names(members)]

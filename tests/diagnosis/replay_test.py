@@ -11,10 +11,13 @@ from hypothesis import strategies as st
 
 from ugat_marl.diagnosis.features import DetectorLayout
 from ugat_marl.diagnosis.replay import Day, Replay, replay_document
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import apply_effects, load_scenario, parse_domain
 from ugat_marl.errors import MeasuredDataError, SimulatorError
 from ugat_marl.scenarios import Network, Period, Scenario, SignalLog
 from ugat_marl.simulation import standard_detectors
+
+THRESHOLDS = Thresholds()
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +134,9 @@ def test_every_second_shows_what_the_log_says(log: SignalLog, early: float) -> N
 def replay(scenario: Scenario) -> Replay:
     network = Network.read(scenario)
     detectors = standard_detectors(network)
-    return Replay(scenario, network, detectors, DetectorLayout.of(network, detectors).owner)
+    return Replay(
+        scenario, network, detectors, DetectorLayout.of(network, detectors).owner, THRESHOLDS
+    )
 
 
 def test_vehicles_obey_the_measured_signals(scenario: Scenario) -> None:
@@ -171,7 +176,9 @@ class Watched(Replay):
     def __init__(self, scenario: Scenario) -> None:
         network = Network.read(scenario)
         detectors = standard_detectors(network)
-        super().__init__(scenario, network, detectors, DetectorLayout.of(network, detectors).owner)
+        super().__init__(
+            scenario, network, detectors, DetectorLayout.of(network, detectors).owner, THRESHOLDS
+        )
         self.parked: list[list[float]] = []
 
     def _run(self, scenario: Scenario, period: Period, seed: int, directory: Path) -> Day:

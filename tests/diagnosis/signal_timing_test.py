@@ -21,9 +21,12 @@ from ugat_marl.diagnosis.features import (
 )
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.study import timing_effects
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
 from ugat_marl.scenarios import Network, Period, Scenario, SignalLog
 from ugat_marl.simulation import standard_detectors
+
+THRESHOLDS = Thresholds()
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +59,7 @@ def cycles(
 def found(scenario: Scenario, network: Network, log: SignalLog, tls: str = "C") -> list[str]:
     period = Period("day1", 0.0, 3600.0, "fit", {tls: log}, {})
     measured = Measured(standard_detectors(network), (period,))
-    return [str(effect) for effect in timing_effects(scenario, network, measured)]
+    return [str(effect) for effect in timing_effects(scenario, network, measured, THRESHOLDS)]
 
 
 def test_the_same_times_are_no_effect(scenario: Scenario, network: Network) -> None:
@@ -157,7 +160,9 @@ def test_counts_stand_where_detections_would(layout: DetectorLayout) -> None:
         ("day2", 0.0, 900.0, "stop:S_C_0", 999),
         ("day1", 0.0, 900.0, "nowhere", 999),
     )
-    found = counts_tally(layout, PERIOD, table, without_gaps(table, [PERIOD]))
+    found = counts_tally(
+        layout, PERIOD, table, without_gaps(table, [PERIOD], THRESHOLDS), THRESHOLDS
+    )
     lane = next(i for i, item in enumerate(layout.lanes) if item.id == "S_C_0")
     behind = next(i for i, item in enumerate(layout.exits) if item[1] == "C_E_0")
     assert found.sums[INDEX["count_stop"], lane].tolist() == [60.0, 15.0]
@@ -176,11 +181,13 @@ def test_a_count_across_bins_is_shared_out(layout: DetectorLayout) -> None:
         ("day1", 200.0, 600.0, "stop:S_C_0", 40),
         ("day1", 600.0, 900.0, "stop:S_C_0", 5),
     )
-    found = counts_tally(layout, PERIOD, table, without_gaps(table, [PERIOD]))
+    found = counts_tally(
+        layout, PERIOD, table, without_gaps(table, [PERIOD], THRESHOLDS), THRESHOLDS
+    )
     lane = next(i for i, item in enumerate(layout.lanes) if item.id == "S_C_0")
     assert found.bins[BIN_FEATURES.index("count_stop"), lane] == pytest.approx([30.0, 30.0, 5.0])
-    assert bins_together(table) == 2, "nobody knows when in 400 s they came"
-    pooled = Pools.of(layout, 2).pool(found)["time"]
+    assert bins_together(table, THRESHOLDS) == 2, "nobody knows when in 400 s they came"
+    pooled = Pools.of(layout, THRESHOLDS, 2).pool(found)["time"]
     row = BIN_FEATURES.index("count_stop") * len(layout.places) + lane
     assert pooled[row].tolist() == [[60.0, 1.0]], "what is left at the end is not used"
 
@@ -191,10 +198,10 @@ def test_what_was_not_counted_is_no_count_of_zero(layout: DetectorLayout) -> Non
         ("day1", 600.0, 900.0, "stop:S_C_0", 30),
         ("day1", 0.0, 900.0, "exit:C_E_0", 90),
     )
-    whole = without_gaps(table, [PERIOD])
+    whole = without_gaps(table, [PERIOD], THRESHOLDS)
     assert whole == {"exit:C_E_0"}
-    assert not without_gaps(table, [PERIOD, replace(PERIOD, id="day2")])
-    found = counts_tally(layout, PERIOD, table, whole)
+    assert not without_gaps(table, [PERIOD, replace(PERIOD, id="day2")], THRESHOLDS)
+    found = counts_tally(layout, PERIOD, table, whole, THRESHOLDS)
     lane = next(i for i, item in enumerate(layout.lanes) if item.id == "S_C_0")
     line = BIN_FEATURES.index("count_stop"), lane
     assert found.bins[line].tolist() == [10.0, 0.0, 30.0]
@@ -208,7 +215,9 @@ def test_what_was_not_counted_is_no_count_of_zero(layout: DetectorLayout) -> Non
 
 
 def test_no_counts_no_weight(layout: DetectorLayout) -> None:
-    found = counts_tally(layout, PERIOD, counts().cast({"period_id": pl.String}), frozenset())
+    found = counts_tally(
+        layout, PERIOD, counts().cast({"period_id": pl.String}), frozenset(), THRESHOLDS
+    )
     assert not found.sums.any()
     assert not found.counted.any()
     assert found.bins.shape[-1] == 3

@@ -19,13 +19,16 @@ from ugat_marl.diagnosis.features import (
 )
 from ugat_marl.diagnosis.residual import Null
 from ugat_marl.diagnosis.statistics import Pools, Whitener
+from ugat_marl.diagnosis.thresholds import Thresholds
+
+THRESHOLDS = Thresholds()
 
 Array = NDArray[np.float64]
 
 USED = ("lost", "gap2", "gap4-5", "free_speed", "red_time", "count_stop")
 WEIGHT = 50.0
-NETWORK = Pools({"network": np.ones((1, 1))})
-SEVERAL = Pools({"network": np.ones((1, 3)), "lane": np.eye(3)})
+NETWORK = Pools({"network": np.ones((1, 1))}, THRESHOLDS)
+SEVERAL = Pools({"network": np.ones((1, 3)), "lane": np.eye(3)}, THRESHOLDS)
 
 
 def days_of(
@@ -114,8 +117,8 @@ def test_intersections_pool_only_where_there_are_several() -> None:
         exits = ((0, "out_0", ("x",)),)
         return DetectorLayout(tuple(f"C{i}" for i in range(lights)), lanes, exits, (), {})
 
-    assert set(Pools.of(layout(1)).blocks) == {"network", "lane"}
-    pools = Pools.of(layout(2)).blocks
+    assert set(Pools.of(layout(1), THRESHOLDS).blocks) == {"network", "lane"}
+    pools = Pools.of(layout(2), THRESHOLDS).blocks
     assert pools["intersection"].tolist() == [[1, 0, 1], [0, 1, 0]]
     assert pools["network"].tolist() == [[1, 1, 1]]
 

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from ugat_marl.diagnosis.features import BIN_FEATURES
 from ugat_marl.diagnosis.places import largest_stretches, most_unusual, occupied_between
 from ugat_marl.diagnosis.statistics import Distance
+from ugat_marl.diagnosis.thresholds import Thresholds
+
+THRESHOLDS = Thresholds()
 
 Array = NDArray[np.float64]
 
@@ -73,7 +76,7 @@ def scan(
     measured = plain.copy()
     for (first, last), rate in changed.items():
         measured[first:last] = rate
-    return most_unusual(measured, plain, plain, begin_s, side)
+    return most_unusual(measured, plain, plain, begin_s, THRESHOLDS, side)
 
 
 @pytest.mark.parametrize("side", [0, 1])
@@ -105,8 +108,8 @@ def test_a_closure_is_found_and_not_the_queue_that_is_let_go() -> None:
 
 def test_a_period_shorter_than_any_stretch_is_not_scanned() -> None:
     rows = np.full(4, 10.0)
-    assert most_unusual(3 * rows, rows, rows, 0.0) is None
-    assert most_unusual(rows, 0 * rows, rows, 0.0) is None
+    assert most_unusual(3 * rows, rows, rows, 0.0, THRESHOLDS) is None
+    assert most_unusual(rows, 0 * rows, rows, 0.0, THRESHOLDS) is None
 
 
 def test_occupied_seconds_are_shared_among_minutes() -> None:

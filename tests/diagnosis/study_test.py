@@ -11,14 +11,16 @@ import polars as pl
 import pytest
 
 from ugat_marl.data import Measured
-from ugat_marl.diagnosis import Study, Tally
+from ugat_marl.diagnosis import DiagnosisConfig, Study, Tally
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.study import effort_for, heard
-from ugat_marl.diagnosis.thresholds import THRESHOLDS, Effort
+from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.effects import Effect, Headway
 from ugat_marl.scenarios import Detector, Passages, Period
+
+THRESHOLDS = Thresholds()
 
 NAMES = ("one", "two", "three", "four")
 DETECTORS = tuple(Detector(name, f"{name}_0", 1.0, 0.0, "stop") for name in NAMES)
@@ -117,11 +119,12 @@ class Days:
 
 def study(own: Days, other: Days | None) -> Study:
     blank = cast(Any, None)
-    pools = Pools({"lane": np.eye(1)})
+    pools = Pools({"lane": np.eye(1)}, THRESHOLDS)
     engines = [cast(Engine, cast(object, days)) for days in (own, other)]
     return Study(
-        blank, blank, blank, blank, blank, engine=engines[0], pools=pools, allowed=frozenset(),
-        hypotheses=(), effort=Effort(base=6), fit=(), heldout=(), other_days=engines[1],
+        blank, blank, blank, DiagnosisConfig(), blank, engine=engines[0], pools=pools,
+        allowed=frozenset(), hypotheses=(), effort=Effort(base=6), fit=(), heldout=(),
+        other_days=engines[1],
     )  # fmt: skip
 
 

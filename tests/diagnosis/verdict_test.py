@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from ugat_marl.diagnosis import Hypothesis
+from ugat_marl.diagnosis import DiagnosisConfig, Hypothesis
 from ugat_marl.diagnosis.features import FEATURES
 from ugat_marl.diagnosis.places import one_behind_the_other
 from ugat_marl.diagnosis.records import EffectRecord, Located, Parameter, Selected
@@ -73,8 +73,8 @@ def test_an_effect_everywhere() -> None:
         "parameters": {
             "seconds": {
                 "value": 1.45,
-                "low": pytest.approx(1.45 - 1.96 * 0.02),
-                "high": pytest.approx(1.45 + 1.96 * 0.02),
+                "low": pytest.approx(1.43),
+                "high": pytest.approx(1.47),
                 "unit": "s",
             }
         },
@@ -152,7 +152,7 @@ def test_what_to_measure_next_is_said_in_words() -> None:
         selected(best),
         selector,
         won,
-        0.05,
+        DiagnosisConfig(alpha=0.05),
         SITE,
     )
     assert found.verdict == "partially_explained"
@@ -180,7 +180,7 @@ def test_only_a_search_that_ended_says_that_the_library_lacks_it(
         selected(best, complete),
         selector,
         nothing_won,
-        0.05,
+        DiagnosisConfig(alpha=0.05),
         SITE,
     )
     assert found.verdict == "unknown"
@@ -216,7 +216,7 @@ def test_the_end_of_a_range_is_no_answer(
         selected(best),
         selector,
         won,
-        0.05,
+        DiagnosisConfig(alpha=0.05),
         SITE,
     )
     assert found.verdict == verdict
@@ -260,7 +260,7 @@ def test_vehicles_that_leave_are_not_taken_for_counters_that_miss_them(
         selected(best),
         selector,
         won,
-        0.05,
+        DiagnosisConfig(alpha=0.05),
         SITE,
     )
     assert found.verdict == ("not_identifiable" if between else "explained")
@@ -291,7 +291,7 @@ def test_a_hint_that_is_not_confirmed_is_weighed_with_the_other_periods(
         selected(best),
         selector,
         verification,
-        0.05,
+        DiagnosisConfig(alpha=0.05),
         SITE,
     )
     assert found.verdict == verdict

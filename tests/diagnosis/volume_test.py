@@ -12,9 +12,11 @@ from ugat_marl.diagnosis import Hypothesis, Routes
 from ugat_marl.diagnosis.features import FEATURES, INDEX, DetectorLayout, IncomingLane
 from ugat_marl.diagnosis.places import Volume
 from ugat_marl.diagnosis.statistics import Distance
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
 from ugat_marl.scenarios import Scenario
+
+THRESHOLDS = Thresholds()
 
 Way = tuple[str, ...]
 Counts = Mapping[str, tuple[float, float]]
@@ -59,11 +61,11 @@ def a_distance(layout: DetectorLayout, counts: Counts) -> Distance:
 
 
 def directed(layout: DetectorLayout, ways: Mapping[Way, float], counts: Counts) -> dict[str, float]:
-    return Volume(layout, routes(ways)).directed(a_distance(layout, counts))
+    return Volume(layout, routes(ways), THRESHOLDS).directed(a_distance(layout, counts))
 
 
 def proposed(layout: DetectorLayout, ways: Mapping[Way, float], counts: Counts) -> list[Hypothesis]:
-    return Volume(layout, routes(ways)).hypotheses(a_distance(layout, counts))
+    return Volume(layout, routes(ways), THRESHOLDS).hypotheses(a_distance(layout, counts))
 
 
 def test_one_edge_is_its_squared_z() -> None:
@@ -148,13 +150,15 @@ def test_lanes_tell_from_where_vehicles_turn_elsewhere(origin: str) -> None:
         distance.difference["lane"][place, row] = value / 60.0
         distance.z["lane"][place, row] = value / 14.0
     first = next(
-        h for h in Volume(layout, routes(ways)).hypotheses(distance) if h.name == "turning"
+        h
+        for h in Volume(layout, routes(ways), THRESHOLDS).hypotheses(distance)
+        if h.name == "turning"
     )
     assert first.fixed == (("from_edge", origin), ("to_edge", "x"))
     # Two lanes, 80 more and 80 fewer, errors of 14: 2 (80 / 14)^2 beside what the exits say.
     counted = a_distance(layout, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
-    gain = Volume(layout, routes(ways)).directed(distance)["turning"]
-    alone = Volume(layout, routes(ways)).directed(counted)["turning"]
+    gain = Volume(layout, routes(ways), THRESHOLDS).directed(distance)["turning"]
+    alone = Volume(layout, routes(ways), THRESHOLDS).directed(counted)["turning"]
     assert gain - alone == pytest.approx(2 * (80.0 / 14.0) ** 2, rel=0.01)
 
 

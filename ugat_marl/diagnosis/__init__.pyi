@@ -41,7 +41,6 @@ from .statistics import whitened as whitened
 from .study import IN_THE_LOG as IN_THE_LOG
 from .study import DiagnosisConfig as DiagnosisConfig
 from .study import Study as Study
-from .thresholds import THRESHOLDS as THRESHOLDS
 from .thresholds import Effort as Effort
 from .thresholds import Thresholds as Thresholds
 from .verdict import clock as clock

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ugat_marl.data import installed_version
 from ugat_marl.diagnosis.features import FEATURES, DetectorLayout, Greens, Tally, tally
 from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
 from ugat_marl.files import user_cache, write_whole
@@ -47,13 +47,14 @@ class Usual:
     day_to_day: float = 0.0
 
     @classmethod
-    def of(cls, tallies: Sequence[Tally]) -> Usual:
+    def of(cls, tallies: Sequence[Tally], thresholds: Thresholds) -> Usual:
         """Separate ordinary days from days of standstill.
 
         Args:
             tallies: Days of the scenario as it is, by number from 0 on.
+            thresholds: Numbers of the method.
         """
-        aside = frozenset(locked_up(tallies))
+        aside = frozenset(locked_up(tallies, thresholds))
         return cls(aside, day_to_day([day for n, day in enumerate(tallies) if n not in aside]))
 
 
@@ -63,7 +64,7 @@ def day_to_day(tallies: Sequence[Tally]) -> float:
     return 1.4826 * float(np.median(np.abs(counts - np.median(counts)))) + 1e-9
 
 
-def locked_up(tallies: Sequence[Tally], usual: float = 0.0) -> list[int]:
+def locked_up(tallies: Sequence[Tally], thresholds: Thresholds, usual: float = 0.0) -> list[int]:
     """Find the few days of a model on which traffic came to a standstill.
 
     A single such day inflates the noise of all statistics. If such days are common, they belong to
@@ -71,6 +72,7 @@ def locked_up(tallies: Sequence[Tally], usual: float = 0.0) -> list[int]:
 
     Args:
         tallies: Days of one model.
+        thresholds: Numbers of the method.
         usual: Lower bound of `day_to_day`, since few days estimate it badly.
 
     Returns:
@@ -78,8 +80,8 @@ def locked_up(tallies: Sequence[Tally], usual: float = 0.0) -> list[int]:
     """
     counts = _counts(tallies)
     spread = max(day_to_day(tallies), usual)
-    found = np.flatnonzero(np.abs(counts - np.median(counts)) > THRESHOLDS.locked_up * spread)
-    return found.tolist() if len(found) <= max(1.0, THRESHOLDS.rare * len(tallies)) else []
+    found = np.flatnonzero(np.abs(counts - np.median(counts)) > thresholds.locked_up * spread)
+    return found.tolist() if len(found) <= max(1.0, thresholds.rare * len(tallies)) else []
 
 
 def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
@@ -129,6 +131,7 @@ class Engine:
         periods: Measured periods; day ``r`` runs under the signals of period
             ``r mod len(periods)``.
         seed: Root seed of the days.
+        thresholds: Numbers of the method.
         cache: Folder of the cached tallies; None for no cache on disk.
         deadline: ``time.monotonic()`` after which new simulations are refused; None for no limit.
         workers: Simulations at a time, None for one per core; or an executor that simulates days.
@@ -143,6 +146,7 @@ class Engine:
         replay: Replay,
         periods: Sequence[Period],
         seed: int,
+        thresholds: Thresholds,
         *,
         cache: Path | None = None,
         deadline: float | None = None,
@@ -156,6 +160,7 @@ class Engine:
         self.deadline = deadline
         self._replay = replay
         self._seed = seed
+        self._thresholds = thresholds
         self._cache = cache
         self._workers = workers
         self._greens: list[tuple[Greens, ...]] = [layout.greens(period) for period in periods]
@@ -163,7 +168,15 @@ class Engine:
         self._known: dict[str, Replicate] = {}
         self._unmeasured = Unmeasured.of(periods)
         versions = installed_version("eclipse-sumo"), installed_version("numpy")
-        head = (VERSION, FEATURES, scenario.hash, layout.detectors, versions, seed)
+        head = (
+            VERSION,
+            FEATURES,
+            scenario.hash,
+            layout.detectors,
+            versions,
+            seed,
+            thresholds.of_a_day(),
+        )
         head += (self._unmeasured,) if self._unmeasured else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in layout.places})
@@ -177,7 +190,10 @@ class Engine:
 
     def measured(self, periods: Sequence[Period]) -> list[Tally]:
         """Return the tallies of measured periods."""
-        return [tally(self.layout, period, self.layout.greens(period)) for period in periods]
+        return [
+            tally(self.layout, period, self.layout.greens(period), self._thresholds)
+            for period in periods
+        ]
 
     @contextlib.contextmanager
     def watched(self, advance: Callable[[], None], most: int) -> Iterator[None]:
@@ -207,7 +223,7 @@ class Engine:
             OutOfTime: The budget does not suffice for these days.
         """
         days = self.replicates([], range(self._base_days))
-        return Usual.of([day.tally for day in days]) if days else Usual()
+        return Usual.of([day.tally for day in days], self._thresholds) if days else Usual()
 
     def first(self, count: int) -> list[int]:
         """Return the numbers of the first days that are ordinary under the scenario as it is."""
@@ -228,7 +244,7 @@ class Engine:
             advance: Function to call after each day.
         """
         days = self.replicates(effects, numbers, advance)
-        aside = locked_up([day.tally for day in days], self.usual.day_to_day)
+        aside = locked_up([day.tally for day in days], self._thresholds, self.usual.day_to_day)
         known = enumerate(zip(numbers, days, strict=True))
         return {number: day for place, (number, day) in known if place not in aside}
 
@@ -329,7 +345,9 @@ class Engine:
         """Simulate a day and count it."""
         day = self._day(effects, number)
         period = self._unmeasured.kept_from(day.period)
-        counted = tally(self.layout, period, self._greens[number % len(self.periods)])
+        counted = tally(
+            self.layout, period, self._greens[number % len(self.periods)], self._thresholds
+        )
         # The cache holds float32, so round here: the result must not depend on the cache.
         counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
         return self._with_due(counted, day.travel_time_s, day.due)

@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import DayThresholds
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import (
     GREEN,
@@ -331,12 +331,14 @@ class Tally:
         )
 
 
-def bins_of(period: Period) -> int:
+def bins_of(period: Period, thresholds: DayThresholds) -> int:
     """Return the number of bins of time in a period."""
-    return max(1, round((period.end_s - period.begin_s) / THRESHOLDS.bin_s))
+    return max(1, round((period.end_s - period.begin_s) / thresholds.bin_s))
 
 
-def tally(layout: DetectorLayout, period: Period, greens: Sequence[Greens]) -> Tally:
+def tally(
+    layout: DetectorLayout, period: Period, greens: Sequence[Greens], thresholds: DayThresholds
+) -> Tally:
     """Reduce a period to its features.
 
     Args:
@@ -344,11 +346,15 @@ def tally(layout: DetectorLayout, period: Period, greens: Sequence[Greens]) -> T
         period: Period with passages.
         greens: Greens of every lane, ``layout.greens(period)``; simulated days use those of the
             measured period.
+        thresholds: Numbers of the method.
     """
     places = len(layout.lanes) + len(layout.exits)
-    bins = bins_of(period)
+    bins = bins_of(period, thresholds)
     counter = _Counter(
-        np.zeros((len(FEATURES), places, 2)), np.zeros((len(BIN_FEATURES), places, bins)), period
+        np.zeros((len(FEATURES), places, 2)),
+        np.zeros((len(BIN_FEATURES), places, bins)),
+        period,
+        thresholds,
     )
     stops = np.zeros(len(layout.lanes))
     advances = np.zeros(len(layout.lanes))
@@ -382,12 +388,14 @@ class _Counter:
         sums: Sums and numbers of observations, ``(features, places, 2)``.
         bins: Counts and occupied seconds, ``(bin features, places, bins)``.
         period: Period that is counted.
+        thresholds: Numbers of the method.
         place: Index of the place that is being filled.
     """
 
     sums: Array
     bins: Array
     period: Period
+    thresholds: DayThresholds
     place: int = 0
 
     def add(self, name: str, values: Array) -> None:
@@ -427,7 +435,7 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     counter.ratio("discharged", 0.0, cycles)
     if not len(stop) or not cycles:
         return
-    crossed = stop.off_s
+    thresholds, crossed = counter.thresholds, stop.off_s
     cycle = np.searchsorted(greens.start_s, crossed, "right") - 1
     inside = (cycle >= 0) & (crossed <= greens.red_s[np.maximum(cycle, 0)])
     stop, crossed, cycle = stop.at(inside), crossed[inside], cycle[inside]
@@ -442,10 +450,10 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     before = np.where(number == 0, start, np.roll(crossed, 1))
     gap = crossed - before
     broken = np.cumsum(
-        gap > np.where(number == 0, THRESHOLDS.first_gap_s, THRESHOLDS.queue_break_s)
+        gap > np.where(number == 0, thresholds.first_gap_s, thresholds.queue_break_s)
     )
     # vehicles before the first long gap of their green
-    alive = queue & (broken - broken[first] + (gap[first] > THRESHOLDS.first_gap_s) == 0)
+    alive = queue & (broken - broken[first] + (gap[first] > thresholds.first_gap_s) == 0)
     protected = alive & greens.protected[cycle]
     counter.add("gap_permitted", gap[alive & ~greens.protected[cycle] & (number >= 1)])
     lost = gap[protected & (number == 0)]
@@ -489,7 +497,7 @@ def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
     counter.ratio("late_crossings", float((counted & (red > 0) & (red <= 2.0)).sum()), cycles)
     counter.ratio(
         "red_crossings",
-        float((counted & (red > 2.0) & (red <= THRESHOLDS.after_red_s)).sum()),
+        float((counted & (red > 2.0) & (red <= counter.thresholds.after_red_s)).sum()),
         cycles,
     )
     counter.add("last_crossing", after[counted & (red <= 3.0)])
@@ -513,7 +521,7 @@ def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: f
     on, speed = advance.on_s, advance.speed_mps
     over = advance.off_s - on
     gap = np.append(np.inf, np.diff(on))
-    moving = np.where(np.isfinite(speed), speed > THRESHOLDS.moving_mps, over < 1.2)
+    moving = np.where(np.isfinite(speed), speed > counter.thresholds.moving_mps, over < 1.2)
     platoon = moving & np.append(False, moving[:-1]) & (gap < 6.0)
     counter.add("platoon_gap", gap[platoon])
     counter.add("platoon_short", (gap[platoon] < 1.6).astype(np.float64))
@@ -594,32 +602,39 @@ def _conserved(
 # --- counts alone ---------------------------------------------------------------------------------
 
 
-def bins_together(counts: pl.DataFrame | None) -> int:
+def bins_together(counts: pl.DataFrame | None, thresholds: DayThresholds) -> int:
     """Return the number of bins that the longest interval of the counts covers.
 
     Args:
         counts: Table with ``begin_s, end_s``; None if single vehicles were detected.
+        thresholds: Numbers of the method.
     """
     if counts is None or counts.is_empty():
         return 1
     longest = float((counts["end_s"] - counts["begin_s"]).cast(pl.Float64).to_numpy().max())
-    return max(1, math.ceil(longest / THRESHOLDS.bin_s - 1e-6))
+    return max(1, math.ceil(longest / thresholds.bin_s - 1e-6))
 
 
-def without_gaps(counts: pl.DataFrame, periods: Sequence[Period]) -> frozenset[str]:
+def without_gaps(
+    counts: pl.DataFrame, periods: Sequence[Period], thresholds: DayThresholds
+) -> frozenset[str]:
     """Find detectors that were counted in every period from begin to end."""
     length = pl.col("end_s").cast(pl.Float64) - pl.col("begin_s").cast(pl.Float64)
     found = set(counts["detector_id"].to_list())
     for period in periods:
         own = counts.filter(pl.col("period_id") == period.id)
         times = dict(own.group_by("detector_id").agg(length.sum()).iter_rows())
-        least = THRESHOLDS.whole * (period.end_s - period.begin_s)
+        least = thresholds.whole * (period.end_s - period.begin_s)
         found = {name for name in found if times.get(name, 0.0) >= least}
     return frozenset(found)
 
 
 def counts_tally(
-    layout: DetectorLayout, period: Period, counts: pl.DataFrame, whole: Collection[str]
+    layout: DetectorLayout,
+    period: Period,
+    counts: pl.DataFrame,
+    whole: Collection[str],
+    thresholds: DayThresholds,
 ) -> Tally:
     """Return a tally that holds only counts; all other features stay empty.
 
@@ -629,9 +644,10 @@ def counts_tally(
         counts: Table with ``period_id, begin_s, end_s, detector_id, count``.
         whole: Detectors `without_gaps`. Other detectors fill only their known bins, since the mean
             of some hours is not the mean of the period.
+        thresholds: Numbers of the method.
     """
     places = len(layout.lanes) + len(layout.exits)
-    length = bins_of(period)
+    length = bins_of(period, thresholds)
     sums = np.zeros((len(FEATURES), places, 2))
     bins = np.zeros((len(BIN_FEATURES), places, length))
     covered = np.zeros_like(bins)
@@ -646,5 +662,5 @@ def counts_tally(
             line = BIN_FEATURES.index(name), place
             bins[line] += count * inside / max(end - begin, 1e-9)
             covered[line] += inside
-    known = (covered > THRESHOLDS.whole * np.diff(edges)).astype(np.float64)
+    known = (covered > thresholds.whole * np.diff(edges)).astype(np.float64)
     return Tally(sums, bins * known, known=known)

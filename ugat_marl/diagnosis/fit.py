@@ -12,7 +12,6 @@ from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_of
 from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.statistics import Array, Pools, Reference, Whitener, change_between, shrunk
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
 from ugat_marl.effects import EVERYWHERE
 
 Change = tuple[dict[str, Array], float]
@@ -38,7 +37,6 @@ class Fitter:
         base_days: Tallies of its simulated days, by number of the day.
         data: Tallies of the periods to fit.
         days: Number of simulated days for each evaluation.
-        price: Cost of every effect; an effect must reduce the distance by more.
         speeds: True if speeds were measured.
     """
 
@@ -51,7 +49,6 @@ class Fitter:
         data: Sequence[Tally],
         *,
         days: int,
-        price: float,
         speeds: bool,
     ) -> None:
         self.engine = engine
@@ -60,7 +57,7 @@ class Fitter:
         self.base_days = base_days
         self.data = tuple(data)
         self.days = days
-        self.price = price
+        self.thresholds = pools.thresholds
         self.speeds = speeds
 
     def simulate(self, members: Members, days: int | None = None) -> Fitted:
@@ -80,7 +77,7 @@ class Fitter:
             paired=[self.base_days[number] for number in found],
         )
         distance = reference.distance(self.data, relative_to=self.base)
-        cost = distance.total + distance.penalty + self.price * len(members)
+        cost = distance.total + distance.penalty + self.thresholds.price * len(members)
         known = {number: day.tally for number, day in found.items()}
         return Fitted(members, known, reference, distance, cost)
 
@@ -99,7 +96,7 @@ class Fitter:
             whitener = self.whitener(best)
             if jacobian is None or number == 2:
                 jacobian = self.jacobian(best, whitener)
-            step = _solve(jacobian, whitener.measured)
+            step = _solve(jacobian, whitener.measured, self.thresholds.ridge)
             moved = self._moved(best, step)
             if moved == best.members:
                 break
@@ -115,7 +112,7 @@ class Fitter:
                     jacobian = None
                     continue
             gain, best = best.cost - found.cost, found
-            if gain < THRESHOLDS.least_gain and number:
+            if gain < self.thresholds.least_gain and number:
                 break
         return best
 
@@ -128,12 +125,12 @@ class Fitter:
         """
         if not len(model.values):
             return model
-        precise = self.simulate(model.members, THRESHOLDS.settling_days)
+        precise = self.simulate(model.members, self.thresholds.settling_days)
         whitener = self.whitener(precise)
-        step = _solve(self.jacobian(model, whitener), whitener.measured)
-        if (np.abs(step) <= THRESHOLDS.settled_within * errors).all():
+        step = _solve(self.jacobian(model, whitener), whitener.measured, self.thresholds.ridge)
+        if (np.abs(step) <= self.thresholds.settled_within * errors).all():
             return precise
-        moved = self.simulate(self._moved(precise, step), THRESHOLDS.settling_days)
+        moved = self.simulate(self._moved(precise, step), self.thresholds.settling_days)
         return moved if moved.cost < precise.cost else precise
 
     def fitted(self, start: Fitted) -> Fitted:
@@ -150,16 +147,19 @@ class Fitter:
         The same few days are simulated before and after a move.
         """
         members = best.members
-        cost = self.simulate(members, THRESHOLDS.window_days).cost
-        for step in THRESHOLDS.window_steps_s:
+        cost = self.simulate(members, self.thresholds.window_days).cost
+        for step in self.thresholds.window_steps_s:
             for direction in ((-1, 0), (1, 0), (0, -1), (0, 1)):
                 while True:
                     move = (step * direction[0], step * direction[1])
-                    moved = tuple((_shifted(h, move), values) for h, values in members)
+                    moved = tuple(
+                        (_shifted(h, move, self.thresholds.shortest_window_s), values)
+                        for h, values in members
+                    )
                     if moved == members:
                         break
-                    found = self.simulate(moved, THRESHOLDS.window_days).cost
-                    if found >= cost - THRESHOLDS.least_gain:
+                    found = self.simulate(moved, self.thresholds.window_days).cost
+                    if found >= cost - self.thresholds.least_gain:
                         break
                     members, cost = moved, found
         if members == best.members:
@@ -176,7 +176,9 @@ class Fitter:
             if value != EVERYWHERE
         ]
         blocks = None if places else WIDE
-        return Whitener(model.reference, self.data, THRESHOLDS.interpolation, self.base, blocks)
+        return Whitener(
+            model.reference, self.data, self.thresholds.interpolation, self.base, blocks
+        )
 
     def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
         """Return derivatives of the whitened statistics, ``(free values, statistics)``."""
@@ -191,12 +193,12 @@ class Fitter:
         found: list[Change] = []
         for place, (hypothesis, values) in enumerate(model.members):
             for index in range(len(values)):
-                change, delta = self._change(model, place, index, THRESHOLDS.nearby)
+                change, delta = self._change(model, place, index, self.thresholds.nearby)
                 errors = float(np.linalg.norm(whitener(change)))
-                if errors < THRESHOLDS.plain_move and not hypothesis.step:
+                if errors < self.thresholds.plain_move and not hypothesis.step:
                     share = min(
-                        THRESHOLDS.nearby * THRESHOLDS.plain_move / max(errors, 1e-9),
-                        THRESHOLDS.far,
+                        self.thresholds.nearby * self.thresholds.plain_move / max(errors, 1e-9),
+                        self.thresholds.far,
                     )
                     change, delta = self._change(model, place, index, share)
                 found.append((change, delta))
@@ -207,21 +209,24 @@ class Fitter:
         hypothesis, values = model.members[place]
         moved = _moved_a_little(hypothesis, values, index, share)
         members = replaced(model.members, place, moved)
-        return shrunk(*self.difference(model, members)), (moved[index] - values[index]) or 1.0
+        return shrunk(*self.difference(model, members), self.thresholds), (
+            moved[index] - values[index]
+        ) or 1.0
 
     def window_changes(self, model: Fitted) -> list[Change]:
         """Move begin and end of windows a minute inwards, for effects with free values.
 
         Strength and duration of an effect are estimated together, so their errors are correlated.
         """
+        shortest_s = self.thresholds.shortest_window_s
         found: list[Change] = []
         for place, (hypothesis, values) in enumerate(model.members):
-            for move in ((THRESHOLDS.shortest_window_s, 0.0), (0.0, -THRESHOLDS.shortest_window_s)):
-                moved = _shifted(hypothesis, move) if values else hypothesis
+            for move in ((shortest_s, 0.0), (0.0, -shortest_s)):
+                moved = _shifted(hypothesis, move, shortest_s) if values else hypothesis
                 if moved is not hypothesis:
                     members = (*model.members[:place], (moved, values), *model.members[place + 1 :])
                     found.append(
-                        (shrunk(*self.difference(model, members)), THRESHOLDS.shortest_window_s)
+                        (shrunk(*self.difference(model, members), self.thresholds), shortest_s)
                     )
         return found
 
@@ -273,18 +278,19 @@ def _moved_a_little(
     return moved
 
 
-def _shifted(hypothesis: Hypothesis, move: tuple[float, float]) -> Hypothesis:
+def _shifted(hypothesis: Hypothesis, move: tuple[float, float], shortest_s: float) -> Hypothesis:
     """Return the hypothesis with a moved window; itself without a window or if it gets too short.
 
     Args:
         hypothesis: The hypothesis.
         move: Moves of begin and end, s.
+        shortest_s: Shortest window, s.
     """
     known = dict(hypothesis.fixed)
     if not set(WINDOW) <= known.keys():
         return hypothesis
     begin, end = (known[name] + shift for name, shift in zip(WINDOW, move, strict=True))
-    if begin < 0 or end - begin < THRESHOLDS.shortest_window_s:
+    if begin < 0 or end - begin < shortest_s:
         return hypothesis
     changed = {**known, WINDOW[0]: begin, WINDOW[1]: end}
     return replace(hypothesis, fixed=tuple((name, changed[name]) for name, _ in hypothesis.fixed))
@@ -296,7 +302,7 @@ def replaced(members: Members, place: int, values: tuple[float, ...]) -> Members
     return (*members[:place], (hypothesis, values), *members[place + 1 :])
 
 
-def _solve(jacobian: Array, residual: Array) -> Array:
+def _solve(jacobian: Array, residual: Array, ridge: float) -> Array:
     """Solve ``(J J' + ridge I) x = J r`` for the step x, with the rows of J scaled to length 1.
 
     `scipy.optimize.least_squares` does not fit here. It chooses the points of evaluation itself,
@@ -305,10 +311,11 @@ def _solve(jacobian: Array, residual: Array) -> Array:
     Args:
         jacobian: J, ``(free values, statistics)``.
         residual: r, ``(statistics,)``.
+        ridge: Ridge of the normal equations.
     """
     scale = np.sqrt((jacobian**2).sum(axis=1)) + 1e-12
     scaled = jacobian / scale[:, None]
-    normal = scaled @ scaled.T + THRESHOLDS.ridge * np.eye(len(scaled))
+    normal = scaled @ scaled.T + ridge * np.eye(len(scaled))
     return np.linalg.solve(normal, scaled @ residual) / scale
 
 
@@ -339,7 +346,7 @@ def _crookedness(
         for index, value in enumerate(values):
             row = len(found)
             moves: list[tuple[float, float]] = []
-            for share in THRESHOLDS.straightness_moves:
+            for share in fitter.thresholds.straightness_moves:
                 changed = list(values)
                 changed[index] = value + share * errors[row]
                 moved = hypothesis.clipped(changed)
@@ -350,7 +357,7 @@ def _crookedness(
             slope = float(asked @ got) / max(float(asked @ asked), 1e-12)
             if len(moves) < 2:
                 found.append(0.0)
-            elif slope < THRESHOLDS.blunt:
+            elif slope < fitter.thresholds.blunt:
                 found.append(float(np.mean(asked**2)))
             else:
                 found.append(float(((got / slope - asked) ** 2).sum()) / (len(moves) - 1))

@@ -15,7 +15,7 @@ from ugat_marl.diagnosis.records import Disagreement, Located, Tested
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
 from ugat_marl.diagnosis.study import Study
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 
 SHOWN = 40
 """Largest number of disagreements that are reported."""
@@ -140,7 +140,7 @@ def _stretches(
         if used[row].sum() < 3:
             continue
         middle = float(np.median(z[row][used[row]]))
-        best = _stretch(z[row] - middle)
+        best = _stretch(z[row] - middle, reference.pools.thresholds)
         if best is None:
             continue
         value, first, last = best
@@ -165,7 +165,7 @@ def _stretches(
     return found
 
 
-def _stretch(z: Array) -> tuple[float, int, int] | None:
+def _stretch(z: Array, thresholds: Thresholds) -> tuple[float, int, int] | None:
     """Find the contiguous bins with the largest standardised sum, ``sum(z) / sqrt(bins)``.
 
     Returns:
@@ -173,7 +173,7 @@ def _stretch(z: Array) -> tuple[float, int, int] | None:
     """
     sums = np.concatenate(([0.0], np.cumsum(np.clip(z, -15, 15))))
     best: tuple[float, int, int] | None = None
-    for length in range(1, max(int(THRESHOLDS.longest_stretch * len(z)), 1) + 1):
+    for length in range(1, max(int(thresholds.longest_stretch * len(z)), 1) + 1):
         values = (sums[length:] - sums[:-length]) / math.sqrt(length)
         place = int(np.argmax(np.abs(values)))
         if best is None or abs(values[place]) > abs(best[0]):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout
 from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.statistics import Distance, Reference
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import ExaminedStrengths
 from ugat_marl.scenarios import Passages, Period, Scenario, driven_routes, edge_of
 
@@ -40,14 +40,22 @@ class PlaceFinder:
         layout: Lanes and detectors.
         routes: Routes of the scenario.
         allowed: Names of effects to examine.
+        thresholds: Numbers of the method.
     """
 
-    def __init__(self, layout: DetectorLayout, routes: Routes, allowed: Collection[str]) -> None:
+    def __init__(
+        self,
+        layout: DetectorLayout,
+        routes: Routes,
+        allowed: Collection[str],
+        thresholds: Thresholds,
+    ) -> None:
         self._layout = layout
+        self._thresholds = thresholds
         self._routes = routes
         self.allowed = frozenset(allowed)
         self._edges = [edge for _, edge, _ in layout.places]
-        self._volume = Volume(layout, routes)
+        self._volume = Volume(layout, routes, thresholds)
 
     def hypotheses(
         self, reference: Reference, distance: Distance, periods: Sequence[Period]
@@ -74,9 +82,9 @@ class PlaceFinder:
         hardly changes, so differences of the data do not show parking reliably.
         """
         lanes = self._layout.lanes
-        if len(lanes) > THRESHOLDS.most_lanes or "parking" not in self.allowed:
+        if len(lanes) > self._thresholds.most_lanes or "parking" not in self.allowed:
             return []
-        return [_parking(lane.id) for lane in lanes]
+        return [_parking(lane.id, self._thresholds) for lane in lanes]
 
     def directed(self, distance: Distance) -> dict[str, float]:
         """Return the squared standardised sizes of the best origin, turn and stretch of time."""
@@ -90,23 +98,23 @@ class PlaceFinder:
         block = reference.blocks["time"]
         found: list[tuple[float, str, float]] = []
         first = BIN_FEATURES.index("count_advance") * len(self._edges)
-        width = THRESHOLDS.bin_s * reference.pools.together
+        width = self._thresholds.bin_s * reference.pools.together
         for origin in self._routes.passing:
             rows = [
                 first + index
                 for index, lane in enumerate(self._layout.lanes)
-                if self._routes.share(origin, lane.edge) > THRESHOLDS.mostly
+                if self._routes.share(origin, lane.edge) > self._thresholds.mostly
             ]
             known = z[rows] != 0
             if not known.any():
                 continue
             mean = np.where(np.isfinite(block.mean[rows]), block.mean[rows], 0.0)
             noise = np.where(known, difference[rows] / np.where(known, z[rows], 1.0), np.inf)
-            for shift in THRESHOLDS.shifts_s:
+            for shift in self._thresholds.shifts_s:
                 change = (_later(mean, shift / width) - mean) / np.abs(noise)
                 size = float((change**2).sum())
                 strength = float((change * z[rows]).sum()) / max(size, 1e-9)
-                if 0.5 < strength < 2.0 and strength**2 * size > THRESHOLDS.suspect_timing:
+                if 0.5 < strength < 2.0 and strength**2 * size > self._thresholds.suspect_timing:
                     found.append((strength**2 * size, origin, shift))
         chosen: dict[str, float] = {}
         for _, origin, shift in sorted(found, reverse=True):
@@ -188,7 +196,7 @@ class PlaceFinder:
         if not rows:
             return None
         begin, end = periods[0].begin_s, periods[0].end_s
-        minutes = max(int((end - begin) / THRESHOLDS.scan_s), 1)
+        minutes = max(int((end - begin) / self._thresholds.scan_s), 1)
         bins = block.mean.shape[1]
         which = np.minimum((np.arange(minutes) * bins) // minutes, bins - 1)
         per_bin = np.bincount(which, minlength=bins)
@@ -199,7 +207,7 @@ class PlaceFinder:
         else:  # without passages only the counts of whole bins are known
             more = distance.difference["time"][rows].sum(axis=0) / np.maximum(per_bin, 1)
             measured = expected + more[which]
-        return most_unusual(measured, expected, variance, begin, side)
+        return most_unusual(measured, expected, variance, begin, self._thresholds, side)
 
     def _minutes(
         self, periods: Sequence[Period], members: Sequence[int], kind: str, other: str, minutes: int
@@ -236,7 +244,7 @@ class PlaceFinder:
         """Propose parking on lanes, speeds on edges, lost time and clocks at traffic lights."""
         found: list[Hypothesis] = []
         lanes = self._layout.lanes
-        found += [_parking(lane) for lane in self._disturbed(distance)]
+        found += [_parking(lane, self._thresholds) for lane in self._disturbed(distance)]
         speed = distance.z["lane"][: len(lanes), INDEX["free_speed"]]
         by_edge: dict[str, float] = defaultdict(float)
         for lane, value in zip(lanes, speed, strict=True):
@@ -315,8 +323,8 @@ class PlaceFinder:
         return found
 
 
-def _parking(lane: str) -> Hypothesis:
-    fixed = (("lane", lane), ("dwell_s", THRESHOLDS.dwell_s))
+def _parking(lane: str, thresholds: Thresholds) -> Hypothesis:
+    fixed = (("lane", lane), ("dwell_s", thresholds.dwell_s))
     return Hypothesis("parking", fixed, ("per_hour",), ((20.0,),), (0.0,), 3.0)
 
 
@@ -422,10 +430,12 @@ class Volume:
     Args:
         layout: Lanes and detectors.
         routes: Routes of the scenario.
+        thresholds: Numbers of the method.
     """
 
-    def __init__(self, layout: DetectorLayout, routes: Routes) -> None:
+    def __init__(self, layout: DetectorLayout, routes: Routes, thresholds: Thresholds) -> None:
         self._layout = layout
+        self._thresholds = thresholds
         self._routes = routes
         self._edges = [edge for _, edge, _ in layout.places]
 
@@ -443,21 +453,21 @@ class Volume:
         found: list[Hypothesis] = []
         if len(self._routes.passing) > 1:
             for gain, origin, factor in sorted(self._origins(counts), reverse=True)[
-                : THRESHOLDS.places_of_a_kind
+                : self._thresholds.places_of_a_kind
             ]:
                 level = float(np.clip(factor, 0.3, 3.0))
                 fixed = (("edge", origin),)
-                if gain > THRESHOLDS.suspect_change:
+                if gain > self._thresholds.suspect_change:
                     found.append(
                         Hypothesis(
                             "demand_level", fixed, ("factor",), ((level,),), (1.0,), 0.03, both=True
                         )
                     )
         for gain, origin, target, share in sorted(self._turns(counts, distance), reverse=True)[
-            : THRESHOLDS.places_of_a_kind
+            : self._thresholds.places_of_a_kind
         ]:
             fixed = (("from_edge", origin), ("to_edge", target))
-            if gain > THRESHOLDS.suspect_change:
+            if gain > self._thresholds.suspect_change:
                 found.append(Hypothesis("turning", fixed, ("share",), ((share,),), (0.0,), 0.03))
         return found
 
@@ -495,15 +505,15 @@ class Volume:
         shared = np.array([[joint.get(a, {}).get(b, 0.0) for b in edges] for a in edges])
         shared = shared.reshape(len(edges), len(edges))
         size = np.sqrt(np.maximum(np.diag(shared), 1e-9))
-        alone = np.where(np.diag(shared) > 0, THRESHOLDS.alone, 1.0)
-        return (1 - THRESHOLDS.alone) * shared / np.outer(size, size) + np.diag(alone)
+        alone = np.where(np.diag(shared) > 0, self._thresholds.alone, 1.0)
+        return (1 - self._thresholds.alone) * shared / np.outer(size, size) + np.diag(alone)
 
     def _origins(self, counts: _Counts) -> list[tuple[float, str, float]]:
         """Return squared z, origin and factor of every origin that the counts can show."""
         found: list[tuple[float, str, float]] = []
         for origin, reached in self._routes.passing.items():
             strength, gain, size = counts.weighed(reached)
-            if size > THRESHOLDS.suspect_change:
+            if size > self._thresholds.suspect_change:
                 found.append((gain, origin, 1.0 + strength))
         return found
 
@@ -605,7 +615,12 @@ def _largest(difference: Array, variance: Array) -> float:
 
 
 def most_unusual(
-    measured: Array, expected: Array, variance: Array, begin_s: float, side: int = 0
+    measured: Array,
+    expected: Array,
+    variance: Array,
+    begin_s: float,
+    thresholds: Thresholds,
+    side: int = 0,
 ) -> tuple[float, float, float, float] | None:
     """Scan all stretches of time for the largest standardised difference from a constant ratio.
 
@@ -616,18 +631,19 @@ def most_unusual(
         expected: Expected values per minute.
         variance: Variances of the expected values per minute.
         begin_s: Begin of the first minute, s.
+        thresholds: Numbers of the method.
         side: -1 or 1 to find only smaller or only larger values; 0 for both.
 
     Returns:
         Standardised size, begin and end in s, ratio to the rest; None if all is chance.
     """
     minutes = len(measured)
-    if expected.sum() <= 0 or minutes * THRESHOLDS.scan_s <= THRESHOLDS.shortest_stretch_s:
+    if expected.sum() <= 0 or minutes * thresholds.scan_s <= thresholds.shortest_stretch_s:
         return None
     sums = [np.concatenate(([0.0], np.cumsum(row))) for row in (measured, expected, variance)]
-    shortest = int(THRESHOLDS.shortest_stretch_s / THRESHOLDS.scan_s)
+    shortest = int(thresholds.shortest_stretch_s / thresholds.scan_s)
     best: tuple[float, int, int, float] | None = None
-    for length in range(shortest, max(int(THRESHOLDS.longest_stretch * minutes), shortest) + 1):
+    for length in range(shortest, max(int(thresholds.longest_stretch * minutes), shortest) + 1):
         inside = [row[length:] - row[:-length] for row in sums]
         # z = (measured - rest * expected) / noise in the stretch, rest = their ratio outside
         rest = (sums[0][-1] - inside[0]) / np.maximum(sums[1][-1] - inside[1], 1e-9)
@@ -640,10 +656,10 @@ def most_unusual(
         if best is None or size[place] > best[0]:
             ratio = float(inside[0][place] / max(rest[place] * inside[1][place], 1e-9))
             best = (float(size[place]), place, place + length, ratio)
-    if best is None or best[0] < THRESHOLDS.unusual_stretch:
+    if best is None or best[0] < thresholds.unusual_stretch:
         return None
     z, first, last, ratio = best
-    return z, begin_s + THRESHOLDS.scan_s * first, begin_s + THRESHOLDS.scan_s * last, ratio
+    return z, begin_s + thresholds.scan_s * first, begin_s + thresholds.scan_s * last, ratio
 
 
 def occupied_between(on: Array, off: Array, edges: Array) -> Array:
@@ -667,6 +683,7 @@ def fault_hypotheses(
     layout: DetectorLayout, reference: Reference, distance: Distance, periods: Sequence[Period]
 ) -> list[Hypothesis]:
     """Propose detectors that count too few, stay on, fall silent, or are exchanged."""
+    thresholds = reference.pools.thresholds
     found: list[Hypothesis] = []
     places = {name: (place, INDEX[kind]) for name, (kind, place) in layout.counted.items()}
     z = {name: float(distance.z["lane"][row]) for name, row in places.items()}
@@ -678,16 +695,16 @@ def fault_hypotheses(
             found.append(
                 Hypothesis("undercount", (("place", name),), ("share",), ((share,),), (0.0,), 0.02)
             )
-    stuck = _stuck(periods)
+    stuck = _stuck(periods, thresholds)
     on = {dict(item.fixed)["detector"] for item in stuck}
-    silent = [x for x in _silent(periods, mean) if dict(x.fixed)["detector"] not in on]
+    silent = [x for x in _silent(periods, mean, thresholds) if dict(x.fixed)["detector"] not in on]
     found += stuck + silent
     kinds = {item.id: item.kind for item in layout.detectors}
     found += _swapped(kinds, mean, difference, z)
     return found
 
 
-def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:
+def _stuck(periods: Sequence[Period], thresholds: Thresholds) -> list[Hypothesis]:
     """Find detectors that were on for minutes at the same time of every period."""
     found: list[Hypothesis] = []
     for name in sorted(set.intersection(*(set(p.passages) for p in periods))):
@@ -698,7 +715,7 @@ def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:
                 item.on_s, nan=period.begin_s
             )
             longest = int(np.argmax(time))
-            if time[longest] < THRESHOLDS.stuck_s:
+            if time[longest] < thresholds.stuck_s:
                 break
             on, off = float(item.on_s[longest]), float(item.off_s[longest])
             on = period.begin_s if np.isnan(on) else on
@@ -712,7 +729,9 @@ def _stuck(periods: Sequence[Period]) -> list[Hypothesis]:
     return found[:3]
 
 
-def _silent(periods: Sequence[Period], rate: Mapping[str, float]) -> list[Hypothesis]:
+def _silent(
+    periods: Sequence[Period], rate: Mapping[str, float], thresholds: Thresholds
+) -> list[Hypothesis]:
     """Find detectors that were silent at the same time of every period, against expectation."""
     found: list[tuple[float, Hypothesis]] = []
     for name, expected in rate.items():
@@ -725,7 +744,7 @@ def _silent(periods: Sequence[Period], rate: Mapping[str, float]) -> list[Hypoth
             longest = int(np.argmax(np.diff(times)))
             begin, end = max(begin, float(times[longest])), min(end, float(times[longest + 1]))
         missing = expected * (end - begin) / 60.0 * len(periods)
-        if end > begin and missing > THRESHOLDS.silent:
+        if end > begin and missing > thresholds.silent:
             fixed = (("detector", name), ("begin_s", round(begin, 1)), ("end_s", round(end, 1)))
             found.append((missing, Hypothesis("dropout", fixed, (), ((),), None)))
     found.sort(key=lambda item: -item[0])

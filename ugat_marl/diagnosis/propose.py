@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ugat_marl.diagnosis.hypotheses import Hypothesis
 from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Distance, Reference, Whitener, softened, without_noise
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 
 Array = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def _side(direction: Direction) -> bool:
 
 
 def propose(
-    directions: Sequence[Direction], whitener: Whitener, price: float, largest: int = 3
+    directions: Sequence[Direction], whitener: Whitener, thresholds: Thresholds
 ) -> list[Proposed]:
     """Find sets of effects, in order of the cost that they would leave.
 
@@ -93,8 +93,7 @@ def propose(
     Args:
         directions: Changes of the statistics under hypotheses.
         whitener: The measured difference and its noise.
-        price: Cost of every effect.
-        largest: Size of the largest sets.
+        thresholds: Numbers of the method.
 
     Returns:
         Each set of hypotheses once, at its best strengths, least cost first.
@@ -102,13 +101,15 @@ def propose(
     if not directions:
         return []
     target = whitener.measured
-    basis = np.stack([whitener(without_noise(x.difference, x.variance)) for x in directions])
+    basis = np.stack(
+        [whitener(without_noise(x.difference, x.variance, thresholds)) for x in directions]
+    )
     gram = basis @ basis.T
     match = basis @ target
     start = float(target @ target)
     best: dict[tuple[object, ...], Proposed] = {}
     kept = list(range(len(directions)))
-    for size in range(1, largest + 1):
+    for size in range(1, len(thresholds.candidates) + 1):
         if size == 3 and len(kept) > 40:  # all triples would take too long
             kept = _useful(best, directions, 40)
         for chosen in itertools.combinations(kept, size):
@@ -116,13 +117,13 @@ def propose(
             if len(set(keys)) < size:
                 continue
             signs = tuple(directions[index].hypothesis.both for index in chosen)
-            found = _least_squares(gram, match, chosen, signs)
+            found = _least_squares(gram, match, chosen, signs, thresholds)
             if found is None:
                 continue
             left = start - float(
                 found @ (2 * match[list(chosen)] - gram[np.ix_(chosen, chosen)] @ found)
             )
-            cost = left + price * size
+            cost = left + thresholds.price * size
             if keys not in best or cost < best[keys].expected:
                 members = tuple(
                     (directions[index].hypothesis, directions[index].at(float(strength)))
@@ -139,7 +140,11 @@ def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
 
 
 def _least_squares(
-    gram: Array, match: Array, chosen: tuple[int, ...], both: tuple[bool, ...]
+    gram: Array,
+    match: Array,
+    chosen: tuple[int, ...],
+    both: tuple[bool, ...],
+    thresholds: Thresholds,
 ) -> Array | None:
     """Return strengths along the directions, clipped; None if one of the directions does not help.
 
@@ -148,6 +153,7 @@ def _least_squares(
         match: Scalar products of the directions with the measured difference, ``(directions,)``.
         chosen: Indices of the directions to use.
         both: True for directions that may have a negative strength.
+        thresholds: Numbers of the method.
     """
     part = gram[np.ix_(chosen, chosen)]
     try:
@@ -158,9 +164,9 @@ def _least_squares(
         return None
     # a negative strength helps only if the effect has an opposite
     size = np.where(both, np.abs(found), found)
-    if (size < THRESHOLDS.least_strength).any():
+    if (size < thresholds.least_strength).any():
         return None
-    return np.clip(found, -THRESHOLDS.farthest, THRESHOLDS.farthest)
+    return np.clip(found, -thresholds.farthest, thresholds.farthest)
 
 
 def _useful(
@@ -181,17 +187,17 @@ def _useful(
     return found[:count]
 
 
-def promising(proposals: Sequence[Proposed]) -> list[Proposed]:
+def promising(proposals: Sequence[Proposed], thresholds: Thresholds) -> list[Proposed]:
     """Choose the best sets of each size; larger sets only if they promise a clearly lower cost."""
     if not proposals:
         return []
     chosen = [item for item in proposals if len(item.members) == 1][:1]
     least = math.inf
-    for size in (1, 2, 3):
+    for size in range(1, len(thresholds.candidates) + 1):
         own = [item for item in proposals if len(item.members) == size]
         if own and own[0].expected < 0.95 * least - 20.0:  # more must be gained
             near = [item for item in own if item.expected <= 1.3 * own[0].expected + 50.0]
-            chosen += near[: THRESHOLDS.candidates[size - 1]]
+            chosen += near[: thresholds.candidates[size - 1]]
             least = own[0].expected
     return list(dict.fromkeys(chosen))
 
@@ -208,5 +214,10 @@ def squared_gap(distance: Distance, base: Reference, periods: int) -> float:
     for name, difference in distance.difference.items():
         block = base.blocks[name]
         noise = block.noise(block.weight, periods)
-        total += float((softened(name, np.nan_to_num(difference / np.sqrt(noise))) ** 2).sum())
+        total += float(
+            (
+                softened(name, np.nan_to_num(difference / np.sqrt(noise)), base.pools.thresholds)
+                ** 2
+            ).sum()
+        )
     return total

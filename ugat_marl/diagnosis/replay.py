@@ -39,7 +39,7 @@ from ugat_marl.diagnosis.features import (
     Tally,
     bins_of,
 )
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import DayThresholds
 from ugat_marl.effects import (
     Effect,
     depart_s,
@@ -100,6 +100,7 @@ class Replay:
         network: The network of the scenario.
         detectors: Detectors that are compared.
         owner: Traffic light by detector.
+        thresholds: Numbers of the method.
         answering: True if the signals followed the traffic; days then get the measured arrivals.
     """
 
@@ -111,18 +112,19 @@ class Replay:
         network: Network,
         detectors: Sequence[Detector],
         owner: Mapping[str, str],
+        thresholds: DayThresholds,
         *,
         answering: bool = False,
     ) -> None:
-        self._given = scenario, network, detectors, owner
+        self._given = scenario, network, detectors, owner, thresholds
         self.answering = answering
         self._scenario = demand_as_vehicles(scenario)
         self._network = network
         self._detectors = tuple(detectors)
         self._owner = dict(owner)
-        self._arrivals = (
-            Arrivals(DetectorLayout.of(network, detectors), network) if answering else None
-        )
+        self._thresholds = thresholds
+        layout = DetectorLayout.of(network, detectors)
+        self._arrivals = Arrivals(layout, network, thresholds) if answering else None
         self._own = detector_effects(scenario)
         self._days: OrderedDict[int, Scenario] = OrderedDict()
         self._lock = threading.Lock()
@@ -187,7 +189,7 @@ class Replay:
     def _run(self, scenario: Scenario, period: Period, seed: int, directory: Path) -> Day:
         settings = scenario.settings
         step = settings.step_length_s
-        begin = max(settings.begin_s, period.begin_s - THRESHOLDS.warm_up_s)
+        begin = max(settings.begin_s, period.begin_s - self._thresholds.warm_up_s)
         begin = settings.begin_s + step * round((begin - settings.begin_s) / step)
         loops = directory / "loops.xml"
         signals = replay_document(scenario, period, begin)
@@ -333,13 +335,15 @@ class Arrivals:
     Args:
         layout: Lanes and detectors.
         network: The network.
+        thresholds: Numbers of the method.
     """
 
-    def __init__(self, layout: DetectorLayout, network: Network) -> None:
+    def __init__(self, layout: DetectorLayout, network: Network, thresholds: DayThresholds) -> None:
+        self._thresholds = thresholds
         lanes = network.lanes.values()
         self._pace_s = {lane.edge: lane.length_m / lane.speed_mps for lane in lanes}
         self._ways: dict[str, _Way] = {}
-        self._approaches = _approaches(layout)
+        self._approaches = _approaches(layout, thresholds)
         self._counted = frozenset(edge for _, edge, _ in layout.places)
 
     def given(self, asked: Scenario, drivers: Scenario, period: Period) -> tuple[Scenario, Due]:
@@ -418,7 +422,7 @@ class Arrivals:
         lanes = self._approaches[edge]
         seen = [period.passages.get(lane.advance, Passages.none()) for lane in lanes]
         times = [
-            unhindered(one, lane.speed_mps, period, lane.zone_m)
+            unhindered(one, lane.speed_mps, period, self._thresholds, lane.zone_m)
             for one, lane in zip(seen, lanes, strict=True)
         ]
         crossed = [
@@ -429,7 +433,7 @@ class Arrivals:
         if any(lane.stop is None for lane in lanes):
             left = times
         else:
-            more = missed(np.concatenate(times), np.concatenate(crossed), period)
+            more = missed(np.concatenate(times), np.concatenate(crossed), period, self._thresholds)
             spread = [more[index :: len(lanes)] for index in range(len(lanes))]
             times = [np.sort(np.concatenate(pair)) for pair in zip(times, spread, strict=True)]
             left = by_lane_left(times, crossed, [lane.travel_s for lane in lanes])
@@ -442,7 +446,7 @@ class Arrivals:
 
     def _by_edge(self, vehicles: Iterable[ET.Element], period: Period) -> dict[str, Array]:
         """Count vehicles that would reach the end of each counted edge, ``(bins,)``."""
-        bins = bins_of(period)
+        bins = bins_of(period, self._thresholds)
         times: dict[str, list[float]] = {edge: [] for edge in self._counted}
         for item in vehicles:
             if item.tag == "vehicle":
@@ -568,7 +572,7 @@ def corrected(counted: Tally, layout: DetectorLayout, due: Due) -> Tally:
     return replace(counted, sums=sums, bins=np.maximum(bins, 0.0))
 
 
-def _approaches(layout: DetectorLayout) -> dict[str, tuple[_Lane, ...]]:
+def _approaches(layout: DetectorLayout, thresholds: DayThresholds) -> dict[str, tuple[_Lane, ...]]:
     """Find edges with an advance detector on every lane in front of the traffic light."""
     zones = {item.id: item for item in layout.detectors}
     lanes: dict[str, list[_Lane] | None] = {}
@@ -582,7 +586,7 @@ def _approaches(layout: DetectorLayout) -> dict[str, tuple[_Lane, ...]]:
         zone = zones[advance[0]]
         begin = zone.position_m
         end = begin if stop is None else zones[stop].position_m
-        travel = max(end - begin, 0.0) / (THRESHOLDS.fastest * lane.speed_mps)
+        travel = max(end - begin, 0.0) / (thresholds.fastest * lane.speed_mps)
         known.append(
             _Lane(
                 advance[0],
@@ -606,7 +610,9 @@ def _factor(item: ET.Element) -> float:
     return float(item.get("speedFactor", "1"))
 
 
-def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float = 0.0) -> Array:
+def unhindered(
+    seen: Passages, limit_mps: float, period: Period, thresholds: DayThresholds, zone_m: float = 0.0
+) -> Array:
     """Return the arrival times of vehicles as if no queue had delayed them, s.
 
     A vehicle that crosses the detector in a queue had joined the queue earlier, at an unknown time.
@@ -617,18 +623,19 @@ def unhindered(seen: Passages, limit_mps: float, period: Period, zone_m: float =
         seen: Passages over an advance detector.
         limit_mps: Speed limit at the detector, m/s.
         period: The measured period.
+        thresholds: Numbers of the method.
         zone_m: Length of the detection zone, m.
     """
     seen = seen.at(np.isfinite(seen.on_s))
     times = seen.on_s.copy()
     over = np.maximum(seen.off_s - seen.on_s, 1e-3)
     pace = (
-        np.where(np.isfinite(seen.speed_mps), seen.speed_mps, (THRESHOLDS.length_m + zone_m) / over)
+        np.where(np.isfinite(seen.speed_mps), seen.speed_mps, (thresholds.length_m + zone_m) / over)
         / limit_mps
     )
-    slow = pace < THRESHOLDS.held_up
-    close = np.diff(times, prepend=-np.inf) < THRESHOLDS.close_s
-    for place in np.flatnonzero(close & ~slow & (pace < THRESHOLDS.free)).tolist():
+    slow = pace < thresholds.held_up
+    close = np.diff(times, prepend=-np.inf) < thresholds.close_s
+    for place in np.flatnonzero(close & ~slow & (pace < thresholds.free)).tolist():
         slow[place] = slow[place - 1]  # a close follower stood farther back in the same queue
     edges = np.flatnonzero(np.diff(np.concatenate(([False], slow, [False]))))
     for first, behind in zip(edges[::2], edges[1::2], strict=True):
@@ -669,7 +676,7 @@ def by_lane_left(
     return [np.array(sorted([*own, *left])) for own, left in zip(found, waiting, strict=True)]
 
 
-def missed(times: Array, crossed: Array, period: Period) -> Array:
+def missed(times: Array, crossed: Array, period: Period, thresholds: DayThresholds) -> Array:
     """Return times for vehicles that the advance detectors missed, s, evenly spread by window.
 
     Vehicles are missed if the stop detectors saw many more.
@@ -678,10 +685,11 @@ def missed(times: Array, crossed: Array, period: Period) -> Array:
         times: Times at the advance detectors, s.
         crossed: Times at the stop detectors, s.
         period: The measured period.
+        thresholds: Numbers of the method.
     """
-    if len(crossed) - len(times) <= THRESHOLDS.missing + THRESHOLDS.missing_share * len(times):
+    if len(crossed) - len(times) <= thresholds.missing + thresholds.missing_share * len(times):
         return np.empty(0)
-    count = max(1, round((period.end_s - period.begin_s) / THRESHOLDS.missed_window_s))
+    count = max(1, round((period.end_s - period.begin_s) / thresholds.missed_window_s))
     edges = np.linspace(period.begin_s, period.end_s, count + 1)
     lacking = np.histogram(crossed, edges)[0] - np.histogram(times, edges)[0]
     lacking = np.maximum(lacking, 0)

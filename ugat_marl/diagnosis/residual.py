@@ -31,7 +31,6 @@ from ugat_marl.diagnosis.statistics import (
     whitened,
     without_noise,
 )
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
 
@@ -69,6 +68,7 @@ class Null:
         doubt: Mapping[str, Array] | None = None,
     ) -> None:
         generator = np.random.default_rng(7)
+        self._thresholds = thresholds = pools.thresholds
         self.reference = Reference(pools, tallies, speeds=speeds, doubt=doubt)
         self._directed = directed(self.reference) if directed else None
         draws: dict[str, list[float]] = {}
@@ -77,7 +77,7 @@ class Null:
             own = directed(model) if directed else None
             others = tallies[1 - half :: 2]
             size = min(periods, max(len(others) - 1, 1))
-            for _ in range(THRESHOLDS.null_draws):
+            for _ in range(thresholds.null_draws):
                 chosen = generator.choice(len(others), size, replace=False)
                 found = model.distance([others[int(i)] for i in chosen])
                 for name, value in _statistics(found, own).items():
@@ -101,11 +101,11 @@ class Null:
             extra: Further variance of the expected statistics, for errors of the free values.
         """
         found = self._judge(self.reference.distance(data, extra=extra))
-        if len(data) < 2 or found.p > THRESHOLDS.one_day:
+        if len(data) < 2 or found.p > self._thresholds.one_day:
             return found
         others = [[*data[:i], *data[i + 1 :]] for i in range(len(data))]
         without = [self._judge(self.reference.distance(part, extra=extra)).p for part in others]
-        return replace(found, p=max(without)) if max(without) > THRESHOLDS.one_day else found
+        return replace(found, p=max(without)) if max(without) > self._thresholds.one_day else found
 
     def _judge(self, found: Distance) -> Residual:
         values = _statistics(found, self._directed)
@@ -123,7 +123,7 @@ class Null:
     def floor(self) -> float:
         """Total distance that 99 of 100 data sets of the model stay below."""
         mean, deviation = self._moments["total"]
-        return math.exp(mean + THRESHOLDS.floor_deviations * deviation)
+        return math.exp(mean + self._thresholds.floor_deviations * deviation)
 
     def _chance(self, name: str, value: float) -> float:
         return log_normal_tail(value, *self._moments[name])
@@ -186,6 +186,7 @@ class MatchedFilters:
         extra: Mapping[str, Array] | None = None,
         fitted: Sequence[Mapping[str, Array]] = (),
     ) -> None:
+        self._thresholds = thresholds = reference.pools.thresholds
         sums = reference.pools.pool(sum_of(data))
         self._parts: list[tuple[str, list[Group]]] = []
         scales: dict[str, Array] = {}
@@ -210,12 +211,14 @@ class MatchedFilters:
             self._away = _spanned(rows(fitted))
         found = found - (found @ self._away) @ self._away.T
         left = np.sqrt((found**2).sum(axis=1))
-        seen = (left > THRESHOLDS.least_apart * size) & (size > 0)
+        seen = (left > thresholds.least_apart * size) & (size > 0)
         self._units = found[seen] / left[seen, None]
 
     def __call__(self, distance: Distance) -> float:
         """Return the largest squared component along any of the directions."""
-        counted = {name: softened(name, distance.z[name]) for name, _ in self._parts}
+        counted = {
+            name: softened(name, distance.z[name], self._thresholds) for name, _ in self._parts
+        }
         components = self._units @ self._whitened(counted)
         return float((components**2).max(initial=0.0))
 
@@ -253,9 +256,8 @@ class Directions:
         if not self.changes:
             return {}
         wide = [direction.difference for direction in self.changes]
-        single = [
-            without_noise(direction.difference, direction.variance) for direction in self.changes
-        ]
+        thresholds = reference.pools.thresholds
+        single = [without_noise(x.difference, x.variance, thresholds) for x in self.changes]
         return {
             name: MatchedFilters(changes, reference, data, blocks, self.extra, self.fitted)
             for name, changes, blocks in (

@@ -27,7 +27,7 @@ from ugat_marl.diagnosis.propose import Direction, between, promising, propose, 
 from ugat_marl.diagnosis.records import Fitted, Located, Selected, Tested
 from ugat_marl.diagnosis.residual import Directions, Null
 from ugat_marl.diagnosis.statistics import Whitener
-from ugat_marl.diagnosis.thresholds import THRESHOLDS, Effort
+from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
 from ugat_marl.progress import Reporter, Silent
@@ -66,6 +66,7 @@ class Selector:
         reporter: Reporter,
     ) -> None:
         self._fitter = fitter
+        self._thresholds = fitter.thresholds
         self._place_finder = place_finder
         self._library = tuple(library)
         self._periods = tuple(periods)
@@ -96,7 +97,7 @@ class Selector:
         base = best = located.base
         complete = True
         try:
-            for number in range(THRESHOLDS.rounds):
+            for number in range(self._thresholds.rounds):
                 found = self._round(best, number)
                 if found is None:
                     break
@@ -118,7 +119,7 @@ class Selector:
         """Simulate more days of a model and test the remaining difference."""
         fitter = self._fitter
         moves = len(model.values) * MOVES_OF_A_VALUE * fitter.days
-        days = THRESHOLDS.settling_days + self._effort.test + moves
+        days = self._thresholds.settling_days + self._effort.test + moves
         with (
             self._reporter.task("is what is left chance", days) as advance,
             fitter.engine.watched(advance, days),
@@ -131,7 +132,7 @@ class Selector:
         days = self._days(model)
         errors, extra = uncertainty(fitter, model, days, steps=True)
         for name, difference in self._first.difference.items():
-            extra[name] = extra[name] + (THRESHOLDS.tolerance * difference) ** 2
+            extra[name] = extra[name] + (self._thresholds.tolerance * difference) ** 2
         fitted = tuple(change for change, _ in fitter.changes(model))
         directions = Directions((*self._of_library, *self._places), extra, fitted)
         null = self._null(days, len(fitter.data), directions, model.effects)
@@ -152,16 +153,18 @@ class Selector:
         whitener = self._whitener(start.model, WIDE)
         gap = float(whitener.measured @ whitener.measured)
         chance = float(len(whitener.measured))  # expected squared length if only noise is left
-        enough = chance + THRESHOLDS.look_elsewhere * max(gap - chance, 0.0)
-        proposals = propose(directions, whitener, self._fitter.price)
-        chosen = [item.members for item in promising(proposals)]
-        little = gap < THRESHOLDS.little * chance  # the difference is then in single places
+        enough = chance + self._thresholds.look_elsewhere * max(gap - chance, 0.0)
+        proposals = propose(directions, whitener, self._thresholds)
+        chosen = [item.members for item in promising(proposals, self._thresholds)]
+        little = gap < self._thresholds.little * chance  # the difference is then in single places
         near = little or not proposals or proposals[0].expected > enough
         if near:
             chosen = [*chosen[:2], *self._elsewhere(start.model, directions, number)]
         if number == 0:
             chosen += self._nearest()
-            chosen += settings_as_members(self._library) if gap > THRESHOLDS.huge * chance else []
+            chosen += (
+                settings_as_members(self._library) if gap > self._thresholds.huge * chance else []
+            )
         best = self._fitted(start, chosen, f"round {number + 1}: candidates")
         if best is None and not near:  # simulations did not confirm the prediction of the library
             chosen = self._elsewhere(start.model, directions, number)
@@ -171,14 +174,17 @@ class Selector:
     def _fitted(self, start: Tested, chosen: Sequence[Members], title: str) -> Tested | None:
         """Return the best set of effects on top of a model; None if none is worth its price."""
         tried = self._tried(start.model, list(dict.fromkeys(chosen)), title)
-        best = self._refined(tried, THRESHOLDS.candidates_fitted, start.model.cost)
+        best = self._refined(tried, self._thresholds.candidates_fitted, start.model.cost)
         if best is None:
             return None
         gain = start.model.cost - best.cost
-        if gain > self._fitter.price:
+        if gain > self._thresholds.price:
             return self.test(best)
         # An effect may be clear along its own direction although the total distance hardly changes.
-        if start.residual.p < self._alpha / THRESHOLDS.plain and gain > -self._fitter.price:
+        if (
+            start.residual.p < self._alpha / self._thresholds.plain
+            and gain > -self._thresholds.price
+        ):
             tested = self.test(best)
             return tested if tested.residual.p > self._alpha else None
         return None
@@ -196,9 +202,9 @@ class Selector:
         for place, members in enumerate(strengths):
             with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
                 model = self._fitter.simulate(members, self._effort.bank)
-                if squared_gap(model.distance, base, periods) < THRESHOLDS.nearer * gap:
+                if squared_gap(model.distance, base, periods) < self._thresholds.nearer * gap:
                     found.append((model.cost, place))
-        return [strengths[place] for _, place in sorted(found)[: THRESHOLDS.nearest]]
+        return [strengths[place] for _, place in sorted(found)[: self._thresholds.nearest]]
 
     def _elsewhere(
         self, model: Fitted, directions: Sequence[Direction], number: int
@@ -211,7 +217,7 @@ class Selector:
         places = {direction.hypothesis.key for direction in known}
         added = self._bank(model, [h for h in local if h.key not in places], number, "places")
         added += known
-        proposals = propose([*directions, *added], self._whitener(model, None), self._fitter.price)
+        proposals = propose([*directions, *added], self._whitener(model, None), self._thresholds)
         places |= {item.key for item in local}
         self.examined |= self._place_finder.allowed
         alone = [item for item in proposals if len(item.members) == 1]
@@ -220,14 +226,14 @@ class Selector:
             hypothesis = item.members[0][0]
             if hypothesis.key in places:
                 best.setdefault(hypothesis.name, item.members)
-        here = list(best.values())[: THRESHOLDS.kinds_of_places]
+        here = list(best.values())[: self._thresholds.kinds_of_places]
         # The strength estimated from counts may be nearer than the strength along a direction.
         here += [((h, h.levels[0]),) for ((h, _),) in here if h.levels[0]]
-        return [*(item.members for item in promising(proposals)), *here]
+        return [*(item.members for item in promising(proposals, self._thresholds)), *here]
 
     def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
         data, base = self._fitter.data, self._fitter.base
-        return Whitener(model.reference, data, THRESHOLDS.foresight, base, blocks)
+        return Whitener(model.reference, data, self._thresholds.foresight, base, blocks)
 
     def _library_directions(self, model: Fitted, number: int) -> tuple[Direction, ...]:
         """Return directions of the library on top of a model; those of the first round are kept."""
@@ -296,7 +302,7 @@ class Selector:
         best: Fitted | None = None
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
-                if best is None or gap - model.cost > THRESHOLDS.hopeful * (gap - best.cost):
+                if best is None or gap - model.cost > self._thresholds.hopeful * (gap - best.cost):
                     found = self._kept(self._fitter.fitted(model))
                     best = found if best is None or found.cost < best.cost else best
                 advance(note=names_of(model.members))
@@ -340,7 +346,7 @@ def pruned(
     reporter = reporter or Silent()
 
     def settled(model: Fitted) -> Fitted:
-        return fitter.simulate(model.members, THRESHOLDS.settling_days)
+        return fitter.simulate(model.members, fitter.thresholds.settling_days)
 
     members = tuple(item for item in best.model.members if item[0].matters(item[1]))
     if members and len(members) < len(best.model.members):
@@ -351,9 +357,9 @@ def pruned(
             for part in each_left_out(best.model.members):
                 fewer.append(kept(settled(fitter.refine(fitter.simulate(part), 2))))
                 advance(note=names_of(part))
-        doubtful = [fewer[place] for place in _doubtful(best)]
+        doubtful = [fewer[place] for place in _doubtful(best, fitter.thresholds.half_interval)]
         least = min(fewer, key=cost_of)
-        if least.cost - settled(best.model).cost > THRESHOLDS.negligible:
+        if least.cost - settled(best.model).cost > fitter.thresholds.negligible:
             if not doubtful:
                 break
             least = min(doubtful, key=cost_of)
@@ -370,7 +376,7 @@ def pruned(
     return test(fitter.simulate(something)) if something else base
 
 
-def _doubtful(tested: Tested) -> list[int]:
+def _doubtful(tested: Tested, half_interval: float) -> list[int]:
     """Return indices of effects whose intervals hold the nominal values: they may be absent."""
     found: list[int] = []
     first = 0
@@ -379,6 +385,6 @@ def _doubtful(tested: Tested) -> list[int]:
         first += len(values)
         if values and hypothesis.nominal is not None:
             away = np.abs(np.subtract(values, hypothesis.nominal))
-            if (away <= THRESHOLDS.half_interval * errors).all():
+            if (away <= half_interval * errors).all():
                 found.append(place)
     return found

@@ -23,21 +23,13 @@ from ugat_marl.diagnosis.features import (
     DetectorLayout,
     Tally,
 )
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 
 Array = NDArray[np.float64]
 
 SINGLE = ("lane", "time")
 """Blocks of single lanes and bins of time. Most differences there are chance, so differences that
 may be chance are not used when a model changes."""
-SOFT = {
-    "network": np.inf,
-    "intersection": np.inf,
-    "lane": THRESHOLDS.soft_lane,
-    "time": THRESHOLDS.soft_time,
-}
-"""Standardised differences beyond this count less, by block. Single lanes and bins of time have
-heavy tails, since a queue either reaches a place or does not."""
 
 
 @dataclass(frozen=True)
@@ -46,15 +38,17 @@ class Pools:
 
     Attributes:
         blocks: Matrix ``(members, places)`` of zeros and ones, by name of the block.
+        thresholds: Numbers of the method.
         together: Number of bins of time that are joined to one; leftover bins at the end are not
             used.
     """
 
     blocks: dict[str, Array]
+    thresholds: Thresholds
     together: int = 1
 
     @classmethod
-    def of(cls, layout: DetectorLayout, together: int = 1) -> Pools:
+    def of(cls, layout: DetectorLayout, thresholds: Thresholds, together: int = 1) -> Pools:
         """Pool the network, every intersection if there are several, every lane."""
         places = len(layout.places)
         owners = [owner for owner, _, _ in layout.places]
@@ -67,7 +61,7 @@ class Pools:
                 ]
             )
         blocks["lane"] = np.eye(places)
-        return cls(blocks, together)
+        return cls(blocks, thresholds, together)
 
     def pool(self, item: Tally) -> dict[str, Array]:
         """Return sums and weights ``(members, features, 2)`` of every block.
@@ -169,6 +163,7 @@ class Reference:
         self.pools = pools
         self.days = len(tallies)
         self._speeds = speeds
+        self._thresholds = pools.thresholds
         stacked = _stack(pools, tallies)
         partners = _stack(pools, paired) if paired else {}
         self.blocks: dict[str, Block] = {}
@@ -181,24 +176,28 @@ class Reference:
     def _block(self, sums: Array, prior: Block | None, partner: Array | None, name: str) -> Block:
         """Make a block from sums ``(days, members, features, 2)``."""
         timed = name == "time"
-        mean, variance, weight, residual = _moments(sums)
+        mean, variance, weight, residual = _moments(sums, self._thresholds)
         if timed:
             variance = _smoothed(mean, variance)
         error = variance / len(sums)
         if prior is not None:
-            scale = len(sums) / (len(sums) + THRESHOLDS.few_days)
+            scale = len(sums) / (len(sums) + self._thresholds.few_days)
             variance = scale * variance + (1 - scale) * prior.variance
             error = variance / len(sums)
             if partner is not None:
-                moved = _moved(mean, residual, partner) if name in SINGLE else True
-                mean, error = _controlled(mean, variance, residual, partner, prior)
+                moved = (
+                    _moved(mean, residual, partner, self._thresholds) if name in SINGLE else True
+                )
+                mean, error = _controlled(
+                    mean, variance, residual, partner, prior, self._thresholds
+                )
                 mean = np.where(moved, mean, prior.mean)
                 variance = np.where(moved, variance, prior.variance)
                 error = np.where(moved, error, prior.error)
         if timed:
             used = mean > 0.5
         else:
-            used = (weight >= THRESHOLDS.least_observations) & np.isfinite(mean)
+            used = (weight >= self._thresholds.least_observations) & np.isfinite(mean)
             used &= ~_constant(self._speeds)[None, :]
         if timed:
             correlation = np.eye(sums.shape[2])
@@ -240,7 +239,9 @@ class Reference:
             mean = np.where(np.isfinite(block.mean), block.mean, other.mean)
             difference[name] = np.where(used, value - mean, 0.0)
             z[name] = difference[name] / np.sqrt(variance)
-            parts[name] = _mahalanobis(softened(name, z[name]), used, other.correlation)
+            parts[name] = _mahalanobis(
+                softened(name, z[name], self._thresholds), used, other.correlation
+            )
             total += parts[name]
             if relative_to:
                 ratio = np.log(
@@ -250,10 +251,18 @@ class Reference:
         return Distance(total, parts, penalty, z, difference)
 
 
-def softened(block: str, z: Array) -> Array:
-    """Return ``s asinh(z / s)`` with s of `SOFT`: large differences of single places count less."""
-    soft = SOFT[block]
+def softened(block: str, z: Array, thresholds: Thresholds) -> Array:
+    """Return ``s asinh(z / s)``: large differences of single places count less.
+
+    Single lanes and bins of time have heavy tails: a queue either reaches a place or does not.
+    """
+    soft = _softness(block, thresholds)
     return soft * np.arcsinh(z / soft) if soft < np.inf else z
+
+
+def _softness(block: str, thresholds: Thresholds) -> float:
+    """Return the standardised difference beyond which differences in a block count less."""
+    return {"lane": thresholds.soft_lane, "time": thresholds.soft_time}.get(block, np.inf)
 
 
 def _stack(pools: Pools, tallies: Sequence[Tally]) -> dict[str, Array]:
@@ -279,7 +288,7 @@ def _smoothed(mean: Array, variance: Array) -> Array:
     return np.maximum(0.5 * variance + 0.5 * scale * mean, 0.05)
 
 
-def _moments(sums: Array) -> tuple[Array, Array, Array, Array]:
+def _moments(sums: Array, thresholds: Thresholds) -> tuple[Array, Array, Array, Array]:
     """Return ratio estimates from sums ``(days, members, features, 2)``.
 
     With sums s and numbers of observations n: mean m = Σs / Σn, residual of a day
@@ -294,28 +303,35 @@ def _moments(sums: Array) -> tuple[Array, Array, Array, Array]:
     mean = total[..., 0] / np.maximum(total[..., 1], 1e-9)
     residual = (sums[..., 0] - mean * sums[..., 1]) / np.maximum(weight, 1e-9)
     variance = (residual**2).sum(axis=0) / max(len(sums) - 1, 1)
-    grain = (_grain(sums.shape[2]) / np.maximum(weight, 1.0)) ** 2
+    grain = (_grain(sums.shape[2], thresholds) / np.maximum(weight, 1.0)) ** 2
     mean = np.where(weight > 0, mean, np.nan)
     return mean, np.maximum(variance, grain), weight, residual
 
 
-def _moved(mean: Array, residual: Array, partner: Array) -> NDArray[np.bool_]:
+def _moved(
+    mean: Array, residual: Array, partner: Array, thresholds: Thresholds
+) -> NDArray[np.bool_]:
     """Mark statistics that differ from those of the same days of the prior model beyond chance."""
-    before, _, _, other = _moments(partner)
+    before, _, _, other = _moments(partner, thresholds)
     days = len(partner)
     noise = ((residual - other) ** 2).sum(axis=0) / max(days - 1, 1) / days
-    return np.nan_to_num((mean - before) ** 2, nan=np.inf) > THRESHOLDS.certain * noise
+    return np.nan_to_num((mean - before) ** 2, nan=np.inf) > thresholds.certain * noise
 
 
 def _controlled(
-    mean: Array, variance: Array, residual: Array, partner: Array, prior: Block
+    mean: Array,
+    variance: Array,
+    residual: Array,
+    partner: Array,
+    prior: Block,
+    thresholds: Thresholds,
 ) -> tuple[Array, Array]:
     """Return the mean and its variance, corrected by the same days of the prior model.
 
     The days of the prior model are a control variate: m' = m - b (m_same - m_prior), with b the
     slope of the residuals on those of the prior model.
     """
-    before, _, _, other = _moments(partner)
+    before, _, _, other = _moments(partner, thresholds)
     spread = (other**2).sum(axis=0)
     slope = np.clip((residual * other).sum(axis=0) / np.maximum(spread, 1e-12), 0.0, 1.5)
     slope = np.where(np.isfinite(prior.mean) & np.isfinite(before), slope, 0.0)
@@ -327,13 +343,13 @@ def _controlled(
 
 
 @functools.cache
-def _grain(width: int) -> Array:
+def _grain(width: int, thresholds: Thresholds) -> Array:
     """Return the least standard deviation of a sum over a day, by feature or bin of time."""
     if width != len(FEATURES):
-        return np.full(width, THRESHOLDS.grain)
+        return np.full(width, thresholds.grain)
     return np.array(
         [
-            THRESHOLDS.least_events if name in EVENT_FEATURES else THRESHOLDS.grain
+            thresholds.least_events if name in EVENT_FEATURES else thresholds.grain
             for name, _, _ in FEATURES
         ]
     )
@@ -393,8 +409,8 @@ def change_between(
     difference: dict[str, Array] = {}
     variance: dict[str, Array] = {}
     for name in new:
-        mean, _, _, left = _moments(new[name])
-        base, _, _, right = _moments(old[name])
+        mean, _, _, left = _moments(new[name], pools.thresholds)
+        base, _, _, right = _moments(old[name], pools.thresholds)
         difference[name] = np.nan_to_num(mean - base)
         days = len(after)
         spread = ((left - right) ** 2).sum(axis=0) / max(days - 1, 1)
@@ -402,7 +418,9 @@ def change_between(
     return difference, variance
 
 
-def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> dict[str, Array]:
+def shrunk(
+    difference: Mapping[str, Array], variance: Mapping[str, Array], thresholds: Thresholds
+) -> dict[str, Array]:
     """Return differences d shrunk towards 0: ``d max(0, 1 - certain * variance / d^2)``.
 
     Noise in a derivative makes the steps of a fit too short and its standard errors too small.
@@ -410,17 +428,17 @@ def shrunk(difference: Mapping[str, Array], variance: Mapping[str, Array]) -> di
     found: dict[str, Array] = {}
     for name, values in difference.items():
         squared = np.maximum(values**2, 1e-300)
-        found[name] = values * np.maximum(1.0 - THRESHOLDS.certain * variance[name] / squared, 0.0)
+        found[name] = values * np.maximum(1.0 - thresholds.certain * variance[name] / squared, 0.0)
     return found
 
 
 def without_noise(
-    difference: Mapping[str, Array], variance: Mapping[str, Array]
+    difference: Mapping[str, Array], variance: Mapping[str, Array], thresholds: Thresholds
 ) -> dict[str, Array]:
     """Return differences; in blocks of `SINGLE`, those that may be chance are set to 0."""
     found: dict[str, Array] = {}
     for name, values in difference.items():
-        certain = values**2 > THRESHOLDS.certain * variance[name]
+        certain = values**2 > thresholds.certain * variance[name]
         found[name] = np.where(certain, values, 0.0) if name in SINGLE else values
     return found
 
@@ -466,7 +484,9 @@ class Whitener:
             weight = sums[name][..., 1] / len(data)
             noise = block.noise(weight, len(data))
             difference = found.difference[name]
-            soft = 0.0 if SOFT[name] == np.inf else 1.0 / SOFT[name]
+            soft = 1.0 / _softness(
+                name, reference.pools.thresholds
+            )  # 0 for blocks that are not softened
             scale = np.sqrt(noise + (max(tolerance, soft) * difference) ** 2)
             used = chosen.blocks[name].used & (weight >= 1.0)
             self._parts.append((name, scale, correlation_groups(used, block.correlation)))

@@ -30,7 +30,7 @@ from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, change_between, sum_of
-from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, THRESHOLDS, Effort
+from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, Effort, Thresholds
 from ugat_marl.effects import Effect, effect_from_record
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.parallel import Workers
@@ -59,6 +59,7 @@ class DiagnosisConfig:
         cache: Folder of the remembered days; None for the user's cache folder.
         workers: Simulations at a time, None for one per core; or an executor.
         effort: Numbers of simulated days; None for those that suit the size of the network.
+        thresholds: Numbers of the method.
     """
 
     budget_s: float = 600.0
@@ -68,6 +69,7 @@ class DiagnosisConfig:
     cache: Path | None = None
     workers: Workers = None
     effort: Effort | None = None
+    thresholds: Thresholds = field(default_factory=Thresholds)
 
     def __post_init__(self) -> None:
         if not self.budget_s > 0:
@@ -130,7 +132,7 @@ class Study:
             MeasuredDataError: The data hold nothing to compare, or no vehicle of the scenario
                 reaches a measured lane.
         """
-        network = Network.read(scenario)
+        network, thresholds = Network.read(scenario), config.thresholds
         detectors = heard(measured)
         noted = (*measured.findings, *unreached(scenario, measured, detectors))
         measured = replace(measured, findings=noted)
@@ -148,9 +150,10 @@ class Study:
             return Engine(
                 scenario,
                 layout,
-                Replay(scenario, network, detectors, layout.owner, answering=answering),
+                Replay(scenario, network, detectors, layout.owner, thresholds, answering=answering),
                 [*periods, *measured.of("heldout")],
                 config.seed,
+                thresholds,
                 cache=config.cache or default_cache(),
                 deadline=time.monotonic() + config.budget_s,
                 workers=config.workers,
@@ -158,6 +161,7 @@ class Study:
             )
 
         engine = simulating(answering, effort.base)
+        together = 1 if measured.has_events else bins_together(measured.counts, thresholds)
         return cls(
             scenario,
             network,
@@ -165,12 +169,12 @@ class Study:
             config,
             layout,
             engine,
-            Pools.of(layout, 1 if measured.has_events else bins_together(measured.counts)),
+            Pools.of(layout, thresholds, together),
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
             effort,
-            _tallies(layout, engine, measured, periods),
-            _tallies(layout, engine, measured, measured.of("heldout") or periods),
+            _tallies(layout, engine, measured, periods, thresholds),
+            _tallies(layout, engine, measured, measured.of("heldout") or periods, thresholds),
             simulating(False, 0) if answering else None,
             ruled_out,
         )
@@ -190,7 +194,7 @@ class Study:
         with reporter.task("the scenario as it is", self.effort.base) as advance:
             days = self.engine.replicates([], range(self.effort.base), advance)
         if self.other_days is not None:
-            numbers = range(min(THRESHOLDS.doubt_days, self.effort.base))
+            numbers = range(min(self.config.thresholds.doubt_days, self.effort.base))
             with reporter.task("the same with other vehicles", len(numbers)) as advance:
                 self.other_days.replicates([], numbers, advance)  # `doubt` takes them from memory
         aside = self.engine.usual.set_aside
@@ -273,21 +277,24 @@ class Study:
         if self.other_days is None:
             return None
         if effects not in self._doubts:
-            numbers = range(min(THRESHOLDS.doubt_days, self.effort.base))
+            numbers = range(min(self.config.thresholds.doubt_days, self.effort.base))
             own = self.engine.ordinary(effects, numbers)
             other = self.other_days.ordinary(effects, numbers)
             both = [number for number in own if number in other]
             days = [[found[number].tally for number in both] for found in (own, other)]
             apart, _ = change_between(self.pools, *days)
             self._doubts[effects] = {
-                name: (THRESHOLDS.left_open * values) ** 2 for name, values in apart.items()
+                name: (self.config.thresholds.left_open * values) ** 2
+                for name, values in apart.items()
             }
         return self._doubts[effects]
 
     @functools.cached_property
     def place_finder(self) -> PlaceFinder:
         """Finder of places and windows."""
-        return PlaceFinder(self.layout, Routes.of(self.scenario), self.allowed)
+        return PlaceFinder(
+            self.layout, Routes.of(self.scenario), self.allowed, self.config.thresholds
+        )
 
     def fitter(self, base: Tested) -> Fitter:
         """Make the fitter of single models; see `selector` for the search."""
@@ -298,7 +305,6 @@ class Study:
             base.model.days,
             self.fit,
             days=self.effort.fit,
-            price=THRESHOLDS.price,
             speeds=self.speeds,
         )
 
@@ -335,12 +341,18 @@ def heard(measured: Measured) -> tuple[Detector, ...]:
 
 
 def _tallies(
-    layout: DetectorLayout, engine: Engine, measured: Measured, periods: Sequence[Period]
+    layout: DetectorLayout,
+    engine: Engine,
+    measured: Measured,
+    periods: Sequence[Period],
+    thresholds: Thresholds,
 ) -> tuple[Tally, ...]:
     if measured.has_events or measured.counts is None:
         return tuple(engine.measured(periods))
-    whole = without_gaps(measured.counts, measured.periods)
-    return tuple(counts_tally(layout, period, measured.counts, whole) for period in periods)
+    whole = without_gaps(measured.counts, measured.periods, thresholds)
+    return tuple(
+        counts_tally(layout, period, measured.counts, whole, thresholds) for period in periods
+    )
 
 
 # --- measured edges without demand ----------------------------------------------------------------
@@ -407,7 +419,9 @@ IN_THE_LOG = ("yellow_time", "all_red_time")
 _AMBER = frozenset("yY")
 
 
-def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> tuple[Effect, ...]:
+def timing_effects(
+    scenario: Scenario, network: Network, measured: Measured, thresholds: Thresholds
+) -> tuple[Effect, ...]:
     """Return effects for yellow and all-red times of the log that differ from the scenario's.
 
     Logs with only states of the network's own programme are left out.
@@ -425,9 +439,9 @@ def timing_effects(scenario: Scenario, network: Network, measured: Measured) -> 
     clearances = (yellow, control.yellow_s), (red, control.all_red_s)
     for name, (seen, now) in zip(IN_THE_LOG, clearances, strict=True):
         total = sum(seen.values())
-        if total >= THRESHOLDS.least_clearances:
+        if total >= thresholds.least_clearances:
             value, count = seen.most_common(1)[0]
-            if count >= THRESHOLDS.usual_share * total and abs(value - now) > 0.05:
+            if count >= thresholds.usual_share * total and abs(value - now) > 0.05:
                 found.append(effect_from_record({"name": name, "seconds": value}))
     return tuple(found)
 

@@ -7,7 +7,7 @@ That follows from the method and was not measured.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ LEAST_EFFORT = Effort(24, 2, 3, 16)
 
 
 @dataclass(frozen=True)
-class Thresholds:
-    """Numbers of the method, in the order of the stages."""
+class DayThresholds:
+    """Numbers that decide the features of a day; a change makes cached days useless."""
 
     # --- features: what is counted ------------------------------------------------------------
 
@@ -92,6 +92,15 @@ class Thresholds:
     fastest: float = 1.3
     """Multiple of the speed limit that no vehicle exceeds between two detectors. By hand. Halved:
     vehicles are matched to others that arrived before them."""
+
+    def of_a_day(self) -> tuple[tuple[str, object], ...]:
+        """Return the names and values of these numbers alone, for the key of cached days."""
+        return tuple((item.name, getattr(self, item.name)) for item in fields(DayThresholds))
+
+
+@dataclass(frozen=True)
+class Thresholds(DayThresholds):
+    """Numbers of the method, in the order of the stages."""
 
     # --- engine: ordinary days ----------------------------------------------------------------
 
@@ -322,7 +331,3 @@ class Thresholds:
     interval_s: float = 900.0
     """Interval of FHWA's criteria, s (FHWA-HOP-18-036, chapter 5). Halved: counts are noisier and
     fail the criteria."""
-
-
-THRESHOLDS = Thresholds()
-"""Numbers that all stages use."""

@@ -21,7 +21,7 @@ from ugat_marl.diagnosis.records import (
     Verified,
 )
 from ugat_marl.diagnosis.select import Selector
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.study import DiagnosisConfig
 from ugat_marl.effects import Effect, known_effects
 
 NOUNS = {"swapped": "swapped detectors", "stuck": "a stuck detector"}
@@ -33,7 +33,7 @@ def conclude(
     selection: Selected,
     selector: Selector,
     verification: Verified,
-    alpha: float,
+    config: DiagnosisConfig,
     layout: DetectorLayout,
 ) -> Conclusion:
     """Draw the conclusion of a search.
@@ -43,11 +43,12 @@ def conclude(
         selection: Result of the search.
         selector: The search, which also tests rivals.
         verification: Tests on the held-out periods.
-        alpha: Level of the tests.
+        config: Level of the tests and numbers of the method.
         layout: Lanes and detectors.
     """
     base, best = located.base, selection.best
-    confirmed = verification.before.distance - verification.after.distance >= THRESHOLDS.confirmed
+    alpha, thresholds = config.alpha, config.thresholds
+    confirmed = verification.before.distance - verification.after.distance >= thresholds.confirmed
     chance = combined(base.residual.p, verification.before.p)
     if chance > alpha and not confirmed and selection.complete:
         sentence = (
@@ -60,15 +61,15 @@ def conclude(
         return Conclusion("unknown", best, (), sentence, _look_at(selection))
     names = describe_members(best.model.members)
     shrink = verification.shrink if verification.shrink is not None else 0.0
-    chance_only = verification.after.p > alpha and best.residual.p > THRESHOLDS.fit_level
+    chance_only = verification.after.p > alpha and best.residual.p > thresholds.fit_level
     if not confirmed:
         sentence = (
             f"The fitted periods hint at {names}, but the held-out periods do not confirm it."
         )
         return Conclusion("unknown", best, (), sentence, "more periods")
     if chance_only and selection.complete:
-        return _sufficient(selection, selector, alpha, layout)
-    if shrink >= THRESHOLDS.part:
+        return _sufficient(selection, selector, config, layout)
+    if shrink >= thresholds.part:
         verb = "explains" if len(best.model.members) == 1 else "explain"
         sentence = f"{names[:1].upper()}{names[1:]} {verb} {100 * shrink:.0f} % of the gap; " + (
             "something else remains that the library does not have."
@@ -114,7 +115,7 @@ def unverified(located: Located, selected: Selected) -> tuple[Verified, Conclusi
 
 
 def _sufficient(
-    selection: Selected, selector: Selector, alpha: float, layout: DetectorLayout
+    selection: Selected, selector: Selector, config: DiagnosisConfig, layout: DetectorLayout
 ) -> Conclusion:
     """Conclude if the selected set of effects leaves no more than chance."""
     best = selection.best
@@ -132,7 +133,7 @@ def _sufficient(
             "not_identifiable", best, (), sentence, f"video of {first} and {behind}: do they "
             "miss vehicles, or is there a driveway or car park that the network lacks?",
         )  # fmt: skip
-    rivals = _rivals(selection, selector, alpha)
+    rivals = _rivals(selection, selector, config)
     if rivals:
         others = "; or ".join(describe_members(rival.members) for rival in rivals)
         sentence = f"The data fit either equally well: {names}; or {others}."
@@ -163,7 +164,7 @@ def combined(one: float, other: float) -> float:
     return float(stats.chi2.sf(-2.0 * math.log(product), df=4))
 
 
-def _rivals(selection: Selected, selector: Selector, alpha: float) -> tuple[Fitted, ...]:
+def _rivals(selection: Selected, selector: Selector, config: DiagnosisConfig) -> tuple[Fitted, ...]:
     """Find other sets of effects that leave no more than chance at nearly the same cost."""
     best = selection.best.model
     names = _kinds(best.members)
@@ -173,11 +174,11 @@ def _rivals(selection: Selected, selector: Selector, alpha: float) -> tuple[Fitt
         for rival in selection.rivals
         if len(rival.members) <= len(best.members)
         and not _kinds(rival.members) >= names
-        and rival.cost - best.cost < THRESHOLDS.indistinct
+        and rival.cost - best.cost < config.thresholds.indistinct
     ]
-    for rival in near[: THRESHOLDS.rivals_tested]:
+    for rival in near[: config.thresholds.rivals_tested]:
         tested = selector.test(rival)
-        if tested.residual.p > alpha:
+        if tested.residual.p > config.alpha:
             found.append(rival)
     return tuple(found)
 
@@ -262,23 +263,23 @@ def place_and_window(
 
 
 def effect_record(
-    hypothesis: Hypothesis, values: tuple[float, ...], errors: tuple[float, ...] | None = None
+    hypothesis: Hypothesis, values: tuple[float, ...], margins: tuple[float, ...] | None = None
 ) -> EffectRecord:
-    """Return the record of an effect, with 95 % intervals of its values if errors are given.
+    """Return the record of an effect, with 95 % intervals of its values if their margins are given.
 
     Args:
         hypothesis: The effect with its fixed fields.
         values: Values of its free fields.
-        errors: Standard errors of these values.
+        margins: Half widths of the intervals of these values.
     """
     place, window = place_and_window(hypothesis)
     ranges = known_effects()[hypothesis.name].ranges
     parameters: dict[str, Parameter] = {}
     for index, (name, value) in enumerate(zip(hypothesis.free, values, strict=True)):
         allowed, low, high = ranges[name], None, None
-        if errors is not None:
-            low = max(value - THRESHOLDS.half_interval * errors[index], allowed.low)
-            high = min(value + THRESHOLDS.half_interval * errors[index], allowed.high)
+        if margins is not None:
+            low = max(value - margins[index], allowed.low)
+            high = min(value + margins[index], allowed.high)
         parameters[name] = Parameter(value, low, high, allowed.unit)
     for name, value in hypothesis.fixed:
         if not isinstance(value, str) and name not in WINDOW:

@@ -30,7 +30,7 @@ from ugat_marl.diagnosis.records import (
 from ugat_marl.diagnosis.residual import Null
 from ugat_marl.diagnosis.statistics import Array, sum_of
 from ugat_marl.diagnosis.study import Study
-from ugat_marl.diagnosis.thresholds import THRESHOLDS
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect
 
 
@@ -126,7 +126,7 @@ def courtesy(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
     def row(model: Tested) -> CriteriaRow:
         tallies = model.model.tallies
         values = geh(hourly(data), hourly(sum_of(tallies)))
-        criteria = fhwa(every, tallies, study.pools.together)
+        criteria = fhwa(every, tallies, study.pools.together, study.config.thresholds)
         some = len(values) > 0
         return CriteriaRow(
             geh_below_5=float((values < 5).mean()) if some else None,
@@ -211,25 +211,28 @@ def geh(measured: Array, simulated: Array) -> Array:
     return np.sqrt(2 * (m - c) ** 2 / (m + c))
 
 
-def fhwa(measured: Sequence[Tally], simulated: Sequence[Tally], together: int) -> Criteria | None:
+def fhwa(
+    measured: Sequence[Tally], simulated: Sequence[Tally], together: int, thresholds: Thresholds
+) -> Criteria | None:
     """Compute the four criteria on the counts of stop and exit detectors.
 
     Args:
-        measured: Tallies of the measured days, at least `THRESHOLDS.least_days`.
+        measured: Tallies of the measured days, at least `Thresholds.least_days`.
         simulated: Tallies of simulated days; their mean is compared.
         together: Number of bins of time that one measured count covers.
+        thresholds: Numbers of the method.
 
     Returns:
         None if there are too few days, or if no detector counts in all intervals of all days.
     """
     shortest = min(day.bins.shape[-1] for day in (*measured, *simulated))
-    bins = min(max(round(THRESHOLDS.interval_s / THRESHOLDS.bin_s), together), shortest)
+    bins = min(max(round(thresholds.interval_s / thresholds.bin_s), together), shortest)
     real = [_intervals(day, bins, shortest // bins) for day in measured]
     days = np.stack([counts for counts, _ in real])
     model = np.mean([_intervals(day, bins, shortest // bins)[0] for day in simulated], axis=0)
     whole = np.all([known for _, known in real], axis=(0, 2))
     used = whole & (days.sum(axis=(0, 2)) > 0)
-    if len(measured) < THRESHOLDS.least_days or not used.any():
+    if len(measured) < thresholds.least_days or not used.any():
         return None
     days, model = days[:, used], model[used]
     chosen = representative(days)

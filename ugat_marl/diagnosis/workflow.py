@@ -77,7 +77,7 @@ def diagnose(
     study = Study.of(scenario, measured, config)
     for finding in study.measured.findings:
         reporter.say(f"note: {finding.text}")
-    read = timing_effects(scenario, study.network, measured)
+    read = timing_effects(scenario, study.network, measured, config.thresholds)
     timing = tuple(effect for effect in read if effect.name not in config.leave_out)
     named = timing
     try:
@@ -116,9 +116,7 @@ def _compared(
     selected = selector.select(located)
     try:
         verified = verify_model(study, located.base, selected.best)
-        conclusion = conclude(
-            located, selected, selector, verified, study.config.alpha, study.layout
-        )
+        conclusion = conclude(located, selected, selector, verified, study.config, study.layout)
         if conclusion.verdict == "no_discrepancy":
             verified = Verified(verified.before, verified.before, None)
             conclusion = _beside_the_log(study, located, conclusion, timing)
@@ -159,7 +157,11 @@ def _record(
     complete = located.complete if selected is None else selected.complete
     examined = located.examined if selected is None else selected.examined
     sides = tables_of(study, base, best) if tables else Tables()
-    named = () if selected is None or conclusion.verdict == "unknown" else _named(best, selected)
+    named = (
+        ()
+        if selected is None or conclusion.verdict == "unknown"
+        else _named(best, selected, study.config.thresholds.half_interval)
+    )
     searched = _begun(
         study, timing, conclusion.verdict, conclusion.sentence, None if complete else examined
     )
@@ -245,11 +247,11 @@ def _begun(
     )
 
 
-def _named(best: Tested, selected: Selected) -> tuple[NamedEffect, ...]:
+def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[NamedEffect, ...]:
     """Return records of the effects of the selected model, with intervals and grounds.
 
     The grounds are the model's distance, and the cost by which the best model with another set of
-    effect names is worse.
+    effect names is worse. `half_interval` is half the width of a 95 % interval in standard errors.
     """
     names = {hypothesis.name for hypothesis, _ in best.model.members}
     others = [
@@ -262,9 +264,11 @@ def _named(best: Tested, selected: Selected) -> tuple[NamedEffect, ...]:
     effects: list[NamedEffect] = []
     place = 0
     for hypothesis, values in best.model.members:
-        errors = tuple(float(error) for error in best.errors[place : place + len(values)])
+        margins = tuple(
+            half_interval * float(error) for error in best.errors[place : place + len(values)]
+        )
         place += len(values)
-        effects.append(_with_grounds(effect_record(hypothesis, values, errors), grounds))
+        effects.append(_with_grounds(effect_record(hypothesis, values, margins), grounds))
     return tuple(effects)
 
 

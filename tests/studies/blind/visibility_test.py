@@ -19,12 +19,15 @@ from studies.blind.visibility import effect_of, judge_visibility, separation
 from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, EVENT_FEATURES, FEATURES
 from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import effect_from_record
 from ugat_marl.errors import UnknownNameError
 
+THRESHOLDS = Thresholds()
+
 Array = NDArray[np.float64]
 
-NETWORK = Pools({"network": np.ones((1, 1))})
+NETWORK = Pools({"network": np.ones((1, 1))}, THRESHOLDS)
 ROWS = [row for row, (name, _, _) in enumerate(FEATURES) if name not in EVENT_FEATURES]
 PERIODS = 3
 
