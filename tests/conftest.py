@@ -7,13 +7,15 @@ import shutil
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
 import pytest
 
 import ugat_marl
+from ugat_marl.simulation import Host
+from ugat_marl.simulation.process import SERVICE
 
 # `studies` is imported from the checkout; behind all else, so that the installed suite is tested.
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -100,6 +102,20 @@ def make_crossing(
             assert after != before, f"the edit of {name} changed nothing"
             file.write_text(after)
     return directory
+
+
+@pytest.fixture(scope="session")
+def _host() -> Iterator[Host]:
+    host = Host(SERVICE)
+    yield host
+    host.close()
+
+
+@pytest.fixture(autouse=True)
+def _warm(_host: Host) -> None:
+    """Keeps the process that forks simulators from one test to the next: SUMO is loaded once."""
+    if hasattr(os, "fork"):
+        _host.warm()
 
 
 @pytest.fixture

@@ -30,12 +30,9 @@ STEPS = 8
 
 
 @pytest.fixture(scope="module")
-def scenarios() -> Iterator[dict[str, Scenario]]:
-    """The scenarios, read once, while one environment keeps SUMO's parent process warm."""
-    env = ugat_marl.parallel_env("single-v1", duration_s=60)
-    env.reset(seed=0)
-    yield {name: ugat_marl.load_scenario(name) for name in NAMES}
-    env.close()
+def scenarios() -> dict[str, Scenario]:
+    """The scenarios, read once."""
+    return {name: ugat_marl.load_scenario(name) for name in NAMES}
 
 
 @pytest.fixture(params=NAMES)

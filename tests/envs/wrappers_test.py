@@ -352,12 +352,9 @@ def test_masked_observations_conform_but_for_being_dictionaries() -> None:
 
 
 @pytest.fixture(scope="module")
-def scenarios() -> Iterator[dict[str, Scenario]]:
-    """The scenarios, read once, while one environment keeps SUMO's parent process warm."""
-    env = ugat_marl.parallel_env("single-v1", duration_s=60)
-    env.reset(seed=0)
-    yield {name: ugat_marl.load_scenario(name) for name in ("grid2x2-v1", "mixed-v1")}
-    env.close()
+def scenarios() -> dict[str, Scenario]:
+    """The scenarios, read once."""
+    return {name: ugat_marl.load_scenario(name) for name in ("grid2x2-v1", "mixed-v1")}
 
 
 @pytest.mark.parametrize("name", ["grid2x2-v1", "mixed-v1"])

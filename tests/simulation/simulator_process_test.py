@@ -32,23 +32,14 @@ from ugat_marl.simulation import (
     Message,
     ProcessSimulator,
     Simulator,
+    kept_warm,
     launch_of,
 )
-from ugat_marl.simulation.process import SERVICE
 
 Crossing = Callable[..., Path]
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
 needs_proc = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def warm() -> Iterator[None]:
-    """Keeps the warm parent between tests, so that each does not wait for SUMO to load."""
-    host = Host(SERVICE)
-    host.warm()
-    yield
-    host.close()
 
 
 def pid_of(env: Any) -> int:
@@ -312,6 +303,34 @@ def test_a_killed_warm_parent_is_replaced(crossing: Crossing) -> None:
     assert env._simulator._host._parent is other._simulator._host._parent
     env.close()
     other.close()
+
+
+def test_a_warm_parent_ends_with_its_last_host_or_with_the_block_that_keeps_it() -> None:
+    def opened() -> Host:
+        host = Host("types:SimpleNamespace")  # a service of this test alone
+        host.warm()
+        return host
+
+    def parent_after_close() -> Any:
+        host = opened()
+        parent = host.warm()
+        host.close()
+        return parent
+
+    assert not parent_after_close().alive
+    with kept_warm():
+        with kept_warm():
+            kept = parent_after_close()
+        assert kept.alive
+        assert parent_after_close() is kept
+    assert not kept.alive
+    with kept_warm():
+        kept = parent_after_close()
+        host = opened()
+        assert host.warm() is kept
+    assert kept.alive
+    host.close()
+    assert not kept.alive
 
 
 def test_asking_before_starting_or_after_closing(crossing: Crossing, tmp_path: Path) -> None:

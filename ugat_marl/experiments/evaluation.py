@@ -34,6 +34,7 @@ from ugat_marl.policies import (
 )
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
+from ugat_marl.simulation import kept_warm
 
 Watch = Callable[[str, str, TrafficEnv], StepCallback]
 """Maker of a callback from the name of the policy, the name of the domain and the environment. The
@@ -52,6 +53,7 @@ class _Task:
     watch: Watch | None
 
 
+@kept_warm()
 def evaluate(
     scenario: Scenario,
     policies: Mapping[str, PolicyFactory],
@@ -143,6 +145,7 @@ def best_rules(
     return found
 
 
+@kept_warm()
 def race(
     scenario: Scenario,
     domain: Domain,

@@ -65,6 +65,7 @@ from ugat_marl.policies import (
 )
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
+from ugat_marl.simulation import kept_warm
 
 TRAININGS = "trainings"
 """Folder in a run's folder; it holds the folders of the jobs."""
@@ -228,6 +229,7 @@ class TransferConfig:
         return self.ugat.pretrain_episodes + self.ugat.iterations * self.ugat.grounded_episodes
 
 
+@kept_warm()
 def transfer(
     config: TransferConfig,
     directory: Path,

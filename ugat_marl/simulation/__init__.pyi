@@ -6,6 +6,7 @@ from .detectors import read_passages as read_passages
 from .detectors import standard_detectors as standard_detectors
 from .host import Host as Host
 from .host import Worker as Worker
+from .host import kept_warm as kept_warm
 from .host import one_line_message as one_line_message
 from .process import ProcessSimulator as ProcessSimulator
 from .process import simulator_of as simulator_of

@@ -1,10 +1,11 @@
 """Worker processes: a warm parent that forks them, and the connection to each of them.
 
 A `Host` starts workers of one `Service`. The warm parent starts with the first worker and ends with
-the last host. It has loaded the service and forks a fresh process for each worker. Starting a
-worker is therefore cheap, and workers share no state. Where processes cannot fork, every worker is
-a new interpreter. Neither kind imports the user's ``__main__``. Parent and workers end with the
-user's process, even if that is killed; `ugat_marl.simulation.worker` is their side.
+the last host, or at the end of `kept_warm`. It has loaded the service and forks a fresh process for
+each worker. Starting a worker is therefore cheap, and workers share no state. Where processes
+cannot fork, every worker is a new interpreter. Neither kind imports the user's ``__main__``. Parent
+and workers end with the user's process, even if that is killed; `ugat_marl.simulation.worker` is
+their side.
 
 Messages are JSON, followed by float64 arrays. Nothing is unpickled, so messages cannot run code.
 """
@@ -22,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, ClassVar, Literal, Protocol
 
@@ -75,6 +76,20 @@ class Service(Protocol):
     def abandoned(self) -> None:
         """Clean up after the user's process has died; runs in the warm parent."""
         ...
+
+
+@contextlib.contextmanager
+def kept_warm() -> Iterator[None]:
+    """Keep warm parents while no host uses them, so that the next host need not load SUMO again.
+
+    Functions that make one environment after another are decorated with it. Parents without a host
+    end with the outermost block.
+    """
+    _WarmParent.keep()
+    try:
+        yield
+    finally:
+        _WarmParent.keep_no_longer()
 
 
 class Host:
@@ -284,6 +299,8 @@ class _WarmParent:
     _lock: ClassVar[threading.RLock] = threading.RLock()
     _current: ClassVar[dict[str, _WarmParent]] = {}
     _told_of_forks: ClassVar[bool] = False
+    _blocks: ClassVar[int] = 0
+    """Number of `kept_warm` blocks being executed."""
 
     def __init__(self, service: str) -> None:
         self._service = service
@@ -328,11 +345,26 @@ class _WarmParent:
         return self._owner == os.getpid() and self._process.poll() is None
 
     def release(self) -> None:
-        """Release the parent; the last release ends it."""
+        """Release the parent; the last release ends it, unless it is kept."""
         with self._lock:
             self._users -= 1
-            if self._users == 0:
+            if self._users == 0 and self._blocks == 0:
                 self.end()
+
+    @classmethod
+    def keep(cls) -> None:
+        """Enter a block of `kept_warm`."""
+        with cls._lock:
+            cls._blocks += 1
+
+    @classmethod
+    def keep_no_longer(cls) -> None:
+        """Leave a block of `kept_warm`; the last one to be left ends the parents without users."""
+        with cls._lock:
+            cls._blocks -= 1
+            if cls._blocks == 0:
+                for parent in [parent for parent in cls._current.values() if parent._users == 0]:
+                    parent.end()
 
     def tell(self, message: dict[str, Any]) -> None:
         """Send a message that has no answer."""

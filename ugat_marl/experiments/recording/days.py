@@ -55,7 +55,12 @@ from ugat_marl.scenarios import (
     draw_day,
 )
 from ugat_marl.seeding import derive_seed
-from ugat_marl.simulation import detectors_document, read_passages, standard_detectors
+from ugat_marl.simulation import (
+    detectors_document,
+    kept_warm,
+    read_passages,
+    standard_detectors,
+)
 
 
 @dataclass(frozen=True)
@@ -98,6 +103,7 @@ class _Day:
     trajectories: pl.DataFrame | None
 
 
+@kept_warm()
 def record(
     scenario: Scenario,
     domain: Domain,
