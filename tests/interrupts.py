@@ -8,6 +8,18 @@ from typing import Any
 from ugat_marl.progress import Silent
 
 
+class KillAt(Silent):
+    """Raises when a task begins."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def task(self, name: str, total: int) -> Any:
+        if name == self._name:
+            raise KeyboardInterrupt
+        return super().task(name, total)
+
+
 class KillAfter(Silent):
     """Raises after some steps of one task."""
 

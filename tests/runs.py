@@ -6,21 +6,55 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from ugat_marl.data import Scores
+from ugat_marl.data import Metrics, Scores
 from ugat_marl.effects import Domain, domain_label
-from ugat_marl.experiments import Evaluation
+from ugat_marl.experiments import Evaluation, TransferConfig
 from ugat_marl.experiments.scores import Result
+from ugat_marl.grounding import FitConfig, UgatConfig
+from ugat_marl.policies import DQNConfig, NetworkPolicy
 from ugat_marl.scenarios import Scenario
 
 JOBS = "ugat_marl.experiments.jobs"
+
+SMALL = TransferConfig(
+    scenario="single-v1",
+    real="V4",
+    duration_s=100,
+    evaluation_seeds=1,
+    tuning_seeds=1,
+    control=False,
+    ugat=UgatConfig(
+        pretrain_episodes=2,
+        iterations=2,
+        grounded_episodes=2,
+        sim_rollouts=2,
+        real_rollouts=2,
+        least_accuracy=None,  # so little training proves nothing
+        fit=FitConfig(epochs=2),
+    ),
+    dqn=DQNConfig(warmup_decisions=5, epsilon_decay_decisions=50),
+)
+"""A run that takes a second or two."""
 
 
 def checkpoint_of(run: Path) -> Path:
     """The checkpoint of the run's grounded training."""
     (folder,) = run.glob("trainings/*/checkpoint")
     return folder
+
+
+def weights(run: Path, name: str) -> np.ndarray[Any, Any]:
+    """The weights of a policy of the run."""
+    return NetworkPolicy.load(run / "policies" / f"{name}.pt").parameters
+
+
+def numbers(run: Path) -> dict[tuple[int, str], float]:
+    """What the run logged in its iterations, by iteration and name."""
+    rows = Metrics.read(run / "metrics.parquet").rows
+    return {(step, name): value for stage, step, name, value in rows if stage == "iteration"}
 
 
 def search_few_rules(patch: pytest.MonkeyPatch, *rules: str) -> None:

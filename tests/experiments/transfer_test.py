@@ -13,42 +13,19 @@ import pytest
 import torch
 
 from tests.interrupts import KillAfter
-from tests.runs import checkpoint_of, play_nothing
+from tests.runs import SMALL, checkpoint_of, numbers, play_nothing, weights
 from ugat_marl.__main__ import main
-from ugat_marl.data import Metrics, TransitionLog
+from ugat_marl.data import TransitionLog
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, TransferConfig, transfer
+from ugat_marl.experiments import Evaluation, transfer
 from ugat_marl.experiments.jobs import file_names
 from ugat_marl.experiments.randomised import RandomisedEnv
-from ugat_marl.grounding import FitConfig, RandomDelays, TimedConfig, UgatConfig
-from ugat_marl.policies import DQNConfig, NetworkPolicy
-
-SMALL = TransferConfig(
-    scenario="single-v1",
-    duration_s=100,
-    evaluation_seeds=1,
-    tuning_seeds=1,
-    control=False,
-    ugat=UgatConfig(
-        pretrain_episodes=2,
-        iterations=2,
-        grounded_episodes=3,
-        sim_rollouts=2,
-        real_rollouts=2,
-        least_accuracy=None,  # so little training proves nothing
-        fit=FitConfig(epochs=2),
-    ),
-    dqn=DQNConfig(warmup_decisions=5, epsilon_decay_decisions=50),
-)
+from ugat_marl.grounding import RandomDelays, TimedConfig, UgatConfig
 
 
 @pytest.fixture(autouse=True)
 def unjudged(monkeypatch: pytest.MonkeyPatch) -> None:
     play_nothing(monkeypatch)
-
-
-def weights(folder: Path, name: str) -> np.ndarray[Any, Any]:
-    return NetworkPolicy.load(folder / "policies" / f"{name}.pt").parameters
 
 
 def episodes(folder: Path, name: str) -> int:
@@ -109,18 +86,18 @@ def test_every_control_is_trained_as_long_as_it_says_where_it_says(
         "fine-tuned on the same data", "domain randomisation", "trained in real",
     ]  # fmt: skip
     assert trained(found) == names
-    assert config.episodes == 8
+    assert config.episodes == 6
     for name in ("more plain sim", "random delay 0-5 s", "domain randomisation", "trained in real"):
-        assert episodes(tmp_path, name) == 8
+        assert episodes(tmp_path, name) == 6
     # UGAT saw two roll-outs of the real domain in each of two iterations.
     assert episodes(tmp_path, "fine-tuned on the same data") == 2 + 4
-    assert len(worlds) == len(set(worlds)) == 8
+    assert len(worlds) == len(set(worlds)) == 6
     for world in worlds:
         parts = {part.partition("=")[0] for part in world.split("+")}
         assert parts == {
             "acceleration", "deceleration", "emergency_deceleration", "startup_delay",
         }  # fmt: skip
-    assert set(late) == {5} and len(late) == 6 * 10  # six episodes of ten decisions
+    assert set(late) == {5} and len(late) == 4 * 10  # four episodes of ten decisions
     policies = [weights(tmp_path, file) for file in file_names(names)]
     for i, one in enumerate(policies):
         assert not any(np.array_equal(one, other) for other in policies[:i])
@@ -128,10 +105,8 @@ def test_every_control_is_trained_as_long_as_it_says_where_it_says(
 
 def test_controls_are_the_trainings_that_go_by_other_names(tmp_path: Path) -> None:
     """The oracle is a correction that is right; fine-tuning goes on in the real domain."""
-    ugat = replace(SMALL.ugat, grounded_episodes=2)  # as many as roll-outs of the real domain
-    config = replace(
-        SMALL, ugat=ugat, oracle=True, fine_tuned=True, corrected="V4", further=("V4",)
-    )
+    # SMALL has as many grounded episodes as roll-outs of the real domain.
+    config = replace(SMALL, oracle=True, fine_tuned=True, corrected="V4", further=("V4",))
     transfer(config, tmp_path)
     for one, other in (
         ("trained-in-real", "corrected-sim"),
@@ -196,12 +171,6 @@ def test_what_makes_no_sense_is_refused(options: dict[str, Any], complaint: str)
         replace(SMALL, **options)
     with pytest.raises(UnknownNameError, match=r"placebo 'shufled'.*'shuffled'"):
         replace(SMALL, placebo="shufled")  # pyright: ignore[reportArgumentType]
-
-
-def numbers(folder: Path) -> dict[tuple[int, str], float]:
-    """What was logged, by iteration and name."""
-    rows = Metrics.read(folder / "metrics.parquet").rows
-    return {(step, name): value for stage, step, name, value in rows if stage == "iteration"}
 
 
 def follows(folder: Path) -> float:

@@ -12,15 +12,15 @@ import polars as pl
 import pytest
 import torch
 
-from tests.runs import checkpoint_of, search_few_rules
-from ugat_marl.data import Metrics, TransitionLog
+from tests.interrupts import KillAt
+from tests.runs import SMALL, checkpoint_of, numbers, play_nothing, search_few_rules
+from ugat_marl.data import TransitionLog
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import TransferConfig, transfer
+from ugat_marl.experiments import transfer
 from ugat_marl.experiments.training import simulated_worlds
 from ugat_marl.grounding import (
-    FitConfig,
     GateConfig,
     GroundedEnv,
     PhaseTransform,
@@ -31,8 +31,7 @@ from ugat_marl.grounding import (
     UgatConfig,
 )
 from ugat_marl.grounding.forward import ForwardConfig
-from ugat_marl.policies import DQNConfig, observer_of, roll_out
-from ugat_marl.progress import Silent
+from ugat_marl.policies import observer_of, roll_out
 
 MOST_S = 4
 
@@ -254,46 +253,16 @@ def test_a_log_recorded_in_a_grounded_simulation_says_what_was_held_back(env: Tr
 # --- the algorithm
 
 
-SMALL = TransferConfig(
-    scenario="single-v1",
+LATE = replace(
+    SMALL,
     real="late_green=*,2",
     duration_s=150,
-    evaluation_seeds=1,
-    tuning_seeds=1,
-    control=False,
-    ugat=UgatConfig(
-        grounding="timed",
-        pretrain_episodes=2,
-        iterations=2,
-        grounded_episodes=1,
-        sim_rollouts=2,
-        real_rollouts=2,
-        fit=FitConfig(epochs=3),
-        timed=TimedConfig(most_s=3),
-    ),
-    dqn=DQNConfig(warmup_decisions=20, epsilon_decay_decisions=100),
+    ugat=replace(SMALL.ugat, grounding="timed", grounded_episodes=1, timed=TimedConfig(most_s=3)),
 )
 
 
-class Killed(Exception):
-    """Stands for a kill at one moment."""
-
-
-class KillAt(Silent):
-    """Raises when the task of a name begins."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def task(self, name: str, total: int) -> Any:
-        if name == self._name:
-            raise Killed
-        return super().task(name, total)
-
-
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The search for the best rule is not under test here."""
     search_few_rules(monkeypatch, "largest-queue:20")
 
 
@@ -310,11 +279,12 @@ def test_the_kind_of_grounding_decides_what_is_made(env: TrafficEnv) -> None:
 
 
 @pytest.mark.parametrize("match", [False, True])
+@pytest.mark.usefixtures("few_rules")
 def test_a_run_with_timed_grounding_resumes_where_it_was(match: bool, tmp_path: Path) -> None:
-    timed = replace(SMALL.ugat.timed, match=match)
-    small = replace(SMALL, ugat=replace(SMALL.ugat, timed=timed))
+    timed = replace(LATE.ugat.timed, match=match)
+    small = replace(LATE, ugat=replace(LATE.ugat, timed=timed))
     transfer(small, tmp_path / "unbroken")
-    with pytest.raises(Killed):
+    with pytest.raises(KeyboardInterrupt):
         transfer(small, tmp_path / "run", reporter=KillAt("fitting f and h, iteration 2"))
     other = replace(small, ugat=replace(small.ugat, grounding="phase"))
     with pytest.raises(CheckpointError, match="holds another run"):
@@ -325,21 +295,20 @@ def test_a_run_with_timed_grounding_resumes_where_it_was(match: bool, tmp_path: 
     table = [(tmp_path / name / "table.json").read_text() for name in ("run", "unbroken")]
     assert table[0] == table[1]
 
-    rows = Metrics.read(tmp_path / "run" / "metrics.parquet").rows
-    numbers = {(step, name): value for _, step, name, value in rows}
+    found = numbers(tmp_path / "run")
     for step in (1, 2):
         for name in (
             "lost_time/best_s", "lost_time/low_s/signal_0", "lost_time/high_s",
             "forward/ratio", "simulated/ratio", "inverse/guess_s", "gate/alpha",
             "att_s/late_green=*,2",
         ):  # fmt: skip
-            assert (step, name) in numbers, name
-        assert 0 <= numbers[step, "lost_time/low_s"] <= numbers[step, "lost_time/best_s"]
-        assert numbers[step, "lost_time/best_s"] <= numbers[step, "lost_time/high_s"] <= 3
+            assert (step, name) in found, name
+        assert 0 <= found[step, "lost_time/low_s"] <= found[step, "lost_time/best_s"]
+        assert found[step, "lost_time/best_s"] <= found[step, "lost_time/high_s"] <= 3
         for name in ("matched_s/signal_0", "beyond_s/signal_0", "chance"):
-            assert ((step, f"lost_time/{name}") in numbers) == match
-    assert numbers[1, "gate/alpha"] == np.inf
-    assert numbers[2, "gate/alpha"] == pytest.approx(numbers[1, "gate/mean_u"])
+            assert ((step, f"lost_time/{name}") in found) == match
+    assert found[1, "gate/alpha"] == np.inf
+    assert found[2, "gate/alpha"] == pytest.approx(found[1, "gate/mean_u"])
 
     for name, delayed in (("sim", True), ("real", False)):
         log = TransitionLog.read(checkpoint_of(tmp_path / "run") / f"{name}-000.parquet")
@@ -348,16 +317,18 @@ def test_a_run_with_timed_grounding_resumes_where_it_was(match: bool, tmp_path: 
         assert held.served_features.any()
 
 
-def test_a_log_of_the_street_without_crossings_will_do(tmp_path: Path) -> None:
+def test_a_log_of_the_street_without_crossings_will_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play_nothing(monkeypatch)
     street = SimulatedWorld(lambda: parallel_env("single-v1", "V4", duration_s=150), "real", 2, 0.3)
     log = street.collect(Alternating(), 0, seed=1)
     street.close()
     assert log is not None and not log.transitions("signal_0").served_features.size
     log.write(tmp_path / "log.parquet")
-    ugat = replace(SMALL.ugat, iterations=1, least_accuracy=0.2)
-    config = replace(SMALL, real="none", real_log=tmp_path / "log.parquet", ugat=ugat)
+    ugat = replace(LATE.ugat, iterations=1, least_accuracy=0.2)
+    config = replace(LATE, real="none", real_log=tmp_path / "log.parquet", ugat=ugat)
     transfer(config, tmp_path / "timed")
-    rows = Metrics.read(tmp_path / "timed" / "metrics.parquet").rows
-    numbers = {name: value for stage, _, name, value in rows if stage == "iteration"}
-    assert 0 <= numbers["lost_time/best_s"] <= 3
-    assert numbers["gate/trusted"] in (0.0, 1.0)
+    found = numbers(tmp_path / "timed")
+    assert 0 <= found[1, "lost_time/best_s"] <= 3
+    assert found[1, "gate/trusted"] in (0.0, 1.0)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +18,9 @@ import polars as pl
 import pytest
 import torch
 
-from tests.runs import checkpoint_of, search_few_rules
+from tests.interrupts import KillAfter, KillAt
+from tests.runs import SMALL, checkpoint_of, play_nothing, search_few_rules, weights
+from ugat_marl.__main__ import main
 from ugat_marl.data import Metrics, Run, TransitionLog, lock_folder
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
@@ -30,34 +30,16 @@ from ugat_marl.grounding import FitConfig, GateConfig, SimulatedWorld, UgatConfi
 from ugat_marl.grounding.uncertainty import MethodName
 from ugat_marl.policies import (
     DQN,
-    DQNConfig,
     EpsilonGreedy,
-    NetworkPolicy,
     make_rule,
     observer_of,
     roll_out,
 )
 from ugat_marl.progress import Silent
 
-SMALL = TransferConfig(
-    scenario="single-v1",
-    real="V4",
-    duration_s=100,
-    evaluation_seeds=1,
-    tuning_seeds=1,
-    control=False,
-    ugat=UgatConfig(
-        pretrain_episodes=12,
-        iterations=2,
-        grounded_episodes=2,
-        sim_rollouts=2,
-        real_rollouts=2,
-        least_accuracy=None,  # so little training proves nothing
-        fit=FitConfig(epochs=3),
-    ),
-    dqn=DQNConfig(warmup_decisions=20, epsilon_decay_decisions=100),
-)
 FEW_RULES = ("largest-queue:20", "programme")
+LONG = replace(SMALL, ugat=replace(SMALL.ugat, pretrain_episodes=12))
+"""Plain training is saved after ten episodes, so that it can be interrupted in between."""
 
 
 @pytest.fixture(autouse=True)
@@ -66,40 +48,26 @@ def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
     search_few_rules(monkeypatch, *FEW_RULES)
 
 
+@pytest.fixture
+def unjudged(monkeypatch: pytest.MonkeyPatch) -> None:
+    play_nothing(monkeypatch)
+
+
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run nobody disturbs."""
     folder = tmp_path_factory.mktemp("unbroken") / "run"
     with pytest.MonkeyPatch.context() as patch:
         search_few_rules(patch, *FEW_RULES)
-        transfer(SMALL, folder)
+        transfer(LONG, folder)
     return folder
-
-
-class Killed(Exception):
-    """Stands for a kill at one moment."""
-
-
-class KillAt(Silent):
-    """Raises when the n-th task of a name begins."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def task(self, name: str, total: int) -> Any:
-        if name == self._name:
-            raise Killed
-        return super().task(name, total)
-
-
-def weights(folder: Path, name: str) -> np.ndarray[Any, Any]:
-    return NetworkPolicy.load(folder / "policies" / f"{name}.pt").parameters
 
 
 def test_a_run_leaves_what_it_promises(unbroken: Path) -> None:
     table = json.loads((unbroken / "table.json").read_text())
     assert {row["policy"] for row in table["summary"]} >= {"direct transfer", "UGAT"}
     assert {row["domain"] for row in table["summary"]} == {"sim", "V4"}
+    assert table["scenario_hash"] == load_scenario("single-v1").hash
     metrics = Metrics.read(unbroken / "metrics.parquet")
     names = {name for stage, _, name, _ in metrics.rows if stage == "iteration"}
     for name in (
@@ -122,45 +90,38 @@ def test_alpha_starts_infinite_and_then_is_the_mean_of_u(unbroken: Path) -> None
     assert rows[2, "gate/alpha"] == pytest.approx(rows[1, "gate/mean_u"])
 
 
+@pytest.mark.usefixtures("unjudged")
 def test_alpha_can_start_at_what_the_first_fit_expects(tmp_path: Path) -> None:
-    few = replace(
-        SMALL.ugat, pretrain_episodes=2, iterations=1, grounded_episodes=1,
-        gate=GateConfig(start="fitted"),
-    )  # fmt: skip
+    few = replace(SMALL.ugat, iterations=1, grounded_episodes=1, gate=GateConfig(start="fitted"))
     transfer(replace(SMALL, ugat=few), tmp_path / "run")
     rows = {name: value for *_, name, value in Metrics.read(tmp_path / "run/metrics.parquet").rows}
     assert rows["gate/alpha"] == pytest.approx(rows["mean_u_on_predictions"])
     assert rows["gate/acceptance"] < 1.0
 
 
-@pytest.mark.parametrize(
-    "moment",
-    [
-        "plain sim, episode 11-12",
-        "roll-outs, iteration 1",
-        "fitting f and h, iteration 2",
-        "grounded, iteration 2",
-    ],
-)
-def test_resuming_gives_the_numbers_of_an_unbroken_run(
-    moment: str, unbroken: Path, tmp_path: Path
-) -> None:
+def test_resuming_gives_the_numbers_of_an_unbroken_run(unbroken: Path, tmp_path: Path) -> None:
+    """One run is interrupted at four moments, and taken up again after each."""
     folder = tmp_path / "run"
-    with pytest.raises(Killed):
-        transfer(SMALL, folder, reporter=KillAt(moment))
-    transfer(SMALL, folder, resume=True)
-    for name in ("metrics.parquet",):
-        assert pl.read_parquet(folder / name).equals(pl.read_parquet(unbroken / name))
-    assert np.array_equal(weights(folder, "ugat"), weights(unbroken, "ugat"))
+    for moment in (
+        "plain sim, episode 11-12", "roll-outs, iteration 1", "fitting f and h, iteration 2",
+        "grounded, iteration 2",
+    ):  # fmt: skip
+        with pytest.raises(KeyboardInterrupt):
+            transfer(LONG, folder, resume=folder.exists(), reporter=KillAt(moment))
+    transfer(LONG, folder, resume=True)
+    one, two = (pl.read_parquet(path / "metrics.parquet") for path in (folder, unbroken))
+    assert one.equals(two)
+    for name in ("direct-transfer", "ugat"):
+        assert np.array_equal(weights(folder, name), weights(unbroken, name))
     assert (folder / "table.json").read_text() == (unbroken / "table.json").read_text()
 
 
 def short_of(method: MethodName) -> TransferConfig:
     fit = FitConfig(uncertainty=method, epochs=2, members=2, passes=3)
-    ugat = replace(SMALL.ugat, pretrain_episodes=2, grounded_episodes=1, fit=fit)
-    return replace(SMALL, duration_s=100, ugat=ugat)
+    return replace(SMALL, ugat=replace(SMALL.ugat, grounded_episodes=1, fit=fit))
 
 
+@pytest.mark.usefixtures("unjudged")
 @pytest.mark.parametrize("method", ["ensemble", "none"])
 def test_every_uncertainty_trains(method: MethodName, tmp_path: Path) -> None:
     transfer(short_of(method), tmp_path)
@@ -174,10 +135,11 @@ def test_every_uncertainty_trains(method: MethodName, tmp_path: Path) -> None:
         assert rows[2, "gate/alpha"] == pytest.approx(rows[1, "gate/mean_u"])
 
 
+@pytest.mark.usefixtures("unjudged")
 def test_a_run_with_dropout_resumes(tmp_path: Path) -> None:
     """Its thinned networks are part of the checkpoint, and are not those of a fresh grounding."""
     config = short_of("dropout")
-    with pytest.raises(Killed):
+    with pytest.raises(KeyboardInterrupt):
         transfer(config, tmp_path / "run", reporter=KillAt("fitting f and h, iteration 2"))
     transfer(config, tmp_path / "run", resume=True)
     transfer(config, tmp_path / "unbroken")
@@ -185,14 +147,19 @@ def test_a_run_with_dropout_resumes(tmp_path: Path) -> None:
     assert one.equals(two)
 
 
-def test_a_killed_process_resumes(tmp_path: Path) -> None:
+def test_a_killed_process_resumes(
+    tmp_path: Path, python: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "run"
     command = [
-        sys.executable, "-m", "ugat_marl", "train", "single-v1", "--duration-s", "60", "--out",
-        str(folder), "--pretrain-episodes", "11", "--iterations", "1", "--grounded-episodes", "1",
-        "--fit.epochs", "2", "--no-control", "--evaluation-seeds", "1", "--tuning-seeds", "1",
+        "train", "single-v1", "--duration-s", "60", "--out", str(folder), "--pretrain-episodes",
+        "11", "--iterations", "1", "--grounded-episodes", "1", "--sim-rollouts", "2",
+        "--real-rollouts", "2", "--fit.epochs", "2", "--no-control", "--evaluation-seeds", "1",
+        "--tuning-seeds", "1",
     ]  # fmt: skip
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    process = subprocess.Popen(
+        [*python, "-m", "ugat_marl", *command], stdout=subprocess.DEVNULL, start_new_session=True
+    )
     deadline = time.monotonic() + 120
     while not list(folder.glob("trainings/*/checkpoint/state.json")):
         assert process.poll() is None
@@ -202,12 +169,10 @@ def test_a_killed_process_resumes(tmp_path: Path) -> None:
     process.wait()
     state = json.loads((checkpoint_of(folder) / "state.json").read_text())
     assert state["pretrained"] == 10
-    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "direct transfer" in done.stdout
-    again = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert again.returncode == 2
-    assert "--resume" in again.stderr
+    assert main([*command, "--resume"]) == 0
+    assert "direct transfer" in capsys.readouterr().out
+    assert main(command) == 2
+    assert "--resume" in capsys.readouterr().err
 
 
 def cut_in_half(path: Path) -> None:
@@ -243,16 +208,16 @@ def test_a_damaged_checkpoint_is_named_and_left_alone(
     (checkpoint_of(folder).parent / "scores.json").unlink()  # nothing reads on in a finished job
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     with pytest.raises(error, match=file):
-        transfer(SMALL, folder, resume=True)
+        transfer(LONG, folder, resume=True)
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
 
 
 def test_a_run_of_another_scenario_is_refused(unbroken: Path) -> None:
-    other = TransferConfig("grid2x2-v1", duration_s=100, ugat=SMALL.ugat, dqn=SMALL.dqn)
+    other = replace(LONG, scenario="grid2x2-v1")
     with pytest.raises(CheckpointError, match="holds another run: its scenario"):
         transfer(other, unbroken, resume=True)
     with pytest.raises(OptionError, match="--resume"):
-        transfer(SMALL, unbroken)
+        transfer(LONG, unbroken)
 
 
 def recorded(path: Path, scenario: str = "single-v1", observation: str = "count") -> Path:
@@ -283,11 +248,7 @@ def test_a_recorded_log_takes_the_place_of_the_real_simulator(
         return collect(self, *args)
 
     monkeypatch.setattr(SimulatedWorld, "collect", noting)
-    config = TransferConfig(
-        "single-v1", real="none", real_log=log, duration_s=100, evaluation_seeds=1,
-        tuning_seeds=1, control=False, ugat=SMALL.ugat, dqn=SMALL.dqn,
-    )  # fmt: skip
-    found = transfer(config, tmp_path / "run")
+    found = transfer(replace(SMALL, real="none", real_log=log), tmp_path / "run")
     assert played == {"sim"}
     assert found.domains == ["sim"]
 
@@ -316,20 +277,13 @@ def test_a_log_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         TransferConfig("single-v1", real="none")
 
 
+@pytest.mark.usefixtures("unjudged")
 def test_the_control_starts_from_direct_transfer(tmp_path: Path) -> None:
-    config = TransferConfig(
-        "single-v1", duration_s=100, evaluation_seeds=1, tuning_seeds=1,
-        ugat=UgatConfig(
-            pretrain_episodes=2, iterations=1, grounded_episodes=1, sim_rollouts=2,
-            real_rollouts=2, fit=FitConfig(epochs=1),
-        ),
-        dqn=DQNConfig(warmup_decisions=5),
-    )  # fmt: skip
-    found = transfer(config, tmp_path / "run")
+    ugat = replace(SMALL.ugat, iterations=1, grounded_episodes=1)
+    found = transfer(replace(SMALL, control=True, ugat=ugat), tmp_path / "run")
     assert "more plain sim" in found.policies
     direct = weights(tmp_path / "run", "direct-transfer")
     assert not np.array_equal(direct, weights(tmp_path / "run", "more-plain-sim"))
-    assert load_scenario("single-v1").hash == found.scenario_hash
 
 
 @pytest.fixture(scope="module")
@@ -375,26 +329,13 @@ def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
         assert not np.array_equal(mine, weights(tmp_path / "run", other))
 
 
+@pytest.mark.usefixtures("unjudged")
 def test_training_in_the_corrected_sim_resumes(repaired: Path, tmp_path: Path) -> None:
     config = replace(SHORT, corrected=str(repaired))
     transfer(config, tmp_path / "unbroken")
 
-    class KillIn(Silent):
-        @contextlib.contextmanager
-        def task(self, name: str, total: int) -> Any:
-            with super().task(name, total) as advance:
-
-                def one(*args: Any, **note: Any) -> None:
-                    done.append(name)
-                    advance(*args, **note)
-                    if name == "training: corrected sim" and done.count(name) == 11:
-                        raise Killed
-
-                yield one
-
-    done: list[str] = []
-    with pytest.raises(Killed):
-        transfer(config, tmp_path / "run", reporter=KillIn())
+    with pytest.raises(KeyboardInterrupt):
+        transfer(config, tmp_path / "run", reporter=KillAfter("training: corrected sim", 11))
     (kept,) = (tmp_path / "run" / "trainings").glob("*-scratch-*/learner.pt")
     assert kept.stat().st_size, "nothing was kept of ten episodes"
     moved = shutil.copytree(repaired, tmp_path / "elsewhere")
@@ -403,6 +344,7 @@ def test_training_in_the_corrected_sim_resumes(repaired: Path, tmp_path: Path) -
     assert np.array_equal(first, again)
 
 
+@pytest.mark.usefixtures("unjudged")
 def test_another_correction_is_another_run(repaired: Path, tmp_path: Path) -> None:
     config = replace(SHORT, corrected=str(repaired))
     transfer(config, tmp_path / "run")
@@ -425,6 +367,7 @@ def test_a_correction_that_cannot_be_trained_in_is_refused_at_once(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.usefixtures("unjudged")
 def test_models_that_are_too_poor_are_not_obeyed(tmp_path: Path) -> None:
     ugat = replace(SMALL.ugat, pretrain_episodes=1, iterations=1, least_accuracy=1.0)
     transfer(replace(SMALL, ugat=ugat), tmp_path / "run")
@@ -466,6 +409,7 @@ def test_two_processes_do_not_train_in_one_folder(tmp_path: Path) -> None:
     Run(tmp_path / "job", {"a": 1}, Silent()).close()
 
 
+@pytest.mark.usefixtures("unjudged")
 def test_a_changed_log_is_another_run(tmp_path: Path) -> None:
     log = recorded(tmp_path / "real.parquet")
     ugat = replace(SMALL.ugat, pretrain_episodes=1, iterations=1)

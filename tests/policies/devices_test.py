@@ -22,12 +22,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from studies.bench.learning_program import Noise
-from tests.runs import play_nothing
+from tests.runs import SMALL, play_nothing
 from ugat_marl.__main__ import main
 from ugat_marl.data import SETTINGS_FILE, AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import PaperConfig, TransferConfig, transfer
+from ugat_marl.experiments import PaperConfig, transfer
 from ugat_marl.experiments.paper import Planner
 from ugat_marl.grounding import (
     UNCERTAINTY_METHODS,
@@ -39,7 +39,6 @@ from ugat_marl.grounding import (
     TimedConfig,
     TimedTransform,
     Ugat,
-    UgatConfig,
     answer_with_noise,
 )
 from ugat_marl.grounding.fitting import OffData
@@ -450,23 +449,7 @@ def test_placed_modules_are_on_the_device_for_a_while(standin: torch.device) -> 
 # --- commands
 
 
-RUN = TransferConfig(
-    scenario="single-v1",
-    duration_s=100,
-    evaluation_seeds=1,
-    tuning_seeds=1,
-    control=False,
-    ugat=UgatConfig(
-        pretrain_episodes=2,
-        iterations=1,
-        grounded_episodes=2,
-        sim_rollouts=2,
-        real_rollouts=2,
-        least_accuracy=None,
-        fit=FitConfig(epochs=2),
-    ),
-    dqn=DQNConfig(warmup_decisions=5, epsilon_decay_decisions=20),
-)
+RUN = dataclasses.replace(SMALL, ugat=dataclasses.replace(SMALL.ugat, iterations=1))
 
 
 def test_a_run_is_the_same_elsewhere_and_goes_on_here(

@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.runs import search_few_rules
+from tests.interrupts import KillAt
+from tests.runs import SMALL, search_few_rules
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import TransferConfig, policy_factory, transfer
-from ugat_marl.grounding import FitConfig, UgatConfig
+from ugat_marl.experiments import policy_factory, transfer
 from ugat_marl.policies import BASELINES, DQN, Learner, NetworkPolicy, learner_factory
 from ugat_marl.policies.learners import catalogue
 from ugat_marl.policies.learners.catalogue import Baseline
 from ugat_marl.policies.learners.dqn import DQNConfig
-from ugat_marl.progress import Silent
 from ugat_marl.testing import ToyTraffic
 
 if not catalogue.baselines_folder().is_dir():
@@ -40,22 +39,11 @@ class Plain:
     def __init__(self, env, config, seed):
         self.config, self.seed = config, seed
 """
-SMALL = TransferConfig(
-    scenario="single-v1",
-    duration_s=100,
-    evaluation_seeds=1,
-    tuning_seeds=1,
+IPPO = replace(
+    SMALL,
     learner="ippo",
     learner_settings=("hidden=16", "update_every=5", "epochs=2"),
-    ugat=UgatConfig(
-        pretrain_episodes=2,
-        iterations=2,
-        grounded_episodes=2,
-        sim_rollouts=2,
-        real_rollouts=2,
-        least_accuracy=None,  # so little training proves nothing
-        fit=FitConfig(epochs=2),
-    ),
+    control=True,
 )
 
 
@@ -153,27 +141,11 @@ def test_importing_the_names_imports_no_library() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.fixture
-def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The search for the best rule is not under test here."""
+def test_ugat_trains_a_baseline_and_takes_it_up_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     search_few_rules(monkeypatch, "largest-queue:20")
-
-
-class KillIn(Silent):
-    """Raises when some task begins."""
-
-    def __init__(self, title: str) -> None:
-        self.title = title
-
-    def task(self, title: str, total: int) -> Any:
-        if title == self.title:
-            raise KeyboardInterrupt
-        return super().task(title, total)
-
-
-@pytest.mark.usefixtures("few_rules")
-def test_ugat_trains_a_baseline_and_takes_it_up_again(tmp_path: Path) -> None:
-    found = transfer(SMALL, tmp_path / "whole")
+    found = transfer(IPPO, tmp_path / "whole")
     assert found.policies[:3] == ["direct transfer", "UGAT", "more plain sim"]
     assert found.notes["learner"] == "ippo"
     files = sorted(path.name for path in (tmp_path / "whole" / "policies").iterdir())
@@ -183,11 +155,11 @@ def test_ugat_trains_a_baseline_and_takes_it_up_again(tmp_path: Path) -> None:
         assert NetworkPolicy.load(path).hidden == (16,)
         assert policy_factory(str(path))  # as evaluate reads it
     with pytest.raises(KeyboardInterrupt):
-        transfer(SMALL, tmp_path / "broken", reporter=KillIn("grounded, iteration 2"))
+        transfer(IPPO, tmp_path / "broken", reporter=KillAt("grounded, iteration 2"))
     for other in ({"learner": "dqn", "learner_settings": ()}, {"learner_settings": ("hidden=8",)}):
         with pytest.raises(CheckpointError, match="another run"):
-            transfer(replace(SMALL, **other), tmp_path / "broken", resume=True)
-    transfer(SMALL, tmp_path / "broken", resume=True)
+            transfer(replace(IPPO, **other), tmp_path / "broken", resume=True)
+    transfer(IPPO, tmp_path / "broken", resume=True)
     for name in files:
         one, other = (
             NetworkPolicy.load(tmp_path / run / "policies" / name).parameters
