@@ -17,7 +17,7 @@ from ugat_marl.diagnosis.engine import Engine, OutOfTime, Replicate
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
 from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
 from ugat_marl.diagnosis.thresholds import Thresholds
-from ugat_marl.effects import Effect, load_scenario, apply_detector_effects, parse_domain
+from ugat_marl.effects import Effect, apply_detector_effects, load_scenario, parse_domain
 from ugat_marl.errors import SimulatorError
 from ugat_marl.scenarios import Network, Passages, Period, Scenario
 from ugat_marl.simulation import standard_detectors

@@ -22,7 +22,7 @@ from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.diagnosis.places import PlaceFinder, _later
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
-from ugat_marl.effects import Domain, load_scenario, apply_detector_effects, parse_domain
+from ugat_marl.effects import Domain, apply_detector_effects, load_scenario, parse_domain
 from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period
 
 THRESHOLDS = Thresholds()

@@ -42,7 +42,7 @@ from ugat_marl.grounding import Probe, RandomDelays, RecordedWorld, SimulatedWor
 from ugat_marl.parallel import Workers, in_this_process
 from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory
 from ugat_marl.progress import Bars, Reporter
-from ugat_marl.simulation import exit_when_input_ends
+from ugat_marl.simulation import exit_when_input_ends, kept_warm
 
 JOB, SCORES, POLICY, DIRECT_POLICY, LEARNER, RULE_FILE = (
     "job.json", "scores.json", "policy.pt", "direct-policy.pt", "learner.pt", "rule.txt",
@@ -290,6 +290,7 @@ class Record:
         return [self.scores[mark, domain, seed] for seed in job.evaluation_seeds]
 
 
+@kept_warm()
 def perform(job: Job, folder: Path, reporter: Reporter, workers: Workers = 1) -> Record:
     """Do the missing training and evaluations of a job, and write them to its folder.
 
