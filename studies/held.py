@@ -130,12 +130,12 @@ class Watched:
         self._sums: defaultdict[str, list[float]] = defaultdict(list)
         self._scores: dict[str, Any] = {}
 
-    def see(self, what: str, value: Any) -> None:
+    def see(self, name: str, value: Any) -> None:
         """Add a value to the digest of its kind, and its sum to the list of sums."""
-        self._digests[what].update(json.dumps(canonical(value)).encode())
-        if what in ("observations", "rewards"):
+        self._digests[name].update(json.dumps(canonical(value)).encode())
+        if name in ("observations", "rewards"):
             arrays = value.values() if isinstance(value, Mapping) else [value]
-            self._sums[what].append(math.fsum(float(x) for a in arrays for x in np.ravel(a)))
+            self._sums[name].append(math.fsum(float(x) for a in arrays for x in np.ravel(a)))
 
     def score(self, scores: Any) -> None:
         """Keep the measures of the finished episode."""
@@ -143,12 +143,12 @@ class Watched:
 
     def values(self) -> Values:
         """Return measures, sums per decision, and digests."""
-        found: Values = {f"{self._label}: scores": list(flat_numbers(self._scores))}
-        for what, sums in self._sums.items():
-            found[f"{self._label}: sum of {what}"] = list(sums)
-        for what, digest in self._digests.items():
-            found[f"{self._label}: bytes of {what}"] = [digest.hexdigest()]
-        return found
+        numbers: Values = {f"{self._label}: scores": list(flat_numbers(self._scores))}
+        for name, sums in self._sums.items():
+            numbers[f"{self._label}: sum of {name}"] = list(sums)
+        for name, digest in self._digests.items():
+            numbers[f"{self._label}: bytes of {name}"] = [digest.hexdigest()]
+        return numbers
 
 
 def canonical(value: Any) -> Any:
@@ -160,7 +160,7 @@ def canonical(value: Any) -> Any:
     if isinstance(value, np.generic):
         return canonical(value.item())
     if isinstance(value, list | tuple):
-        return [canonical(item) for item in value]
+        return [canonical(entry) for entry in value]
     if isinstance(value, float):
         return value.hex()
     if value is None or isinstance(value, bool | int | str):
@@ -171,8 +171,8 @@ def canonical(value: Any) -> Any:
 def flat_numbers(value: Any) -> Iterator[Any]:
     """Yield the numbers of nested tables, in their order."""
     if isinstance(value, Mapping):
-        for item in value.values():
-            yield from flat_numbers(item)
+        for entry in value.values():
+            yield from flat_numbers(entry)
     else:
         yield value
 
@@ -230,7 +230,7 @@ def take_turns(label: str, env: Any) -> Values:
 
 def step_together(scenario: str) -> Values:
     """Play two environments in a vector: an episode, and the beginning of the next."""
-    domains, found = ["sim", "V4"], {}
+    domains, values = ["sim", "V4"], {}
     with ugat_marl.vector_env(scenario, 2, domains, duration_s=IN_A_VECTOR_S) as env:
         batch = env.reset(seed=SEED)
         rngs = [np.random.default_rng(SEED + i) for i in range(2)]
@@ -252,17 +252,17 @@ def step_together(scenario: str) -> Values:
                 watched[end.environment].see("last", [end.observations, end.masks])
                 watched[end.environment].score(end.scores)
         for one in watched:
-            found |= one.values()
-    return found
+            values |= one.values()
+    return values
 
 
 def episodes(scenario: str) -> tuple[Values, Values]:
     """Return the values of a scenario's episodes in a worker process."""
-    found = play("V4", ugat_marl.parallel_env(scenario, "V4"), SEED + 1)
-    found |= play("sim", ugat_marl.parallel_env(scenario))
+    values = play("V4", ugat_marl.parallel_env(scenario, "V4"), SEED + 1)
+    values |= play("sim", ugat_marl.parallel_env(scenario))
     if scenario == "single-v1":
-        found |= take_turns("in turns", ugat_marl.env(scenario, duration_s=300.0))
-    return found, {}
+        values |= take_turns("in turns", ugat_marl.env(scenario, duration_s=300.0))
+    return values, {}
 
 
 def episodes_in_process(scenario: str) -> tuple[Values, Values]:
@@ -277,20 +277,20 @@ def episodes_in_a_vector(scenario: str) -> tuple[Values, Values]:
 
 def domains() -> tuple[Values, Values]:
     """Return the values of short episodes in many domains, and the hashes of their scenarios."""
-    found: Values = {}
+    values: Values = {}
     for domain in DOMAINS.split():
         duration_s = 700.0 if domain in BEGINNING_LATE else 200.0
-        found |= play(domain, ugat_marl.parallel_env("mixed-v1", domain, duration_s=duration_s))
-    return found, {}
+        values |= play(domain, ugat_marl.parallel_env("mixed-v1", domain, duration_s=duration_s))
+    return values, {}
 
 
 def variants() -> tuple[Values, Values]:
     """Return the values of short episodes with other options, and with delayed greens."""
-    found: Values = {}
+    values: Values = {}
     for name, options in VARIANTS.items():
-        found |= play(name, ugat_marl.parallel_env("mixed-v1", duration_s=300.0, **options))
+        values |= play(name, ugat_marl.parallel_env("mixed-v1", duration_s=300.0, **options))
     late = ugat_marl.parallel_env("mixed-v1", "V2", duration_s=300.0)
-    return found | play("late greens", late, late=True), {}
+    return values | play("late greens", late, late=True), {}
 
 
 def scenarios() -> tuple[Values, Values]:
@@ -332,43 +332,43 @@ def training(grounding: str, *more: str) -> tuple[Values, Values]:
         )
         table = json.loads((out / "table.json").read_text(encoding="utf-8"))
         logged, queues = table_of(out / "metrics.parquet"), table_of(out / "queues.parquet")
-    found: Values = {}
+    values: Values = {}
     for row in table["episodes"]:
         scores = {**row, **row.get("scores", {})}
         label = f"{row['policy']}, {row['domain']}, seed {row['seed']}"
-        found[label] = [scores[measure] for measure in MEASURES]
+        values[label] = [scores[measure] for measure in MEASURES]
     for row in sorted(logged, key=lambda row: (row["stage"], row["name"], row["step"])):
-        found.setdefault(f"{row['stage']}: {row['name']}", []).append(row["value"])
+        values.setdefault(f"{row['stage']}: {row['name']}", []).append(row["value"])
     for row in queues:
         label = f"queue, {row['policy']}, {row['domain']}, {row['intersection']}"
-        found.setdefault(label, []).append(row["queue"])
-    return found, {key: [text] for key, text in table["notes"].items()}
+        values.setdefault(label, []).append(row["queue"])
+    return values, {key: [text] for key, text in table["notes"].items()}
 
 
 def measured_values(folder: Path, label: str) -> Values:
     """Return the number of rows, the sums of columns and a digest of measured data."""
-    found: Values = {}
+    values: Values = {}
     for path in sorted(folder.iterdir()):
         rows = table_of(path)
-        found[f"{label}{path.stem}: rows"] = [len(rows)]
+        values[f"{label}{path.stem}: rows"] = [len(rows)]
         for name in rows[0] if rows else ():
             column = [row[name] for row in rows]
             digest = hashlib.sha256(json.dumps(canonical(column)).encode()).hexdigest()
             numbers = [x for x in column if isinstance(x, int | float) and math.isfinite(x)]
-            found[f"{label}{path.stem}: {name}"] = [math.fsum(numbers), digest]
-    return found
+            values[f"{label}{path.stem}: {name}"] = [math.fsum(numbers), digest]
+    return values
 
 
 def recorded_rules() -> tuple[Values, Values]:
     """Record measured data under each rule and return their values."""
-    found: Values = {}
+    values: Values = {}
     for rule in RULES.split():
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "measured"
             options = ["--policy", rule, "--periods", "1", "--duration-s", "600", "--workers", "1"]
             command("record", "mixed-v1", *options, "--seed", "5", "--out", out)
-            found |= measured_values(out, f"{rule}, ")
-    return found, {}
+            values |= measured_values(out, f"{rule}, ")
+    return values, {}
 
 
 def diagnosis(domain: str) -> tuple[Values, Values]:
@@ -384,7 +384,7 @@ def diagnosis(domain: str) -> tuple[Values, Values]:
         options += ["--seed", "0", "--no-report", "--leave-out", *UNEXAMINED.split()]
         command("diagnose", "single-v1", data, "--out", out, *options)
         record = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
-        found = measured_values(data, "measured ")
+        values = measured_values(data, "measured ")
     if not record["complete"]:
         raise RuntimeError(f"the diagnosis of {domain} is not complete")
     names: Values = {}
@@ -392,18 +392,18 @@ def diagnosis(domain: str) -> tuple[Values, Values]:
     for key in sorted(record.keys() - OF_THE_RUN, key=lambda key: (key not in first, key)):
         for path, value in leaves(key, record[key]):
             words = isinstance(value, str) and key not in ("verdict", "effects")
-            (names if words or key in WORDS else found).setdefault(path, []).append(value)
-    return found, names
+            (names if words or key in WORDS else values).setdefault(path, []).append(value)
+    return values, names
 
 
 def leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
     """Yield the leaves of nested JSON with their paths; ``[]`` means each entry of a list."""
     if isinstance(value, dict):
-        for key, item in value.items():
-            yield from leaves(f"{path}.{key}", item)
+        for key, entry in value.items():
+            yield from leaves(f"{path}.{key}", entry)
     elif isinstance(value, list):
-        for item in value:
-            yield from leaves(f"{path}[]", item)
+        for entry in value:
+            yield from leaves(f"{path}[]", entry)
     else:
         yield path, value
 
@@ -420,12 +420,12 @@ def needing(scenario: str, part: Callable[[str], tuple[Values, Values]]) -> tupl
 
 def parts() -> dict[str, Callable[[], tuple[Values, Values]]]:
     """Return all parts by their names."""
-    found: dict[str, Callable[[], tuple[Values, Values]]] = {"scenarios": scenarios}
+    parts_by_name: dict[str, Callable[[], tuple[Values, Values]]] = {"scenarios": scenarios}
     ways = {"worker": episodes, "in-process": episodes_in_process, "vector": episodes_in_a_vector}
     for scenario in EPISODES:
         for way, part in ways.items():
-            found[f"episodes/{scenario}/{way}"] = lambda s=scenario, p=part: needing(s, p)
-    return found | {
+            parts_by_name[f"episodes/{scenario}/{way}"] = lambda s=scenario, p=part: needing(s, p)
+    return parts_by_name | {
         "variants": variants,
         "domains": domains,
         "rules": recorded_rules,
@@ -461,14 +461,14 @@ def played(name: str) -> dict[str, Any]:
 def plain(values: Values) -> Values:
     """Return values that JSON can hold: numbers that are not finite become texts."""
     return {
-        label: [str(x) if isinstance(x, float) and not math.isfinite(x) else x for x in found]
-        for label, found in values.items()
+        label: [str(x) if isinstance(x, float) and not math.isfinite(x) else x for x in entries]
+        for label, entries in values.items()
     }
 
 
 def digest_of(values: Values) -> str:
     """Return the SHA-256 of the values; labels and their order do not count."""
-    lines = sorted(json.dumps(found) for found in values.values())
+    lines = sorted(json.dumps(entries) for entries in values.values())
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 

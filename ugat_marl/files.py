@@ -170,18 +170,18 @@ def scan_xml(pieces: Iterable[bytes], name: str) -> Iterator[Tag]:
         ScenarioError: As for `parse_xml`.
     """
     parser = _refusing_parser(name)
-    found: list[Tag] = []
+    tags: list[Tag] = []
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        found.append(Tag(tag, attributes, parser.CurrentLineNumber))
+        tags.append(Tag(tag, attributes, parser.CurrentLineNumber))
 
     parser.StartElementHandler = start
     for piece in pieces:
         _parse(parser, piece, False, name)
-        yield from found
-        found.clear()
+        yield from tags
+        tags.clear()
     _parse(parser, b"", True, name)
-    yield from found
+    yield from tags
 
 
 def parse_xml(content: bytes, name: str) -> ET.Element:

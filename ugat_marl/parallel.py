@@ -247,17 +247,17 @@ class RayExecutor(Executor):
         if self._owns and self._ray.is_initialized():
             self._ray.shutdown()
 
-    def _settle(self, future: Future[Any], found: Future[Any]) -> None:
+    def _settle(self, future: Future[Any], outcome: Future[Any]) -> None:
         """Pass a result or an error on. Ray wraps the part's own error, so unwrap it."""
         with self._lock:
             self._running.pop(future, None)
         if not future.set_running_or_notify_cancel():
             return
-        error = found.exception()
+        error = outcome.exception()
         if error is not None:
             future.set_exception(getattr(error, "cause", None) or error)
         else:
-            future.set_result(found.result())
+            future.set_result(outcome.result())
 
     def _withdraw(self, future: Future[Any]) -> None:
         with self._lock:

@@ -54,9 +54,11 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
             f"{path}: not a readable checkpoint ({first_line[:200]}); it may have been cut short: "
             "use an earlier one or train again"
         ) from None
-    found = content.get("kind") if isinstance(content, dict) else None
-    if found != kind:
-        raise CheckpointError(f"{path}: holds {found!r}, expected {kind!r}; give the right file")
+    kind_read = content.get("kind") if isinstance(content, dict) else None
+    if kind_read != kind:
+        raise CheckpointError(
+            f"{path}: holds {kind_read!r}, expected {kind!r}; give the right file"
+        )
     require_finite(content, str(path), "cannot be used: take an earlier checkpoint or train again")
     return content
 
@@ -90,27 +92,27 @@ def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> N
 
 
 def checked_tensors(
-    path: Path, found: Mapping[str, torch.Tensor], own: Mapping[str, torch.Tensor]
+    path: Path, read: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]
 ) -> dict[str, torch.Tensor]:
     """Return the tensors of a checkpoint, checked against the learner's own.
 
     Args:
         path: The checkpoint, for messages.
-        found: Tensors of the checkpoint; those that the learner does not need are left out.
-        own: The learner's tensors, with the required names, shapes and types.
+        read: Tensors of the checkpoint; those that the learner does not need are left out.
+        expected: The learner's tensors, with the required names, shapes and types.
 
     Raises:
         CheckpointError: A tensor has another shape or type.
         KeyError: A tensor is missing.
     """
-    for name, tensor in own.items():
-        given = found[name]
+    for name, tensor in expected.items():
+        given = read[name]
         if given.shape != tensor.shape or given.dtype != tensor.dtype:
             raise CheckpointError(
                 f"{path}: {name} has shape {tuple(given.shape)}, this learner needs "
                 f"{tuple(tensor.shape)}; use the settings it was saved with"
             )
-    return {name: found[name] for name in own}
+    return {name: read[name] for name in expected}
 
 
 def _tensors(prefix: str, content: Mapping[str, Any]) -> Iterator[tuple[str, torch.Tensor]]:

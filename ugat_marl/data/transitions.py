@@ -470,9 +470,9 @@ def checked(
     agent = pl.col("agent")
     size = agent.replace_strict(dict(sizes), return_dtype=pl.UInt32)
     limit = agent.replace_strict(dict(phases), return_dtype=pl.Int16)
-    own = agent.replace_strict(dict(features), return_dtype=pl.UInt32)
+    widths = agent.replace_strict(dict(features), return_dtype=pl.UInt32)
     length = pl.col("served_features").list.len()
-    wrong = (length != own) & (length != 0)
+    wrong = (length != widths) & (length != 0)
     _refuse_rows(frame, wrong, "served_features", "has the wrong length")
     for column in VECTORS:
         _refuse_rows(frame, pl.col(column).list.len() != size, column, "has the wrong length")
@@ -509,16 +509,16 @@ def _converted(frame: pl.DataFrame) -> pl.DataFrame:
     return pl.DataFrame(columns)
 
 
-def _same_kind(found: pl.DataType, wanted: pl.DataType) -> bool:
+def _same_kind(given: pl.DataType, wanted: pl.DataType) -> bool:
     if isinstance(wanted, pl.List):
-        if not isinstance(found, pl.List | pl.Array):
+        if not isinstance(given, pl.List | pl.Array):
             return False
-        return found.inner.is_float()
+        return given.inner.is_float()
     if wanted.is_integer():
-        return found.is_integer()
+        return given.is_integer()
     if wanted.is_float():
-        return found.is_float()
-    return found == wanted
+        return given.is_float()
+    return given == wanted
 
 
 def _refuse_rows(frame: pl.DataFrame, bad: pl.Expr, column: str, complaint: str) -> None:

@@ -111,7 +111,9 @@ class PhaseOrder(ControllerEffect):
             ScenarioError: The phases of an intersection have no barrier.
         """
         del timing, decision_interval_s
-        return _Ordered([successors(item, self.rule) for item in network.intersections])
+        return _Ordered(
+            [successors(intersection, self.rule) for intersection in network.intersections]
+        )
 
 
 class _Ordered(Actuator):
@@ -171,7 +173,7 @@ ACTING: tuple[type[Effect], ...] = (ExecutionDelay, LostCommands, PhaseOrder, Ma
 """Effects on commands."""
 
 
-def successors(item: Intersection, rule: str = "") -> list[list[int]]:
+def successors(intersection: Intersection, rule: str = "") -> list[list[int]]:
     """Return, for each phase of an intersection, the other phases that may follow it, by index.
 
     Without a rule, any phase may follow any other. With ``"cyclic"``, only the next one in the list
@@ -185,24 +187,24 @@ def successors(item: Intersection, rule: str = "") -> list[list[int]]:
     - ``"barrier-both"``: both rules hold.
 
     Args:
-        item: The intersection.
+        intersection: The intersection.
         rule: One of `PHASE_ORDERS`, or "".
 
     Raises:
         ScenarioError: All phases belong to one street, so there is no barrier.
     """
-    count = len(item.phases)
+    count = len(intersection.phases)
     if rule == "cyclic":
         return [[(phase + 1) % count] for phase in range(count)]
     if not rule:
         return [[other for other in range(count) if other != phase] for phase in range(count)]
-    streets = _streets(item)
+    streets = _streets(intersection)
     if len(set(streets)) < 2:
         raise ScenarioError(
-            f"phase order {rule!r}: the phases of traffic light {item.id!r} have no barrier, since "
-            "they all serve the same approaches; use 'cyclic', or other phases"
+            f"phase order {rule!r}: the phases of traffic light {intersection.id!r} have no "
+            "barrier, since they all serve the same approaches; use 'cyclic', or other phases"
         )
-    enters, leaves = _first_phases(item, streets), _last_phases(item, streets)
+    enters, leaves = _first_phases(intersection, streets), _last_phases(intersection, streets)
 
     def may_follow(phase: int, other: int) -> bool:
         if streets[phase] == streets[other]:
@@ -227,15 +229,21 @@ class _Served(NamedTuple):
     left: frozenset[str]
 
     @classmethod
-    def by(cls, item: Intersection, phase: str) -> _Served:
-        through = {x.from_edge for x in item.links if x.direction == "s" and phase[x.index] in "Gg"}
-        left = {x.from_edge for x in item.links if x.direction in "lLt" and phase[x.index] == "G"}
+    def by(cls, intersection: Intersection, phase: str) -> _Served:
+        through = {
+            x.from_edge for x in intersection.links if x.direction == "s" and phase[x.index] in "Gg"
+        }
+        left = {
+            x.from_edge
+            for x in intersection.links
+            if x.direction in "lLt" and phase[x.index] == "G"
+        }
         return cls(frozenset(through), frozenset(left))
 
 
-def _streets(item: Intersection) -> list[int]:
+def _streets(intersection: Intersection) -> list[int]:
     """Return the street of each phase, by number; phases with a common approach share it."""
-    served = [_Served.by(item, phase) for phase in item.phases]
+    served = [_Served.by(intersection, phase) for phase in intersection.phases]
     streets = list(range(len(served)))
     for one, other in itertools.combinations(range(len(served)), 2):
         if (served[one].through | served[one].left) & (served[other].through | served[other].left):
@@ -244,7 +252,7 @@ def _streets(item: Intersection) -> list[int]:
     return streets
 
 
-def _first_phases(item: Intersection, streets: Sequence[int]) -> set[int]:
+def _first_phases(intersection: Intersection, streets: Sequence[int]) -> set[int]:
     """Return, of each street, the phases with the most left turns and no through movements.
 
     A street without such a phase keeps all its phases.
@@ -253,12 +261,12 @@ def _first_phases(item: Intersection, streets: Sequence[int]) -> set[int]:
         streets,
         [
             0 if served.through else len(served.left)
-            for served in (_Served.by(item, phase) for phase in item.phases)
+            for served in (_Served.by(intersection, phase) for phase in intersection.phases)
         ],
     )
 
 
-def _last_phases(item: Intersection, streets: Sequence[int]) -> set[int]:
+def _last_phases(intersection: Intersection, streets: Sequence[int]) -> set[int]:
     """Return, of each street, the phases with the most through movements and no left turns.
 
     A street without such a phase keeps all its phases.
@@ -267,7 +275,7 @@ def _last_phases(item: Intersection, streets: Sequence[int]) -> set[int]:
         streets,
         [
             0 if served.left else len(served.through)
-            for served in (_Served.by(item, phase) for phase in item.phases)
+            for served in (_Served.by(intersection, phase) for phase in intersection.phases)
         ],
     )
 

@@ -215,8 +215,8 @@ class ControllerEffect(Effect):
 
     def apply(self, scenario: Scenario) -> Scenario:
         """List the effect in the scenario; the last of two of the same name counts."""
-        others = [item for item in scenario.settings.effects if item.get("name") != self.name]
-        listed = sorted([*others, self.record()], key=lambda item: str(item.get("name")))
+        others = [record for record in scenario.settings.effects if record.get("name") != self.name]
+        listed = sorted([*others, self.record()], key=lambda record: str(record.get("name")))
         settings = scenario.settings.model_copy(update={"effects": tuple(listed)})
         known = () if str(self) in scenario.applied else (str(self),)  # a scenario is loaded twice
         return replace(scenario, settings=settings, applied=(*scenario.applied, *known))

@@ -61,44 +61,44 @@ class Routes:
     def of(cls, scenario: Scenario) -> Routes:
         """Read all routes that vehicles of a scenario may refer to."""
         documents = (*scenario.additional, *scenario.routes)
-        found = cls()
+        routes = cls()
         if not any(mentions(document, "route=", "route =") for document in documents):
-            return found
+            return routes
         distributions: list[ET.Element] = []
         shared: dict[tuple[str, ...], tuple[str, ...]] = {}  # many routes go the same way
         for document in documents:
             if not mentions(document, "<route "):
                 continue
             for part in document.parts():
-                for item in part.iter("route"):
-                    if "id" in item.attrib:
-                        edges = _edges(item)
-                        found.edges[item.get("id", "")] = shared.setdefault(edges, edges)
+                for element in part.iter("route"):
+                    if "id" in element.attrib:
+                        edges = _edges(element)
+                        routes.edges[element.get("id", "")] = shared.setdefault(edges, edges)
                 distributions += part.iter("routeDistribution")
-        found.first = {name: edges[0] for name, edges in found.edges.items() if edges}
-        for item in distributions:
-            inner = [_edges(x) for x in item.iter("route")]
-            inner += [found.edges.get(x, ()) for x in item.get("routes", "").split()]
+        routes.first = {name: edges[0] for name, edges in routes.edges.items() if edges}
+        for element in distributions:
+            inner = [_edges(x) for x in element.iter("route")]
+            inner += [routes.edges.get(x, ()) for x in element.get("routes", "").split()]
             first = {edges[0] for edges in inner if edges}
             if len(first) == 1:
-                found.first[item.get("id", "")] = next(iter(first))
-        return found
+                routes.first[element.get("id", "")] = next(iter(first))
+        return routes
 
-    def edges_of(self, item: ET.Element) -> tuple[str, ...]:
+    def edges_of(self, element: ET.Element) -> tuple[str, ...]:
         """Return the edges of a vehicle or flow; none if SUMO still has to find its way."""
-        own = item.find("route")
-        return _edges(own) if own is not None else self.edges.get(item.get("route", ""), ())
+        inner = element.find("route")
+        return _edges(inner) if inner is not None else self.edges.get(element.get("route", ""), ())
 
-    def origin(self, item: ET.Element) -> str | None:
+    def origin(self, element: ET.Element) -> str | None:
         """Return the first edge of a vehicle, trip or flow; None if only SUMO knows it."""
-        own = item.find("route")
-        if own is not None:
-            return next(iter(_edges(own)), None)
-        return self.first.get(item.get("route", "")) or item.get("from")
+        inner = element.find("route")
+        if inner is not None:
+            return next(iter(_edges(inner)), None)
+        return self.first.get(element.get("route", "")) or element.get("from")
 
 
-def _edges(item: ET.Element) -> tuple[str, ...]:
-    return tuple(item.get("edges", "").split())
+def _edges(element: ET.Element) -> tuple[str, ...]:
+    return tuple(element.get("edges", "").split())
 
 
 @dataclass(frozen=True)
@@ -173,24 +173,24 @@ class DemandTiming(Effect):
         """
         earliest = scenario.settings.begin_s
 
-        def shifted(item: ET.Element) -> list[ET.Element]:
-            begin = depart_s(item)
+        def shifted(element: ET.Element) -> list[ET.Element]:
+            begin = depart_s(element)
             if math.isnan(begin):
-                return [item]
-            key = "begin" if item.tag == "flow" else "depart"
+                return [element]
+            key = "begin" if element.tag == "flow" else "depart"
             if begin >= earliest:  # others take no part in the simulation anyway
                 begin += self.seconds
-            if item.tag == "flow":
-                if end := item.get("end"):
+            if element.tag == "flow":
+                if end := element.get("end"):
                     until = parse_time(end) + self.seconds
                     if until <= earliest:
                         return []
-                    item.set("end", seconds_text(until))
+                    element.set("end", seconds_text(until))
                 begin = max(begin, earliest)
             elif begin < earliest:
                 return []
-            item.set(key, seconds_text(begin))
-            return [item]
+            element.set(key, seconds_text(begin))
+            return [element]
 
         return replace_departing(scenario, self, self.edge, shifted)
 
@@ -220,30 +220,30 @@ def replace_departing(
 
     def change(root: ET.Element) -> bool:
         children: list[ET.Element] = []
-        found = False
-        for item in root:
-            if is_demand(item) and (edge == EVERYWHERE or routes.origin(item) == edge):
-                found = True
-                children += becomes(item)
+        any_changed = False
+        for element in root:
+            if is_demand(element) and (edge == EVERYWHERE or routes.origin(element) == edge):
+                any_changed = True
+                children += becomes(element)
             else:
-                children.append(item)
+                children.append(element)
         root[:] = children
-        return found
+        return any_changed
 
     return edit_scenario(scenario, change, *TAGS, applied=str(effect), in_order=True)
 
 
-def scaled_flow(item: ET.Element, factor: float, end_s: float) -> ET.Element | None:
+def scaled_flow(element: ET.Element, factor: float, end_s: float) -> ET.Element | None:
     """Return the flow with another rate; None if nothing is left of it.
 
     Args:
-        item: A ``<flow>``.
+        element: A ``<flow>``.
         factor: Factor of its rate.
         end_s: End of the flow, in s, if it has none itself.
     """
     if factor <= 0:
         return None
-    flow = copy.deepcopy(item)
+    flow = copy.deepcopy(element)
     if number := flow.get("number"):
         if "end" not in flow.attrib and any(key in flow.attrib for key in _RATES):
             seconds = _seconds_of_number(flow, float(number))
@@ -301,17 +301,17 @@ def _scaled(
     least = max(settings.begin_s, begin)
     mark = _mark(scenario)
 
-    def scaled(item: ET.Element) -> list[ET.Element]:
-        if item.tag == "flow":
-            return _scaled_window(item, window, factor, over, mark)
-        depart = depart_s(item)
+    def scaled(element: ET.Element) -> list[ET.Element]:
+        if element.tag == "flow":
+            return _scaled_window(element, window, factor, over, mark)
+        depart = depart_s(element)
         if not (math.isnan(depart) or begin <= depart < end):
-            return [item]
-        name = item.get("id", "")
+            return [element]
+        name = element.get("id", "")
         count = math.floor(factor) + (hashed_uniform(salt, name) < factor - math.floor(factor))
-        found = [item] if count else []
+        copies = [element] if count else []
         for number in range(1, count):
-            twin = copy.deepcopy(item)
+            twin = copy.deepcopy(element)
             twin.set("id", f"{name}{mark}{number}")
             if not math.isnan(depart):
                 shift = TWIN_S * (2 * hashed_uniform(salt, "when", name, str(number)) - 1)
@@ -319,8 +319,8 @@ def _scaled(
                 if not least <= time < end:
                     time = depart - shift
                 twin.set("depart", seconds_text(round(max(time, least), 2)))
-            found.append(twin)
-        return found
+            copies.append(twin)
+        return copies
 
     return replace_departing(scenario, effect, edge, scaled)
 
@@ -328,38 +328,38 @@ def _scaled(
 def _mark(scenario: Scenario) -> str:
     """Return a mark for the ids of twins that no id has yet, because demand may grow twice."""
     documents = (*scenario.additional, *scenario.routes)
-    found = (_TWIN.finditer(window) for document in documents for window in windows(document))
-    return "+" * (1 + max((len(match[1]) for matches in found for match in matches), default=0))
+    twins = (_TWIN.finditer(window) for document in documents for window in windows(document))
+    return "+" * (1 + max((len(match[1]) for matches in twins for match in matches), default=0))
 
 
 def _scaled_window(
-    item: ET.Element, window: tuple[float, float], factor: float, over_s: float, mark: str
+    element: ET.Element, window: tuple[float, float], factor: float, over_s: float, mark: str
 ) -> list[ET.Element]:
     """Return a flow in up to three parts: before, within and after the window."""
-    begin = depart_s(item)
+    begin = depart_s(element)
     if math.isnan(begin):
-        return [item]
-    end = parse_time(item.get("end", "")) if item.get("end") else math.inf
+        return [element]
+    end = parse_time(element.get("end", "")) if element.get("end") else math.inf
     if math.isinf(end):
-        number = float(item.get("number", "inf"))
-        by_rate = any(key in item.attrib for key in _RATES)
-        lasts = _seconds_of_number(item, number) if by_rate and number < math.inf else math.inf
+        number = float(element.get("number", "inf"))
+        by_rate = any(key in element.attrib for key in _RATES)
+        lasts = _seconds_of_number(element, number) if by_rate and number < math.inf else math.inf
         end = min(begin + lasts, max(over_s, begin))
     first, last = max(begin, window[0]), min(end, window[1])
     if first >= last:
-        return [item]
+        return [element]
     if first == begin and last == end:
-        whole = scaled_flow(item, factor, over_s)
+        whole = scaled_flow(element, factor, over_s)
         return [] if whole is None else [whole]
     parts = (
         (begin, first, 1.0, ""),
         (first, last, factor, f"{mark}surge"),
         (last, end, 1.0, f"{mark}after"),
     )
-    found: list[ET.Element] = []
+    flows: list[ET.Element] = []
     for start, stop, rate, suffix in parts:
-        part = copy.deepcopy(item)
-        part.set("id", f"{item.get('id', '')}{suffix if start > begin else ''}")
+        part = copy.deepcopy(element)
+        part.set("id", f"{element.get('id', '')}{suffix if start > begin else ''}")
         part.set("begin", seconds_text(start))
         part.set("end", seconds_text(stop))
         number = part.attrib.pop("number", None)
@@ -367,5 +367,5 @@ def _scaled_window(
             part.set("period", f"{(end - begin) / float(number):.12g}")
         scaled = scaled_flow(part, rate, stop) if stop > start else None
         if scaled is not None:
-            found.append(scaled)
-    return found
+            flows.append(scaled)
+    return flows

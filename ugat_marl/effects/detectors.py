@@ -38,13 +38,13 @@ def detector_lights(scenario: Scenario, detectors: Sequence[Detector]) -> dict[s
     end; if there is none, to the light at the other end. Detectors at no light are left out.
     """
     places = network_places(scenario)
-    found: dict[str, str] = {}
-    for item in detectors:
-        first, second = (places.begins, places.ends)[:: 1 if item.kind == "exit" else -1]
-        light = first.get(item.lane) or second.get(item.lane)
+    lights: dict[str, str] = {}
+    for detector in detectors:
+        first, second = (places.begins, places.ends)[:: 1 if detector.kind == "exit" else -1]
+        light = first.get(detector.lane) or second.get(detector.lane)
         if light is not None:
-            found[item.id] = light
-    return found
+            lights[detector.id] = light
+    return lights
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def apply_detector_effects(
 
 
 def _named(effect: Effect, place: str, detectors: Sequence[Detector]) -> set[str]:
-    known = {item.id for item in detectors}
+    known = {detector.id for detector in detectors}
     if place == EVERYWHERE:
         return known
     if place not in known:

@@ -125,11 +125,11 @@ def with_default_types(scenario: Scenario) -> Scenario:
     for document in (*scenario.additional, *scenario.routes):
         if not mentions(document, "DEFAULT_"):
             continue
-        for item in document.scan():
-            if item.name == "vType":
-                declared.add(item.attributes.get("id", ""))
-            named.add(item.attributes.get("type", ""))
-            named.update(item.attributes.get("vTypes", "").split())
+        for tag in document.scan():
+            if tag.name == "vType":
+                declared.add(tag.attributes.get("id", ""))
+            named.add(tag.attributes.get("type", ""))
+            named.update(tag.attributes.get("vTypes", "").split())
     root = ET.Element("additional")
     for name in DEFAULT_TYPES:
         if name in named and name not in declared:
@@ -141,14 +141,18 @@ def with_default_types(scenario: Scenario) -> Scenario:
     return replace(scenario, additional=(document, *scenario.additional))
 
 
-def is_demand(item: Root) -> bool:
+def is_demand(element: Root) -> bool:
     """Return True if an element is a vehicle, trip or flow of the demand."""
-    return item.tag in DEPARTING and not item.get("id", "").startswith(BLOCKERS)
+    return element.tag in DEPARTING and not element.get("id", "").startswith(BLOCKERS)
 
 
-def depart_s(item: Root) -> float:
+def depart_s(element: Root) -> float:
     """Return the departure of a vehicle or trip, or the begin of a flow, in s; NaN if triggered."""
-    text = item.get("begin", "0") if item.tag.lower().endswith("flow") else item.get("depart", "")
+    text = (
+        element.get("begin", "0")
+        if element.tag.lower().endswith("flow")
+        else element.get("depart", "")
+    )
     try:
         return parse_time(text)
     except ValueError:
@@ -167,11 +171,11 @@ def _clock() -> Callable[[Root], float]:
     """Return a function that gives the departure of each element in turn; -inf if it has none."""
     latest = -sys.float_info.max
 
-    def departure(item: Root) -> float:
+    def departure(element: Root) -> float:
         nonlocal latest
-        if item.tag not in _SORTED:
+        if element.tag not in _SORTED:
             return -math.inf
-        time = depart_s(item)
+        time = depart_s(element)
         latest = latest if math.isnan(time) else time
         return latest
 

@@ -57,20 +57,20 @@ _ASSUMED = "assumed values"
 
 def _observation() -> list[NamedDomain]:
     """Return domains with noise, dead detectors, short detection zones, late or lost counts."""
-    found = [
+    worlds = [
         NamedDomain(f"noise-{n}", "observation", f"counting_error={n}", f"noise{n}")
         for n in (3, 5, 10, 20)
     ]
-    found += [
+    worlds += [
         NamedDomain(f"zone-{n}", "observation", f"detection_zone={n}", f"dz{n}")
         for n in (10, 20, 50, 100)
     ]
-    found += [
+    worlds += [
         NamedDomain(f"failure-{n}", "observation", f"detector_failure={n / 100}", f"sensor{n}")
         for n in (5, 20, 50, 70)
     ]
     combined = ((100, 3, 0.05, ""), (50, 3, 0.1, ""), (20, 3, 0.2, "3"), (10, 5, 0.25, "4"))
-    found += [
+    worlds += [
         NamedDomain(
             f"combined-{n}",
             "observation",
@@ -80,27 +80,27 @@ def _observation() -> list[NamedDomain]:
         )
         for n, (zone, error, share, older) in enumerate(combined, start=1)
     ]
-    found += [
+    worlds += [
         NamedDomain(f"noise-{n}-percent", "observation", f"counting_noise={n / 100}")
         for n in (3, 10, 20)
     ]
-    found += [
+    worlds += [
         NamedDomain("late-counts-10", "observation", "observation_delay=10"),
         NamedDomain("late-counts-30", "observation", "observation_delay=30"),
         NamedDomain("lost-readings-20", "observation", "lost_readings=0.2"),
         NamedDomain("coarse-counts-5", "observation", "quantised_counts=5"),
     ]
-    return found
+    return worlds
 
 
 def _action() -> list[NamedDomain]:
     """Return domains with late or lost commands, limits of greens, or an order of phases."""
     chained = "there every command also waits for the one before"
-    found = [
+    worlds = [
         NamedDomain(f"delay-{s}", "action", f"execution_delay={s}", f"delay setting{n}", chained)
         for n, s in enumerate((20, 30, 40, 60), start=1)
     ]
-    found += [
+    worlds += [
         NamedDomain("flexible", "action", _GREENS[1:], "flexible", _ON_SITE),
         NamedDomain("cyclic", "action", f"phase_order=cyclic{_GREENS}", "cyclic", _ON_SITE),
         *(
@@ -121,7 +121,7 @@ def _action() -> list[NamedDomain]:
         NamedDomain("lost-commands-30", "action", "lost_commands=0.3"),
         NamedDomain("long-greens", "action", "min_green=20"),
     ]
-    return found
+    return worlds
 
 
 def _transition() -> list[NamedDomain]:
@@ -133,7 +133,7 @@ def _transition() -> list[NamedDomain]:
         "V3": (0.75, 3.50, 6.00, 0.25),
         "V4": (0.50, 1.50, 2.00, 0.50),
     }
-    found = [
+    worlds = [
         NamedDomain(
             name,
             "transition",
@@ -162,11 +162,11 @@ def _transition() -> list[NamedDomain]:
         "downpour": "V3+desired_speed=0.85+headway=1.3",
         "blizzard": "V4+desired_speed=0.7+headway=2+demand_level=*,0.9",
     }
-    found += [
+    worlds += [
         NamedDomain(name, "transition", effects, note=_ASSUMED) for name, effects in others.items()
     ]
     engine = "SUMO's mesoscopic model: an engine to train in, --sim meso"
-    return [*found, NamedDomain("meso", "transition", "queue_model=500", note=engine)]
+    return [*worlds, NamedDomain("meso", "transition", "queue_model=500", note=engine)]
 
 
 def _reward() -> list[NamedDomain]:
@@ -186,7 +186,7 @@ def _reward() -> list[NamedDomain]:
 
 
 NAMED_DOMAINS: dict[str, NamedDomain] = {
-    item.name: item for item in (*_observation(), *_action(), *_transition(), *_reward())
+    named.name: named for named in (*_observation(), *_action(), *_transition(), *_reward())
 }
 """All named domains, by name."""
 
@@ -210,16 +210,16 @@ def expand_domains(names: Sequence[str]) -> list[str]:
         names: Domains. ``"all"`` means ``sim`` and every named domain; the name of a gap means its
             domains. Both leave out those in `TO_TRAIN_IN`.
     """
-    found: list[str] = []
-    streets = [item for item in NAMED_DOMAINS.values() if item.name not in TO_TRAIN_IN]
+    expanded: list[str] = []
+    streets = [named for named in NAMED_DOMAINS.values() if named.name not in TO_TRAIN_IN]
     for name in names:
         if name.lower() == "all":
-            found += ["sim", *(item.name for item in streets)]
+            expanded += ["sim", *(named.name for named in streets)]
         elif name.lower() in GAP_KINDS:
-            found += [item.name for item in streets if item.gap == name.lower()]
+            expanded += [named.name for named in streets if named.gap == name.lower()]
         else:
-            found.append(name)
-    return list(dict.fromkeys(found))
+            expanded.append(name)
+    return list(dict.fromkeys(expanded))
 
 
 def parse_domain(domain: Domain) -> tuple[Effect, ...]:
@@ -231,11 +231,11 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
     """
     if not isinstance(domain, str):
         given: Sequence[Any] = domain
-        for item in given:
-            if not isinstance(item, Effect):
+        for part_or_effect in given:
+            if not isinstance(part_or_effect, Effect):
                 raise OptionError(
-                    f"domain {domain!r}: {item!r} is not an effect; give a name such as 'V1' on "
-                    "its own, or a list of effects such as [StartupDelay(0.5)]"
+                    f"domain {domain!r}: {part_or_effect!r} is not an effect; give a name such as "
+                    "'V1' on its own, or a list of effects such as [StartupDelay(0.5)]"
                 )
         return tuple(domain)
     parts = _parts(domain)
@@ -309,7 +309,9 @@ def scenario_in_domain(scenario: Scenario, domain: Domain) -> Scenario:
 
 def _checked(scenario: Scenario) -> Scenario:
     """Return the scenario; refuse a detection zone together with a reach."""
-    zones = (item for item in scenario.settings.effects if item.get("name") == DetectionZone.name)
+    zones = (
+        record for record in scenario.settings.effects if record.get("name") == DetectionZone.name
+    )
     if scenario.control.reach_m and any(zones):
         raise OptionError(
             f"scenario {scenario.id!r}: a detection_zone shows vehicles on the lane at the light "
@@ -330,9 +332,9 @@ def _signals(scenario: Scenario) -> set[tuple[str, ...]]:
     """Return all connections with a signal: light, link index, edges and lanes."""
     keys = ("tl", "linkIndex", "from", "fromLane", "to", "toLane")
     return {
-        tuple(item.get(key, "") for key in keys)
-        for item in scenario.network.parse().iter("connection")
-        if "tl" in item.attrib
+        tuple(element.get(key, "") for key in keys)
+        for element in scenario.network.parse().iter("connection")
+        if "tl" in element.attrib
     }
 
 

@@ -41,22 +41,27 @@ class Speeds:
     least: float = _LEAST
     greatest: float = _GREATEST
 
-    def write(self, item: ET.Element) -> None:
+    def write(self, element: ET.Element) -> None:
         """Write the distribution into a type in SUMO's form."""
         values = (self.mean, self.deviation, self.least, self.greatest)
-        item.attrib.pop("speedDev", None)
-        item.set("speedFactor", f"normc({','.join(f'{value:.8g}' for value in values)})")
+        element.attrib.pop("speedDev", None)
+        element.set("speedFactor", f"normc({','.join(f'{value:.8g}' for value in values)})")
 
     @classmethod
-    def of(cls, item: ET.Element, general: float | None) -> Speeds:
+    def of(cls, element: ET.Element, general: float | None) -> Speeds:
         """Read a type as SUMO does.
 
         Args:
-            item: A ``<vType>``.
+            element: A ``<vType>``.
             general: SUMO's option ``default.speeddev``, if it is set.
         """
-        mean, deviation, least, greatest = 1.0, default_deviation(item, general), _LEAST, _GREATEST
-        text = item.get("speedFactor", "")
+        mean, deviation, least, greatest = (
+            1.0,
+            default_deviation(element, general),
+            _LEAST,
+            _GREATEST,
+        )
+        text = element.get("speedFactor", "")
         if normal := _NORMAL.fullmatch(text):
             numbers = [float(part) for part in normal[2].split(",")]
             mean, deviation = numbers[0], numbers[1] if len(numbers) > 1 else 0.0
@@ -64,16 +69,16 @@ class Speeds:
                 least, greatest = numbers[2], numbers[3]
         elif text:
             mean = float(text)
-        if own := item.get("speedDev"):
-            deviation = float(own)
+        if deviation_text := element.get("speedDev"):
+            deviation = float(deviation_text)
         return cls(mean, deviation, least, greatest)
 
 
-def default_deviation(item: ET.Element, general: float | None) -> float:
+def default_deviation(element: ET.Element, general: float | None) -> float:
     """Return the default deviation of speedFactor of a vehicle class."""
     if general is not None and general >= 0:
         return general
-    kind = item.get("vClass", "passenger")
+    kind = element.get("vClass", "passenger")
     return 0.0 if kind in _STEADY else 0.05 if kind in _CALM else 0.1
 
 
@@ -148,34 +153,34 @@ class HeavyShare(Effect):
         cars = _cars(scenario)
         used: dict[str, ET.Element] = {}
 
-        def heavy(item: ET.Element) -> list[ET.Element]:
-            kind = item.get("type", DEFAULT_TYPES[0])
-            if not is_demand(item) or kind not in cars:
-                return [item]
-            name = item.get("id", "")
+        def heavy(element: ET.Element) -> list[ET.Element]:
+            kind = element.get("type", DEFAULT_TYPES[0])
+            if not is_demand(element) or kind not in cars:
+                return [element]
+            name = element.get("id", "")
             truck = f"{_HEAVY}{cars[kind].get('id')}"
-            if item.tag != "flow":
+            if element.tag != "flow":
                 if hashed_uniform(self.name, name) < self.share:
                     used[truck] = cars[kind]
-                    item.set("type", truck)
-                return [item]
+                    element.set("type", truck)
+                return [element]
             used[truck] = cars[kind]
-            rest = scaled_flow(item, 1 - self.share, over)
-            part = scaled_flow(item, self.share, over)
+            rest = scaled_flow(element, 1 - self.share, over)
+            part = scaled_flow(element, self.share, over)
             if part is not None:
                 part.attrib |= {"id": f"{name}+heavy", "type": truck}
             return [flow for flow in (rest, part) if flow is not None]
 
         def change(root: ET.Element) -> bool:
-            parts = [heavy(item) for item in root]
-            root[:] = [item for part in parts for item in part]
+            parts = [heavy(element) for element in root]
+            root[:] = [element for part in parts for element in part]
             return any(len(part) != 1 or is_demand(part[0]) for part in parts)
 
         scenario = edit_scenario(scenario, change, *TAGS, applied=str(self))
 
         types, *others = scenario.additional
         root = types.parse()
-        present = {item.get("id") for item in root.iter("vType")}
+        present = {element.get("id") for element in root.iter("vType")}
         root.extend(_truck(used[name], name) for name in sorted(set(used) - present))
         return replace(scenario, additional=(types.edited(xml_bytes(root)), *others))
 
@@ -188,25 +193,25 @@ def _types(scenario: Scenario) -> tuple[dict[str, ET.Element], dict[str, list[st
         if not mentions(document, "<vType"):
             continue
         for part in document.parts():
-            types |= {item.get("id", ""): item for item in part.iter("vType")}
-            for item in part.iter("vTypeDistribution"):
-                inner = [x.get("id", "") for x in item.iter("vType")]
-                members[item.get("id", "")] = inner + item.get("vTypes", "").split()
+            types |= {element.get("id", ""): element for element in part.iter("vType")}
+            for distribution in part.iter("vTypeDistribution"):
+                inner = [x.get("id", "") for x in distribution.iter("vType")]
+                members[distribution.get("id", "")] = inner + distribution.get("vTypes", "").split()
     return types, members
 
 
 def _cars(scenario: Scenario) -> dict[str, ET.Element]:
     """Return types and distributions of cars; a distribution is given with its first car type."""
     types, members = _types(scenario)
-    found = {
-        name: item
-        for name, item in types.items()
-        if item.get("vClass", "passenger") == "passenger" and not name.startswith(_HEAVY)
+    passenger_cars = {
+        name: element
+        for name, element in types.items()
+        if element.get("vClass", "passenger") == "passenger" and not name.startswith(_HEAVY)
     }
     for distribution, names in members.items():
-        if cars := [found[name] for name in names if name in found]:
-            found[distribution] = cars[0]
-    return found
+        if cars := [passenger_cars[name] for name in names if name in passenger_cars]:
+            passenger_cars[distribution] = cars[0]
+    return passenger_cars
 
 
 def _truck(car: ET.Element, name: str) -> ET.Element:
@@ -236,14 +241,14 @@ def _with_speeds(
 
     def change(root: ET.Element) -> bool:
         types = driven_types(root)
-        for item in types:
-            typed(known[item.get("id", "")]).write(item)
-        own = [x for x in root if is_demand(x) and "speedFactor" in x.attrib]
-        for item in own:
-            kind = known.get(item.get("type", DEFAULT_TYPES[0]), usual)
-            value = single(item.get("id", ""), float(item.get("speedFactor", "1")), kind)
-            item.set("speedFactor", f"{value:.6g}")
-        return bool(types or own)
+        for element in types:
+            typed(known[element.get("id", "")]).write(element)
+        with_factor = [x for x in root if is_demand(x) and "speedFactor" in x.attrib]
+        for element in with_factor:
+            kind = known.get(element.get("type", DEFAULT_TYPES[0]), usual)
+            value = single(element.get("id", ""), float(element.get("speedFactor", "1")), kind)
+            element.set("speedFactor", f"{value:.6g}")
+        return bool(types or with_factor)
 
     return edit_scenario(scenario, change, "<vType", "speedFactor", applied=str(effect))
 
@@ -251,10 +256,10 @@ def _with_speeds(
 def _speeds(scenario: Scenario, general: float | None) -> dict[str, Speeds]:
     """Return the speeds of each type, and the mean speeds of each distribution of types."""
     types, members = _types(scenario)
-    found = {name: Speeds.of(item, general) for name, item in types.items()}
+    speeds = {name: Speeds.of(element, general) for name, element in types.items()}
     for distribution, names in members.items():
-        if inner := [found[name] for name in names if name in found]:
-            found[distribution] = Speeds(
+        if inner := [speeds[name] for name in names if name in speeds]:
+            speeds[distribution] = Speeds(
                 fmean(x.mean for x in inner), fmean(x.deviation for x in inner)
             )
-    return found
+    return speeds

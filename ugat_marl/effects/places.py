@@ -112,9 +112,9 @@ def _places(content: bytes, source: str) -> Places:
         if edge.get("function") in ("internal", "crossing", "walkingarea", "connector"):
             continue
         name = edge.get("id", "")
-        own = edge.findall("lane")
-        edges[name] = tuple(lane.get("id", "") for lane in own)
-        for index, lane in enumerate(own):
+        lanes_of_edge = edge.findall("lane")
+        edges[name] = tuple(lane.get("id", "") for lane in lanes_of_edge)
+        for index, lane in enumerate(lanes_of_edge):
             lanes[lane.get("id", "")] = LanePlace(
                 name,
                 index,
@@ -123,27 +123,27 @@ def _places(content: bytes, source: str) -> Places:
                 _cars(lane),
             )
     following: dict[str, dict[str, None]] = defaultdict(dict)
-    lights = {item.get("id", ""): None for item in root.iter("tlLogic")}
+    lights = {element.get("id", ""): None for element in root.iter("tlLogic")}
     ends: dict[str, str] = {}
     begins: dict[str, str] = {}
-    for item in root.iter("connection"):
-        start, end = item.get("from", ":"), item.get("to", ":")
+    for connection in root.iter("connection"):
+        start, end = connection.get("from", ":"), connection.get("to", ":")
         if start not in edges or end not in edges:
             continue
-        entry = f"{start}_{item.get('fromLane')}"
-        leaving = f"{end}_{item.get('toLane')}"
+        entry = f"{start}_{connection.get('fromLane')}"
+        leaving = f"{end}_{connection.get('toLane')}"
         if (entry not in lanes or lanes[entry].cars) and (
             leaving not in lanes or lanes[leaving].cars
         ):
             following[start][end] = None
-        if light := item.get("tl"):
+        if light := connection.get("tl"):
             lights[light] = None
             ends.setdefault(entry, light)
             begins.setdefault(leaving, light)
     return Places(
         lanes,
         edges,
-        {edge: tuple(found) for edge, found in following.items()},
+        {edge: tuple(onward) for edge, onward in following.items()},
         tuple(lights),
         ends,
         begins,
@@ -158,8 +158,8 @@ def _cars(lane: ET.Element) -> bool:
 
 
 def _trace(before: Mapping[str, str], start: str, edge: str) -> tuple[str, ...]:
-    found = [edge]
+    trace = [edge]
     while edge != start:
         edge = before[edge]
-        found.append(edge)
-    return tuple(reversed(found))
+        trace.append(edge)
+    return tuple(reversed(trace))

@@ -141,7 +141,7 @@ class LocalSpeed(Effect):
         places = network_places(scenario)
         places.check(self.name, "edge", self.edge, places.edges)
         file = re.sub(r"[^\w.#-]", "_", f"local-speed.{self.edge}.add.xml")
-        before = [item for item in scenario.additional if item.name == file]
+        before = [added for added in scenario.additional if added.name == file]
         if before:
             root = before[0].parse()
             for step in root.iter("step"):
@@ -156,7 +156,7 @@ class LocalSpeed(Effect):
                 begin = seconds_text(scenario.settings.begin_s)
                 ET.SubElement(sign, "step", {"time": begin, "speed": f"{speed:.6g}"})
         document = Document(file, None, xml_bytes(root))
-        others = tuple(item for item in scenario.additional if item.name != file)
+        others = tuple(added for added in scenario.additional if added.name != file)
         return replace(
             scenario, additional=(*others, document), applied=(*scenario.applied, str(self))
         )
@@ -172,9 +172,9 @@ def shift_parking(scenario: Scenario, seed: int) -> Scenario:
 
     def later(root: ET.Element) -> bool:
         parked = [x for x in root.iter("vehicle") if x.get("id", "").startswith(_PARKED)]
-        for item in parked:
-            time = (float(item.get("depart", "0")) - begin + shift) % duration
-            item.set("depart", f"{begin + time:.2f}")
+        for element in parked:
+            time = (float(element.get("depart", "0")) - begin + shift) % duration
+            element.set("depart", f"{begin + time:.2f}")
         return bool(parked)
 
     return replace(scenario, routes=edit(scenario.routes, later, _PARKED, in_order=True))
@@ -228,9 +228,9 @@ def _with_blockers(
             "departLane": str(place.index), "departPos": f"{middle:.2f}", "departSpeed": "0",
             "arrivalLane": str(place.index), "arrivalPos": f"{middle + 0.5:.2f}",
         }  # fmt: skip
-        item = ET.SubElement(root, "vehicle", vehicle)
-        ET.SubElement(item, "route", {"edges": place.edge})
-        ET.SubElement(item, "stop", {"lane": lane, "endPos": f"{middle:.2f}", **stand})
+        element = ET.SubElement(root, "vehicle", vehicle)
+        ET.SubElement(element, "route", {"edges": place.edge})
+        ET.SubElement(element, "stop", {"lane": lane, "endPos": f"{middle:.2f}", **stand})
     document = Document(_file(kind), None, xml_bytes(root))
     return replace(scenario, routes=(*scenario.routes, document))
 

@@ -150,7 +150,9 @@ class _Zone(Sensor):
 
     def __init__(self, metres: float, network: Network) -> None:
         self.zone_m = metres
-        incoming = {lane for item in network.intersections for lane in item.incoming_lanes}
+        incoming = {
+            lane for intersection in network.intersections for lane in intersection.incoming_lanes
+        }
         self._at_stop_line = np.array(
             [lane in incoming for lane in network.lane_table().ids], dtype=np.float64
         )

@@ -48,16 +48,20 @@ class LateGreen(Effect):
             UnknownNameError: No such traffic light.
         """
         settings = scenario.settings.model_dump()
-        own = {tls: dict(item) for tls, item in settings["intersections"].items()}
+        tables = {
+            tls: dict(intersection) for tls, intersection in settings["intersections"].items()
+        }
         if self.place == EVERYWHERE:
             settings["control"] = {**settings["control"], "late_green_s": self.seconds}
-            for item in own.values():
-                item.pop("late_green_s", None)
+            for table in tables.values():
+                table.pop("late_green_s", None)
         else:
             places = network_places(scenario)
             places.check(self.name, "traffic light", self.place, places.lights)
-            own[self.place] = {**own.get(self.place, {}), "late_green_s": self.seconds}
-        settings["intersections"] = {tls: item for tls, item in own.items() if item}
+            tables[self.place] = {**tables.get(self.place, {}), "late_green_s": self.seconds}
+        settings["intersections"] = {
+            tls: intersection for tls, intersection in tables.items() if intersection
+        }
         return replace(
             scenario,
             settings=validate_settings(settings, f"scenario {scenario.id!r}"),
@@ -95,12 +99,14 @@ def late_greens(scenario: Scenario) -> dict[str, float]:
     """Return the late green of traffic lights in s, without those that have none."""
     start_s = QUEUE_START_S if "mesosim" in scenario.settings.sumo else 0.0
     general = scenario.control.late_green_s + start_s
-    own = scenario.settings.intersections
-    if not general and not own:
+    tables = scenario.settings.intersections
+    if not general and not tables:
         return {}
-    found = dict.fromkeys(network_places(scenario).lights, general) if general else {}
-    found |= {tls: x.late_green_s + start_s for tls, x in own.items() if x.late_green_s is not None}
-    return {tls: seconds for tls, seconds in found.items() if seconds > 0}
+    late = dict.fromkeys(network_places(scenario).lights, general) if general else {}
+    late |= {
+        tls: x.late_green_s + start_s for tls, x in tables.items() if x.late_green_s is not None
+    }
+    return {tls: seconds for tls, seconds in late.items() if seconds > 0}
 
 
 def with_late_green_programmes(scenario: Scenario) -> Scenario:
@@ -119,11 +125,11 @@ def with_late_green_programmes(scenario: Scenario) -> Scenario:
     queues = QUEUE_START_S if "mesosim" in scenario.settings.sumo else 0.0
 
     def change(root: ET.Element) -> bool:
-        logics = [item for item in root.iter("tlLogic") if item.get("id") in late]
-        for item in logics:
-            seconds = late[item.get("id", "")]
-            if seconds > queues or not _jumps(item):  # of queues alone nobody asked for it
-                _delay(item, round(seconds / step) * step, step, scenario.id)
+        logics = [element for element in root.iter("tlLogic") if element.get("id") in late]
+        for logic in logics:
+            seconds = late[logic.get("id", "")]
+            if seconds > queues or not _jumps(logic):  # of queues alone nobody asked for it
+                _delay(logic, round(seconds / step) * step, step, scenario.id)
         return bool(logics)
 
     return replace(
@@ -149,7 +155,9 @@ def _delay(logic: ET.Element, late_s: float, step_s: float, scenario: str) -> No
             f"scenario {scenario!r}: late green in the programme of traffic light "
             f"{logic.get('id')!r}, whose phases name their successors (next=...), is not possible"
         )
-    cycle = [(parse_time(item.get("duration", "0")), item.get("state", "")) for item in phases]
+    cycle = [
+        (parse_time(element.get("duration", "0")), element.get("state", "")) for element in phases
+    ]
     held, _ = with_late_green(cycle, late_s, step_s, Held.after(cycle[-1][1]))
     for phase, segment in zip(phases, cycle, strict=True):
         held, shown = with_late_green([segment], late_s, step_s, held)

@@ -95,7 +95,7 @@ def effect_from_record(record: Mapping[str, Any], where: str = "") -> Effect:
     if name not in EFFECTS:
         raise UnknownNameError("effect", name, EFFECTS, where and f"It stands{where}.")
     kind = EFFECTS[name]
-    parameters = [item.name for item in fields(kind)]
+    parameters = [field.name for field in fields(kind)]
     for key in values:
         if key not in parameters:
             raise UnknownNameError(
@@ -118,7 +118,7 @@ def effect_from_text(text: str) -> Effect:
     if name not in EFFECTS:
         raise UnknownNameError("effect", name, EFFECTS)
     kind = EFFECTS[name]
-    parameters = [item.name for item in fields(kind)]
+    parameters = [field.name for field in fields(kind)]
     parts = [part.strip() for part in values.split(",")]
     if len(parts) != len(parameters):
         raise OptionError(

@@ -58,16 +58,16 @@ class Turning(Effect):
             )  # fmt: skip
         routes = Routes.of(scenario)
 
-        def way(item: ET.Element) -> Way:
-            return routes.edges_of(item) or _fastest(item, places)
+        def way(element: ET.Element) -> Way:
+            return routes.edges_of(element) or _fastest(element, places)
 
         tails = self._tails(scenario, way, places)
         over = scenario.settings.begin_s + scenario.settings.duration_s
 
         def change(root: ET.Element) -> bool:
             children: list[ET.Element] = []
-            for item in root:
-                children += self._turned(item, way, tails, over)
+            for element in root:
+                children += self._turned(element, way, tails, over)
             changed = len(children) != len(root) or any(
                 a is not b for a, b in zip(children, root, strict=True)
             )
@@ -80,40 +80,40 @@ class Turning(Effect):
         self, scenario: Scenario, way: Callable[[ET.Element], Way], places: Places
     ) -> Counter[Way]:
         """Return the further ways of vehicles that take the turn, and the number on each."""
-        found: Counter[Way] = Counter()
+        tails: Counter[Way] = Counter()
         for document in (*scenario.additional, *scenario.routes):
             if not mentions(document, *TAGS):
                 continue
-            for item in chain.from_iterable(document.parts()):
-                edges = way(item) if is_demand(item) else ()
+            for element in chain.from_iterable(document.parts()):
+                edges = way(element) if is_demand(element) else ()
                 for index, pair in enumerate(pairwise(edges)):
                     if pair == (self.from_edge, self.to_edge):
-                        found[edges[index + 1 :]] += 1
+                        tails[edges[index + 1 :]] += 1
                         break
-        return found or Counter({_way_out(self.to_edge, places): 1})
+        return tails or Counter({_way_out(self.to_edge, places): 1})
 
     def _turned(
         self,
-        item: ET.Element,
+        element: ET.Element,
         way: Callable[[ET.Element], Way],
         tails: Counter[Way],
         over_s: float,
     ) -> list[ET.Element]:
         """Return the elements that replace one element of a route file."""
-        if not is_demand(item):
-            return [item]
-        edges = way(item)
+        if not is_demand(element):
+            return [element]
+        edges = way(element)
         place = next((n for n, edge in enumerate(edges[:-1]) if edge == self.from_edge), None)
         if place is None or edges[place + 1] == self.to_edge:
-            return [item]
-        name = item.get("id", "")
+            return [element]
+        name = element.get("id", "")
         salt = f"{self.name} {self.from_edge} {self.to_edge}"
-        if item.tag != "flow":
+        if element.tag != "flow":
             if hashed_uniform(salt, name) >= self.share:
-                return [item]
-            return [_with_route(item, (*edges[: place + 1], *_drawn(tails, salt, name)))]
-        parts = [scaled_flow(item, 1 - self.share, over_s)]
-        turned = scaled_flow(item, self.share, over_s)
+                return [element]
+            return [_with_route(element, (*edges[: place + 1], *_drawn(tails, salt, name)))]
+        parts = [scaled_flow(element, 1 - self.share, over_s)]
+        turned = scaled_flow(element, self.share, over_s)
         total = sum(tails.values())
         for number, (tail, count) in enumerate(sorted(tails.items())):
             part = scaled_flow(turned, count / total, over_s) if turned is not None else None
@@ -131,18 +131,18 @@ def _drawn(tails: Counter[Way], salt: str, name: str) -> Way:
     return ways[bisect_right(bounds, hashed_uniform(salt, "way", name) * bounds[-1])]
 
 
-def _fastest(item: ET.Element, places: Places) -> Way:
+def _fastest(element: ET.Element, places: Places) -> Way:
     """Return the way of a trip over empty streets; none if it names no origin or destination."""
-    stations = [item.get("from", ""), *item.get("via", "").split(), item.get("to", "")]
+    stations = [element.get("from", ""), *element.get("via", "").split(), element.get("to", "")]
     if not stations[0] or not stations[-1]:
         return ()
-    found: list[str] = [stations[0]]
+    way: list[str] = [stations[0]]
     for start, end in pairwise(stations):
         part = places.path(start, end)
         if part is None:
             return ()
-        found += part[1:]
-    return tuple(found)
+        way += part[1:]
+    return tuple(way)
 
 
 def _way_out(start: str, places: Places) -> Way:
@@ -151,9 +151,9 @@ def _way_out(start: str, places: Places) -> Way:
     return min(ways, key=lambda way: sum(map(places.seconds, way)), default=(start,))
 
 
-def _with_route(item: ET.Element, edges: Way) -> ET.Element:
+def _with_route(element: ET.Element, edges: Way) -> ET.Element:
     """Return the vehicle or flow on another route; stops elsewhere are left out."""
-    made = copy.deepcopy(item)
+    made = copy.deepcopy(element)
     if made.tag == "trip":
         made.tag = "vehicle"
     for key in ("route", "from", "to", "via", *_ENDS):

@@ -32,7 +32,7 @@ of 1 s, which PWagner2009 does not."""
 
 def driven_types(root: ET.Element) -> list[ET.Element]:
     """Return all vehicle types of a document that drive on the road."""
-    return [item for item in root.iter("vType") if item.get("vClass") not in _NOT_DRIVEN]
+    return [element for element in root.iter("vType") if element.get("vClass") not in _NOT_DRIVEN]
 
 
 @dataclass(frozen=True)
@@ -50,35 +50,35 @@ class VehicleEffect(Effect):
 
         def change(root: ET.Element) -> bool:
             types = driven_types(root)
-            for item in types:
+            for element in types:
                 for effect in effects:
-                    effect.write(item, step_s)
+                    effect.write(element, step_s)
             return bool(types)
 
         edited = edit_scenario(with_default_types(scenario), change, "<vType", applied="")
         return replace(edited, applied=(*scenario.applied, *map(str, effects)))
 
-    def write(self, item: ET.Element, step_s: float) -> None:
+    def write(self, element: ET.Element, step_s: float) -> None:
         """Put the effect into one type, of a scenario with this step length."""
-        self._write(item, getattr(self, fields(self)[0].name), step_s)
+        self._write(element, getattr(self, fields(self)[0].name), step_s)
 
-    def _write(self, item: ET.Element, number: float, step_s: float) -> None:
+    def _write(self, element: ET.Element, number: float, step_s: float) -> None:
         """Write the effect's number into one type, for this step length in s."""
         del step_s
-        _set(item, self.attribute, number)
+        _set(element, self.attribute, number)
 
 
-def _set(item: ET.Element, attribute: str, number: float) -> None:
+def _set(element: ET.Element, attribute: str, number: float) -> None:
     value = f"{number:.12g}"
-    item.set(attribute, value)
-    for model in item:  # an old way to write a type, which overrules the attributes
+    element.set(attribute, value)
+    for model in element:  # an old way to write a type, which overrules the attributes
         if model.tag.startswith("carFollowing-") and attribute in model.attrib:
             model.set(attribute, value)
 
 
-def _get(item: ET.Element, attribute: str, default: float) -> float:
-    models = [model for model in item if model.tag.startswith("carFollowing-")]
-    texts = (element.get(attribute) for element in (*models, item))
+def _get(vehicle_type: ET.Element, attribute: str, default: float) -> float:
+    models = [model for model in vehicle_type if model.tag.startswith("carFollowing-")]
+    texts = (element.get(attribute) for element in (*models, vehicle_type))
     return float(next((text for text in texts if text is not None), default))
 
 
@@ -146,8 +146,8 @@ class Headway(VehicleEffect):
     examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((1.3, 1.7), 1.0, 0.05)
     seconds: float
 
-    def _write(self, item: ET.Element, number: float, step_s: float) -> None:
-        _set(item, "tau", max(number, step_s, _get(item, "actionStepLength", 0)))
+    def _write(self, element: ET.Element, number: float, step_s: float) -> None:
+        _set(element, "tau", max(number, step_s, _get(element, "actionStepLength", 0)))
 
 
 @dataclass(frozen=True)
@@ -185,10 +185,10 @@ class ReactionStep(VehicleEffect):
     examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((2.0,), 1.0, 0.5)
     seconds: float
 
-    def _write(self, item: ET.Element, number: float, step_s: float) -> None:
+    def _write(self, element: ET.Element, number: float, step_s: float) -> None:
         steps = max(round(number / step_s), 1)
-        _set(item, "actionStepLength", steps * step_s)
-        _set(item, "tau", max(_get(item, "tau", 1), steps * step_s))
+        _set(element, "actionStepLength", steps * step_s)
+        _set(element, "tau", max(_get(element, "tau", 1), steps * step_s))
 
 
 @dataclass(frozen=True)
@@ -262,11 +262,11 @@ class DriverModel(Effect):
 
         def change(root: ET.Element) -> bool:
             types = driven_types(root)
-            for item in types:
-                for old in [x for x in item if x.tag.startswith("carFollowing-")]:
-                    item.attrib.update(old.attrib)
-                    item.remove(old)
-                item.set("carFollowModel", self.model)
+            for element in types:
+                for old in [x for x in element if x.tag.startswith("carFollowing-")]:
+                    element.attrib.update(old.attrib)
+                    element.remove(old)
+                element.set("carFollowModel", self.model)
             return bool(types)
 
         scenario = with_default_types(scenario)

@@ -48,9 +48,9 @@ def checked_delays(seconds: Mapping[str, float], agents: Sequence[str]) -> dict[
     return {agent: float(delay) for agent, delay in seconds.items()}
 
 
-def _refuse_unknown(what: str, given: Mapping[str, Any], agents: Sequence[str]) -> None:
+def _refuse_unknown(kind: str, given: Mapping[str, Any], agents: Sequence[str]) -> None:
     if unknown := sorted(set(given) - set(agents)):
-        raise ActionError(f"{what} for unknown agents {unknown}; agents: {[*agents]}")
+        raise ActionError(f"{kind} for unknown agents {unknown}; agents: {[*agents]}")
 
 
 def _is_phase(action: Any, space: Discrete) -> bool:

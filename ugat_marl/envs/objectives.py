@@ -57,10 +57,10 @@ class Objectives:
         self._cost = cost
         self.persons: dict[str, float] = {"": PERSONS_IN_A_CAR}
         for document in (*scenario.additional, *scenario.routes):
-            for item in document.scan():
-                if item.name == "vType":
-                    carried = PERSONS.get(item.attributes.get("vClass", ""), PERSONS_IN_A_CAR)
-                    self.persons[item.attributes.get("id", "")] = carried
+            for tag in document.scan():
+                if tag.name == "vType":
+                    carried = PERSONS.get(tag.attributes.get("vClass", ""), PERSONS_IN_A_CAR)
+                    self.persons[tag.attributes.get("id", "")] = carried
 
     @classmethod
     def of(cls, effects: Sequence[Effect], scenario: Scenario) -> Objectives | None:

@@ -65,12 +65,12 @@ class Observer:
         self._lanes = network.lane_table()
         items = network.intersections
         self._incoming = np.concatenate(
-            [self._lanes.indices(item.incoming_lanes) for item in items]
+            [self._lanes.indices(intersection.incoming_lanes) for intersection in items]
         )
         self._downstream = _downstream_matrix(network) if name == "pressure" else None
         self._gather, sizes = _gather(network, name)
         self._sizes = sizes
-        self._phases = [len(item.phases) for item in items]
+        self._phases = [len(intersection.phases) for intersection in items]
         self._near = _within(network, neighbours)
         self.layouts = [
             AgentLayout(
@@ -87,8 +87,8 @@ class Observer:
         self.groups = group_names(kinds)
         self.agents = member_names(self.groups)
         low = -1.0 if name == "pressure" else 0.0
-        spaces = {own[0]: self._space(own[0], low) for own in self.groups.values()}
-        first = {place: own[0] for own in self.groups.values() for place in own}
+        spaces = {members[0]: self._space(members[0], low) for members in self.groups.values()}
+        first = {place: members[0] for members in self.groups.values() for place in members}
         self.spaces = [spaces[first[index]] for index in range(len(items))]
         self._place()
 
@@ -107,10 +107,10 @@ class Observer:
         Returns:
             For each intersection float32 ``(layout.size,)``, parts of one fresh array.
         """
-        own = np.zeros(self._length, dtype=np.float32)
-        own[self._feature_places] = self._flat(snapshot)
-        own[self._first_phases + np.array(phases)] = 1.0
-        seen = own if self._context is None else own[self._context]
+        vector = np.zeros(self._length, dtype=np.float32)
+        vector[self._feature_places] = self._flat(snapshot)
+        vector[self._first_phases + np.array(phases)] = 1.0
+        seen = vector if self._context is None else vector[self._context]
         return [seen[part] for part in self._parts]
 
     def _place(self) -> None:
@@ -121,19 +121,22 @@ class Observer:
         """
         features = [layout.features for layout in self.layouts]
         widths = [f + phases for f, phases in zip(features, self._phases, strict=True)]
-        own = _slices(widths)
-        starts = np.array([part.start for part in own])
+        slices = _slices(widths)
+        starts = np.array([part.start for part in slices])
         self._length = sum(widths)
         self._first_phases = starts + np.array(features)
         self._feature_places = np.concatenate(
-            [np.arange(part.start, part.start + f) for part, f in zip(own, features, strict=True)]
+            [
+                np.arange(part.start, part.start + f)
+                for part, f in zip(slices, features, strict=True)
+            ]
         )
         self._context: NDArray[np.int64] | None = None
-        self._parts = own
+        self._parts = slices
         if any(self._near):
             places = np.arange(self._length)
             seen = [
-                np.concatenate([places[own[j]] for j in (index, *near)])
+                np.concatenate([places[slices[j]] for j in (index, *near)])
                 for index, near in enumerate(self._near)
             ]
             self._context = np.concatenate(seen)
@@ -183,14 +186,17 @@ def _gather(network: Network, name: str) -> tuple[NDArray[np.int64], list[int]]:
     count = len(lanes.ids)
     parts: list[NDArray[np.int64]] = []
     sizes: list[int] = []
-    for item in network.intersections:
-        incoming, outgoing = lanes.indices(item.incoming_lanes), lanes.indices(item.outgoing_lanes)
+    for intersection in network.intersections:
+        incoming, outgoing = (
+            lanes.indices(intersection.incoming_lanes),
+            lanes.indices(intersection.outgoing_lanes),
+        )
         if name == "movements":
-            own = np.concatenate((incoming, incoming + count, outgoing + count))
+            columns = np.concatenate((incoming, incoming + count, outgoing + count))
         else:
-            own = incoming
-        parts.append(own)
-        sizes.append(len(own))
+            columns = incoming
+        parts.append(columns)
+        sizes.append(len(columns))
     return np.concatenate(parts), sizes
 
 
@@ -198,10 +204,10 @@ def _downstream_matrix(network: Network) -> NDArray[np.float64]:
     """Return a matrix whose rows average, for each incoming lane, the lanes its links lead to."""
     lanes = network.lane_table()
     rows: list[NDArray[np.float64]] = []
-    for item in network.intersections:
-        for lane in item.incoming_lanes:
+    for intersection in network.intersections:
+        for lane in intersection.incoming_lanes:
             row = np.zeros(len(lanes.ids))
-            for to_lane in {link.to_lane for link in item.links if link.from_lane == lane}:
+            for to_lane in {link.to_lane for link in intersection.links if link.from_lane == lane}:
                 row[lanes.indices([to_lane])] = 1.0
             rows.append(row / row.sum())
     return np.stack(rows)
@@ -209,8 +215,10 @@ def _downstream_matrix(network: Network) -> NDArray[np.float64]:
 
 def _within(network: Network, hops: int) -> list[list[int]]:
     """Return, for each intersection, the others at most `hops` roads away, nearest first."""
-    position = {item.id: index for index, item in enumerate(network.intersections)}
-    near = within_hops({item.id: item.neighbours for item in network.intersections}, hops)
+    position = {intersection.id: index for index, intersection in enumerate(network.intersections)}
+    near = within_hops(
+        {intersection.id: intersection.neighbours for intersection in network.intersections}, hops
+    )
     return [[position[name] for name in others] for others in near.values()]
 
 

@@ -46,7 +46,7 @@ class EnvOptions:
         ):
             value = getattr(self, name)
             if value not in allowed:
-                names = [item for item in allowed if item]
+                names = [choice for choice in allowed if choice]
                 raise UnknownNameError(f"value of option {name!r}:", str(value), names)
         roads: Any = self.neighbours
         if not isinstance(roads, int) or roads < 0:
@@ -59,7 +59,7 @@ class EnvOptions:
         Raises:
             UnknownNameError: An option or a value does not exist.
         """
-        known = [item.name for item in fields(cls)]
+        known = [field.name for field in fields(cls)]
         for name in options:
             if name not in known:
                 raise UnknownNameError("option", name, known)

@@ -116,8 +116,8 @@ class Picture:
         roads = [place(np.array(lane.shape)) for lane in lanes.values()]
         turns = [
             place(np.array([lanes[link.from_lane].shape[-1], lanes[link.to_lane].shape[0]]))
-            for item in network.intersections
-            for link in item.links
+            for intersection in network.intersections
+            for link in intersection.links
             if link.from_lane in lanes and link.to_lane in lanes
         ]
         wide = max(1.6, _LANE_M * self._view.scale) * _POINTS
@@ -129,7 +129,7 @@ class Picture:
     def _draw_names(self, network: Network, names: Mapping[str, str]) -> None:
         from matplotlib.patheffects import withStroke
 
-        centres = {item.id: item.position for item in network.intersections}
+        centres = {intersection.id: intersection.position for intersection in network.intersections}
         known = [(name, centres[tls]) for name, tls in names.items() if tls in centres]
         if not known or len(known) > _NAMED:
             return
@@ -194,16 +194,16 @@ class _Heads:
         self._keys: list[tuple[str, int]] = []
         across: list[Floats] = []
         along: list[Floats] = []
-        for item in network.intersections:
+        for intersection in network.intersections:
             by_lane = itertools.groupby(
-                sorted(item.links, key=lambda link: (link.from_lane, link.index)),
+                sorted(intersection.links, key=lambda link: (link.from_lane, link.index)),
                 key=lambda link: link.from_lane,
             )
             for lane, links in by_lane:
-                own = list(links)
-                for number, link in enumerate(own):
-                    self._keys.append((item.id, link.index))
-                    bar, arrow = _head(network.lanes[lane].shape, view, number, len(own))
+                lane_links = list(links)
+                for number, link in enumerate(lane_links):
+                    self._keys.append((intersection.id, link.index))
+                    bar, arrow = _head(network.lanes[lane].shape, view, number, len(lane_links))
                     across.append(bar)
                     along.append(arrow)
         self._across, self._along = np.array(across), np.array(along)

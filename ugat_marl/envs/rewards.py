@@ -59,8 +59,12 @@ class Rewarder:
             )
         self._reward = reward
         lanes = network.lane_table()
-        self._incoming = [lanes.indices(item.incoming_lanes) for item in network.intersections]
-        self._outgoing = [lanes.indices(item.outgoing_lanes) for item in network.intersections]
+        self._incoming = [
+            lanes.indices(intersection.incoming_lanes) for intersection in network.intersections
+        ]
+        self._outgoing = [
+            lanes.indices(intersection.outgoing_lanes) for intersection in network.intersections
+        ]
         self._sum_in = _Sums(self._incoming)
         self._sum_out = _Sums(self._outgoing)
 
@@ -85,13 +89,13 @@ class Rewarder:
         ]
 
     def _view(self, snapshot: Snapshot, index: int) -> IntersectionView:
-        own = self._incoming[index]
+        incoming = self._incoming[index]
         return IntersectionView(
             snapshot.time_s,
-            snapshot.vehicles[own],
-            snapshot.halting[own],
-            snapshot.mean_speed_mps[own],
-            snapshot.waiting_s[own],
+            snapshot.vehicles[incoming],
+            snapshot.halting[incoming],
+            snapshot.mean_speed_mps[incoming],
+            snapshot.waiting_s[incoming],
             snapshot.vehicles[self._outgoing[index]],
         )
 

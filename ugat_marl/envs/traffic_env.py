@@ -153,13 +153,13 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._states = [signals.initial_state(self._timing) for _ in self.agents]
         lights = self.network.intersections
         self._delays = signals.GreenDelays(
-            {item.id: item.phases[0] for item in lights},
+            {intersection.id: intersection.phases[0] for intersection in lights},
             late_greens(self.scenario),
             self.scenario.settings.step_length_s,
         )
         self._recorder = EpisodeRecorder(
             self._lanes,
-            [self._lanes.indices(item.incoming_lanes) for item in lights],
+            [self._lanes.indices(intersection.incoming_lanes) for intersection in lights],
         )
         return self._observe(), self._infos()
 
@@ -281,12 +281,15 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         observer, items = self._observer, self.network.intersections
         agents = self.possible_agents = list(observer.agents)
         self.agent_groups = {
-            group: [agents[place] for place in own] for group, own in observer.groups.items()
+            group: [agents[place] for place in members]
+            for group, members in observer.groups.items()
         }
-        self.intersection_of = {a: item.id for a, item in zip(agents, items, strict=True)}
+        self.intersection_of = {
+            a: intersection.id for a, intersection in zip(agents, items, strict=True)
+        }
         self.layouts: dict[str, AgentLayout] = dict(zip(agents, observer.layouts, strict=True))
         self.observation_spaces = dict(zip(agents, observer.spaces, strict=True))
-        phases = [len(item.phases) for item in items]
+        phases = [len(intersection.phases) for intersection in items]
         actions = {count: Discrete(count) for count in phases}
         self.action_spaces = {a: actions[count] for a, count in zip(agents, phases, strict=True)}
         self._all_free = [np.ones(count, dtype=np.int8) for count in phases]
@@ -316,11 +319,11 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         assert self._simulator is not None
         plans: dict[str, list[signals.Segment]] = {}
         states: list[signals.SignalState] = []
-        for item, state, phase in zip(
+        for intersection, state, phase in zip(
             self.network.intersections, self._states, requested, strict=True
         ):
-            after, plans[item.id] = signals.advance(
-                item.phases, state, phase, self.decision_interval_s, self._timing
+            after, plans[intersection.id] = signals.advance(
+                intersection.phases, state, phase, self.decision_interval_s, self._timing
             )
             states.append(after)
         if self.options.signals == "programme":

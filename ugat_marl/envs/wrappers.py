@@ -110,10 +110,10 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
     @property
     def base(self) -> Any:
         """The environment inside all wrappers."""
-        found: Any = self
-        while isinstance(found, Wrapper):
-            found = found.env.unwrapped
-        return found
+        env: Any = self
+        while isinstance(env, Wrapper):
+            env = env.env.unwrapped
+        return env
 
     def observation_space(self, agent: str) -> Any:
         """The space of an agent's observations, the same object at each call."""
@@ -166,9 +166,9 @@ class PaddedDiscrete(spaces.Discrete):
         own: Number of actions that exist.
     """
 
-    def __init__(self, n: int, own: int) -> None:
+    def __init__(self, n: int, n_valid: int) -> None:
         super().__init__(n)
-        self.own = own
+        self.own = n_valid
 
     def sample(self, mask: Any = None, probability: Any = None) -> np.int64:
         """Draw an action by `mask` or `probability`, or by default among those that exist."""
@@ -184,8 +184,8 @@ class _Pad(Wrapper):
         super().__init__(env)
         self._own = {agent: _discrete(env, agent) for agent in self.action_spaces}
         self._most = max(int(space.n) for space in self._own.values())
-        padded = {own: PaddedDiscrete(self._most, own) for own in map(_size, self._own.values())}
-        self.action_spaces = {agent: padded[_size(own)] for agent, own in self._own.items()}
+        padded = {size: PaddedDiscrete(self._most, size) for size in map(_size, self._own.values())}
+        self.action_spaces = {agent: padded[_size(size)] for agent, size in self._own.items()}
         common = common_box(list(self.observation_spaces.values()))
         self._width = common.shape[0]
         self.observation_spaces = dict.fromkeys(self.observation_spaces, common)
@@ -202,11 +202,11 @@ class _Pad(Wrapper):
 
     def _told(self, infos: Infos) -> Infos:
         told = dict(infos)
-        for agent, own in self._own.items():
+        for agent, space in self._own.items():
             if agent in infos:
                 mask = np.zeros(self._most, dtype=np.int8)
                 given = infos[agent].get("action_mask")
-                mask[: own.n] = 1 if given is None else given
+                mask[: space.n] = 1 if given is None else given
                 told[agent] = {**infos[agent], "action_mask": mask}
         return told
 
@@ -247,7 +247,7 @@ class _SharedObservation(Wrapper):
                 "of all agents to the end"
             )
         every = np.concatenate([observations[agent] for agent in self.observation_spaces])
-        return {agent: np.concatenate((own, every)) for agent, own in observations.items()}
+        return {agent: np.concatenate((vector, every)) for agent, vector in observations.items()}
 
 
 class _FrameStack(Wrapper):

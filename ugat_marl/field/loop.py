@@ -173,8 +173,8 @@ class FieldLoop:
         if lacking := [light for light in site.lights if light not in shown]:
             raise OptionError(f"the street has no traffic light {lacking[0]!r}; it has {[*shown]}")
         self.lights = {
-            item.id: Light(item.phases, site.timing, shown[item.id])
-            for item in site.network.intersections
+            intersection.id: Light(intersection.phases, site.timing, shown[intersection.id])
+            for intersection in site.network.intersections
         }
         self._watchdog = Watchdog(site.capacity, site.halting, limits)
         self._held: frozenset[str] = frozenset()
@@ -328,14 +328,14 @@ def _answer_of(policy: Policy, site: Site) -> Callable[..., list[int]]:
 def _without_green(site: Site, plans: Mapping[str, list[Segment]]) -> frozenset[str]:
     """Return the lanes in front of lights that have no green in these plans."""
     held: set[str] = set()
-    for item in site.network.intersections:
-        states = [state for _, state in plans[item.id]]
+    for intersection in site.network.intersections:
+        states = [state for _, state in plans[intersection.id]]
         green = {
             link.from_lane
-            for link in item.links
+            for link in intersection.links
             if any(state[link.index] in GREEN for state in states)
         }
-        held.update(lane for lane in item.incoming_lanes if lane not in green)
+        held.update(lane for lane in intersection.incoming_lanes if lane not in green)
     return frozenset(held)
 
 

@@ -110,18 +110,18 @@ class Trust:
         Args:
             faults: Light to the fault of its data or of the policy, ``<kind>: <details>``.
         """
-        found: dict[str, str] = {}
+        reasons: dict[str, str] = {}
         for light, good in self._good.items():
             if light in faults:
                 self._good[light] = 0
-                self._last[light] = found[light] = faults[light]
+                self._last[light] = reasons[light] = faults[light]
             elif good < self._return_after:
                 self._good[light] = good + 1
-                found[light] = (
+                reasons[light] = (
                     f"returning: {good + 1:g} of {self._return_after} good decisions after "
                     f"{self._last[light]}"
                 )
-        return found
+        return reasons
 
 
 def fixed_time(
@@ -139,7 +139,7 @@ def fixed_time(
         green_s: Time of a phase, s, its clearance included.
     """
     streets = ControlledNetwork(
-        {item.id: item for item in network.intersections},
+        {intersection.id: intersection for intersection in network.intersections},
         {name: lane.capacity for name, lane in network.lanes.items()},
         {name: lane.length_m / lane.speed_mps for name, lane in network.lanes.items()},
         decision_interval_s,

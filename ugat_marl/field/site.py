@@ -69,13 +69,15 @@ class Site:
             )
         network = Network.read(scenario)
         items = network.intersections
-        own = {
-            item.id: item.incoming_lanes
+        sees = {
+            intersection.id: intersection.incoming_lanes
             if name in _INCOMING_ONLY
-            else (*item.incoming_lanes, *item.outgoing_lanes)
-            for item in items
+            else (*intersection.incoming_lanes, *intersection.outgoing_lanes)
+            for intersection in items
         }
-        near = within_hops({item.id: item.neighbours for item in items}, hops)
+        near = within_hops(
+            {intersection.id: intersection.neighbours for intersection in items}, hops
+        )
         return cls(
             network,
             Observer(network, name, hops),
@@ -83,9 +85,9 @@ class Site:
             control.decision_interval_s,
             {
                 light: tuple(
-                    dict.fromkeys(lane for one in (light, *near[light]) for lane in own[one])
+                    dict.fromkeys(lane for one in (light, *near[light]) for lane in sees[one])
                 )
-                for light in own
+                for light in sees
             },
             name in _HALTING,
         )
@@ -93,19 +95,19 @@ class Site:
     @cached_property
     def lights(self) -> tuple[str, ...]:
         """The traffic lights, in the order of the observer's agents."""
-        return tuple(item.id for item in self.network.intersections)
+        return tuple(intersection.id for intersection in self.network.intersections)
 
     @cached_property
     def capacity(self) -> dict[str, float]:
         """Lane that must be counted to the number of vehicles that fit on it."""
-        lanes = dict.fromkeys(lane for own in self.sees.values() for lane in own)
+        lanes = dict.fromkeys(lane for seen_lanes in self.sees.values() for lane in seen_lanes)
         return {lane: self.network.lanes[lane].capacity for lane in lanes}
 
     @cached_property
     def spaces(self) -> dict[str, Discrete]:
         """Agent to its action space, one action per phase."""
         items = zip(self.observer.agents, self.network.intersections, strict=True)
-        return {agent: Discrete(len(item.phases)) for agent, item in items}
+        return {agent: Discrete(len(intersection.phases)) for agent, intersection in items}
 
     def observe(
         self, counts: Mapping[str, LaneCount], now_s: float, phases: list[int]

@@ -128,8 +128,10 @@ class TraciStreet:
             self._counter: Any = self._connection.lane
             if detectors == "areas":
                 self._counter = self._connection.lanearea
-                found = {name: self._counter.getLaneID(name) for name in self._counter.getIDList()}
-                self._lane_of = {name: lane for name, lane in found.items() if lane in set(lanes)}
+                lane_of = {
+                    name: self._counter.getLaneID(name) for name in self._counter.getIDList()
+                }
+                self._lane_of = {name: lane for name, lane in lane_of.items() if lane in set(lanes)}
             for name in self._lane_of:
                 self._counter.subscribe(name, _COUNTED)
             self._time_s = float(self._connection.simulation.getTime())
@@ -176,14 +178,14 @@ class TraciStreet:
             self._connection.close(False)
 
     @contextlib.contextmanager
-    def _told(self, what: str) -> Iterator[None]:
+    def _told(self, action: str) -> Iterator[None]:
         self._amid = True  # stays True if Ctrl-C interrupts the command
         try:
             yield
             self._amid = False
         except (TraCIException, FatalTraCIError, OSError) as error:
             self.close()
-            raise SimulatorError(f"{what} ({self._where}): {error}") from None
+            raise SimulatorError(f"{action} ({self._where}): {error}") from None
 
 
 _COUNTED = (tc.LAST_STEP_VEHICLE_NUMBER, tc.LAST_STEP_VEHICLE_HALTING_NUMBER)

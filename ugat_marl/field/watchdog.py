@@ -43,10 +43,10 @@ class TrustLimits:
     green_s: float = 30.0
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value, endless = getattr(self, item.name), item.name in _MAY_BE_ENDLESS
+        for field in fields(self):
+            value, endless = getattr(self, field.name), field.name in _MAY_BE_ENDLESS
             if not (value >= 0 and (endless or value < math.inf)):
-                raise OptionError(f"{item.name} = {value}: must be a number, 0 or more")
+                raise OptionError(f"{field.name} = {value}: must be a number, 0 or more")
         if self.reserve_ms >= self.answer_ms:
             raise OptionError(
                 f"reserve_ms = {self.reserve_ms:g} leaves the policy nothing of the "
@@ -83,20 +83,20 @@ class Watchdog:
             now_s: Time on the street's clock, s.
             held: Lanes without green since the last call; no vehicle could leave them.
         """
-        found: dict[str, str] = {}
+        lane_faults: dict[str, str] = {}
         elapsed, self._looked_s = now_s - self._looked_s, now_s
         for lane, capacity in self._capacity.items():
             count = counts.get(lane)
             if count is None:
-                found[lane] = f"missing: no count of lane {lane}"
+                lane_faults[lane] = f"missing: no count of lane {lane}"
             elif wrong := self._wrong(count, capacity, now_s):
-                found[lane] = f"{wrong} on lane {lane}"
+                lane_faults[lane] = f"{wrong} on lane {lane}"
             else:
                 waits = lane in held or count.vehicles >= _FULL * capacity
                 self._note(lane, count, now_s, 0.0 if waits else elapsed)
                 continue
             self._value.pop(lane, None)  # the lane's next good count is a change
-        return self._stuck(now_s) | found
+        return self._stuck(now_s) | lane_faults
 
     def _wrong(self, count: LaneCount, capacity: float, now_s: float) -> str:
         try:

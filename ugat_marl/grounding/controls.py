@@ -88,8 +88,8 @@ def shuffled(log: TransitionLog, seed: int) -> TransitionLog:
     outcomes = ["next_observation", "served_features"]
     parts: list[pl.DataFrame] = []
     for agent in log.agents:
-        own = log.frame.filter(pl.col("agent") == agent)
-        order = numpy_generator(seed, "shuffled", agent).permutation(own.height)
-        parts.append(own.with_columns(own[name].gather(order) for name in outcomes))
+        agent_rows = log.frame.filter(pl.col("agent") == agent)
+        order = numpy_generator(seed, "shuffled", agent).permutation(agent_rows.height)
+        parts.append(agent_rows.with_columns(agent_rows[name].gather(order) for name in outcomes))
     frame = pl.concat(parts).sort("episode", "step", maintain_order=True)
     return TransitionLog(log.provenance, frame)

@@ -196,9 +196,9 @@ class OffData:
             view: View of h, with the length of observations and the columns of phases.
             fixed: ``(agents, 1, width)`` bool, further columns that are never redrawn.
         """
-        own = weight.bool()[..., None]
-        low = torch.where(own, inputs, torch.inf).amin(1, keepdim=True)
-        high = torch.where(own, inputs, -torch.inf).amax(1, keepdim=True)
+        on_rows = weight.bool()[..., None]
+        low = torch.where(on_rows, inputs, torch.inf).amin(1, keepdim=True)
+        high = torch.where(on_rows, inputs, -torch.inf).amax(1, keepdim=True)
         centre, reach = (high + low) / 2, (high - low) * OFF_DATA_REACH
         kept = nn.functional.pad(view.lights, (0, low.shape[-1] - view.width))
         change = torch.zeros(low.shape, dtype=torch.bool)
@@ -456,17 +456,17 @@ def _epoch(
     optimiser: torch.optim.Optimizer,
 ) -> float:
     """Pass once over the batches; return the mean loss over agents, members and batches."""
-    found: list[Tensor] = []
+    losses: list[Tensor] = []
     for batch in batches:
-        own = taken(weight, batch)
+        batch_weight = taken(weight, batch)
         # The sum of the agents' means: the gradient of an agent does not depend on the others.
-        mean = (loss(batch, epoch) * own).sum(-1) / own.sum(-1).clamp(min=1.0)
+        mean = (loss(batch, epoch) * batch_weight).sum(-1) / batch_weight.sum(-1).clamp(min=1.0)
         optimiser.zero_grad(set_to_none=True)
         mean.sum().backward()
         optimiser.step()
-        found.append(mean.detach().mean())
+        losses.append(mean.detach().mean())
     # Read once at the end, because each read waits for the GPU.
-    return sum(torch.stack(found).cpu().tolist()) / len(batches)
+    return sum(torch.stack(losses).cpu().tolist()) / len(batches)
 
 
 @torch.no_grad()
@@ -476,6 +476,9 @@ def _mean_loss(loss: RowLoss, weight: Tensor, members: int) -> Tensor:
     total, rows = weight.new_zeros(()), weight.new_zeros(())
     for batch in weight.any(0).nonzero()[:, 0].split(chunk):
         columns = batch if members == 1 else batch.expand(members, -1)
-        own = taken(weight, columns)
-        total, rows = total + (loss(columns, -1) * own).sum(-1), rows + own.sum(-1)
+        batch_weight = taken(weight, columns)
+        total, rows = (
+            total + (loss(columns, -1) * batch_weight).sum(-1),
+            rows + batch_weight.sum(-1),
+        )
     return total / rows

@@ -220,9 +220,9 @@ class Gate:
             ("no grounded action was taken", accepted == 0),
             ("every grounded action was taken", accepted == decisions),
         ):
-            found = everywhere & (decisions > 0) & self.trusted
-            if found.any():
-                names = [a for a, hit in zip(self.agents, found, strict=True) if hit]
+            warned = everywhere & (decisions > 0) & self.trusted
+            if warned.any():
+                names = [a for a, hit in zip(self.agents, warned, strict=True) if hit]
                 shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
                 parts.append(f"{share} at {len(names)} of {len(self.agents)} ({shown})")
         if not parts:

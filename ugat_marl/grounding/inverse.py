@@ -218,26 +218,26 @@ class DelayModel(AnswerModel):
             change: ``(agents, batch, features)`` change of the features, unscaled.
         """
         batch = action.shape[1]
-        found = torch.zeros(len(self._fan_in), batch, max(self._fan_in))
+        assembled = torch.zeros(len(self._fan_in), batch, max(self._fan_in))
         for i, (size, layout) in enumerate(
             zip(self.view.sizes, self.stack.layouts.values(), strict=True)
         ):
             end = size + layout.features
-            found[i, :, :size] = observation[i, :, :size]
-            found[i, :, size:end] = change[i, :, : layout.features]
-            found[i].scatter_(1, end + action[i][:, None], 1.0)
-        return found
+            assembled[i, :, :size] = observation[i, :, :size]
+            assembled[i, :, size:end] = change[i, :, : layout.features]
+            assembled[i].scatter_(1, end + action[i][:, None], 1.0)
+        return assembled
 
     @property
     def action_columns(self) -> Tensor:
         """Columns of the action in the inputs, ``(agents, 1, width)`` bool."""
-        found = torch.zeros(len(self._fan_in), 1, max(self._fan_in), dtype=torch.bool)
+        columns = torch.zeros(len(self._fan_in), 1, max(self._fan_in), dtype=torch.bool)
         for i, (size, layout) in enumerate(
             zip(self.view.sizes, self.stack.layouts.values(), strict=True)
         ):
             start = size + layout.features
-            found[i, 0, start : start + layout.phases] = True
-        return found
+            columns[i, 0, start : start + layout.phases] = True
+        return columns
 
     def predict(self, observation: Tensor, action: Tensor, change: Tensor) -> InversePrediction:
         """Answer with the delay that h assigns to a change."""

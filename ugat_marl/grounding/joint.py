@@ -88,8 +88,8 @@ def together(
         actions: ``(agents,)`` the policy's actions.
         permitted: ``(agents, phases)`` action masks.
     """
-    own = running(actions, permitted)
-    told, given_up, turn = own, np.zeros(len(actions), bool), 0
+    policy_phases = running(actions, permitted)
+    told, given_up, turn = policy_phases, np.zeros(len(actions), bool), 0
     while True:
         for count in range(1, PASSES + 1):
             grounded, u = answer(told)
@@ -107,7 +107,7 @@ def together(
             turn = (turn + 1) % len(in_turn)
             if count == PASSES:  # agents given up never move again, so the search ends
                 given_up = given_up | movers
-                will_run = own
+                will_run = policy_phases
             told = np.where(movers, will_run, told)
 
 

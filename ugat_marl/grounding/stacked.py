@@ -46,11 +46,11 @@ class Stack:
 
     def current_phase(self, observation: Tensor) -> Tensor:
         """Return the phase, ``(agents, batch)``, in ``(agents, batch, width)`` observations."""
-        found = torch.zeros(observation.shape[:2], dtype=torch.long)
+        phases = torch.zeros(observation.shape[:2], dtype=torch.long)
         for i, layout in enumerate(self.layouts.values()):
             shown = observation[i, :, layout.features : layout.features + layout.phases]
-            found[i] = shown.argmax(-1)
-        return found
+            phases[i] = shown.argmax(-1)
+        return phases
 
     def observations(self, observations: Mapping[str, NDArray[np.float32]]) -> Tensor:
         """Return one observation per agent as ``(agents, 1, width)`` float32."""
@@ -125,33 +125,33 @@ def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
     """
     refuse_other_agents(log, stack)
     rows = [log.transitions(agent) for agent in stack.agents]
-    for agent, own in zip(stack.agents, rows, strict=True):
-        if not len(own):
+    for agent, agent_rows in zip(stack.agents, rows, strict=True):
+        if not len(agent_rows):
             raise LogError(f"the transition log has no row of {agent}; record whole episodes")
     number = np.unique(log.frame["episode"].to_numpy())
-    count, n = len(rows), max(len(own) for own in rows)
+    count, n = len(rows), max(len(agent_rows) for agent_rows in rows)
     observation = torch.zeros(count, n, stack.width)
     following = torch.zeros(count, n, stack.width)
     asked, executed, step = (torch.zeros(count, n, dtype=torch.long) for _ in range(3))
     episode = torch.full((count, n), -1)
     weight, delay_s = torch.zeros(count, n), torch.zeros(count, n)
-    for i, own in enumerate(rows):
-        k, size = len(own), stack.sizes[i]
-        observation[i, :k, :size] = torch.from_numpy(own.observation)
-        following[i, :k, :size] = torch.from_numpy(own.next_observation)
-        asked[i, :k] = torch.from_numpy(own.action)
-        executed[i, :k] = torch.from_numpy(own.executed)
-        delay_s[i, :k] = torch.from_numpy(own.delay_s)
-        episode[i, :k] = torch.from_numpy(np.searchsorted(number, own.episode))
-        step[i, :k] = torch.from_numpy(own.step)
+    for i, agent_rows in enumerate(rows):
+        k, size = len(agent_rows), stack.sizes[i]
+        observation[i, :k, :size] = torch.from_numpy(agent_rows.observation)
+        following[i, :k, :size] = torch.from_numpy(agent_rows.next_observation)
+        asked[i, :k] = torch.from_numpy(agent_rows.action)
+        executed[i, :k] = torch.from_numpy(agent_rows.executed)
+        delay_s[i, :k] = torch.from_numpy(agent_rows.delay_s)
+        episode[i, :k] = torch.from_numpy(np.searchsorted(number, agent_rows.episode))
+        step[i, :k] = torch.from_numpy(agent_rows.step)
         weight[i, :k] = 1.0
     served: Tensor | None = None
-    if all(own.served_features.shape[1] for own in rows):
+    if all(agent_rows.served_features.shape[1] for agent_rows in rows):
         most = max(layout.features for layout in stack.layouts.values())
         served = torch.zeros(count, n, most)
-        for i, own in enumerate(rows):
-            part = torch.from_numpy(own.served_features)
-            served[i, : len(own), : part.shape[1]] = part
+        for i, agent_rows in enumerate(rows):
+            part = torch.from_numpy(agent_rows.served_features)
+            served[i, : len(agent_rows), : part.shape[1]] = part
     return StackedTransitions(
         observation, following, served, asked, executed, delay_s, episode, step, weight
     )

@@ -215,11 +215,11 @@ class TimedTransform(Transform):
         self, lost: LostTime, learnt: NDArray[np.bool_], rewards: EpisodeRewards | None
     ) -> MatchedDelays | None:
         """Set the constant delays where models have learnt something; return the matched delays."""
-        found = learnt & lost.shown
-        self.constants.delay_s.copy_(lost.phase_s * torch.from_numpy(found)[:, None])
+        shown = learnt & lost.shown
+        self.constants.delay_s.copy_(lost.phase_s * torch.from_numpy(shown)[:, None])
         if rewards is None:
             return None
-        matched = match_delays(rewards, np.where(found, lost.best_s, 0.0))
+        matched = match_delays(rewards, np.where(shown, lost.best_s, 0.0))
         matched = replace(matched, beyond_s=matched.beyond_s * learnt)
         self.constants.beyond_s.copy_(torch.from_numpy(matched.beyond_s)[:, None])
         return matched
@@ -309,7 +309,7 @@ class TimedTransform(Transform):
             return Grounding(actions, actions, np.zeros_like(delay), np.ones_like(switched), delay)
         # Grounding keeps all phases, so those of the neighbours are known in advance.
         phases = torch.from_numpy(running(actions, permitted))[:, None]
-        found, u = self.delays(  # lines 11 and 12
+        delays_s, u = self.delays(  # lines 11 and 12
             self.forward.view.seen(observations, phases, earlier),
             self.local.seen(observations, phases),
             asked,
@@ -317,10 +317,10 @@ class TimedTransform(Transform):
         accepted = self.gate.decide(  # lines 13 and 15
             u[:, 0].numpy(),
             usual[:, 0].round().long().numpy(),
-            found[:, 0].round().long().numpy(),
+            delays_s[:, 0].round().long().numpy(),
             asked=switched,
         )
-        delay = np.where(accepted, found[:, 0].numpy(), usual[:, 0].numpy())
+        delay = np.where(accepted, delays_s[:, 0].numpy(), usual[:, 0].numpy())
         delay = np.where(switched, delay, 0.0).astype(np.float32)
         return Grounding(actions, actions, u[:, 0].numpy(), accepted, delay)
 
@@ -336,8 +336,8 @@ class TimedTransform(Transform):
         answer = self.inverse.predict(local, actions, change)
         usual = self.constants.delay_s.gather(1, actions)
         # h estimates the lost time alone, so matching is added afterwards.
-        found = likely_delay(answer.probability, usual, self.timed.spread_s)
-        return self._later(found), answer.u
+        likely_s = likely_delay(answer.probability, usual, self.timed.spread_s)
+        return self._later(likely_s), answer.u
 
     def _later(self, delay_s: Tensor) -> Tensor:
         """Return delays ``(agents, batch)`` plus `beyond_s`, limited to 0 to `most_s` s."""

@@ -189,11 +189,13 @@ class Transform(abc.ABC):
             CheckpointError: The state has other agents or shapes, is incomplete or not finite.
         """
         layouts = state.get("layouts")
-        own = [(agent, list(_sizes(layout))) for agent, layout in self.stack.layouts.items()]
-        if not isinstance(layouts, Mapping) or list(layouts.items()) != own:
+        layout_sizes = [
+            (agent, list(_sizes(layout))) for agent, layout in self.stack.layouts.items()
+        ]
+        if not isinstance(layouts, Mapping) or list(layouts.items()) != layout_sizes:
             raise CheckpointError(
                 "the grounding in the checkpoint belongs to other agents or another observation; "
-                f"this one has {len(own)} agents ({', '.join(self.stack.agents[:4])} ...)"
+                f"this one has {len(layout_sizes)} agents ({', '.join(self.stack.agents[:4])} ...)"
             )
         sights = _sights(self.inputs, self.local)
         if state.get("inputs") != sights:
@@ -251,12 +253,12 @@ def _sizes(layout: AgentLayout) -> tuple[int, int, int]:
     return layout.features, layout.phases, layout.context
 
 
-def _refuse_foreign(name: str, found: Any, own: Mapping[str, Tensor]) -> None:
-    """Refuse parts of a model whose names or shapes differ from `own`, or that are not finite."""
-    if not isinstance(found, Mapping) or set(found) != set(own):
+def _refuse_foreign(name: str, read: Any, expected: Mapping[str, Tensor]) -> None:
+    """Refuse parts of a model of other names or shapes than `expected`, or not finite."""
+    if not isinstance(read, Mapping) or set(read) != set(expected):
         raise CheckpointError(f"the {name} model in the checkpoint has other parts than this one")
-    for part, value in own.items():
-        tensor = found[part]
+    for part, value in expected.items():
+        tensor = read[part]
         if not isinstance(tensor, Tensor) or tensor.shape != value.shape:
             shape = tuple(tensor.shape) if isinstance(tensor, Tensor) else type(tensor).__name__
             raise CheckpointError(

@@ -216,8 +216,8 @@ def divergence_from_even(logits: Tensor, mask: Tensor) -> Tensor:
     Dietterich, "Deep Anomaly Detection with Outlier Exposure", ICLR 2019, train with it on
     outliers.
     """
-    own, count = log_probability(logits, mask).masked_fill(~mask, 0.0), mask.sum(-1)
-    return -own.sum(-1) / count - count.log()
+    log_p, count = log_probability(logits, mask).masked_fill(~mask, 0.0), mask.sum(-1)
+    return -log_p.sum(-1) / count - count.log()
 
 
 def normalised_entropy(probability: Tensor, mask: Tensor) -> Tensor:
@@ -286,18 +286,22 @@ class _Divergence(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, alpha: Tensor, mask: Tensor) -> Tensor:
-        own = torch.where(mask, alpha, 1.0)  # a concentration of 1 contributes nothing below
-        total = (own * mask).sum(-1)
+        masked_alpha = torch.where(
+            mask, alpha, 1.0
+        )  # a concentration of 1 contributes nothing below
+        total = (masked_alpha * mask).sum(-1)
         count = mask.sum(-1).to(alpha.dtype)
-        ctx.save_for_backward(own, mask, total, count)
-        pull = ((own - 1.0) * (torch.digamma(own) - torch.digamma(total)[..., None])).sum(-1)
-        return torch.lgamma(total) - torch.lgamma(count) - torch.lgamma(own).sum(-1) + pull
+        ctx.save_for_backward(masked_alpha, mask, total, count)
+        pull = (
+            (masked_alpha - 1.0) * (torch.digamma(masked_alpha) - torch.digamma(total)[..., None])
+        ).sum(-1)
+        return torch.lgamma(total) - torch.lgamma(count) - torch.lgamma(masked_alpha).sum(-1) + pull
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        own, mask, total, count = ctx.saved_tensors
+        masked_alpha, mask, total, count = ctx.saved_tensors
         shared = (total - count) * torch.polygamma(1, total)
-        slope = (own - 1.0) * torch.polygamma(1, own) - shared[..., None]
+        slope = (masked_alpha - 1.0) * torch.polygamma(1, masked_alpha) - shared[..., None]
         return gradients[0][..., None] * slope * mask, None
 
 
@@ -528,8 +532,8 @@ class EnsembleNet(AnswerNet):
         if inputs.dim() == 3:
             inputs = inputs[:, None].expand(-1, self.members, -1, -1)
         agents, members, rows, width = inputs.shape
-        own = inputs.transpose(0, 1).reshape(members * agents, rows, width)
-        embedding = torch.relu(self.encoders(own)).view(members, agents * rows, -1)
+        member_inputs = inputs.transpose(0, 1).reshape(members * agents, rows, width)
+        embedding = torch.relu(self.encoders(member_inputs)).view(members, agents * rows, -1)
         weight = self.head.weight.view(members, -1, embedding.shape[-1])
         bias = self.head.bias.view(members, 1, -1)
         out = torch.baddbmm(bias, embedding, weight.transpose(1, 2))
@@ -543,8 +547,10 @@ class EnsembleNet(AnswerNet):
     def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
         """Return the cross-entropy, member by member."""
         del lesson
-        own = target.reshape(outputs.shape[:3])
-        return negative_log_likelihood(outputs, own, self.valid_actions[:, None]).view(target.shape)
+        member_target = target.reshape(outputs.shape[:3])
+        return negative_log_likelihood(outputs, member_target, self.valid_actions[:, None]).view(
+            target.shape
+        )
 
     def certainty(self, outputs: Tensor) -> Tensor:
         """Return the divergence from equal probabilities, member by member."""
@@ -569,5 +575,7 @@ class PlainNet(EnsembleNet):
 
     def answer(self, inputs: Tensor) -> InversePrediction:
         """Return the likeliest action with u = 0."""
-        found = super().answer(inputs)
-        return InversePrediction(found.action, found.probability, torch.zeros_like(found.u))
+        base_answer = super().answer(inputs)
+        return InversePrediction(
+            base_answer.action, base_answer.probability, torch.zeros_like(base_answer.u)
+        )

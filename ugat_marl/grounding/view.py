@@ -75,8 +75,8 @@ def neighbours_of(env: AnyParallelEnv) -> dict[str, tuple[str, ...]]:
     base: Any = env.unwrapped
     agent = {light: name for name, light in base.intersection_of.items()}
     return {
-        agent[item.id]: tuple(agent[other] for other in item.neighbours)
-        for item in base.network.intersections
+        agent[intersection.id]: tuple(agent[other] for other in intersection.neighbours)
+        for intersection in base.network.intersections
     }
 
 
@@ -113,7 +113,7 @@ class View:
         self.near = {agent: tuple((near or {}).get(agent, ())) for agent in stack.agents}
         self.joint = any(self.near.values())
         places = [self._places(agent) for agent in stack.agents]
-        self.sizes = [len(own) for own in places]
+        self.sizes = [len(agent_places) for agent_places in places]
         self.width = max(self.sizes)
         # Padding reads the last column of all, which is zero.
         nothing = len(stack.agents) * history * (stack.width + stack.actions)
@@ -182,19 +182,19 @@ class View:
             return observed + [(first + k, True) for k in range(layout.phases * executed)]
 
         size = stack.layouts[agent].size
-        found = moment(agent, 0, size, executed=False)
+        columns = moment(agent, 0, size, executed=False)
         for lag in range(1, self.history):
-            found += moment(agent, lag, size, executed=True)
+            columns += moment(agent, lag, size, executed=True)
         for name in self.near[agent]:
             layout = stack.layouts[name]
-            found += moment(name, 0, layout.features + layout.phases, executed=True)
-        return found
+            columns += moment(name, 0, layout.features + layout.phases, executed=True)
+        return columns
 
 
 def _refuse_unequal_times(data: StackedTransitions, stack: Stack) -> None:
     for times in (data.episode, data.step):
-        for agent, own in zip(stack.agents, times, strict=True):
-            if not torch.equal(own, times[0]):
+        for agent, agent_times in zip(stack.agents, times, strict=True):
+            if not torch.equal(agent_times, times[0]):
                 raise LogError(
                     f"the log has rows of {agent} at other times than of {stack.agents[0]}; models "
                     "that see their neighbours need all agents at every decision: record whole "

@@ -185,9 +185,11 @@ class _RollOutAlone:
     def play(self, seed: int, always_s: int | None, stop: Stop) -> TransitionLog:
         """Run one roll-out, with random delays or with the constant delay `always_s`."""
         env = _delayed(self.make_env, self.most_delay_s, always_s)
-        own = copy.deepcopy(self.policy)  # policies with memory must not share it between threads
+        policy = copy.deepcopy(
+            self.policy
+        )  # policies with memory must not share it between threads
         try:
-            return _recorded(env, EpsilonGreedy(own, self.epsilon), seed, stop)
+            return _recorded(env, EpsilonGreedy(policy, self.epsilon), seed, stop)
         finally:
             env.close()
 
@@ -253,13 +255,13 @@ def roll_outs(
         All transitions, and the scores of every episode.
     """
     stop = Stop()
-    found: dict[int, tuple[TransitionLog, Scores]] = {}
+    played: dict[int, tuple[TransitionLog, Scores]] = {}
     with (reporter or Silent()).task(title, len(seeds)) as advance:
         parts = [(seed, stop) for seed in seeds]
         for number, (log, scores) in as_done(workers, each.play, parts, stop):
-            found[number] = log, scores
+            played[number] = log, scores
             advance(note=f"ATT {scores.att_s:.0f} s")
-    logs, scores = zip(*(found[number] for number in range(len(seeds))), strict=True)
+    logs, scores = zip(*(played[number] for number in range(len(seeds))), strict=True)
     return TransitionLog.concatenate(list(logs)), tuple(scores)
 
 
@@ -279,19 +281,19 @@ class RecordedWorld:
     def __init__(
         self, log: TransitionLog, env: TrafficEnv, held_out_every: int = FitConfig.held_out_every
     ) -> None:
-        own = log.provenance
-        for what, found, wanted in (
-            ("agents", list(own.layouts), list(env.layouts)),
+        provenance = log.provenance
+        for fact, given, wanted in (
+            ("agents", list(provenance.layouts), list(env.layouts)),
             *(
-                (f"sizes at {agent}", own.layouts.get(agent), layout)
+                (f"sizes at {agent}", provenance.layouts.get(agent), layout)
                 for agent, layout in env.layouts.items()
             ),
-            ("observation", own.observation, env.options.observation),
-            ("decision interval", own.decision_interval_s, env.decision_interval_s),
+            ("observation", provenance.observation, env.options.observation),
+            ("decision interval", provenance.decision_interval_s, env.decision_interval_s),
         ):
-            if found != wanted:
+            if given != wanted:
                 raise LogError(
-                    f"the real log's {what} are {found}, the simulation's {wanted}; record it on "
+                    f"the real log's {fact} are {given}, the simulation's {wanted}; record it on "
                     f"{env.scenario.id!r} with the same options"
                 )
         stack = Stack(env.layouts)

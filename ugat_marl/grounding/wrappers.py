@@ -70,8 +70,10 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         if not acting:  # after the last step; the environment itself says so
             return self.env.step(actions)
         stack = self.transform.stack
-        own = np.array([self._action(agent, actions) for agent in stack.agents])  # line 10
-        outcome = self.transform(self._seen, own, self._allowed, self._earlier)  # lines 11 to 13
+        requested = np.array([self._action(agent, actions) for agent in stack.agents])  # line 10
+        outcome = self.transform(
+            self._seen, requested, self._allowed, self._earlier
+        )  # lines 11 to 13
         executed = dict(zip(stack.agents, outcome.executed.tolist(), strict=True))
         if outcome.delay_s.any():
             delays = dict(zip(stack.agents, outcome.delay_s.tolist(), strict=True))

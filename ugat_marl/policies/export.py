@@ -92,14 +92,14 @@ def layers_of(policy: NetworkPolicy) -> list[Layer]:
             f"a policy with network {policy.structure.network!r} is more than layers of matrices, "
             "which is what .npz and .onnx hold here; export it to .ts"
         )
-    found: list[Layer] = []
+    layers: list[Layer] = []
     parameters = [p.numpy().copy() for p in policy._network.parameters()]
     for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
-        found.append((weight if weight.ndim == 3 else weight[None], bias))
+        layers.append((weight if weight.ndim == 3 else weight[None], bias))
     if policy.ceiling is None:
-        return found
+        return layers
     ceiling = policy.ceiling[:, None, :]
-    (weight, bias), *later = found
+    (weight, bias), *later = layers
     mirror = np.negative(np.eye(weight.shape[1], dtype=np.float32))[None]
     moved = np.add(bias, np.matmul(ceiling, weight), dtype=np.float32)
     return [(mirror, ceiling), (np.negative(weight), moved), *later]
@@ -180,7 +180,7 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
     from ugat_marl.policies.network_policy import checkpoint_header
 
     agents = policy.agents
-    own = checkpoint_header(agents, policy.hidden, policy.env_options, policy.shared)
+    description = checkpoint_header(agents, policy.hidden, policy.env_options, policy.shared)
     if env is not None and AgentSet.of(env) != agents:
         raise OptionError(
             f"the policy acts for {_brief(agents)}, the environment has "
@@ -189,10 +189,10 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
     base: Any = env.unwrapped if env is not None else None
     return {
         "kind": _KIND,
-        **{key: own[key] for key in ("agents", "observation_sizes", "action_counts")},
+        **{key: description[key] for key in ("agents", "observation_sizes", "action_counts")},
         "observation_width": agents.widest_observation,
         "action_width": agents.most_actions,
-        "env_options": json.loads(own["env_options"]),
+        "env_options": json.loads(description["env_options"]),
         "decision_interval_s": getattr(base, "decision_interval_s", None),
         "intersections": getattr(base, "intersection_of", None),
     }

@@ -121,15 +121,15 @@ class NetworkPolicy:
         try:
             agents, hidden, env_options, shared = parse_header(content)
             structure = structure_in(content, agents)
-            own = (agents, hidden, content["parameters"], env_options, shared, structure)
-            return cls(*own, content.get("ceiling"))
+            arguments = (agents, hidden, content["parameters"], env_options, shared, structure)
+            return cls(*arguments, content.get("ceiling"))
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{path}: not a whole policy ({error}); save it again") from None
 
     def __reduce__(self) -> tuple[type[NetworkPolicy], tuple[Any, ...]]:
         # numpy, since torch would send tensors between processes through shared memory
-        own = (self.agents, self.hidden, self.parameters, self.env_options, self.shared)
-        return NetworkPolicy, (*own, self.structure, self.ceiling)
+        arguments = (self.agents, self.hidden, self.parameters, self.env_options, self.shared)
+        return NetworkPolicy, (*arguments, self.structure, self.ceiling)
 
 
 def checkpoint_header(

@@ -138,8 +138,8 @@ class _Recording:
         if not len(left) or self._observer.needs_waiting:  # vehicles that left tell no waiting time
             return None
         vectors = self._observer.observe(before.less(left), self._base.phases)
-        own = zip(self._observer.agents, vectors, self._observer.layouts, strict=True)
-        return {agent: vector[: layout.features] for agent, vector, layout in own}
+        agent_vectors = zip(self._observer.agents, vectors, self._observer.layouts, strict=True)
+        return {agent: vector[: layout.features] for agent, vector, layout in agent_vectors}
 
     def _look(self) -> dict[str, NDArray[np.float32]]:
         vectors = self._observer.observe(self._base.seen, self._base.phases)

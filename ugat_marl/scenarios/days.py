@@ -114,16 +114,16 @@ def _vehicles(routes: tuple[bytes, ...]) -> _Vehicles:
     tails: list[str] = []
     kinds: list[str] = []
     for content in routes:
-        for item in parse_xml(content, "routes"):
-            if item.tag in ("vType", "vTypeDistribution"):
-                types.append(item)
-            elif item.tag == "vehicle":
-                names.append(item.get("id", ""))
-                depart.append(parse_time(item.get("depart", "0")))
-                kinds.append(item.get("type", ""))
-                heads.append(_attributes(item))
-                tails.append("".join(ET.tostring(part, "unicode").strip() for part in item))
-    known = {item.get("id", ""): _speed_of(item.attrib) for item in types.iter("vType")}
+        for element in parse_xml(content, "routes"):
+            if element.tag in ("vType", "vTypeDistribution"):
+                types.append(element)
+            elif element.tag == "vehicle":
+                names.append(element.get("id", ""))
+                depart.append(parse_time(element.get("depart", "0")))
+                kinds.append(element.get("type", ""))
+                heads.append(_attributes(element))
+                tails.append("".join(ET.tostring(part, "unicode").strip() for part in element))
+    known = {element.get("id", ""): _speed_of(element.attrib) for element in types.iter("vType")}
     default = known.get("DEFAULT_VEHTYPE", DEFAULT_SPEED)
     unknown = (np.nan, np.nan, 0.0, np.inf)  # SUMO draws the factor itself
     speeds = [known.get(kind, unknown if kind else default) for kind in kinds]
@@ -137,8 +137,8 @@ def _vehicles(routes: tuple[bytes, ...]) -> _Vehicles:
     )
 
 
-def _attributes(item: ET.Element) -> str:
-    left = {k: v for k, v in item.attrib.items() if k not in ("id", "depart", "speedFactor")}
+def _attributes(element: ET.Element) -> str:
+    left = {k: v for k, v in element.attrib.items() if k not in ("id", "depart", "speedFactor")}
     return "".join(f" {key}={quoteattr(value)}" for key, value in left.items()) + ">"
 
 

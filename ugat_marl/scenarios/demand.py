@@ -62,26 +62,26 @@ def check_demand(
     vehicles = flows = 0
     routed = True
     for document in (*scenario.routes, *scenario.additional):
-        latest, own = -math.inf, document in scenario.routes
+        latest, in_routes = -math.inf, document in scenario.routes
         singles = OwnEdges()
-        for item in document.scan(reporter):
-            if own:
-                singles.read(item)
-            if item.name in ("vehicle", "trip", "flow", "route"):
-                used = edges_used(item)
+        for tag in document.scan(reporter):
+            if in_routes:
+                singles.read(tag)
+            if tag.name in ("vehicle", "trip", "flow", "route"):
+                used = edges_used(tag)
                 if not edges.issuperset(used):
                     edge = next(edge for edge in used if edge not in edges)
-                    raise _unknown_edge(document, item, edge, scenario)
-            if item.name in ("vehicle", "trip", "flow"):
-                depart = _depart_s(item, document, max(begin, latest))
-                if depart < latest and own:
-                    raise _unsorted(document, item, depart, latest)
+                    raise _unknown_edge(document, tag, edge, scenario)
+            if tag.name in ("vehicle", "trip", "flow"):
+                depart = _depart_s(tag, document, max(begin, latest))
+                if depart < latest and in_routes:
+                    raise _unsorted(document, tag, depart, latest)
                 latest = max(latest, depart)
-                if item.name == "flow":
-                    flows += depart < end and begin < _end_s(item, document)
+                if tag.name == "flow":
+                    flows += depart < end and begin < _end_s(tag, document)
                 else:
                     vehicles += begin <= depart < end
-                if own and not whole and latest > end + SPARE_S:
+                if in_routes and not whole and latest > end + SPARE_S:
                     routed &= not singles.lost
                     break
         else:
@@ -95,52 +95,52 @@ def check_demand(
     return Demand(vehicles, flows, routed)
 
 
-def edges_used(item: Tag) -> list[str]:
+def edges_used(tag: Tag) -> list[str]:
     """Return the edges that a vehicle, trip, flow or route names."""
-    return " ".join(item.attributes.get(key, "") for key in _ROUTED).split()
+    return " ".join(tag.attributes.get(key, "") for key in _ROUTED).split()
 
 
-def _who(item: Tag) -> str:
-    name = item.attributes.get("id", "")
-    return f"<{item.name}" + (f" id={name!r}" if name else "") + ">"
+def _who(tag: Tag) -> str:
+    name = tag.attributes.get("id", "")
+    return f"<{tag.name}" + (f" id={name!r}" if name else "") + ">"
 
 
-def _at(document: Document, item: Tag) -> str:
-    return f"{document.source}, line {item.line}"
+def _at(document: Document, tag: Tag) -> str:
+    return f"{document.source}, line {tag.line}"
 
 
-def _unknown_edge(document: Document, item: Tag, edge: str, scenario: Scenario) -> ScenarioError:
+def _unknown_edge(document: Document, tag: Tag, edge: str, scenario: Scenario) -> ScenarioError:
     return ScenarioError(
-        f"{_at(document, item)}: {_who(item)} uses the edge {edge!r}, which "
+        f"{_at(document, tag)}: {_who(tag)} uses the edge {edge!r}, which "
         f"{scenario.network.source} does not have; were the routes made for another network?"
     )
 
 
-def _unsorted(document: Document, item: Tag, depart: float, latest: float) -> ScenarioError:
+def _unsorted(document: Document, tag: Tag, depart: float, latest: float) -> ScenarioError:
     return ScenarioError(
-        f"{_at(document, item)}: {_who(item)} departs at {depart:g} s but stands after one of "
+        f"{_at(document, tag)}: {_who(tag)} departs at {depart:g} s but stands after one of "
         f"{latest:g} s, and SUMO would leave it out; sort the file by departure (SUMO's "
         "tools/route/sort_routes.py does)"
     )
 
 
-def _depart_s(item: Tag, document: Document, triggered_s: float) -> float:
+def _depart_s(tag: Tag, document: Document, triggered_s: float) -> float:
     """Return the departure in s; `triggered_s` for one that something else triggers."""
-    key, default = ("begin", "0") if item.name == "flow" else ("depart", "")
-    text = item.attributes.get(key, default)
-    return triggered_s if text in _NO_TIME else _seconds(text, key, item, document)
+    key, default = ("begin", "0") if tag.name == "flow" else ("depart", "")
+    text = tag.attributes.get(key, default)
+    return triggered_s if text in _NO_TIME else _seconds(text, key, tag, document)
 
 
-def _end_s(item: Tag, document: Document) -> float:
-    text = item.attributes.get("end")
-    return math.inf if text is None else _seconds(text, "end", item, document)
+def _end_s(tag: Tag, document: Document) -> float:
+    text = tag.attributes.get("end")
+    return math.inf if text is None else _seconds(text, "end", tag, document)
 
 
-def _seconds(text: str, key: str, item: Tag, document: Document) -> float:
+def _seconds(text: str, key: str, tag: Tag, document: Document) -> float:
     try:
         return parse_time(text)
     except ValueError:
         raise ScenarioError(
-            f"{_at(document, item)}: {key}={text!r} of {_who(item)} is not a time; "
+            f"{_at(document, tag)}: {key}={text!r} of {_who(tag)} is not a time; "
             "give seconds or h:m:s"
         ) from None

@@ -176,7 +176,10 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
         round(traffic.first_s, 2),
         round(traffic.fill_s, 1),
         shortest,
-        tuple(_facts(item, network, rules, free, traffic, short) for item in network.intersections),
+        tuple(
+            _facts(intersection, network, rules, free, traffic, short)
+            for intersection in network.intersections
+        ),
         network.uncontrolled,
     )
 
@@ -194,116 +197,133 @@ def _short(scenario: Scenario, network: Network) -> set[str]:
 
 
 def _facts(
-    item: Intersection,
+    intersection: Intersection,
     network: Network,
     rules: RightOfWay,
     free: Mapping[str, int],
     traffic: _Traffic,
     short: Container[str],
 ) -> IntersectionFacts:
-    served = [{i for i, letter in enumerate(phase) if letter in GREEN} for phase in item.phases]
+    served = [
+        {i for i, letter in enumerate(phase) if letter in GREEN} for phase in intersection.phases
+    ]
     ever = set[int]().union(*served)
-    stop_and_go = {i for phase in item.phases for i, letter in enumerate(phase) if letter == "s"}
+    stop_and_go = {
+        i for phase in intersection.phases for i, letter in enumerate(phase) if letter == "s"
+    }
     may_go = ever | stop_and_go
-    junctions = tuple(dict.fromkeys(link.junction for link in item.links))
-    moving = {link.from_lane for link in item.links if link.index in may_go}
+    junctions = tuple(dict.fromkeys(link.junction for link in intersection.links))
+    moving = {link.from_lane for link in intersection.links if link.index in may_go}
     return IntersectionFacts(
-        id=item.id,
+        id=intersection.id,
         junctions=junctions,
-        lanes=len(item.incoming_lanes),
-        links=len(item.links),
-        movements=len({_movement(link) for link in item.links}),
+        lanes=len(intersection.incoming_lanes),
+        links=len(intersection.links),
+        movements=len({_movement(link) for link in intersection.links}),
         conflicts=sum(
             a.from_edge != b.from_edge and are_foes(a, b, rules.foes)
-            for a, b in combinations(item.links, 2)
+            for a, b in combinations(intersection.links, 2)
         ),
-        phases=tuple(_phase(item, phase) for phase in item.phases),
-        unserved_lanes=tuple(lane for lane in item.incoming_lanes if lane not in moving),
+        phases=tuple(_phase(intersection, phase) for phase in intersection.phases),
+        unserved_lanes=tuple(lane for lane in intersection.incoming_lanes if lane not in moving),
         unserved_links=tuple(
-            f"{link.from_lane} -> {link.to_lane}" for link in item.links if link.index not in may_go
+            f"{link.from_lane} -> {link.to_lane}"
+            for link in intersection.links
+            if link.index not in may_go
         ),
-        partly_served=tuple(lane for lane in item.incoming_lanes if _in_part(lane, item)),
+        partly_served=tuple(
+            lane for lane in intersection.incoming_lanes if _in_part(lane, intersection)
+        ),
         lanes_behind=tuple(
-            lane for lane in item.incoming_lanes if network.lanes[lane].behind.lanes
+            lane for lane in intersection.incoming_lanes if network.lanes[lane].behind.lanes
         ),
-        short_lanes=tuple(lane for lane in item.incoming_lanes if lane in short),
-        always_green=sum(all(link.index in green for green in served) for link in item.links),
-        right_on_red=sum(link.index in stop_and_go for link in item.links),
-        u_turns=sum(link.direction in "tT" for link in item.links),
-        crossings=len(item.crossings),
+        short_lanes=tuple(lane for lane in intersection.incoming_lanes if lane in short),
+        always_green=sum(
+            all(link.index in green for green in served) for link in intersection.links
+        ),
+        right_on_red=sum(link.index in stop_and_go for link in intersection.links),
+        u_turns=sum(link.direction in "tT" for link in intersection.links),
+        crossings=len(intersection.crossings),
         unserved_crossings=sum(
-            all(phase[walk.index] not in GREEN for phase in item.phases) for walk in item.crossings
+            all(phase[walk.index] not in GREEN for phase in intersection.phases)
+            for walk in intersection.crossings
         ),
-        foot_phases=sum(not green & {link.index for link in item.links} for green in served),
-        clashes=tuple(_clashes(item, rules)),
+        foot_phases=sum(
+            not green & {link.index for link in intersection.links} for green in served
+        ),
+        clashes=tuple(_clashes(intersection, rules)),
         uncontrolled=sum(free.get(junction, 0) for junction in junctions),
-        approaches=tuple(_approaches(item, network, traffic)),
+        approaches=tuple(_approaches(intersection, network, traffic)),
     )
 
 
-def _in_part(lane: str, item: Intersection) -> bool:
-    indices = {link.index for link in item.links if link.from_lane == lane}
-    shown = ({state[index] in GREEN for index in indices} for state in item.phases)
+def _in_part(lane: str, intersection: Intersection) -> bool:
+    indices = {link.index for link in intersection.links if link.from_lane == lane}
+    shown = ({state[index] in GREEN for index in indices} for state in intersection.phases)
     return any(len(letters) > 1 for letters in shown)
 
 
-def _clashes(item: Intersection, rules: RightOfWay) -> Iterator[str]:
+def _clashes(intersection: Intersection, rules: RightOfWay) -> Iterator[str]:
     """Yield the protected greens of vehicles across a crossing with green."""
-    for number, phase in enumerate(item.phases):
-        walks = [walk for walk in item.crossings if phase[walk.index] in GREEN]
-        through = [link for link in item.links if phase[link.index] == "G"]
-        found = (
+    for number, phase in enumerate(intersection.phases):
+        walks = [walk for walk in intersection.crossings if phase[walk.index] in GREEN]
+        through = [link for link in intersection.links if phase[link.index] == "G"]
+        pairs = (
             f"phase {number}: {_movement(link)}"
             for link in through
             if any(link.index != walk.index and are_foes(link, walk, rules.foes) for walk in walks)
         )
-        yield from dict.fromkeys(found)
+        yield from dict.fromkeys(pairs)
 
 
 def _movement(link: Link) -> str:
     return f"{link.from_edge} {turn_of(link)}"
 
 
-def _phase(item: Intersection, state: str) -> PhaseFacts:
+def _phase(intersection: Intersection, state: str) -> PhaseFacts:
     def movements(letter: str) -> tuple[str, ...]:
         return tuple(
-            dict.fromkeys(_movement(link) for link in item.links if state[link.index] == letter)
+            dict.fromkeys(
+                _movement(link) for link in intersection.links if state[link.index] == letter
+            )
         )
 
-    crossings = sum(state[crossing.index] in GREEN for crossing in item.crossings)
+    crossings = sum(state[crossing.index] in GREEN for crossing in intersection.crossings)
     return PhaseFacts(state, movements("G"), movements("g"), crossings)
 
 
-def _approaches(item: Intersection, network: Network, traffic: _Traffic) -> Sequence[ApproachFacts]:
+def _approaches(
+    intersection: Intersection, network: Network, traffic: _Traffic
+) -> Sequence[ApproachFacts]:
     lanes: dict[str, list[str]] = defaultdict(list)
-    for lane in item.incoming_lanes:
+    for lane in intersection.incoming_lanes:
         lanes[network.lanes[lane].edge].append(lane)
-    cycle_s = sum(seconds for seconds, _ in item.programme)
-    found: list[ApproachFacts] = []
-    for edge, own in lanes.items():
+    cycle_s = sum(seconds for seconds, _ in intersection.programme)
+    approaches: list[ApproachFacts] = []
+    for edge, edge_lanes in lanes.items():
         vph = traffic.vph[edge]
-        capacity = SATURATION_VPH * len(own)
-        green = sum(_green_s(item, lane) for lane in own) / len(own)
+        capacity = SATURATION_VPH * len(edge_lanes)
+        green = sum(_green_s(intersection, lane) for lane in edge_lanes) / len(edge_lanes)
         saturation = None
         if cycle_s:
             saturation = vph / (capacity * green / cycle_s) if green else None
-        found.append(
+        approaches.append(
             ApproachFacts(
                 edge,
-                len(own),
+                len(edge_lanes),
                 round(vph, 1),
                 round(vph / capacity, 3),
                 None if saturation is None else round(saturation, 3),
             )
         )
-    return found
+    return approaches
 
 
-def _green_s(item: Intersection, lane: str) -> float:
+def _green_s(intersection: Intersection, lane: str) -> float:
     """Return the seconds of green of a lane per cycle of the programme, mean over its links."""
-    indices = [link.index for link in item.links if link.from_lane == lane]
+    indices = [link.index for link in intersection.links if link.from_lane == lane]
     shown = [
-        sum(seconds for seconds, state in item.programme if state[index] in GREEN)
+        sum(seconds for seconds, state in intersection.programme if state[index] in GREEN)
         for index in indices
     ]
     return sum(shown) / len(shown)
@@ -313,10 +333,10 @@ def _free_links(root: ET.Element) -> Counter[str]:
     """Count the links without a light, by the junction they cross."""
     ends = {edge.get("id", ""): edge.get("to", "") for edge in root.iter("edge")}
     return Counter(
-        ends.get(item.get("from", ""), "")
-        for item in root.iter("connection")
-        if item.get("tl") is None
-        and not any(item.get(end, ":").startswith(":") for end in ("from", "to"))
+        ends.get(element.get("from", ""), "")
+        for element in root.iter("connection")
+        if element.get("tl") is None
+        and not any(element.get(end, ":").startswith(":") for end in ("from", "to"))
     )
 
 

@@ -54,17 +54,17 @@ class Link:
 def links_of(root: ET.Element) -> dict[str, list[Link]]:
     """Return the links for vehicles of every traffic light."""
     links: dict[str, list[Link]] = defaultdict(list)
-    for item in root.iter("connection"):
-        tls = item.get("tl")
-        if tls is None or item.get("from", ":").startswith(":"):
+    for element in root.iter("connection"):
+        tls = element.get("tl")
+        if tls is None or element.get("from", ":").startswith(":"):
             continue
-        junction, request = _request_of(item.get("via", ""))
+        junction, request = _request_of(element.get("via", ""))
         links[tls].append(
             Link(
-                index=int(item.get("linkIndex", "0")),
-                from_lane=f"{item.get('from')}_{item.get('fromLane')}",
-                to_lane=f"{item.get('to')}_{item.get('toLane')}",
-                direction=item.get("dir", "s"),
+                index=int(element.get("linkIndex", "0")),
+                from_lane=f"{element.get('from')}_{element.get('fromLane')}",
+                to_lane=f"{element.get('to')}_{element.get('toLane')}",
+                direction=element.get("dir", "s"),
                 junction=junction,
                 request=request,
             )
@@ -84,21 +84,22 @@ def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
             junction, number = edge.get("id", ":_c0")[1:].rsplit("_c", 1)
             numbers[junction].append(int(number))
     rows = {
-        item.get("id", ""): sum(1 for _ in item.iter("request")) for item in root.iter("junction")
+        element.get("id", ""): sum(1 for _ in element.iter("request"))
+        for element in root.iter("junction")
     }
-    found: dict[str, list[Link]] = defaultdict(list)
-    for item in root.iter("connection"):
-        tls, target = item.get("tl"), item.get("to", "")
+    crossings: dict[str, list[Link]] = defaultdict(list)
+    for connection in root.iter("connection"):
+        tls, target = connection.get("tl"), connection.get("to", "")
         if tls is None or not target.startswith(":") or "_c" not in target:
             continue
         junction, number = target[1:].rsplit("_c", 1)
         if junction in numbers and number.isdigit():
             first = rows.get(junction, 0) - len(numbers[junction])
             row = first + sorted(numbers[junction]).index(int(number))
-            start = f"{item.get('from')}_{item.get('fromLane')}"
-            index = int(item.get("linkIndex", "0"))
-            found[tls].append(Link(index, start, f"{target}_0", CROSSING, junction, row))
-    return found
+            start = f"{connection.get('from')}_{connection.get('fromLane')}"
+            index = int(connection.get("linkIndex", "0"))
+            crossings[tls].append(Link(index, start, f"{target}_0", CROSSING, junction, row))
+    return crossings
 
 
 def foes_of(root: ET.Element) -> dict[str, list[int]]:
@@ -115,11 +116,11 @@ def neighbours_of(
     links: Mapping[str, Sequence[Link]], root: ET.Element
 ) -> dict[str, tuple[str, ...]]:
     """Return the neighbours of each traffic light: roads join them with no light in between."""
-    enters = {link.from_edge: tls for tls, own in links.items() for link in own}
+    enters = {link.from_edge: tls for tls, light_links in links.items() for link in light_links}
     following: dict[str, set[str]] = defaultdict(set)
-    for item in root.iter("connection"):
-        if not item.get("from", ":").startswith(":") and item.get("tl") is None:
-            following[item.get("from", "")].add(item.get("to", ""))
+    for element in root.iter("connection"):
+        if not element.get("from", ":").startswith(":") and element.get("tl") is None:
+            following[element.get("from", "")].add(element.get("to", ""))
     adjacent: dict[str, set[str]] = {tls: set() for tls in links}
     for tls, own in links.items():
         edges = {link.to_edge for link in own}
@@ -133,15 +134,15 @@ def neighbours_of(
             elif other != tls:
                 adjacent[tls].add(other)
                 adjacent[other].add(tls)
-    return {tls: tuple(sorted(found)) for tls, found in adjacent.items()}
+    return {tls: tuple(sorted(beside)) for tls, beside in adjacent.items()}
 
 
 def right_on_red_of(root: ET.Element) -> frozenset[str]:
     """Return the junctions where vehicles may turn right on red after a stop."""
     return frozenset(
-        item.get("id", "")
-        for item in root.iter("junction")
-        if item.get("type") == "traffic_light_right_on_red"
+        element.get("id", "")
+        for element in root.iter("junction")
+        if element.get("type") == "traffic_light_right_on_red"
     )
 
 
@@ -153,14 +154,16 @@ def has_bit(a: Link, b: Link, matrix: Matrix) -> bool:
 
 
 def _matrix(root: ET.Element, attribute: str) -> dict[str, list[int]]:
-    found: dict[str, list[int]] = {}
+    foe_rows: dict[str, list[int]] = {}
     for junction in root.iter("junction"):
         rows = {
             int(r.get("index", "0")): int(r.get(attribute, "0"), 2)
             for r in junction.iter("request")
         }
-        found[junction.get("id", "")] = [rows.get(i, 0) for i in range(max(rows, default=-1) + 1)]
-    return found
+        foe_rows[junction.get("id", "")] = [
+            rows.get(i, 0) for i in range(max(rows, default=-1) + 1)
+        ]
+    return foe_rows
 
 
 def _request_of(via: str) -> tuple[str, int]:
@@ -208,22 +211,22 @@ def behind_of(
     """
     ways = _ways(root, lights)
     widths = Counter(map(edge_of, ways.number))
-    found: dict[str, Upstream] = {}
+    upstream: dict[str, Upstream] = {}
     for lane in ways.at_lights:
         begins_m = _begins(lane, ways, lengths_m, reach_m)
         near = [name for name, at_m in begins_m.items() if at_m < reach_m]
         if not near:
             continue
         shares = _shares(lane, near, ways)
-        own = found[lane] = Upstream()
+        feeding = upstream[lane] = Upstream()
         for name in near:
             road = edge_of(name)
-            own.roads[road] = own.roads.get(road, 0.0) + shares[name] / widths[road]
+            feeding.roads[road] = feeding.roads.get(road, 0.0) + shares[name] / widths[road]
             for feeder, inside in ways.feeds.get(name, ()):
                 if feeder in begins_m and feeder not in ways.at_lights:
-                    own.lanes.update(dict.fromkeys(inside, shares[name]))
-                    own.lanes[feeder] = shares[feeder]
-    return found
+                    feeding.lanes.update(dict.fromkeys(inside, shares[name]))
+                    feeding.lanes[feeder] = shares[feeder]
+    return upstream
 
 
 @dataclass(frozen=True)
@@ -247,10 +250,10 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
     number: dict[str, int] = defaultdict(int)
     at_lights: dict[str, None] = {}
     onward: dict[str, str] = {}
-    for item in root.iter("connection"):
-        start, end, via = item.get("from", ":"), item.get("to", ":"), item.get("via", "")
-        ends_at_light = item.get("tl", "") in lights
-        lane = f"{start}_{item.get('fromLane')}"
+    for element in root.iter("connection"):
+        start, end, via = element.get("from", ":"), element.get("to", ":"), element.get("via", "")
+        ends_at_light = element.get("tl", "") in lights
+        lane = f"{start}_{element.get('fromLane')}"
         if start.startswith(":"):
             onward[lane] = via
             continue
@@ -258,12 +261,12 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
             continue
         if ends_at_light:
             at_lights[lane] = None
-        if item.get("dir") != "t":
+        if element.get("dir") != "t":
             number[lane] += 1
             if not ends_at_light:
-                feeds[f"{end}_{item.get('toLane')}"].append((lane, [via] if via else []))
-    for own in feeds.values():
-        for _, inside in own:
+                feeds[f"{end}_{element.get('toLane')}"].append((lane, [via] if via else []))
+    for ways in feeds.values():
+        for _, inside in ways:
             while inside and (following := onward.get(inside[-1])) and following not in inside:
                 inside.append(following)
     return _Ways(feeds, number, at_lights)
@@ -273,18 +276,18 @@ def _begins(
     lane: str, ways: _Ways, lengths_m: Mapping[str, float], reach_m: float
 ) -> dict[str, float]:
     """Return the distance from each lane's begin to the light, m, nearest first (Dijkstra)."""
-    found: dict[str, float] = {}
+    begins: dict[str, float] = {}
     waiting = [(lengths_m.get(lane, reach_m), lane)]
     while waiting:
         at_m, name = heapq.heappop(waiting)
-        if name in found:
+        if name in begins:
             continue
-        found[name] = at_m
+        begins[name] = at_m
         if at_m < reach_m:
             for feeder, _ in ways.feeds.get(name, ()):
                 if feeder not in ways.at_lights:
                     heapq.heappush(waiting, (at_m + lengths_m.get(feeder, 0.0), feeder))
-    return found
+    return begins
 
 
 def _shares(lane: str, near: Sequence[str], ways: _Ways) -> dict[str, float]:

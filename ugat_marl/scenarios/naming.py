@@ -27,7 +27,9 @@ def group_names(kinds: Sequence[Hashable]) -> dict[str, list[int]]:
 
 def member_names(groups: Mapping[str, Sequence[int]]) -> tuple[str, ...]:
     """Return ``<group>_<n>`` for every position, in the order of the positions."""
-    names = {place: f"{name}_{n}" for name, own in groups.items() for n, place in enumerate(own)}
+    names = {
+        place: f"{name}_{n}" for name, members in groups.items() for n, place in enumerate(members)
+    }
     return tuple(names[place] for place in sorted(names))
 
 

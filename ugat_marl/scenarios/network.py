@@ -145,54 +145,54 @@ class Network:
         crossings = crossings_of(root)
         reachable = neighbours_of(links, root)
         positions = _positions(root)
-        found: list[Intersection] = []
+        agents_found: list[Intersection] = []
         uncontrolled: list[str] = []
         for tls in sorted(links):
-            own = tuple(sorted(links[tls], key=lambda link: (link.index, link.to_lane)))
+            light_links = tuple(sorted(links[tls], key=lambda link: (link.index, link.to_lane)))
             programme = programmes.get(tls, ())
             walks = tuple(crossings.get(tls, ()))
-            phases = _phases_of(scenario, tls, own, walks, programme, rules)
-            if _choices(phases, own, _source_of(scenario, tls)) < 2:
+            phases = _phases_of(scenario, tls, light_links, walks, programme, rules)
+            if _choices(phases, light_links, _source_of(scenario, tls)) < 2:
                 uncontrolled.append(tls)
                 continue
-            found.append(
+            agents_found.append(
                 Intersection(
                     id=tls,
-                    incoming_lanes=_unique(link.from_lane for link in own),
-                    outgoing_lanes=_unique(link.to_lane for link in own),
-                    links=own,
+                    incoming_lanes=_unique(link.from_lane for link in light_links),
+                    outgoing_lanes=_unique(link.to_lane for link in light_links),
+                    links=light_links,
                     phases=phases,
                     programme=programme,
                     neighbours=reachable[tls],
-                    position=_centre([positions[link.junction] for link in own]),
+                    position=_centre([positions[link.junction] for link in light_links]),
                     crossings=walks,
                 )
             )
-        if not found:
-            what = (
+        if not agents_found:
+            obstacle = (
                 "only traffic lights with fewer than two green phases"
                 if links
                 else "no traffic light"
             )
             raise ScenarioError(
-                f"{document.source}: {what}; an environment needs at least one intersection with "
-                "two green phases (netconvert --tls.guess adds traffic lights)"
+                f"{document.source}: {obstacle}; an environment needs at least one intersection "
+                "with two green phases (netconvert --tls.guess adds traffic lights)"
             )
-        agents = {intersection.id for intersection in found}
-        pruned = tuple(_with_neighbours(item, agents) for item in found)
+        agents = {intersection.id for intersection in agents_found}
+        pruned = tuple(_with_neighbours(light, agents) for light in agents_found)
         reach_m = scenario.control.reach_m
         return cls(_with_room(lanes, root, agents, reach_m), pruned, tuple(uncontrolled))
 
     def intersection(self, tls: str) -> Intersection:
         """Return the intersection with this SUMO id."""
-        return next(item for item in self.intersections if item.id == tls)
+        return next(light for light in self.intersections if light.id == tls)
 
     def lane_table(self) -> LaneTable:
         """Return all incoming and outgoing lanes of intersections, each once, in a fixed order."""
         names = _unique(
             lane
-            for item in self.intersections
-            for lane in (*item.incoming_lanes, *item.outgoing_lanes)
+            for upstream in self.intersections
+            for lane in (*upstream.incoming_lanes, *upstream.outgoing_lanes)
         )
         behind = [self.lanes[name].behind for name in names]
         return LaneTable(
@@ -200,25 +200,25 @@ class Network:
             np.array([self.lanes[name].capacity for name in names]),
             np.array([self.lanes[name].speed_mps for name in names]),
             UpstreamLanes(
-                tuple(tuple(item.lanes.items()) for item in behind),
-                tuple(tuple(item.roads.items()) for item in behind),
+                tuple(tuple(upstream.lanes.items()) for upstream in behind),
+                tuple(tuple(upstream.roads.items()) for upstream in behind),
             )
-            if any(item.lanes or item.roads for item in behind)
+            if any(upstream.lanes or upstream.roads for upstream in behind)
             else NO_UPSTREAM_LANES,
         )
 
 
 def within_hops(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str, tuple[str, ...]]:
     """Return, for each name, the other names at most `hops` roads away, nearest first."""
-    found: dict[str, tuple[str, ...]] = {}
+    near: dict[str, tuple[str, ...]] = {}
     for name in neighbours:
         reached, frontier = [name], [name]
         for _ in range(hops):
             ahead = (other for one in frontier for other in neighbours[one])
             frontier = list(dict.fromkeys(other for other in ahead if other not in reached))
             reached += frontier
-        found[name] = tuple(reached[1:])
-    return found
+        near[name] = tuple(reached[1:])
+    return near
 
 
 def signal_widths(scenario: Scenario) -> dict[str, int]:
@@ -239,8 +239,8 @@ def signal_widths(scenario: Scenario) -> dict[str, int]:
 
 def _source_of(scenario: Scenario, tls: str) -> str | Sequence[str]:
     """Return the source of a traffic light's phases, or the states if the settings list them."""
-    own = scenario.settings.intersections.get(tls)
-    return own.phases if own and own.phases is not None else scenario.control.phases
+    settings = scenario.settings.intersections.get(tls)
+    return settings.phases if settings and settings.phases is not None else scenario.control.phases
 
 
 def _choices(phases: Sequence[str], links: Sequence[Link], source: str | Sequence[str]) -> int:
@@ -292,36 +292,36 @@ def _check_programme(
     """Refuse an impossible programme and return the number of letters of its states."""
     letters = len(programme[0][1])
     for index, (_, state) in enumerate(programme):
-        what = f"{where}: state {index} of its programme ({state!r})"
+        state_name = f"{where}: state {index} of its programme ({state!r})"
         if len(state) < width or len(state) != letters:
             raise ScenarioError(
-                f"{what} has {len(state)} letters, but "
+                f"{state_name} has {len(state)} letters, but "
                 + (f"it controls {width} links" if len(state) < width else f"state 0 has {letters}")
                 + "; write one letter per link into every <phase> of the <tlLogic>"
             )
         if unknown := sorted(set(state) - SIGNAL_LETTERS):
             raise ScenarioError(
-                f"{what} has unknown letters {unknown}; allowed: {sorted(SIGNAL_LETTERS)}"
+                f"{state_name} has unknown letters {unknown}; allowed: {sorted(SIGNAL_LETTERS)}"
             )
         _check_greens(state, links, foes, f"{where}: state {index} of its programme")
     return letters
 
 
 def _check_greens(
-    state: str, links: Sequence[Link], foes: Mapping[str, Sequence[int]], what: str
+    state: str, links: Sequence[Link], foes: Mapping[str, Sequence[int]], state_name: str
 ) -> None:
     if pair := conflicting_greens(state, links, foes):
         raise ScenarioError(
-            f"{what} ({state!r}) gives protected green (G) to the links {pair[0]} and {pair[1]}, "
-            "whose paths cross; write g for the one that must yield"
+            f"{state_name} ({state!r}) gives protected green (G) to the links {pair[0]} and "
+            f"{pair[1]}, whose paths cross; write g for the one that must yield"
         )
 
 
 def _check_lanes(
     links: Mapping[str, Sequence[Link]], lanes: Mapping[str, Lane], source: str
 ) -> None:
-    for tls, own in links.items():
-        for lane in (name for link in own for name in (link.from_lane, link.to_lane)):
+    for tls, light_links in links.items():
+        for lane in (name for link in light_links for name in (link.from_lane, link.to_lane)):
             if lane not in lanes:
                 raise ScenarioError(
                     f"{source}: traffic light {tls!r} controls a connection over lane {lane!r}, "
@@ -351,9 +351,9 @@ def _with_room(
 ) -> dict[str, Lane]:
     """Return the lanes; add to short lanes at lights the upstream lanes counted with them."""
     lengths_m = {name: lane.length_m for name, lane in lanes.items()}
-    for name, own in behind_of(root, lengths_m, max(reach_m, VEHICLE_SPACE_M), agents).items():
-        behind = own if reach_m else Upstream(own.lanes)
-        room_m = sum(lengths_m.get(other, 0.0) * share for other, share in own.lanes.items())
+    for name, upstream in behind_of(root, lengths_m, max(reach_m, VEHICLE_SPACE_M), agents).items():
+        behind = upstream if reach_m else Upstream(upstream.lanes)
+        room_m = sum(lengths_m.get(other, 0.0) * share for other, share in upstream.lanes.items())
         room_m = max(lengths_m[name] + room_m, reach_m)
         lanes[name] = replace(lanes[name], behind=behind, room_m=room_m)
     return lanes
@@ -381,8 +381,8 @@ def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[f
 
 def _positions(root: ET.Element) -> dict[str, tuple[float, float]]:
     positions = {
-        item.get("id", ""): (float(item.get("x", "0")), float(item.get("y", "0")))
-        for item in root.iter("junction")
+        element.get("id", ""): (float(element.get("x", "0")), float(element.get("y", "0")))
+        for element in root.iter("junction")
     }
     return {"": (0.0, 0.0), **positions}
 
@@ -396,5 +396,7 @@ def _unique(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _with_neighbours(item: Intersection, agents: set[str]) -> Intersection:
-    return replace(item, neighbours=tuple(n for n in item.neighbours if n in agents))
+def _with_neighbours(intersection: Intersection, agents: set[str]) -> Intersection:
+    return replace(
+        intersection, neighbours=tuple(n for n in intersection.neighbours if n in agents)
+    )

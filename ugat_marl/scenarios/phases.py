@@ -170,7 +170,7 @@ def _with_crossings(
 ) -> list[list[Link]]:
     """Add to each phase the crossings it can serve, and a phase for the crossings left over."""
     alone: list[Link] = []
-    found = [list(phase) for phase in phases]
+    letters = [list(phase) for phase in phases]
     for crossing in crossings:
         possible: list[int] = []
         for turning in ("r", "rl"):
@@ -182,10 +182,10 @@ def _with_crossings(
             if possible:
                 break
         for number in possible:
-            found[number].append(crossing)
+            letters[number].append(crossing)
         if not possible:
             alone.append(crossing)
-    return [*found, alone] if alone else found
+    return [*letters, alone] if alone else letters
 
 
 def state_of(green: Sequence[Link], links: Sequence[Link], rules: RightOfWay, width: int) -> str:
@@ -238,8 +238,8 @@ def _movements(links: Sequence[Link]) -> dict[Movement, list[Link]]:
         letters = {link.index for link in groups.get(name, ())}
         while joined := [
             other
-            for other, own in groups.items()
-            if other != name and letters & {link.index for link in own}
+            for other, members in groups.items()
+            if other != name and letters & {link.index for link in members}
         ]:
             for other in joined:
                 groups[name] += groups.pop(other)
@@ -282,13 +282,13 @@ def _maximal_cliques(
     compatible: Mapping[Movement, set[Movement]], source: str
 ) -> Iterator[frozenset[Movement]]:
     """Yield all maximal cliques (Bron-Kerbosch). The graphs are small, so it needs no pivoting."""
-    found = 0
+    count = 0
     stack = [(frozenset[Movement](), set(compatible), set[Movement]())]
     while stack:
         clique, candidates, excluded = stack.pop()
         if not candidates and not excluded:
-            found += 1
-            if found > MOST_PHASES:
+            count += 1
+            if count > MOST_PHASES:
                 raise ScenarioError(
                     f"{source}: more than {MOST_PHASES} conflict-free phases; "
                     'use phases = "programme" or list the phases'
@@ -319,22 +319,22 @@ def suited(network: Path) -> tuple[dict[str, str], list[str]]:
     rules = RightOfWay(foes_of(root), yields_of(root))
     crossings = crossings_of(root)
     programmes = _programmes_of(root)
-    found: dict[str, str] = {}
+    sources: dict[str, str] = {}
     for tls, links in sorted(links_of(root).items()):
         walks = crossings.get(tls, [])
         usual = "permitted" if _shared(links) else "conflict-free"
         if len(_derived(tls, links, rules, walks, usual)) < 2 <= len(programmes.get(tls, ())):
-            found[tls] = "programme"
+            sources[tls] = "programme"
         elif usual != "conflict-free":
-            found[tls] = usual
+            sources[tls] = usual
     notes: list[str] = []
     for source, why in (
         ("permitted", "lanes for straight on and left turns: their left turns are permitted"),
         ("programme", "no phases that can be derived: they keep their programme's"),
     ):
-        if count := sum(kind == source for kind in found.values()):
+        if count := sum(kind == source for kind in sources.values()):
             notes.append(f"{count} lights have {why}")
-    return found, notes
+    return sources, notes
 
 
 def _derived(
@@ -354,7 +354,7 @@ def _shared(links: Sequence[Link]) -> bool:
     for link in links:
         if link.direction not in "tT":
             turns[link.from_lane].add(turn_of(link))
-    return any({"s", "l"} <= own for own in turns.values())
+    return any({"s", "l"} <= lane_turns for lane_turns in turns.values())
 
 
 def _programmes_of(root: ET.Element) -> dict[str, tuple[str, ...]]:

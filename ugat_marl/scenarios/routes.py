@@ -29,11 +29,11 @@ class OwnEdges:
         """True once another kind of demand was read; this is final."""
         return not self._holds
 
-    def read(self, item: Tag) -> None:
+    def read(self, tag: Tag) -> None:
         """Read the next opening tag."""
-        if item.name in ("vehicle", "trip", "flow", "route", "routeDistribution"):
-            single = item.name == "vehicle" and "route" not in item.attributes
-            self._holds &= item.name == "route" or (single and not self._waiting)
+        if tag.name in ("vehicle", "trip", "flow", "route", "routeDistribution"):
+            single = tag.name == "vehicle" and "route" not in tag.attributes
+            self._holds &= tag.name == "route" or (single and not self._waiting)
             self._waiting = single
 
     def ended(self) -> bool:
@@ -117,7 +117,7 @@ def _routed_by_duarouter(scenario: Scenario) -> Document:
         out = directory / "routed.rou.xml"
 
         def files(documents: tuple[Document, ...]) -> str:
-            return ",".join(str(_for_sumo(item, directory)) for item in documents)
+            return ",".join(str(_for_sumo(document, directory)) for document in documents)
 
         settings = scenario.settings
         command = [

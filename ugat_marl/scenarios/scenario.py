@@ -205,15 +205,15 @@ _SYNONYMS = {
 
 def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
     root = parse_xml(read_bytes(path), str(path))
-    given = {item.tag: item.get("value", item.get("v", "")) for item in root.iter()}
+    given = {element.tag: element.get("value", element.get("v", "")) for element in root.iter()}
 
     def value(key: str, default: str = "") -> str:
         return next((given[name] for name in _SYNONYMS[key] if name in given), default)
 
-    def documents(key: str, what: str = "") -> tuple[Document, ...]:
+    def documents(key: str, kind: str = "") -> tuple[Document, ...]:
         names = _names(value(key), path.parent)
-        if what and not names:
-            raise ScenarioError(f"{path}: no <{key} value=...>; a scenario needs {what}")
+        if kind and not names:
+            raise ScenarioError(f"{path}: no <{key} value=...>; a scenario needs {kind}")
         for name in names:
             if not (path.parent / name).is_file():
                 raise ScenarioError(
@@ -243,10 +243,10 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
             "duration_s": end - begin if end >= 0 else 3600.0,
             "step_length_s": seconds("step-length", "1"),
             "sumo": {
-                item.tag: item.get("value", item.get("v", ""))
+                element.tag: element.get("value", element.get("v", ""))
                 for section in (*root.iter("processing"), *root.iter("routing"))
-                for item in section
-                if may_be_given(item.tag)
+                for element in section
+                if may_be_given(element.tag)
             },
         },
         str(path),

@@ -90,7 +90,7 @@ def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
     try:
         settings = ScenarioFile.model_validate(raw)
     except pydantic.ValidationError as error:
-        explained = dict.fromkeys(_explain(item) for item in error.errors())
+        explained = dict.fromkeys(_explain(problem) for problem in error.errors())
         raise ScenarioError(f"{source}: {'; '.join(explained)}") from None
     for option in settings.sumo:
         if not may_be_given(option):
@@ -145,24 +145,24 @@ def parse_time(text: str) -> float:
     return seconds
 
 
-def _explain(item: Any) -> str:
+def _explain(problem: Any) -> str:
     """Return one error of pydantic in the terms of ``scenario.toml``."""
-    names = [str(part) for part in item["loc"]]
+    names = [str(part) for part in problem["loc"]]
     if "phases" in names:  # pydantic adds the alternatives of the union after the key
         key = ".".join(names[: names.index("phases") + 1])
-        if item["type"] == "missing":
+        if problem["type"] == "missing":
             return f"key {key!r} is missing"
         allowed = "'programme', 'conflict-free', 'permitted', or a list of SUMO states in quotes"
         return f"{key}: give {allowed}"
     key = ".".join(names)
-    if item["type"] == "extra_forbidden":
+    if problem["type"] == "extra_forbidden":
         known = _known_keys(names[:-1])
         guess = nearest(names[-1], known)
         hint = f"did you mean {guess!r}?" if guess else f"known: {', '.join(known)}"
         return f"unknown key {key!r}; {hint}"
-    if item["type"] == "missing":
+    if problem["type"] == "missing":
         return f"key {key!r} is missing"
-    return f"{key} = {item['input']!r}: {item['msg'][:1].lower()}{item['msg'][1:]}"
+    return f"{key} = {problem['input']!r}: {problem['msg'][:1].lower()}{problem['msg'][1:]}"
 
 
 def _known_keys(table: list[str]) -> list[str]:

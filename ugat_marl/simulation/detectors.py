@@ -32,12 +32,12 @@ _END = "@end"
 def standard_detectors(network: Network) -> tuple[Detector, ...]:
     """Return advance and stop detectors on incoming lanes, exit detectors on outgoing ones."""
     places: dict[tuple[str, DetectorKind], float] = {}
-    for item in network.intersections:
-        for name in item.incoming_lanes:
+    for intersection in network.intersections:
+        for name in intersection.incoming_lanes:
             length = network.lanes[name].length_m
             places[name, "advance"] = max(length - ADVANCE_SETBACK_M, min(10.0, 0.3 * length))
             places[name, "stop"] = max(length - STOP_SETBACK_M, 0.6 * length)
-        for name in item.outgoing_lanes:
+        for name in intersection.outgoing_lanes:
             places[name, "exit"] = min(EXIT_DISTANCE_M, 0.5 * network.lanes[name].length_m)
     return tuple(
         Detector(f"{kind}:{lane}", lane, round(position, 2), 0.0, kind)
@@ -95,14 +95,14 @@ def read_passages(
     rows: dict[bytes, list[tuple[float, bool, bytes, float, float]]] = defaultdict(list)
     for name, time, state, vehicle, speed, length in _EVENT.findall(content):
         rows[name].append((float(time), state == b"enter", vehicle, float(speed), float(length)))
-    found: dict[str, Passages] = {}
+    by_detector: dict[str, Passages] = {}
     for detector in detectors:
         first = detector.id.encode()
         last = (detector.id + _END).encode() if detector.length_m > 0 else first
         passages = _clipped(_passages(rows[first], rows[last]), begin_s, end_s)
         if len(passages):
-            found[detector.id] = passages
-    return found
+            by_detector[detector.id] = passages
+    return by_detector
 
 
 def _passages(

@@ -200,14 +200,14 @@ class Worker:
         """True until the worker is ended; always False in a fork of the process that started it."""
         return self._owner == os.getpid() and not self._ended
 
-    def ask(self, what: str, arrays: Sequence[NDArray[Any]] = (), **arguments: Any) -> None:
+    def ask(self, request: str, arrays: Sequence[NDArray[Any]] = (), **arguments: Any) -> None:
         """Send a question; `answer` waits for its answer.
 
         Raises:
             ChannelClosed: The process died, see `obituary`.
         """
         try:
-            self._channel.send(Message({"what": what, **arguments}, list(arrays)))
+            self._channel.send(Message({"what": request, **arguments}, list(arrays)))
         except OSError:
             raise ChannelClosed from None
         except BaseException:  # Ctrl-C in the middle of a message

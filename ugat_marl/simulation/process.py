@@ -95,16 +95,18 @@ class ProcessSimulator:
         if worker is not None:
             worker.end()
 
-    def _ask(self, what: str, **arguments: Any) -> Message:
+    def _ask(self, request: str, **arguments: Any) -> Message:
         worker = self._worker
         if worker is None or not worker.running:
-            raise SimulatorError(f"{what}: no simulation is under way in this process; start one")
+            raise SimulatorError(
+                f"{request}: no simulation is under way in this process; start one"
+            )
         try:
-            worker.ask(what, **arguments)
+            worker.ask(request, **arguments)
             return worker.answer()
         except ChannelClosed:
             self._worker = None
-            raise SimulatorCrashed(worker.obituary(what)) from None
+            raise SimulatorCrashed(worker.obituary(request)) from None
 
 
 def simulator_of(option: str) -> Simulator:
@@ -152,21 +154,21 @@ class Simulations:
 
 
 def _answer(simulator: Simulator, question: dict[str, Any]) -> Message:
-    what = question["what"]
-    if what == "start":
+    request = question["what"]
+    if request == "start":
         fields: dict[str, Any] = dict(question["launch"])
         for name in ("arguments", "lanes"):
             fields[name] = tuple(fields[name])
         return _message(simulator.start(Launch(**fields)))
-    if what == "advance":
+    if request == "advance":
         return _message(simulator.advance(question["seconds"], question["plans"]))
-    if what == "vehicles":
+    if request == "vehicles":
         seen = simulator.vehicles()
         rows = [*seen.position.T, seen.angle_deg, seen.length_m, seen.speed_mps]
         return Message({}, [np.array(rows)])
-    if what == "signals":
+    if request == "signals":
         return Message({"states": simulator.signals()}, [])
-    assert what == "finish", what
+    assert request == "finish", request
     trips = simulator.finish()
     rows = [trips.travel_time_s, trips.delay_s, trips.finished, trips.entered]
     table = [np.array(rows, dtype=np.float64)]

@@ -175,7 +175,7 @@ def launch_of(
     written: dict[str, bytes] = {}
     for option, documents in files.items():
         if documents:
-            paths = [_on_disk(item, directory, written) for item in documents]
+            paths = [_on_disk(document, directory, written) for document in documents]
             arguments += [option, ",".join(paths)]
     for option, value in settings.sumo.items():
         arguments += [f"--{option}", value]
@@ -367,10 +367,10 @@ class LibsumoSimulator:
         taken = np.flatnonzero(vehicles)
         names = [lanes[index] for index in taken.tolist()]
 
-        def measure(what: Callable[[str], float], empty: _Floats) -> _Floats:
+        def measure(query: Callable[[str], float], empty: _Floats) -> _Floats:
             """Return values of all lanes, asking SUMO only about lanes with vehicles."""
             values = empty.copy()
-            values[taken] = np.fromiter(map(what, names), np.float64, len(names))
+            values[taken] = np.fromiter(map(query, names), np.float64, len(names))
             return values
 
         none = np.zeros(len(lanes))
@@ -389,11 +389,11 @@ class LibsumoSimulator:
             near=_near_the_end(lanes, names, self._launch.zone_m),
         )
 
-    def _fail(self, what: str, error: Exception) -> None:
+    def _fail(self, action: str, error: Exception) -> None:
         assert self._launch is not None
         said = _errors_of(Path(self._launch.directory)) or str(error)
         self.close()
-        raise SimulatorError(f"{what}: {said}") from None
+        raise SimulatorError(f"{action}: {said}") from None
 
 
 def _near_the_end(lanes: Sequence[str], taken: Sequence[str], zone_m: float) -> NDArray[np.float64]:
@@ -440,8 +440,10 @@ def _add_those_behind(
             if not count:
                 continue
             total = vehicles[index] + count
-            own = vehicles[index] * speed_mps[index] if vehicles[index] else 0.0
-            speed_mps[index] = (own + count * libsumo.lane.getLastStepMeanSpeed(lane)) / total
+            lane_speed = vehicles[index] * speed_mps[index] if vehicles[index] else 0.0
+            speed_mps[index] = (
+                lane_speed + count * libsumo.lane.getLastStepMeanSpeed(lane)
+            ) / total
             vehicles[index] = total
             halting[index] += share * libsumo.lane.getLastStepHaltingNumber(lane)
             if waiting_s.size:

@@ -49,21 +49,21 @@ def _trips_in(path: Path, persons: Mapping[str, float]) -> Trips:
     emitted_g: list[float] = []
     carried: list[float] = []
     co2_mg = 0.0
-    for _, item in ET.iterparse(path):
-        if item.tag == "emissions":  # ends before the trip it belongs to
-            co2_mg = float(item.get("CO2_abs", "0"))
-        if item.tag == "tripinfo":
-            entered = float(item.get("depart", "-1")) >= 0
-            finished = float(item.get("arrival", "-1")) >= 0
-            waited = float(item.get("departDelay", "0"))
-            inside = float(item.get("duration", "0"))
-            lost = float(item.get("timeLoss", "0"))
+    for _, element in ET.iterparse(path):
+        if element.tag == "emissions":  # ends before the trip it belongs to
+            co2_mg = float(element.get("CO2_abs", "0"))
+        if element.tag == "tripinfo":
+            entered = float(element.get("depart", "-1")) >= 0
+            finished = float(element.get("arrival", "-1")) >= 0
+            waited = float(element.get("departDelay", "0"))
+            inside = float(element.get("duration", "0"))
+            lost = float(element.get("timeLoss", "0"))
             rows.append((waited + inside, waited + lost, finished, entered))
             if persons:
                 emitted_g.append(co2_mg / 1000.0)
-                carried.append(persons.get(item.get("vType", ""), persons[""]))
+                carried.append(persons.get(element.get("vType", ""), persons[""]))
                 co2_mg = 0.0
-        item.clear()
+        element.clear()
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     return Trips(
         table[:, 0],

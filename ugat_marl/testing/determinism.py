@@ -80,12 +80,14 @@ def _in_lock_step(case: EnvironmentCase, seeds: tuple[int, ...]) -> list[Episode
         [begin(env, seed)] for env, seed in zip(envs, seeds, strict=True)
     ]
     while any(env.agents for env in envs):
-        for env, choose, own in zip(envs, chosen, moments, strict=True):
+        for env, choose, env_moments in zip(envs, chosen, moments, strict=True):
             if env.agents:
-                own.append(proceed(env, choose(len(own) - 1, env, own[-1].infos)))
-            if len(own) > case.max_steps:
+                env_moments.append(
+                    proceed(env, choose(len(env_moments) - 1, env, env_moments[-1].infos))
+                )
+            if len(env_moments) > case.max_steps:
                 raise ConformanceError(f"no end after {case.max_steps} steps")
-    return [Episode(tuple(own)) for own in moments]
+    return [Episode(tuple(env_moments)) for env_moments in moments]
 
 
 def other_seeds_give_other_episodes(case: EnvironmentCase) -> None:

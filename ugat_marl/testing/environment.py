@@ -335,12 +335,12 @@ def wrong_actions_are_refused(case: EnvironmentCase) -> None:
         f"the action {too_small} of {agent}": {**right, agent: too_small},
         f"a missing action of {agent}": {a: right[a] for a in right if a != agent},
     }
-    for what, actions in wrongs.items():
+    for kind, actions in wrongs.items():
         with Listening() as heard:
             env.step(actions)
         if heard.error is None:
             raise ConformanceError(
-                f"{what} was accepted; raise ugat_marl.errors.ActionError before anything moves"
+                f"{kind} was accepted; raise ugat_marl.errors.ActionError before anything moves"
             )
     with Listening() as heard:
         env.step(right)
@@ -405,10 +405,10 @@ def groups_are_listed(case: EnvironmentCase) -> None:
     for agent in case.fresh.possible_agents:
         expected.setdefault(agent.rpartition("_")[0], []).append(agent)
     groups: Any = getattr(case.fresh.unwrapped, "agent_groups", None)
-    found = {k: list(v) for k, v in groups.items()} if isinstance(groups, Mapping) else groups
+    listed = {k: list(v) for k, v in groups.items()} if isinstance(groups, Mapping) else groups
     require(
-        found == expected,
-        f"unwrapped.agent_groups is {found!r}; make it {expected!r}",
+        listed == expected,
+        f"unwrapped.agent_groups is {listed!r}; make it {expected!r}",
     )
 
 
@@ -462,22 +462,23 @@ def observation_spaces_are_bounded(case: EnvironmentCase) -> None:
         _require_bounded(case.fresh.observation_space(agent), f"the observation space of {agent}")
 
 
-def _require_bounded(space: Any, what: str) -> None:
+def _require_bounded(space: Any, space_name: str) -> None:
     require(
         isinstance(space, Box) and space.dtype == np.float32 and len(space.shape) == 1,
-        f"{what} is {space}; make it a one-dimensional float32 Box",
+        f"{space_name} is {space}; make it a one-dimensional float32 Box",
     )
     for side, bound in (("low", space.low), ("high", space.high)):
         wrong = np.flatnonzero(~np.isfinite(bound))
         if wrong.size:
             raise ConformanceError(
-                f"{what} has the bound {side}[{wrong[0]}] = {bound[wrong[0]]}; scale observations "
-                "into finite bounds, best [0, 1]"
+                f"{space_name} has the bound {side}[{wrong[0]}] = {bound[wrong[0]]}; scale "
+                "observations into finite bounds, best [0, 1]"
             )
     wrong = np.flatnonzero(space.low >= space.high)
     require(
         not wrong.size,
-        f"{what} has low >= high at {wrong[:3].tolist()}; leave constants out of the observation",
+        f"{space_name} has low >= high at {wrong[:3].tolist()}; leave constants out of the "
+        "observation",
     )
 
 
@@ -604,12 +605,12 @@ def reset_and_close_repeat(case: EnvironmentCase) -> None:
     env.close()
 
 
-def _attempt(what: str, action: Callable[[], object]) -> None:
+def _attempt(description: str, action: Callable[[], object]) -> None:
     with Listening() as heard:
         action()
     if heard.error is not None:
         raise ConformanceError(
-            f"{what} fails: {said(heard.error)}; RLlib and TorchRL do that, so let it work"
+            f"{description} fails: {said(heard.error)}; RLlib and TorchRL do that, so let it work"
         )
 
 
@@ -650,7 +651,7 @@ def close_ends_processes(case: EnvironmentCase) -> None:
 
 def descendants() -> set[int]:
     """Return ids of running descendants of this process; none if the system has no ``/proc``."""
-    found: set[int] = set()
+    pids: set[int] = set()
     unseen = [os.getpid()]
     while unseen:
         process = unseen.pop()
@@ -660,9 +661,9 @@ def descendants() -> set[int]:
         for task in tasks:
             with Listening():
                 children = {int(child) for child in task.read_text().split()}
-                unseen += children - found
-                found |= children
-    return {process for process in found if not _zombie(process)}
+                unseen += children - pids
+                pids |= children
+    return {process for process in pids if not _zombie(process)}
 
 
 def _zombie(process: int) -> bool:

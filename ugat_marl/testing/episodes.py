@@ -203,13 +203,13 @@ def proceed(env: AnyParallelEnv, actions: Actions) -> StepReturn:
 def _moment(
     env: AnyParallelEnv, names: tuple[str, ...], given: Any, actions: Actions | None
 ) -> StepReturn:
-    what = "reset" if actions is None else "step"
+    call = "reset" if actions is None else "step"
     if not isinstance(given, tuple) or len(given) != len(names):
-        raise ConformanceError(f"{what}() must return the tuple ({', '.join(names)})")
+        raise ConformanceError(f"{call}() must return the tuple ({', '.join(names)})")
     for name, part in zip(names, given, strict=True):
         if not isinstance(part, dict):
             raise ConformanceError(
-                f"{what}() returned {name} as {type(part).__name__}; return a dict by agent"
+                f"{call}() returned {name} as {type(part).__name__}; return a dict by agent"
             )
     parts = dict(zip(names, given, strict=True))
     return StepReturn(copy.deepcopy(parts), parts, tuple(env.agents), actions)
@@ -272,17 +272,17 @@ def replaying(episode: Episode, *, reverse: bool = False) -> Choose:
     return choose
 
 
-def require_same(expected: Episode, found: Episode, what: str, cure: str) -> None:
+def require_same(expected: Episode, repeated: Episode, condition: str, cure: str) -> None:
     """Raise a `ConformanceError` that names the first difference of two episodes.
 
     Scores are not compared; use `different` for them.
     """
-    for step, (a, b) in enumerate(zip(expected.moments, found.moments, strict=False)):
+    for step, (a, b) in enumerate(zip(expected.moments, repeated.moments, strict=False)):
         if where := different(a.parts, b.parts):
-            raise ConformanceError(f"{what}: after step {step}, {where}; {cure}")
-    if len(expected.moments) != len(found.moments):
-        lengths = f"{len(expected.moments) - 1} and {len(found.moments) - 1} steps"
-        raise ConformanceError(f"{what}: the episodes have {lengths}; {cure}")
+            raise ConformanceError(f"{condition}: after step {step}, {where}; {cure}")
+    if len(expected.moments) != len(repeated.moments):
+        lengths = f"{len(expected.moments) - 1} and {len(repeated.moments) - 1} steps"
+        raise ConformanceError(f"{condition}: the episodes have {lengths}; {cure}")
 
 
 def different(a: Any, b: Any, path: str = "") -> str:
@@ -292,8 +292,10 @@ def different(a: Any, b: Any, path: str = "") -> str:
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         if set(a) != set(b):
             return f"{path or 'the keys'} {sorted(map(str, a))} became {sorted(map(str, b))}"
-        found = (different(a[key], b[key], f"{path}[{key!r}]" if path else str(key)) for key in a)
-        return next((where for where in found if where), "")
+        differences = (
+            different(a[key], b[key], f"{path}[{key!r}]" if path else str(key)) for key in a
+        )
+        return next((where for where in differences if where), "")
     first, second = np.asarray(a), np.asarray(b)
     if first.shape != second.shape or first.dtype != second.dtype:
         return f"{path} changed from {first.dtype}{first.shape} to {second.dtype}{second.shape}"

@@ -80,7 +80,7 @@ class PolicyCase(EnvironmentCase):
     def ask(self, policy: Policy, order: Callable[[Any], Any] = dict) -> Answers:
         """Return a policy's answers to all questions; `order` sorts the dicts that it gets."""
         policy.reset(self.seed)
-        found: Answers = []
+        answers: Answers = []
         for moment in self.questions:
             observations, infos = copy.deepcopy((moment.observations, moment.infos))
             answer: Any = policy.act(order(observations), order(infos))
@@ -88,8 +88,8 @@ class PolicyCase(EnvironmentCase):
                 raise ConformanceError(
                     f"act() returned {type(answer).__name__}; return a dict by agent"
                 )
-            found.append(dict(answer))
-        return found
+            answers.append(dict(answer))
+        return answers
 
     def actions(self, agent: str) -> int:
         """Return the number of actions of an agent."""

@@ -92,9 +92,9 @@ class ScenarioCase:
         if attribute in self._failed:
             raise NotChecked(f"not checked, because {why}")
         self._failed.add(attribute)
-        found = getattr(self, attribute)
+        value = getattr(self, attribute)
         self._failed.discard(attribute)
-        return found
+        return value
 
     def environment(self, scenario: Scenario) -> TrafficEnv:
         """Return an environment of the scenario; `tidy` closes it."""
@@ -120,52 +120,57 @@ def its_network_can_be_controlled(case: ScenarioCase) -> None:
 
 def every_lane_gets_green(case: ScenarioCase) -> None:
     """Every lane and every link is green in some phase; otherwise vehicles wait for ever."""
-    for item in case.network.intersections:
-        served = _served(item)
-        links = [link for link in item.links if link.index not in served]
-        lanes = {link.from_lane for link in item.links if link.index in served}
-        never = [lane for lane in item.incoming_lanes if lane not in lanes]
+    for intersection in case.network.intersections:
+        served = _served(intersection)
+        links = [link for link in intersection.links if link.index not in served]
+        lanes = {link.from_lane for link in intersection.links if link.index in served}
+        never = [lane for lane in intersection.incoming_lanes if lane not in lanes]
         require(
             not never,
-            f"traffic light {item.id!r}: no phase gives green to the lanes {never}; add a phase "
-            'under [intersections] or use phases = "conflict-free"',
+            f"traffic light {intersection.id!r}: no phase gives green to the lanes {never}; add a "
+            'phase under [intersections] or use phases = "conflict-free"',
         )
         require(
             not links,
-            f"traffic light {item.id!r}: the links {[link.index for link in links]} (from "
+            f"traffic light {intersection.id!r}: the links {[link.index for link in links]} (from "
             f"{sorted({link.from_lane for link in links})}) are green in no phase; vehicles that "
             "turn there block their lane for ever",
         )
 
 
-def _served(item: Intersection) -> set[int]:
+def _served(intersection: Intersection) -> set[int]:
     may_go = GREEN | {"s"}
-    return {i for phase in item.phases for i, letter in enumerate(phase) if letter in may_go}
+    return {
+        i for phase in intersection.phases for i, letter in enumerate(phase) if letter in may_go
+    }
 
 
 def no_greens_conflict(case: ScenarioCase) -> None:
     """No phase and no state of the network's own programme gives green to crossing streams."""
     foes = _foes(case.scenario)
-    for item in case.network.intersections:
-        shown = {"phase": item.phases, "programme": [state for _, state in item.programme]}
-        for what, states in shown.items():
+    for intersection in case.network.intersections:
+        shown = {
+            "phase": intersection.phases,
+            "programme": [state for _, state in intersection.programme],
+        }
+        for origin, states in shown.items():
             for state in states:
-                pair = conflicting_greens(state, item.links, foes)
+                pair = conflicting_greens(state, intersection.links, foes)
                 require(
                     not pair,
-                    f"traffic light {item.id!r}: the {what} {state!r} gives protected green (G) to "
-                    f"the links {pair}, whose ways cross; write g for the one that must yield, or "
-                    "split the phase",
+                    f"traffic light {intersection.id!r}: the {origin} {state!r} gives protected "
+                    f"green (G) to the links {pair}, whose ways cross; write g for the one that "
+                    "must yield, or split the phase",
                 )
 
 
 def _foes(scenario: Scenario) -> dict[str, list[int]]:
     """Return junction to a bit mask of foes for each row of its right-of-way matrix."""
-    found: dict[str, list[int]] = {}
+    foes: dict[str, list[int]] = {}
     for junction in scenario.network.parse().iter("junction"):
         rows = sorted(junction.iter("request"), key=lambda row: int(row.get("index", "0")))
-        found[junction.get("id", "")] = [int(row.get("foes", "0"), 2) for row in rows]
-    return found
+        foes[junction.get("id", "")] = [int(row.get("foes", "0"), 2) for row in rows]
+    return foes
 
 
 def its_routes_exist(case: ScenarioCase) -> None:
@@ -177,8 +182,8 @@ def routes_are_connected(case: ScenarioCase) -> None:
     """Each edge of a written route leads to the next one."""
     case.need_demand()
     leads = {
-        (item.get("from"), item.get("to"))
-        for item in case.scenario.network.parse().iter("connection")
+        (element.get("from"), element.get("to"))
+        for element in case.scenario.network.parse().iter("connection")
     }
     for document in (*case.scenario.routes, *case.scenario.additional):
         for who, edges in _routes(document.parse()):
@@ -191,13 +196,13 @@ def routes_are_connected(case: ScenarioCase) -> None:
 
 
 def _routes(root: ET.Element) -> list[tuple[str, list[str]]]:
-    found: list[tuple[str, list[str]]] = []
+    routes: list[tuple[str, list[str]]] = []
     for parent in root.iter():
-        for item in parent:
-            if item.tag == "route" and item.get("edges"):
-                name = item.get("id") or parent.get("id") or "?"
-                found.append((f"the route of {name!r}", item.get("edges", "").split()))
-    return found
+        for element in parent:
+            if element.tag == "route" and element.get("edges"):
+                name = element.get("id") or parent.get("id") or "?"
+                routes.append((f"the route of {name!r}", element.get("edges", "").split()))
+    return routes
 
 
 def vehicles_enter_early(case: ScenarioCase) -> None:

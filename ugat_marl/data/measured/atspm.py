@@ -124,14 +124,17 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
             they do not fit the network.
     """
     events, mapping = Path(events), Path(mapping)
-    found: list[Finding] = []
+    findings: list[Finding] = []
     widths = signal_widths(scenario)
-    driven = {item.id: {link.index for link in item.links} for item in network.intersections}
+    driven = {
+        intersection.id: {link.index for link in intersection.links}
+        for intersection in network.intersections
+    }
     table = read_mapping(mapping, widths, driven)
     spans = table.spans()
     periods = _periods(mapping, spans, scenario)
     detectors = detectors_of(mapping, _zones(table), network)
-    log = read_log(events, table.time_zone, found)
+    log = read_log(events, table.time_zone, findings)
     known = log.filter(pl.col("device").is_in([device.id for device in table.devices]))
     if known.is_empty():
         raise MeasuredDataError(
@@ -139,8 +142,8 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
             f"{', '.join(map(repr, log['device'].unique().sort().to_list()[:8]))}"
         )
     rows = _in_periods(events, known, spans, periods)
-    _report(events, rows, table, found)
-    signals = _signals(events, rows, table, periods, network, widths, found)
+    _report(events, rows, table, findings)
+    signals = _signals(events, rows, table, periods, network, widths, findings)
     stamps = _detections(rows, table)
     if stamps.is_empty():
         raise MeasuredDataError(
@@ -148,7 +151,7 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
             "channels"
         )
     passages, broken = passages_of(
-        events, with_period(events, stamps, periods, found), periods, detectors, found
+        events, with_period(events, stamps, periods, findings), periods, detectors, findings
     )
     measured = Measured(
         tuple(detector for detector in detectors if detector.id not in broken),
@@ -157,8 +160,8 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
             for period, shown, seen in zip(periods, signals, passages, strict=True)
         ),
     )
-    found += coverage(measured, scenario, network)
-    return replace(measured, findings=tuple(found))
+    findings += coverage(measured, scenario, network)
+    return replace(measured, findings=tuple(findings))
 
 
 def _periods(path: Path, spans: Sequence[Span], scenario: Scenario) -> tuple[Period, ...]:
@@ -190,14 +193,14 @@ def _periods(path: Path, spans: Sequence[Span], scenario: Scenario) -> tuple[Per
 def _zones(table: AtspmMapping) -> pl.DataFrame:
     rows = [
         (
-            item.id or f"{device.id}:{item.channel}",
-            item.lane,
-            item.position_m,
-            item.length_m,
-            item.kind,
+            detector.id or f"{device.id}:{detector.channel}",
+            detector.lane,
+            detector.position_m,
+            detector.length_m,
+            detector.kind,
         )
         for device in table.devices
-        for item in device.detectors
+        for detector in device.detectors
     ]
     return _numbered(frame_of(DETECTORS, rows))
 
@@ -227,12 +230,12 @@ def _in_periods(
     return pl.concat(parts)
 
 
-def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, found: list[Finding]) -> None:
+def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, findings: list[Finding]) -> None:
     """Add findings on faults that the log reports: clocks that were set, and broken detectors."""
     updates = rows.filter(pl.col("event") == CLOCK_UPDATED)
     if updates.height:
         names = ", ".join(map(repr, updates["device"].unique().sort().to_list()[:6]))
-        found.append(
+        findings.append(
             Finding(
                 f"{path.name}: the clock of {names} was set {updates.height} times (event 181); "
                 "times around it may jump by seconds"
@@ -240,10 +243,10 @@ def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, found: list[Fin
         )
     faults = rows.filter(pl.col("event").is_in(DETECTOR_FAULTS))
     for device in table.devices:
-        own = faults.filter(pl.col("device") == device.id)["parameter"].to_list()
-        broken = sorted({item.channel for item in device.detectors} & set(own))
+        faulty = faults.filter(pl.col("device") == device.id)["parameter"].to_list()
+        broken = sorted({detector.channel for detector in device.detectors} & set(faulty))
         if broken:
-            found.append(
+            findings.append(
                 Finding(
                     f"{path.name}: device {device.id!r} reports faults (events 84 to 88) of its "
                     f"channels {', '.join(map(str, broken))}"
@@ -255,9 +258,14 @@ def _detections(rows: pl.DataFrame, table: AtspmMapping) -> pl.DataFrame:
     """Return detector events as rows of ``detections``."""
     zones = pl.DataFrame(
         [
-            (device.id, item.channel, item.id or f"{device.id}:{item.channel}", item.latency_s)
+            (
+                device.id,
+                detector.channel,
+                detector.id or f"{device.id}:{detector.channel}",
+                detector.latency_s,
+            )
             for device in table.devices
-            for item in device.detectors
+            for detector in device.detectors
         ],
         schema={
             "device": pl.String,
@@ -291,19 +299,19 @@ def _signals(
     periods: Sequence[Period],
     network: Network,
     widths: Mapping[str, int],
-    found: list[Finding],
+    findings: list[Finding],
 ) -> tuple[dict[str, SignalLog], ...]:
     shown: list[tuple[str, float, str, str]] = []
-    programmes = {item.id: item.programme for item in network.intersections}
+    programmes = {intersection.id: intersection.programme for intersection in network.intersections}
     for device in table.devices:
         links = _links(device, widths[device.tls], programmes.get(device.tls, ()))
-        sources = {source for own in links for source, _ in own}
+        sources = {source for link_sources in links for source, _ in link_sources}
         silent = set(sources)
         for period in periods:
-            events = _events(path, rows, device, period, sources, found)
+            events = _events(path, rows, device, period, sources, findings)
             silent -= {event.source for event in events}
             if not any(event.time_s >= period.begin_s for event in events):
-                found.append(
+                findings.append(
                     Finding(
                         f"{path.name}: device {device.id!r} logs no signals in period {period.id!r}"
                     )
@@ -311,7 +319,7 @@ def _signals(
                 continue
             states = _states(events, links, device, period)
             shown += [(period.id, time, device.tls, state) for time, state in states]
-        found += [
+        findings += [
             Finding(f"{path.name}: {kind} {number} of device {device.id!r} is never logged: red")
             for kind, number in sorted(silent)
         ]
@@ -320,8 +328,8 @@ def _signals(
             f"{path}: no phase event (1, 8, 10 ...) of a mapped phase; check the phases"
         )
     frame = pl.DataFrame(shown, schema=["period_id", "time_s", "tls_id", "state"], orient="row")
-    frame = with_period(path, _numbered(frame), periods, found, early=True)
-    return signals_of(path, frame, periods, widths, found)
+    frame = with_period(path, _numbered(frame), periods, findings, early=True)
+    return signals_of(path, frame, periods, widths, findings)
 
 
 def _links(
@@ -354,23 +362,23 @@ def _events(
     device: Device,
     period: Period,
     sources: set[Source],
-    found: list[Finding],
+    findings: list[Finding],
 ) -> list[_Event]:
     """Return the changes of colour of a device up to the end of a period, in order."""
-    own = rows.filter(
+    device_rows = rows.filter(
         (pl.col("device") == device.id)
         & (pl.col("period_id") == period.id)
         & pl.col("event").is_in(list(_KIND))
     )
-    if own.is_empty():
+    if device_rows.is_empty():
         return []
-    key, time = np.zeros(own.height, np.int64), own["time_s"].to_numpy()
-    refuse_set_back(path, key, time, own[ROW].to_numpy(), lambda _: f"device {device.id!r}")
-    order = in_order(path, key, time, found)
-    own = own[order]
+    key, time = np.zeros(device_rows.height, np.int64), device_rows["time_s"].to_numpy()
+    refuse_set_back(path, key, time, device_rows[ROW].to_numpy(), lambda _: f"device {device.id!r}")
+    order = in_order(path, key, time, findings)
+    device_rows = device_rows[order]
     events = [
         _Event(time, (_KIND[code], number), code)
-        for time, code, number in own.select("time_s", "event", "parameter").iter_rows()
+        for time, code, number in device_rows.select("time_s", "event", "parameter").iter_rows()
         if (_KIND[code], number) in sources
     ]
     return sorted(events, key=lambda event: (event.time_s, _RANK[event.colour]))
@@ -383,7 +391,7 @@ def _states(
     period: Period,
 ) -> SignalLog:
     """Return the state at the begin of the period and at every change in it."""
-    colours = {source: RED for own in links for source, _ in own}
+    colours = {source: RED for link_sources in links for source, _ in link_sources}
     later: list[_Event] = []
     seen: set[Source] = set()
     for event in events:
@@ -399,8 +407,10 @@ def _states(
     def state() -> str:
         letters = [
             device.constant.get(link)
-            or deciding_letter([green if colours[s] == GREEN else colours[s] for s, green in own])
-            for link, own in enumerate(links)
+            or deciding_letter(
+                [green if colours[s] == GREEN else colours[s] for s, green in link_sources]
+            )
+            for link, link_sources in enumerate(links)
         ]
         return "".join(letters)
 
@@ -415,14 +425,14 @@ def _states(
     return tuple(log)
 
 
-def read_log(path: Path, time_zone: str, found: list[Finding]) -> pl.DataFrame:
+def read_log(path: Path, time_zone: str, findings: list[Finding]) -> pl.DataFrame:
     """Read the events of a log.
 
     Args:
         path: CSV or Parquet file with TimeStamp, DeviceId, EventId and Parameter, or other names
             of these columns.
         time_zone: Time zone of the street; required if the times have a time zone.
-        found: Findings; rows that are left out are added to them.
+        findings: Findings; rows that are left out are added to them.
 
     Returns:
         Columns ``ROW``, ``time`` (local, microseconds), ``device`` (text), ``event`` and
@@ -434,7 +444,7 @@ def read_log(path: Path, time_zone: str, found: list[Finding]) -> pl.DataFrame:
     """
     if path.suffix not in (".csv", ".parquet"):
         raise MeasuredDataError(f"{path}: a log is a .csv or a .parquet file")
-    raw = read_raw(path, found)
+    raw = read_raw(path, findings)
     names: dict[str, str] = {}
     for column in raw.columns:
         meaning = _NAMES.get("".join(x for x in column if x not in " _").lower())
@@ -460,7 +470,7 @@ def read_log(path: Path, time_zone: str, found: list[Finding]) -> pl.DataFrame:
     )
     whole = frame.drop_nulls()
     if whole.height < frame.height:
-        found.append(
+        findings.append(
             Finding(f"{path.name}: {frame.height - whole.height} rows with empty cells left out")
         )
     return whole.with_columns(

@@ -197,6 +197,6 @@ def _check_devices(
                 f"{device.tls!r} show; add them to a phase or an overlap, or write them under "
                 '[devices.constant], as in 3 = "g" for a right turn that always yields'
             )
-        channels = [item.channel for item in device.detectors]
+        channels = [detector.channel for detector in device.detectors]
         if twice := [channel for channel in channels if channels.count(channel) > 1]:
             raise MeasuredDataError(f"{where}: channel {twice[0]} is mapped twice; map it once")

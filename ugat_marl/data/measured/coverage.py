@@ -124,7 +124,7 @@ def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Ite
             NEEDS_SIGNALS,
         )
         return
-    controlled = [item.id for item in network.intersections]
+    controlled = [intersection.id for intersection in network.intersections]
     never = [tls for tls in controlled if not any(tls in period.signals for period in periods)]
     if never:
         yield Finding(
@@ -164,7 +164,7 @@ def is_actuated(periods: Sequence[Period], tls: str) -> bool:
         for (begin_s, state), (end_s, _) in itertools.pairwise(changes[1:]):
             if set(state) & GREEN:
                 lengths.setdefault(state, set()).add(round(end_s - begin_s))
-    return any(len(found) >= MANY_LENGTHS for found in lengths.values())
+    return any(len(distinct) >= MANY_LENGTHS for distinct in lengths.values())
 
 
 def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
@@ -183,7 +183,7 @@ def _of_kinds(measured: Measured, network: Network) -> Iterator[Finding]:
         )
         return
     seen = {name for period in measured.periods for name in period.passages}
-    silent = [item.id for item in measured.detectors if item.id not in seen]
+    silent = [detector.id for detector in measured.detectors if detector.id not in seen]
     if silent:
         many = 2 * len(silent) >= len(measured.detectors)
         yield Finding(
@@ -191,11 +191,11 @@ def _of_kinds(measured: Measured, network: Network) -> Iterator[Finding]:
             + ("; they are not used, and what happens there stays unknown" if many else ""),
             ("dropout", "swapped", "undercount") if many else (),
         )
-    kinds = {item.kind for item in measured.detectors if item.id in seen}
+    kinds = {detector.kind for detector in measured.detectors if detector.id in seen}
     shared = any(
-        len({link.to_edge for link in item.links if link.from_lane == lane}) > 1
-        for item in network.intersections
-        for lane in item.incoming_lanes
+        len({link.to_edge for link in intersection.links if link.from_lane == lane}) > 1
+        for intersection in network.intersections
+        for lane in intersection.incoming_lanes
     )
     needs: dict[DetectorKind, tuple[str, tuple[str, ...]]] = {
         "stop": ("how queues leave the stop line stays unseen", NEEDS_STOP),
@@ -206,9 +206,9 @@ def _of_kinds(measured: Measured, network: Network) -> Iterator[Finding]:
             ("turning",) if shared else (),
         ),
     }
-    for kind, (what, effects) in needs.items():
+    for kind, (kind_name, effects) in needs.items():
         if kind not in kinds:
-            yield Finding(f"no {kind} detector counts: {what}", effects)
+            yield Finding(f"no {kind} detector counts: {kind_name}", effects)
     if len(kinds) < 2:
         yield Finding(
             "all detectors are of one kind: one that misses vehicles looks like less demand",
@@ -218,9 +218,15 @@ def _of_kinds(measured: Measured, network: Network) -> Iterator[Finding]:
 
 
 def _of_speeds(measured: Measured) -> Iterator[Finding]:
-    passages = [item for period in measured.periods for item in period.passages.values()]
+    passages = [
+        detector_passages
+        for period in measured.periods
+        for detector_passages in period.passages.values()
+    ]
     total = sum(map(len, passages))
-    known = sum(int(np.isfinite(item.speed_mps).sum()) for item in passages)
+    known = sum(
+        int(np.isfinite(detector_passages.speed_mps).sum()) for detector_passages in passages
+    )
     if known == 0:
         yield Finding(
             "no speeds: a small change of desired_speed stays unseen, and heavy_share shows only "
@@ -229,7 +235,7 @@ def _of_speeds(measured: Measured) -> Iterator[Finding]:
         )
     elif known < total:
         yield Finding(f"detections: no speed for {total - known} of {total} passages")
-    times = np.concatenate([item.on_s for item in passages])
+    times = np.concatenate([detector_passages.on_s for detector_passages in passages])
     times = times[np.isfinite(times)]
     if len(times) >= BUSY and not (times % 1).any():
         yield Finding(
@@ -239,17 +245,19 @@ def _of_speeds(measured: Measured) -> Iterator[Finding]:
 
 
 def _of_places(detectors: Sequence[Detector], network: Network) -> Iterator[Finding]:
-    into = {lane for item in network.intersections for lane in item.incoming_lanes}
-    out = {lane for item in network.intersections for lane in item.outgoing_lanes}
+    into = {lane for intersection in network.intersections for lane in intersection.incoming_lanes}
+    out = {lane for intersection in network.intersections for lane in intersection.outgoing_lanes}
     wrong = [
-        item.id for item in detectors if item.lane not in (out if item.kind == "exit" else into)
+        detector.id
+        for detector in detectors
+        if detector.lane not in (out if detector.kind == "exit" else into)
     ]
     if wrong:
         yield Finding(
             f"detectors.csv: {_list('detector', wrong)} not on a lane of that kind (advance and "
             "stop: leading to an intersection with signals, exit: leading away); not used"
         )
-    bare = sorted(into - {item.lane for item in detectors if item.kind != "exit"})
+    bare = sorted(into - {detector.lane for detector in detectors if detector.kind != "exit"})
     if bare:
         yield Finding(
             f"detectors.csv: no detector on {_list('incoming lane', bare)}, of {len(into)}; "
@@ -263,15 +271,15 @@ def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
     The cause is a wrong lane or link, or a wrong clock.
     """
     stops: dict[str, list[str]] = {}
-    for item in measured.detectors:
-        if item.kind == "stop":
-            stops.setdefault(item.lane, []).append(item.id)
-    for item in network.intersections:
+    for detector in measured.detectors:
+        if detector.kind == "stop":
+            stops.setdefault(detector.lane, []).append(detector.id)
+    for detector in network.intersections:
         total = red = 0
-        for lane in item.incoming_lanes:
-            links = sorted({link.index for link in item.links if link.from_lane == lane})
+        for lane in detector.incoming_lanes:
+            links = sorted({link.index for link in detector.links if link.from_lane == lane})
             for period in measured.periods:
-                log = period.signals.get(item.id)
+                log = period.signals.get(detector.id)
                 if not log:
                     continue
                 since = np.array([since for since, _ in log])
@@ -284,8 +292,9 @@ def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
                         red += int(is_red[shown].sum())
         if total >= BUSY and red > MOST_ON_RED * total:
             yield Finding(
-                f"{red} of {total} vehicles leave the stop detectors of traffic light {item.id!r} "
-                "while their lane has red; are lanes and links the right ones, and the clocks?"
+                f"{red} of {total} vehicles leave the stop detectors of traffic light "
+                f"{detector.id!r} while their lane has red; are lanes and links the right ones, "
+                "and the clocks?"
             )
 
 
@@ -308,8 +317,8 @@ class _Silence:
 
 def _of_silence(measured: Measured) -> Iterator[Finding]:
     roads: dict[str, list[Detector]] = {}
-    for item in measured.detectors:
-        roads.setdefault(edge_of(item.lane), []).append(item)
+    for silent in measured.detectors:
+        roads.setdefault(edge_of(silent.lane), []).append(silent)
     usual = _usual_rates(measured)
     silences: dict[tuple[str, str], list[_Silence]] = {}
     for period in measured.periods:
@@ -327,17 +336,17 @@ def _of_silence(measured: Measured) -> Iterator[Finding]:
             )
             continue
         for group in roads.values():
-            for name, what, silence in _silent(group, times, period, usual):
-                silences.setdefault((name, what), []).append(silence)
-    for (name, what), found in silences.items():
-        minutes = sorted(round(item.length_s / 60) for item in found)
+            for name, behaviour, silence in _silent(group, times, period, usual):
+                silences.setdefault((name, behaviour), []).append(silence)
+    for (name, behaviour), silent_spans in silences.items():
+        minutes = sorted(round(silent.length_s / 60) for silent in silent_spans)
         span = f"{minutes[0]}" if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"
-        where = f"in {_list('period', [item.period for item in found])}"
-        if len(found) == 1:
-            where = f"from {found[0].begin_s:g} s on in period {found[0].period!r}"
+        where = f"in {_list('period', [silent.period for silent in silent_spans])}"
+        if len(silent_spans) == 1:
+            where = f"from {silent_spans[0].begin_s:g} s on in period {silent_spans[0].period!r}"
         yield Finding(
-            f"detections: {name!r} {what} for {span} min {where}, while a "
-            f"neighbour counts {max(item.meanwhile for item in found)} vehicles"
+            f"detections: {name!r} {behaviour} for {span} min {where}, while a "
+            f"neighbour counts {max(silent.meanwhile for silent in silent_spans)} vehicles"
         )
 
 
@@ -366,19 +375,19 @@ def _silent(
     usual: Mapping[str, float],
 ) -> Iterator[tuple[str, str, _Silence]]:
     """Yield id, words for its state, and silence of detectors silent while their road is busy."""
-    for item in group:
-        begin, length = _longest_gap(times.get(item.id, np.empty(0)), period)
-        if usual.get(item.id, 0.0) * length < EXPECTED:
+    for detector in group:
+        begin, length = _longest_gap(times.get(detector.id, np.empty(0)), period)
+        if usual.get(detector.id, 0.0) * length < EXPECTED:
             continue  # few vehicles use this lane
         if length <= min(SILENT_S, period.end_s - period.begin_s - 1e-6):
             continue
-        others = [times[other.id] for other in group if other.id in times and other is not item]
+        others = [times[other.id] for other in group if other.id in times and other is not detector]
         busy = max(
             (int(((t > begin) & (t < begin + length)).sum()) // 2 for t in others), default=0
         )
         if busy >= BUSY:
-            what = "is on" if _is_on(period, item.id, begin) else "says nothing"
-            yield item.id, what, _Silence(period.id, begin, length, busy)
+            behaviour = "is on" if _is_on(period, detector.id, begin) else "says nothing"
+            yield detector.id, behaviour, _Silence(period.id, begin, length, busy)
 
 
 def _times(period: Period, detector: str) -> NDArray[np.float64]:
@@ -400,7 +409,7 @@ def _longest_gap(times: NDArray[np.float64], period: Period) -> tuple[float, flo
     return float(marks[longest]), float(gaps[longest])
 
 
-def _list(what: str, names: Sequence[str]) -> str:
+def _list(title: str, names: Sequence[str]) -> str:
     """Return names as a list, such as ``2 detectors ('a', 'b')``."""
     shown = ", ".join(map(repr, names[:NAMED])) + (" ..." if len(names) > NAMED else "")
-    return f"{len(names)} {what}{'s' if len(names) != 1 else ''} ({shown})"
+    return f"{len(names)} {title}{'s' if len(names) != 1 else ''} ({shown})"

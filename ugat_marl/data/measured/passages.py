@@ -55,7 +55,7 @@ def passages_of(
     frame: pl.DataFrame,
     periods: Sequence[Period],
     detectors: Sequence[Detector],
-    found: list[Finding],
+    findings: list[Finding],
 ) -> tuple[tuple[dict[str, Passages], ...], frozenset[str]]:
     """Pair on and off events to the vehicles over every detector.
 
@@ -64,7 +64,7 @@ def passages_of(
         frame: Its rows, with `PERIOD`.
         periods: The periods.
         detectors: The detectors.
-        found: Findings; events that are left out or filled in are added to them.
+        findings: Findings; events that are left out or filled in are added to them.
 
     Returns:
         For each period, detector to its passages; and the ids of detectors that cannot be used.
@@ -81,27 +81,27 @@ def passages_of(
         "write on or off",
     )
     names = [detector.id for detector in detectors]
-    frame = _known(path, frame, names, found)
+    frame = _known(path, frame, names, findings)
     frame = frame.with_columns(
-        _plausible(path, frame, "speed_mps", FASTEST_MPS, found),
-        _plausible(path, frame, "length_m", LONGEST_M, found),
+        _plausible(path, frame, "speed_mps", FASTEST_MPS, findings),
+        _plausible(path, frame, "length_m", LONGEST_M, findings),
     )
     once = frame.unique(["key", "time_s", "event"], keep="first", maintain_order=True)
     if once.height < frame.height:
-        found.append(
+        findings.append(
             Finding(
                 f"{path.name}: {frame.height - once.height} of {frame.height} rows are there "
                 "twice; they count once"
             )
         )
-    stream = _sorted(path, once, periods, names, found)
+    stream = _sorted(path, once, periods, names, findings)
     _refuse_copies(path, stream, periods, len(names))
-    paired, broken = _pair(path, stream, names, found)
+    paired, broken = _pair(path, stream, names, findings)
     return _split(paired, periods, names, broken), frozenset(names[i] for i in broken)
 
 
 def _known(
-    path: Path, frame: pl.DataFrame, names: Sequence[str], found: list[Finding]
+    path: Path, frame: pl.DataFrame, names: Sequence[str], findings: list[Finding]
 ) -> pl.DataFrame:
     """Return the rows of known detectors, with the number of their stream as ``key``."""
     index = {name: i for i, name in enumerate(names)}
@@ -118,7 +118,7 @@ def _known(
             f"{path}: no row is of a detector in detectors.csv; the rows are of {listed}"
             + (f" (is {others[0]!r} {near!r}?)" if near else "")
         )
-    found.append(
+    findings.append(
         Finding(
             f"{path.name}: {unknown.height} rows are of detectors that detectors.csv does not "
             f"list ({listed}); they are left out"
@@ -128,7 +128,7 @@ def _known(
 
 
 def _plausible(
-    path: Path, frame: pl.DataFrame, column: str, most: float, found: list[Finding]
+    path: Path, frame: pl.DataFrame, column: str, most: float, findings: list[Finding]
 ) -> pl.Series:
     """Return a column of speeds or lengths; missing and a few impossible values become NaN."""
     values = frame[column]
@@ -153,7 +153,7 @@ def _plausible(
             f"convert the column to {unit}, or leave cells empty that were not measured",
         )
     if count:
-        found.append(Finding(f"{path.name}: {count} impossible {column} taken as not measured"))
+        findings.append(Finding(f"{path.name}: {count} impossible {column} taken as not measured"))
     return values.set(impossible.fill_null(False), None).fill_null(float("nan")).alias(column)
 
 
@@ -162,7 +162,7 @@ def _sorted(
     frame: pl.DataFrame,
     periods: Sequence[Period],
     names: Sequence[str],
-    found: list[Finding],
+    findings: list[Finding],
 ) -> _Stream:
     key = frame["key"].to_numpy()
     time = frame["time_s"].to_numpy()
@@ -174,7 +174,7 @@ def _sorted(
 
     # Ons and offs may have been exported separately, so each has its own stream here.
     refuse_set_back(path, key * 2 + is_on, time, frame[ROW].to_numpy(), name)
-    order = in_order(path, key, time, found)
+    order = in_order(path, key, time, findings)
     order = order[untangled(key[order], time[order], is_on[order])]
     return _Stream(
         key[order],
@@ -186,7 +186,7 @@ def _sorted(
 
 
 def _pair(
-    path: Path, stream: _Stream, names: Sequence[str], found: list[Finding]
+    path: Path, stream: _Stream, names: Sequence[str], findings: list[Finding]
 ) -> tuple[tuple[NDArray[np.int64], Passages], frozenset[int]]:
     """Return passages with their streams, and the detectors with too many lost events."""
     key, time, is_on = stream.key, stream.time, stream.is_on
@@ -210,12 +210,12 @@ def _pair(
         return np.where(np.isfinite(values[partner]), values[partner], values[first])
 
     passages = Passages(on, off, of_pair(stream.speed), of_pair(stream.length))
-    _report(path, int(imputed.sum()), int(lost_off.sum()), int(lost_on.sum()), len(first), found)
+    _report(path, int(imputed.sum()), int(lost_off.sum()), int(lost_on.sum()), len(first), findings)
     detector = key % len(names)
     events = np.bincount(detector, minlength=len(names))
     lost = np.bincount(detector[lost_off | lost_on], minlength=len(names))
     broken = frozenset(np.flatnonzero(lost > MOST_UNPAIRED * events).tolist())
-    found += [
+    findings += [
         Finding(
             f"{path.name}: detector {names[i]!r} has no partner for {lost[i]} of {events[i]} "
             "events; it is not used"
@@ -226,17 +226,17 @@ def _pair(
 
 
 def _report(
-    path: Path, imputed: int, lost_off: int, lost_on: int, kept: int, found: list[Finding]
+    path: Path, imputed: int, lost_off: int, lost_on: int, kept: int, findings: list[Finding]
 ) -> None:
     if imputed:
-        found.append(
+        findings.append(
             Finding(
                 f"{path.name}: {imputed} times on follows on within {IMPUTED_S:g} s; the off in "
                 "between was filled in"
             )
         )
     if lost_off or lost_on:
-        found.append(
+        findings.append(
             Finding(
                 f"{path.name}: {lost_off} ons without off and {lost_on} offs without on were left "
                 f"out; {kept} passages are left"

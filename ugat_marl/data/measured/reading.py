@@ -70,7 +70,7 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
             f"{directory}: no such directory; measured data are a directory with periods.csv, "
             "detectors.csv, signals and detections (docs/reference/measured-data.md)"
         )
-    found: list[Finding] = []
+    findings: list[Finding] = []
     paths = {table.stem: table.path(directory) for table in tables.TABLES}
     for table in (tables.PERIODS, tables.DETECTORS):
         if paths[table.stem] is None:
@@ -84,20 +84,20 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     def rows(table: Table) -> tuple[Path, pl.DataFrame]:
         path = paths[table.stem]
         assert path is not None
-        return path, read_table(path, table, found)
+        return path, read_table(path, table, findings)
 
     periods = periods_of(*rows(tables.PERIODS), scenario)
     detectors = detectors_of(*rows(tables.DETECTORS), network)
     signals: tuple[dict[str, SignalLog], ...] = tuple({} for _ in periods)
     if paths["signals"] is not None:
-        signals = _signals(*rows(tables.SIGNALS), periods, scenario, network, found)
+        signals = _signals(*rows(tables.SIGNALS), periods, scenario, network, findings)
     passages: tuple[dict[str, Passages], ...] = tuple({} for _ in periods)
     if paths["detections"] is not None:
         path, frame = rows(tables.DETECTIONS)
         if frame.is_empty():
             raise MeasuredDataError(f"{path}: no detections; write one row per on and off")
-        frame = with_period(path, frame, periods, found)
-        passages, broken = passages_of(path, frame, periods, detectors, found)
+        frame = with_period(path, frame, periods, findings)
+        passages, broken = passages_of(path, frame, periods, detectors, findings)
         _refuse_empty(
             path, "detections", [p.id for p, x in zip(periods, passages, strict=True) if not x]
         )
@@ -108,7 +108,7 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     )
 
     def extra(table: Table) -> pl.DataFrame | None:
-        return None if paths[table.stem] is None else _extra(*rows(table), table, periods, found)
+        return None if paths[table.stem] is None else _extra(*rows(table), table, periods, findings)
 
     measured = Measured(
         detectors,
@@ -119,8 +119,8 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
         if paths["counts"] is None
         else _counts(*rows(tables.COUNTS), periods, detectors, counts_only),
     )
-    found += coverage(measured, scenario, network)
-    return replace(measured, findings=tuple(found))
+    findings += coverage(measured, scenario, network)
+    return replace(measured, findings=tuple(findings))
 
 
 def _missing(directory: Path, table: Table) -> MeasuredDataError:
@@ -137,12 +137,12 @@ def _signals(
     periods: tuple[Period, ...],
     scenario: Scenario,
     network: Network,
-    found: list[Finding],
+    findings: list[Finding],
 ) -> tuple[dict[str, SignalLog], ...]:
     if frame.is_empty():
         raise MeasuredDataError(f"{path}: no signals; write the state at every change")
-    frame = with_period(path, frame, periods, found, early=True)
-    logs = signals_of(path, frame, periods, signal_widths(scenario), found)
+    frame = with_period(path, frame, periods, findings, early=True)
+    logs = signals_of(path, frame, periods, signal_widths(scenario), findings)
     controlled = [intersection.id for intersection in network.intersections]
     for period, shown in zip(periods, logs, strict=True):
         if not any(tls in shown for tls in controlled):
@@ -158,9 +158,9 @@ def _extra(
     frame: pl.DataFrame,
     table: Table,
     periods: tuple[Period, ...],
-    found: list[Finding],
+    findings: list[Finding],
 ) -> pl.DataFrame:
-    frame = with_period(path, frame, periods, found)
+    frame = with_period(path, frame, periods, findings)
     for column in ("vehicles", "halting", "mean_speed_mps", "speed_mps", "position_m"):
         if column in frame.columns:
             refuse(
@@ -217,11 +217,11 @@ def _counts(
     return frame.select(*tables.COUNTS.columns)
 
 
-def _refuse_empty(path: Path, what: str, periods: list[str]) -> None:
+def _refuse_empty(path: Path, kind: str, periods: list[str]) -> None:
     """Refuse periods for which a file has no rows."""
     if periods:
         raise MeasuredDataError(
-            f"{path}: no {what} in period {', '.join(map(repr, periods[:6]))}; was the file cut "
+            f"{path}: no {kind} in period {', '.join(map(repr, periods[:6]))}; was the file cut "
             "short? Add them, or leave the period out of periods.csv"
         )
 
@@ -330,7 +330,7 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
         "is unknown",
         f"write one of {', '.join(kinds)}",
     )
-    found: list[Detector] = []
+    detectors: list[Detector] = []
     for row in frame.iter_rows(named=True):
         lane = network.lanes.get(row["lane_id"])
         where = f"{place(path, row[ROW])}: detector {row['detector_id']!r}"
@@ -351,8 +351,8 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
                 f"{where} ends {begin + length:g} m along lane {lane.id!r}, which ends at "
                 f"{lane.length_m:g} m; its length_m is at most {lane.length_m - begin:g}"
             )
-        found.append(Detector(row["detector_id"], lane.id, begin, length, row["kind"]))
-    return tuple(found)
+        detectors.append(Detector(row["detector_id"], lane.id, begin, length, row["kind"]))
+    return tuple(detectors)
 
 
 def signals_of(
@@ -360,7 +360,7 @@ def signals_of(
     frame: pl.DataFrame,
     periods: Sequence[Period],
     widths: Mapping[str, int],
-    found: list[Finding],
+    findings: list[Finding],
 ) -> tuple[dict[str, SignalLog], ...]:
     """Return the signal log of every traffic light, one mapping per period.
 
@@ -369,7 +369,7 @@ def signals_of(
         frame: Its rows, with `PERIOD`.
         periods: The periods.
         widths: Number of letters in the state of each traffic light of the network.
-        found: Findings; late logs, gaps and double states are added to them.
+        findings: Findings; late logs, gaps and double states are added to them.
 
     Raises:
         MeasuredDataError: A traffic light is unknown, a state has a wrong length or unknown
@@ -389,7 +389,7 @@ def signals_of(
 
     time = frame["time_s"].to_numpy()
     refuse_set_back(path, key, time, frame[ROW].to_numpy(), name)
-    order = in_order(path, key, time, found)
+    order = in_order(path, key, time, findings)
     key, time = key[order], time[order]
     states = frame["state"].gather(order).to_list()
     starts = np.flatnonzero(np.diff(key, prepend=-1))
@@ -401,7 +401,7 @@ def signals_of(
             list(zip(time[begin:end].tolist(), states[begin:end], strict=True)),
             period,
             f"{path.name}: {name(stream)}",
-            found,
+            findings,
         )
         logs[stream // len(names)][names[stream % len(names)]] = log
     return logs
@@ -440,7 +440,7 @@ def _check_states(path: Path, frame: pl.DataFrame, widths: Mapping[str, int]) ->
 
 
 def _log(
-    entries: list[tuple[float, str]], period: Period, where: str, found: list[Finding]
+    entries: list[tuple[float, str]], period: Period, where: str, findings: list[Finding]
 ) -> SignalLog:
     """Return one log from the begin of the period; the last of equal times counts."""
     kept: list[tuple[float, str]] = []
@@ -451,7 +451,9 @@ def _log(
             kept.pop()
         kept.append(entry)
     if clashes:
-        found.append(Finding(f"{where}: {clashes} moments with two states; the last one is taken"))
+        findings.append(
+            Finding(f"{where}: {clashes} moments with two states; the last one is taken")
+        )
     first = kept[0][0]
     if first > period.begin_s:
         if first > period.begin_s + LATE_S:
@@ -459,7 +461,7 @@ def _log(
                 f"{where} begins at {first:g} s, {first - period.begin_s:g} s late; write the "
                 "state at or before the begin of the period, or begin the period later"
             )
-        found.append(
+        findings.append(
             Finding(
                 f"{where} begins {first - period.begin_s:g} s late; its first state is taken for "
                 "the time before"
@@ -471,7 +473,7 @@ def _log(
     gaps = np.diff(changes)
     if len(gaps) and gaps.max() > SIGNAL_GAP_S:
         at = float(changes[int(gaps.argmax())])
-        found.append(
+        findings.append(
             Finding(
                 f"{where} shows one state for {math.floor(gaps.max() / 60)} min from {at:g} s on; "
                 "was it recorded?"

@@ -60,12 +60,12 @@ class Table:
         Raises:
             MeasuredDataError: The directory has the file in two types.
         """
-        found = [path for path in self._paths(directory) if path.exists()]
-        if len(found) > 1:
+        existing = [path for path in self._paths(directory) if path.exists()]
+        if len(existing) > 1:
             raise MeasuredDataError(
-                f"{directory}: both {found[0].name} and {found[1].name} are there; remove one"
+                f"{directory}: both {existing[0].name} and {existing[1].name} are there; remove one"
             )
-        return found[0] if found else None
+        return existing[0] if existing else None
 
     def names(self) -> tuple[str, ...]:
         """Return the names the file may have."""
@@ -139,13 +139,13 @@ COUNTS = Table(
 TABLES = (PERIODS, DETECTORS, SIGNALS, DETECTIONS, LANES, TRAJECTORIES, COUNTS)
 
 
-def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
+def read_table(path: Path, table: Table, findings: list[Finding]) -> pl.DataFrame:
     """Read the columns of `table` from a file, numbers as Float64, and add `ROW`.
 
     Args:
         path: The file.
         table: Expected columns.
-        found: Findings; unknown columns are added to them.
+        findings: Findings; unknown columns are added to them.
 
     Returns:
         One row per row of the file, in its order. Missing optional columns are null.
@@ -154,9 +154,9 @@ def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
         MeasuredDataError: The file is unreadable or cut short. Or a column is missing, has text
             instead of numbers, or is required and has empty cells.
     """
-    raw = read_raw(path, found)
+    raw = read_raw(path, findings)
     wanted = {**table.columns, **table.optional}
-    _check_columns(path, table, raw.columns, found)
+    _check_columns(path, table, raw.columns, findings)
     start = 1 if path.suffix == ".parquet" else 2  # line 1 of a CSV file is its header
     columns = [pl.int_range(start, raw.height + start, dtype=pl.Int64, eager=True).alias(ROW)]
     for name, kind in wanted.items():
@@ -176,13 +176,13 @@ def read_table(path: Path, table: Table, found: list[Finding]) -> pl.DataFrame:
     return pl.DataFrame(columns)
 
 
-def read_raw(path: Path, found: list[Finding]) -> pl.DataFrame:
+def read_raw(path: Path, findings: list[Finding]) -> pl.DataFrame:
     """Read all columns of a CSV or Parquet file; columns of a CSV file are text.
 
     Raises:
         MeasuredDataError: The file is unreadable, damaged or cut short.
     """
-    return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, found)
+    return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, findings)
 
 
 def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
@@ -196,8 +196,8 @@ def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
 
 def place(path: Path, row: int) -> str:
     """Return the name of a row for messages."""
-    what = {".csv": "line", ".parquet": "row"}.get(path.suffix, "entry")
-    return f"{path}, {what} {row}"
+    unit = {".csv": "line", ".parquet": "row"}.get(path.suffix, "entry")
+    return f"{path}, {unit} {row}"
 
 
 def refuse(path: Path, bad: pl.DataFrame, column: str, complaint: str, way_out: str) -> None:
@@ -217,7 +217,7 @@ def refuse(path: Path, bad: pl.DataFrame, column: str, complaint: str, way_out: 
     )
 
 
-def _check_columns(path: Path, table: Table, given: list[str], found: list[Finding]) -> None:
+def _check_columns(path: Path, table: Table, given: list[str], findings: list[Finding]) -> None:
     wanted = (*table.columns, *table.optional)
     unknown = [name for name in given if name not in wanted]
     for name in table.columns:
@@ -232,7 +232,7 @@ def _check_columns(path: Path, table: Table, given: list[str], found: list[Findi
         missing = [column for column in table.optional if column not in given]
         near = nearest(name, missing)
         guess = f"; if it means {near!r}, rename it" if near else ""
-        found.append(Finding(f"{path.name}: column {name!r} is not read{guess}"))
+        findings.append(Finding(f"{path.name}: column {name!r} is not read{guess}"))
 
 
 def _listed(names: list[str]) -> str:
@@ -281,7 +281,7 @@ def _quietly() -> Iterator[None]:
         os.write(2, said.read())
 
 
-def _read_csv(path: Path, found: list[Finding]) -> pl.DataFrame:
+def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
     content = _bytes(path).removeprefix(b"\xef\xbb\xbf")
     if b"\0" in content:
         line = content[: content.index(b"\0")].count(b"\n") + 1
@@ -304,7 +304,7 @@ def _read_csv(path: Path, found: list[Finding]) -> pl.DataFrame:
             "numbers"
         )
     if not content.endswith((b"\n", b"\r")):
-        found.append(
+        findings.append(
             Finding(f"{path.name}: the last line has no end; the file may have been cut short")
         )
     try:
@@ -336,9 +336,9 @@ def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
         cells = cells.str.strip_chars()
         cells = cells.set(cells == "", None)
     elif not (cells.dtype.is_numeric() or cells.dtype == pl.Null):
-        what = "seconds of the scenario's clock" if name.endswith("_s") else "numbers"
+        meaning = "seconds of the scenario's clock" if name.endswith("_s") else "numbers"
         raise MeasuredDataError(
-            f"{path}: column {name!r} has the type {cells.dtype}; it holds {what}"
+            f"{path}: column {name!r} has the type {cells.dtype}; it holds {meaning}"
         )
     numbers = cells.cast(pl.Float64, strict=False)
     wrong = (numbers.is_null() & cells.is_not_null()) | numbers.is_infinite().fill_null(False)
@@ -382,7 +382,7 @@ def with_period(
     path: Path,
     frame: pl.DataFrame,
     periods: Sequence[Period],
-    found: list[Finding],
+    findings: list[Finding],
     *,
     early: bool = False,
 ) -> pl.DataFrame:
@@ -392,7 +392,7 @@ def with_period(
         path: File of the rows.
         frame: Rows with ``period_id`` and ``time_s``.
         periods: The periods.
-        found: Findings; rows that are left out are added to them.
+        findings: Findings; rows that are left out are added to them.
         early: True to keep rows before the begin of a period.
 
     Raises:
@@ -411,7 +411,7 @@ def with_period(
                 f"{path}: no row is of a period in periods.csv ({', '.join(list(index)[:5])}); "
                 f"the rows are of {names}"
             )
-        found.append(
+        findings.append(
             Finding(
                 f"{path.name}: {other.height} rows are of periods that periods.csv does not list "
                 f"({names}); they are left out"
@@ -426,7 +426,7 @@ def with_period(
     if not early:
         inside &= time >= begins[which]
     if not inside.all():
-        _report_outside(path, periods, which, time, inside, found)
+        _report_outside(path, periods, which, time, inside, findings)
     frame = frame.with_columns(pl.Series("time_s", time))
     return frame.filter(pl.Series(inside))
 
@@ -437,7 +437,7 @@ def _report_outside(
     which: NDArray[np.int32],
     time: NDArray[np.float64],
     inside: NDArray[np.bool_],
-    found: list[Finding],
+    findings: list[Finding],
 ) -> None:
     total = np.bincount(which, minlength=len(periods))
     outside = np.bincount(which[~inside], minlength=len(periods))
@@ -455,7 +455,7 @@ def _report_outside(
             )
     lost = int(outside.sum())
     names = ", ".join(repr(p.id) for p, n in zip(periods, outside, strict=True) if n)
-    found.append(
+    findings.append(
         Finding(f"{path.name}: {lost} of {len(time)} rows lie outside of their periods ({names})")
     )
 
@@ -464,7 +464,7 @@ def in_order(
     path: Path,
     key: NDArray[np.int64],
     time: NDArray[np.float64],
-    found: list[Finding],
+    findings: list[Finding],
 ) -> NDArray[np.int64]:
     """Return row indices sorted by stream and time; equal rows keep their order.
 
@@ -472,13 +472,15 @@ def in_order(
         path: File of the rows.
         key: Number of the stream of each row, ``(n,)``.
         time: Time of each row, s, ``(n,)``.
-        found: Findings; one is added if the rows were not sorted.
+        findings: Findings; one is added if the rows were not sorted.
     """
     as_found = np.argsort(key, kind="stable")
     back = len(_steps_back(key[as_found], time[as_found]))
     if not back:
         return as_found
-    found.append(Finding(f"{path.name}: {back} rows come before an earlier one; they were sorted"))
+    findings.append(
+        Finding(f"{path.name}: {back} rows come before an earlier one; they were sorted")
+    )
     return np.lexsort((time, key))
 
 

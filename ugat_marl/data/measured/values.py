@@ -78,8 +78,14 @@ class Measured:
         the hash.
         """
         digest = hashlib.sha256()
-        for item in self.detectors:
-            zone = (item.id, item.lane, float(item.position_m), float(item.length_m), item.kind)
+        for detector in self.detectors:
+            zone = (
+                detector.id,
+                detector.lane,
+                float(detector.position_m),
+                float(detector.length_m),
+                detector.kind,
+            )
             digest.update(repr(zone).encode())
         for period in self.periods:
             head = (period.id, float(period.begin_s), float(period.end_s), period.split)

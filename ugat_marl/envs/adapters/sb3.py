@@ -99,10 +99,10 @@ class AgentsVecEnv(VecEnv):
             observations, paid, terminated, truncated, told = env.step(chosen)
             now = self._stacked(k, observations, told)
             rewards[rows.start : rows.stop] = [paid[agent] for agent in agents]
-            own = [dict(told[agent]) for agent in agents]
+            agent_infos = [dict(told[agent]) for agent in agents]
             if not env.agents:
                 over[rows.start : rows.stop] = True
-                for agent, row, info in zip(agents, now, own, strict=True):
+                for agent, row, info in zip(agents, now, agent_infos, strict=True):
                     info["terminal_observation"] = row
                     info["TimeLimit.truncated"] = truncated[agent] and not terminated[agent]
                 now = self._begin(k, None)
@@ -110,7 +110,7 @@ class AgentsVecEnv(VecEnv):
                 gone = sorted(set(agents) - set(env.agents))
                 raise EpisodeError(f"{', '.join(gone)} left before the others; all have to stay")
             seen.append(now)
-            infos += own
+            infos += agent_infos
         return np.concatenate(seen), rewards, over, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -197,13 +197,13 @@ def _common_spaces(
     if not isinstance(actions, spaces.Discrete) or actions.start != 0:
         raise OptionError(f"agent {first!r} acts in {actions}; needed: Discrete(n)")
     for other, agent in others:
-        for own, common in (
+        for space, common in (
             (other.observation_space(agent), box),
             (other.action_space(agent), actions),
         ):
-            if own != common:
+            if space != common:
                 raise OptionError(
-                    f"agent {agent!r} has {own}, agent {first!r} {common}; Stable-Baselines3 "
+                    f"agent {agent!r} has {space}, agent {first!r} {common}; Stable-Baselines3 "
                     "needs equal spaces: wrap each environment in ugat_marl.envs.wrappers.pad, "
                     "and for environments of several networks give all the sizes of the largest"
                 )

@@ -130,15 +130,15 @@ def imported(text: str) -> Any:
     """
     module, _, name = text.partition(":")
     try:
-        found: Any = importlib.import_module(module)
+        imported_object: Any = importlib.import_module(module)
         for part in name.split("."):
-            found = getattr(found, part)
+            imported_object = getattr(imported_object, part)
     except (ImportError, AttributeError, ValueError) as error:
         raise OptionError(
             f"{text!r} cannot be imported ({error}); write module:name, such as "
             "ugat_marl.envs.wrappers:pad_spaces"
         ) from None
-    return found
+    return imported_object
 
 
 def sent(domain: Domain) -> Any:
@@ -175,7 +175,7 @@ def domain_chooser(
         scenario_in_domain(scenario, given)
         return lambda environment, episode: given
     listed: list[Any] = list(given)
-    if effects := [item for item in listed if not _is_domain(item)]:
+    if effects := [choice for choice in listed if not _is_domain(choice)]:
         raise OptionError(
             f"domains mixes domains and single effects ({effects[0]}); put the effects of one "
             "domain into a list of their own"
@@ -208,9 +208,9 @@ def in_turn(domains: Sequence[Domain]) -> DomainOf:
     return lambda environment, episode: listed[(environment + episode) % len(listed)]
 
 
-def _is_domain(item: Any) -> bool:
+def _is_domain(choice: Any) -> bool:
     """Return True if an entry of a list is a whole domain, and not one effect of a domain."""
-    return isinstance(item, str | list | tuple)
+    return isinstance(choice, str | list | tuple)
 
 
 def agents_of(env: AnyParallelEnv) -> dict[str, list[Any]]:

@@ -77,7 +77,7 @@ class Episodes:
         """Forget the environments of a closed vector."""
         folder = order["forget"]
         self._folders.discard(folder)
-        for key in [key for key, (own, _) in self._kept.items() if own == folder]:
+        for key in [key for key, (owner, _) in self._kept.items() if owner == folder]:
             del self._kept[key]
         gc.collect()
 

@@ -218,13 +218,13 @@ def baselines_folder() -> Path:
 def _configured(kind: Any, preset: Mapping[str, Any], given: Sequence[str], name: str) -> Any:
     """Make the settings of a learner from those that its name fixes and those of the user."""
     hints = get_type_hints(kind)
-    names = [item.name for item in fields(kind) if item.name not in preset]
+    names = [option.name for option in fields(kind) if option.name not in preset]
     values = dict(preset)
-    for item in given:
-        key, equals, text = item.partition("=")
+    for assignment in given:
+        key, equals, text = assignment.partition("=")
         key = key.replace("-", "_")
         if not equals or not text:
-            raise OptionError(f"learner setting {item!r}: must be NAME=VALUE")
+            raise OptionError(f"learner setting {assignment!r}: must be NAME=VALUE")
         if key not in names:
             raise UnknownNameError(f"setting of {name}", key, names)
         whole = text.split(",") if "tuple" in str(hints[key]) else text
@@ -233,5 +233,5 @@ def _configured(kind: Any, preset: Mapping[str, Any], given: Sequence[str], name
             values[key] = TypeAdapter(hints[key]).validate_python(value)
         except ValidationError as error:
             reason = error.errors()[0]["msg"]
-            raise OptionError(f"learner setting {item!r}: {reason}") from None
+            raise OptionError(f"learner setting {assignment!r}: {reason}") from None
     return kind(**values)

@@ -110,8 +110,8 @@ class LibraryLearner(abc.ABC):
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a whole checkpoint ({error!r})") from None
         self.episodes = episodes
-        for one, own in zip(sums, self._scales, strict=True):
-            own.sums[:] = one
+        for one, scale in zip(sums, self._scales, strict=True):
+            scale.sums[:] = one
 
     @property
     def _scales(self) -> tuple[RewardScale | InputScale, ...]:
@@ -380,9 +380,11 @@ def _state_size(env: AnyParallelEnv) -> int:
     return 0 if space is None else int(space.shape[0])
 
 
-def _require_like(path: Path, found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
+def _require_like(path: Path, read: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
     """Refuse weights of other names or shapes, before anything is overwritten."""
-    shapes = [{name: tuple(tensor.shape) for name, tensor in one.items()} for one in (found, own)]
+    shapes = [
+        {name: tuple(tensor.shape) for name, tensor in one.items()} for one in (read, expected)
+    ]
     if shapes[0] != shapes[1]:
         differing = sorted(
             k for k in {*shapes[0], *shapes[1]} if shapes[0].get(k) != shapes[1].get(k)

@@ -86,11 +86,11 @@ def input_factors(observations: Tensor, agents: AgentSet, pooled: bool) -> Tenso
     Returns:
         Factors ``(agents, widest_observation)``; 1 where an agent has no number.
     """
-    own = torch.from_numpy(observation_mask(agents))
-    square = observations.square().mean(1) * own
+    mask = torch.from_numpy(observation_mask(agents))
+    square = observations.square().mean(1) * mask
     if pooled:
-        square = (square.sum(0) / own.sum(0)).expand_as(square)
-    return torch.where(own, 1 / square.sqrt().clamp_min(LEAST), 1.0)
+        square = (square.sum(0) / mask.sum(0)).expand_as(square)
+    return torch.where(mask, 1 / square.sqrt().clamp_min(LEAST), 1.0)
 
 
 def observation_mask(agents: AgentSet) -> NDArray[np.bool_]:

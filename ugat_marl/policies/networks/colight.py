@@ -72,9 +72,9 @@ class CoLight(nn.Module):
         joint = self.joint(seen.view(1, agents * batch, -1)).relu()
         return self.readout(joint).view(agents, batch, -1)
 
-    def _around(self, own: Tensor) -> Tensor:
+    def _around(self, embedded: Tensor) -> Tensor:
         """Gather rows of each agent and its neighbours, ``(agents, 1 + most neighbours, ...)``.
 
         Rows without a neighbour hold the numbers of agent 0; their share is zero.
         """
-        return own.index_select(0, self.around.flatten()).unflatten(0, self.around.shape)
+        return embedded.index_select(0, self.around.flatten()).unflatten(0, self.around.shape)

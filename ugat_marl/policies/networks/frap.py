@@ -75,8 +75,8 @@ class FRAP(nn.Module):
         """Return z_pq of all pairs of phases, ``(agents, phases, batch, phases, size)``."""
         demands = self.demands(inputs)
         # W [d_p, d_q] = W_1 d_p + W_2 d_q: each half is computed once per phase, not per pair
-        own, other = self.pair.weight[0].chunk(2)
-        first = (demands @ own + self.pair.bias).transpose(1, 2).contiguous().unsqueeze(3)
+        first_half, other = self.pair.weight[0].chunk(2)
+        first = (demands @ first_half + self.pair.bias).transpose(1, 2).contiguous().unsqueeze(3)
         return (first + (demands @ other).unsqueeze(1)).relu()
 
     def demands(self, inputs: Tensor) -> Tensor:
@@ -96,14 +96,14 @@ def _inputs(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
     """
     most = max(len(junction.movements) for junction in junctions)
     kinds = len(junctions[0].movements[0])
-    found = torch.zeros(len(agents), agents.widest_observation, most, kinds + 1)
+    selection = torch.zeros(len(agents), agents.widest_observation, most, kinds + 1)
     for row, junction in enumerate(junctions):
         for movement, places in enumerate(junction.movements):
-            for kind, own in enumerate(places):
-                found[row, list(own), movement, kind] = 1.0
+            for kind, columns in enumerate(places):
+                selection[row, list(columns), movement, kind] = 1.0
             for phase, shares in enumerate(junction.greens):
-                found[row, junction.first_phase + phase, movement, kinds] = shares[movement]
-    return found.flatten(2)
+                selection[row, junction.first_phase + phase, movement, kinds] = shares[movement]
+    return selection.flatten(2)
 
 
 def _greens(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
@@ -112,11 +112,11 @@ def _greens(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
     The shape is ``(agents, phases, movements)``, 0 where padded.
     """
     most = max(len(junction.movements) for junction in junctions)
-    found = torch.zeros(len(agents), agents.most_actions, most)
+    greens = torch.zeros(len(agents), agents.most_actions, most)
     for row, junction in enumerate(junctions):
-        own = torch.tensor(junction.greens)
-        found[row, : own.shape[0], : own.shape[1]] = own
-    return found
+        phase_greens = torch.tensor(junction.greens)
+        greens[row, : phase_greens.shape[0], : phase_greens.shape[1]] = phase_greens
+    return greens
 
 
 def _rivals(agents: AgentSet) -> Tensor:
@@ -124,6 +124,6 @@ def _rivals(agents: AgentSet) -> Tensor:
 
     The weight is ``1 / (phases - 1)``, and 0 for the phase itself and where padded.
     """
-    own = size_mask(agents.action_counts).float()
-    pairs = own.unsqueeze(2) * own.unsqueeze(1) * (1 - torch.eye(agents.most_actions))
-    return pairs / (own.sum(dim=1) - 1).clamp_min(1)[:, None, None]
+    mask = size_mask(agents.action_counts).float()
+    pairs = mask.unsqueeze(2) * mask.unsqueeze(1) * (1 - torch.eye(agents.most_actions))
+    return pairs / (mask.sum(dim=1) - 1).clamp_min(1)[:, None, None]

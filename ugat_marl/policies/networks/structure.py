@@ -81,8 +81,10 @@ class Structure:
         if network == "colight":
             return cls(network, neighbours=_neighbours(agents, base.intersection_of, roads))
         layouts: Mapping[str, AgentLayout] = base.layouts
-        own = [layouts.get(name) for name in agents.names]
-        for name, size, layout in zip(agents.names, agents.observation_sizes, own, strict=True):
+        agent_layouts = [layouts.get(name) for name in agents.names]
+        for name, size, layout in zip(
+            agents.names, agents.observation_sizes, agent_layouts, strict=True
+        ):
             if layout is None or layout.size != size:
                 raise OptionError(
                     f"the observation of agent {name!r} has {size} numbers, its intersection's has "
@@ -90,8 +92,10 @@ class Structure:
                     "are; leave wrappers of observations away, or use the network 'mlp'"
                 )
         halves = observation["observation"] == "movements"
-        rows = zip(roads.intersections, [x for x in own if x is not None], strict=True)
-        return cls(network, tuple(_junction(item, layout, halves) for item, layout in rows))
+        rows = zip(roads.intersections, [x for x in agent_layouts if x is not None], strict=True)
+        return cls(
+            network, tuple(_junction(intersection, layout, halves) for intersection, layout in rows)
+        )
 
     def checked(self, agents: AgentSet) -> Structure:
         """Return the structure itself if it fits the agents.
@@ -166,48 +170,53 @@ def _neighbours(
     at = {light_of[name]: position for position, name in enumerate(agents.names)}
     items = [roads.intersection(light_of[name]) for name in agents.names]
 
-    def metres(item: Intersection, other: int) -> float:
-        return math.dist(item.position, items[other].position)
+    def metres(intersection: Intersection, other: int) -> float:
+        return math.dist(intersection.position, items[other].position)
 
     return tuple(
-        tuple(sorted((at[n] for n in item.neighbours), key=partial(metres, item))[:MOST_NEIGHBOURS])
-        for item in items
+        tuple(
+            sorted((at[n] for n in intersection.neighbours), key=partial(metres, intersection))[
+                :MOST_NEIGHBOURS
+            ]
+        )
+        for intersection in items
     )
 
 
-def _junction(item: Intersection, layout: AgentLayout, halves: bool) -> Junction:
+def _junction(intersection: Intersection, layout: AgentLayout, halves: bool) -> Junction:
     """Return movements and phases of an intersection.
 
     Args:
-        item: The intersection.
+        intersection: The intersection.
         layout: Order of the numbers in its observation.
         halves: True if the observation holds halting vehicles, vehicles and outgoing lanes apart.
     """
     movements: dict[tuple[str, str], list[Link]] = {}
-    for link in item.links:
+    for link in intersection.links:
         movements.setdefault((link.from_edge, turn_of(link)), []).append(link)
     greens = {
         name: tuple(
-            sum(phase[link.index] in GREEN for link in links) / len(links) for phase in item.phases
+            sum(phase[link.index] in GREEN for link in links) / len(links)
+            for phase in intersection.phases
         )
         for name, links in movements.items()
     }
     # a movement that every phase treats alike (a right turn that is always green) cannot compete
     told = [name for name, shares in greens.items() if len(set(shares)) > 1] or list(greens)
     return Junction(
-        movements=tuple(_places(item, movements[name], halves) for name in told),
+        movements=tuple(_places(intersection, movements[name], halves) for name in told),
         greens=tuple(zip(*(greens[name] for name in told), strict=True)),
         first_phase=layout.features,
     )
 
 
-def _places(item: Intersection, links: Sequence[Link], halves: bool) -> tuple[Places, ...]:
+def _places(intersection: Intersection, links: Sequence[Link], halves: bool) -> tuple[Places, ...]:
     """Return the places of a movement's lanes in the observation, one tuple for each kind."""
-    incoming = tuple(sorted({item.incoming_lanes.index(link.from_lane) for link in links}))
+    incoming = tuple(sorted({intersection.incoming_lanes.index(link.from_lane) for link in links}))
     if not halves:
         return (incoming,)
-    outgoing = sorted({item.outgoing_lanes.index(link.to_lane) for link in links})
-    count = len(item.incoming_lanes)
+    outgoing = sorted({intersection.outgoing_lanes.index(link.to_lane) for link in links})
+    count = len(intersection.incoming_lanes)
     return (
         incoming,
         tuple(at + count for at in incoming),

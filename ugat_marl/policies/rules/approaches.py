@@ -59,7 +59,10 @@ class ControlledNetwork:
     @cached_property
     def approaches(self) -> dict[str, Approach]:
         """Agent to the lanes and phases of its intersection."""
-        return {agent: Approach.of(item, self) for agent, item in self.intersections.items()}
+        return {
+            agent: Approach.of(intersection, self)
+            for agent, intersection in self.intersections.items()
+        }
 
     def decisions(self, seconds: float) -> int:
         """Return the fewest decisions that last at least `seconds`."""
@@ -103,22 +106,22 @@ class Approach:
     cycle: tuple[int, ...]
 
     @classmethod
-    def of(cls, item: Intersection, network: ControlledNetwork) -> Approach:
+    def of(cls, intersection: Intersection, network: ControlledNetwork) -> Approach:
         """Collect the lanes and phases of one intersection."""
-        lanes = list(item.incoming_lanes)
-        served = np.zeros((len(item.phases), len(lanes)), np.bool_)
-        for row, phase in enumerate(item.phases):
-            green = green_indices(item, phase)
-            for link in item.links:
+        lanes = list(intersection.incoming_lanes)
+        served = np.zeros((len(intersection.phases), len(lanes)), np.bool_)
+        for row, phase in enumerate(intersection.phases):
+            green = green_indices(intersection, phase)
+            for link in intersection.links:
                 if link.index in green:
                     served[row, lanes.index(link.from_lane)] = True
         return cls(
             tuple(lanes),
-            len(item.outgoing_lanes),
+            len(intersection.outgoing_lanes),
             np.array([network.capacity[lane] for lane in lanes]),
             np.array([network.free_flow_s[lane] for lane in lanes]),
             served,
-            covering_phases(item),
+            covering_phases(intersection),
         )
 
     def traffic(self, agent: str, observation: NDArray[np.float32]) -> Traffic:
@@ -155,18 +158,18 @@ def allowed_phases(infos: Infos, agent: str, phases: int) -> NDArray[np.bool_]:
     return np.ones(phases, np.bool_) if mask is None else np.asarray(mask, dtype=np.bool_)
 
 
-def green_indices(item: Intersection, phase: str) -> frozenset[int]:
+def green_indices(intersection: Intersection, phase: str) -> frozenset[int]:
     """Return the indices of the links that are green in a phase."""
-    return frozenset(link.index for link in item.links if phase[link.index] in GREEN)
+    return frozenset(link.index for link in intersection.links if phase[link.index] in GREEN)
 
 
-def covering_phases(item: Intersection) -> tuple[int, ...]:
+def covering_phases(intersection: Intersection) -> tuple[int, ...]:
     """Return the smallest set of phases that gives every servable link green, ascending.
 
     Among sets of equal size, take the one with the fewest green links in all (least overlap). If
     several remain, take the first.
     """
-    served = [green_indices(item, phase) for phase in item.phases]
+    served = [green_indices(intersection, phase) for phase in intersection.phases]
     wanted = frozenset[int]().union(*served)
     if len(served) > MOST_SEARCHED_PHASES:
         return _greedy_cover(served, wanted)

@@ -38,9 +38,9 @@ def main_roads(network: ControlledNetwork) -> list[Road]:
     free = dict(network.intersections)
     roads: list[Road] = []
     while free:
-        found = [road for agent in free for road in _roads_from(agent, free, network)]
+        candidates = [road for agent in free for road in _roads_from(agent, free, network)]
         best = max(
-            found, key=lambda road: (len(road.agents), road.lanes)
+            candidates, key=lambda road: (len(road.agents), road.lanes)
         )  # max returns the first of equals
         roads.append(best)
         for agent in best.agents:
@@ -51,7 +51,11 @@ def main_roads(network: ControlledNetwork) -> list[Road]:
 def _roads_from(
     agent: str, free: Mapping[str, Intersection], network: ControlledNetwork
 ) -> Iterator[Road]:
-    entered = {edge_of(lane): other for other, item in free.items() for lane in item.incoming_lanes}
+    entered = {
+        edge_of(lane): other
+        for other, intersection in free.items()
+        for lane in intersection.incoming_lanes
+    }
     for edge in dict.fromkeys(edge_of(lane) for lane in free[agent].incoming_lanes):
         agents, edges, arrival_s, lanes = [agent], [edge], [0.0], 0
         while True:
@@ -90,7 +94,9 @@ class GreenWave:
     ) -> None:
         self.env_options: Mapping[str, Any] = {}
         self.green_s, self.main_s = green_s, green_s if main_s is None else main_s
-        self._phases = {a: len(item.phases) for a, item in network.intersections.items()}
+        self._phases = {
+            a: len(intersection.phases) for a, intersection in network.intersections.items()
+        }
         self._turns: dict[str, list[int]] = {}
         self._offsets: dict[str, int] = {}
         for road in main_roads(network):
@@ -123,9 +129,12 @@ class GreenWave:
         for agent, edge, arrival_s, cycle in zip(
             road.agents, road.edges, road.arrival_s, cycles, strict=True
         ):
-            item = network.intersections[agent]
-            wanted = {link.index for link in _straight(item, edge)}
-            along = max(cycle, key=lambda p: len(wanted & green_indices(item, item.phases[p])))
+            intersection = network.intersections[agent]
+            wanted = {link.index for link in _straight(intersection, edge)}
+            along = max(
+                cycle,
+                key=lambda p: len(wanted & green_indices(intersection, intersection.phases[p])),
+            )
             at = cycle.index(along)
             others = [*cycle[at + 1 :], *cycle[:at]]
             turns = [along] * (length - other * len(others))
@@ -133,5 +142,5 @@ class GreenWave:
             self._offsets[agent] = round(arrival_s / network.decision_interval_s)
 
 
-def _straight(item: Intersection, edge: str) -> list[Link]:
-    return [link for link in item.links if link.direction == "s" and link.from_edge == edge]
+def _straight(intersection: Intersection, edge: str) -> list[Link]:
+    return [link for link in intersection.links if link.direction == "s" and link.from_edge == edge]

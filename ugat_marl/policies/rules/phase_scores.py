@@ -91,8 +91,8 @@ class LargestQueue(_Scored):
     def __init__(self, network: ControlledNetwork, hold_s: float = 20.0) -> None:
         self.hold_s = hold_s
         weights = {
-            agent: _queue_weights(item, network.capacity)
-            for agent, item in network.intersections.items()
+            agent: _queue_weights(intersection, network.capacity)
+            for agent, intersection in network.intersections.items()
         }
         super().__init__(network, weights, hold_s)
 
@@ -113,8 +113,8 @@ class MaxPressure(_Scored):
     def __init__(self, network: ControlledNetwork, hold_s: float = 10.0) -> None:
         self.hold_s = hold_s
         weights = {
-            agent: _pressure_weights(item, network.capacity)
-            for agent, item in network.intersections.items()
+            agent: _pressure_weights(intersection, network.capacity)
+            for agent, intersection in network.intersections.items()
         }
         super().__init__(network, weights, hold_s)
 
@@ -164,31 +164,41 @@ class LongestWaiting(_Scored):
         super().__init__(network, weights, hold_s)
 
 
-def _queue_weights(item: Intersection, capacity: Mapping[str, float]) -> NDArray[np.float64]:
+def _queue_weights(
+    intersection: Intersection, capacity: Mapping[str, float]
+) -> NDArray[np.float64]:
     """Return weights that add up the halting vehicles a phase serves.
 
     The shape is ``(phases, 2 * incoming + outgoing)``, as the features of `movements`.
     """
-    incoming = list(item.incoming_lanes)
-    weights = np.zeros((len(item.phases), 2 * len(incoming) + len(item.outgoing_lanes)))
-    for row, phase in enumerate(item.phases):
-        green = green_indices(item, phase)
-        for lane in {link.from_lane for link in item.links if link.index in green}:
+    incoming = list(intersection.incoming_lanes)
+    weights = np.zeros(
+        (len(intersection.phases), 2 * len(incoming) + len(intersection.outgoing_lanes))
+    )
+    for row, phase in enumerate(intersection.phases):
+        green = green_indices(intersection, phase)
+        for lane in {link.from_lane for link in intersection.links if link.index in green}:
             weights[row, incoming.index(lane)] = capacity[lane]
     return weights
 
 
-def _pressure_weights(item: Intersection, capacity: Mapping[str, float]) -> NDArray[np.float64]:
+def _pressure_weights(
+    intersection: Intersection, capacity: Mapping[str, float]
+) -> NDArray[np.float64]:
     """Return weights for vehicles upstream minus mean vehicles downstream.
 
     The shape is ``(phases, 2 * incoming + outgoing)``, as the features of `movements`.
     """
-    incoming, outgoing = list(item.incoming_lanes), list(item.outgoing_lanes)
-    weights = np.zeros((len(item.phases), 2 * len(incoming) + len(outgoing)))
-    for row, phase in enumerate(item.phases):
-        green = green_indices(item, phase)
+    incoming, outgoing = list(intersection.incoming_lanes), list(intersection.outgoing_lanes)
+    weights = np.zeros((len(intersection.phases), 2 * len(incoming) + len(outgoing)))
+    for row, phase in enumerate(intersection.phases):
+        green = green_indices(intersection, phase)
         for lane in incoming:
-            links = [link for link in item.links if link.from_lane == lane and link.index in green]
+            links = [
+                link
+                for link in intersection.links
+                if link.from_lane == lane and link.index in green
+            ]
             targets = sorted({link.to_lane for link in links})
             if targets:
                 weights[row, len(incoming) + incoming.index(lane)] = capacity[lane]

@@ -62,9 +62,9 @@ def from_cityflow(
         notes = write_network(net, folder / NETWORK)
         length_s, routes = duration_s or 3600.0, ()
         if own_vehicles:
-            found = write_routes(flow, net, folder / ROUTES, duration_s, reporter, exact=exact)
+            demand = write_routes(flow, net, folder / ROUTES, duration_s, reporter, exact=exact)
             routes = (ROUTES,)
-            length_s = duration_s or max(3600.0, 600.0 * (math.floor(found.last_s / 600) + 1))
+            length_s = duration_s or max(3600.0, 600.0 * (math.floor(demand.last_s / 600) + 1))
         return RoadFiles(
             f"CityFlow network {roadnet.name}",
             f"Turned from CityFlow's `{roadnet.name}` and `{flow.name}`: lanes, stop lines, turns "
@@ -246,7 +246,7 @@ def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
     without: list[str] = []
     for logic in root.iter("tlLogic"):
         crossing = net.crossings[logic.get("id", "")]
-        own = links.get(crossing.id, [])
+        crossing_links = links.get(crossing.id, [])
         number_of = dict(enumerate(number for number, _ in _ways(crossing, net)))
         width = len(number_of)
         for phase in list(logic):
@@ -255,7 +255,12 @@ def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
         if not clearance_s:
             without.append(crossing.id)
         states = [
-            state_of([k for k in own if number_of[k.index] in green], own, rules, width)
+            state_of(
+                [k for k in crossing_links if number_of[k.index] in green],
+                crossing_links,
+                rules,
+                width,
+            )
             for _, green in greens
         ]
         for place, (seconds, _) in enumerate(greens):
@@ -423,12 +428,12 @@ def _vehicle_type(raw: Any, name: str, where: str, *, exact: bool) -> dict[str, 
 
 
 def _number(raw: Mapping[str, Any], key: str, where: str, *, least: float) -> float:
-    found = raw.get(key)
-    if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
+    value = raw.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ScenarioError(f"{where}: {key!r} is missing or not a number")
-    if found < least:
-        raise ScenarioError(f"{where}: {key} = {found:g} must be at least {least:g}")
-    return float(found)
+    if value < least:
+        raise ScenarioError(f"{where}: {key} = {value:g} must be at least {least:g}")
+    return float(value)
 
 
 class _Routes:
@@ -455,12 +460,12 @@ class _Routes:
 
     @cached_property
     def _ahead(self) -> dict[str, list[str]]:
-        found: dict[str, list[str]] = {name: [] for name in self._net.roads}
+        ahead: dict[str, list[str]] = {name: [] for name in self._net.roads}
         for crossing in self._net.crossings.values():
             for link in crossing.links:
                 if link.lanes:
-                    found[link.start].append(link.end)
-        return found
+                    ahead[link.start].append(link.end)
+        return ahead
 
     @cached_property
     def _length_m(self) -> dict[str, float]:

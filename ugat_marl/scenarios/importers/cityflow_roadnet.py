@@ -87,11 +87,11 @@ def read_roadnet(path: Path) -> Roadnet:
     raw, text = read_json(path)
     reader = _Reader(path, text)
     table = reader.table(raw, "the file")
-    roads = [reader.road(item) for item in reader.items(table, "roads", "the file")]
+    roads = [reader.road(entry) for entry in reader.items(table, "roads", "the file")]
     net = Roadnet(
         reader.by_name(roads, "road"),
         reader.by_name(
-            [reader.crossing(item) for item in reader.items(table, "intersections", "the file")],
+            [reader.crossing(entry) for entry in reader.items(table, "intersections", "the file")],
             "intersection",
         ),
     )
@@ -150,47 +150,47 @@ class _Reader:
         line = f", line {self._text.count(chr(10), 0, place) + 1}" if place >= 0 else ""
         return ScenarioError(f"{self._path}{line}: {complaint}")
 
-    def by_name(self, items: Sequence[Any], what: str) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for item in items:
-            if item.id in found:
-                raise self.error(item.id, f"two {what}s are called {item.id!r}")
-            found[item.id] = item
-        return found
+    def by_name(self, items: Sequence[Any], kind: str) -> dict[str, Any]:
+        named: dict[str, Any] = {}
+        for entry in items:
+            if entry.id in named:
+                raise self.error(entry.id, f"two {kind}s are called {entry.id!r}")
+            named[entry.id] = entry
+        return named
 
     def road(self, raw: Any) -> Road:
-        item = self.table(raw, "a road")
-        name = self._name(item, "id", "a road")
+        table = self.table(raw, "a road")
+        name = self._name(table, "id", "a road")
         where = f"road {name!r}"
         points = tuple(
-            self._point(point, name, where) for point in self.items(item, "points", where)
+            self._point(point, name, where) for point in self.items(table, "points", where)
         )
         lanes = tuple(
             (
                 self._number(lane, "width", name, where, least=0.1),
                 self._number(lane, "maxSpeed", name, where, least=0.1),
             )
-            for lane in self.items(item, "lanes", where)
+            for lane in self.items(table, "lanes", where)
         )
         if len(points) < 2 or not lanes:
             raise self.error(name, f"{where}: needs at least two points and one lane")
         start, end = (
-            self._name(item, key, where) for key in ("startIntersection", "endIntersection")
+            self._name(table, key, where) for key in ("startIntersection", "endIntersection")
         )
         return Road(name, points, lanes, start, end)
 
     def crossing(self, raw: Any) -> Crossing:
-        item = self.table(raw, "an intersection")
-        name = self._name(item, "id", "an intersection")
+        table = self.table(raw, "an intersection")
+        name = self._name(table, "id", "an intersection")
         where = f"intersection {name!r}"
-        light = item.get("trafficLight") or {}
+        light = table.get("trafficLight") or {}
         phases = self.items(light, "lightphases", where) if "lightphases" in light else []
         return Crossing(
             name,
-            self._point(item.get("point"), name, where),
-            self._number(item, "width", name, where) if "width" in item else 0.0,
-            bool(item.get("virtual", False)),
-            tuple(self._link(link, name, where) for link in self.items(item, "roadLinks", where)),
+            self._point(table.get("point"), name, where),
+            self._number(table, "width", name, where) if "width" in table else 0.0,
+            bool(table.get("virtual", False)),
+            tuple(self._link(link, name, where) for link in self.items(table, "roadLinks", where)),
             tuple(
                 (
                     self._number(phase, "time", name, where),
@@ -204,14 +204,14 @@ class _Reader:
         )
 
     def _link(self, raw: Any, name: str, where: str) -> RoadLink:
-        item = self.table(raw, f"{where}: a roadLink")
+        link_table = self.table(raw, f"{where}: a roadLink")
         lanes: list[tuple[int, int]] = []
-        for lane in self.items(item, "laneLinks", f"{where}: a roadLink"):
+        for lane in self.items(link_table, "laneLinks", f"{where}: a roadLink"):
             table = self.table(lane, f"{where}: a laneLink")
             ends = (table.get("startLaneIndex"), table.get("endLaneIndex"))
             a, b = (self._index(end, name, f"{where}: a laneLink") for end in ends)
             lanes.append((a, b))
-        start, end = (self._name(item, key, where) for key in ("startRoad", "endRoad"))
+        start, end = (self._name(link_table, key, where) for key in ("startRoad", "endRoad"))
         return RoadLink(start, end, tuple(dict.fromkeys(lanes)))
 
     def table(self, raw: Any, where: str) -> dict[str, Any]:
@@ -220,29 +220,29 @@ class _Reader:
         return raw
 
     def items(self, raw: Any, key: str, where: str) -> list[Any]:
-        found = self.table(raw, where).get(key)
-        if not isinstance(found, list):
+        entries = self.table(raw, where).get(key)
+        if not isinstance(entries, list):
             raise ScenarioError(f"{self._path}: {where}: {key!r} is missing or not a list")
-        return found
+        return entries
 
-    def _name(self, item: Mapping[str, Any], key: str, where: str) -> str:
-        found = item.get(key)
-        if not isinstance(found, str) or not found:
+    def _name(self, table: Mapping[str, Any], key: str, where: str) -> str:
+        name = table.get(key)
+        if not isinstance(name, str) or not name:
             raise ScenarioError(f"{self._path}: {where}: {key!r} is missing or not a name")
-        return found
+        return name
 
     def _point(self, raw: Any, name: str, where: str) -> Point:
-        item = self.table(raw, f"{where}: a point")
-        x, y = (self._number(item, key, name, where, least=-math.inf) for key in ("x", "y"))
+        table = self.table(raw, f"{where}: a point")
+        x, y = (self._number(table, key, name, where, least=-math.inf) for key in ("x", "y"))
         return x, y
 
     def _number(self, raw: Any, key: str, name: str, where: str, *, least: float = 0.0) -> float:
-        found = self.table(raw, where).get(key)
-        if isinstance(found, bool) or not isinstance(found, int | float):
+        value = self.table(raw, where).get(key)
+        if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.error(name, f"{where}: {key!r} is missing or not a number")
-        if not math.isfinite(found) or found < least:
-            raise self.error(name, f"{where}: {key} = {found} must be at least {least:g}")
-        return float(found)
+        if not math.isfinite(value) or value < least:
+            raise self.error(name, f"{where}: {key} = {value} must be at least {least:g}")
+        return float(value)
 
     def _index(self, raw: Any, name: str, where: str) -> int:
         if isinstance(raw, bool) or not isinstance(raw, int) or raw < 0:

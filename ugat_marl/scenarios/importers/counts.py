@@ -87,7 +87,7 @@ def read_rows(
         raise ScenarioError(
             f"{path}, line 1: the columns {wanted} are needed; there are: {', '.join(columns)}"
         )
-    found: list[Row] = []
+    rows_read: list[Row] = []
     total = 0.0
     for values in _whole(reader, path):
         where = f"{path}, line {reader.line_num}"
@@ -106,9 +106,9 @@ def read_rows(
             raise ScenarioError(
                 f"{where}: end_s ({row.end_s:g}) is not after begin_s ({row.begin_s:g})"
             )
-        found.append(row)
+        rows_read.append(row)
         total += count
-        if len(found) > _MOST_ROWS or total > MOST_VEHICLES:
+        if len(rows_read) > _MOST_ROWS or total > MOST_VEHICLES:
             raise ScenarioError(
                 f"{where}: more than "
                 + (f"{MOST_VEHICLES} vehicles" if total > MOST_VEHICLES else f"{_MOST_ROWS} rows")
@@ -116,7 +116,7 @@ def read_rows(
             )
     if not total:
         raise ScenarioError(f"{path}: no row counts a vehicle")
-    return found
+    return rows_read
 
 
 def _whole(reader: csv.DictReader[str], path: Path) -> Iterator[dict[str, str]]:
@@ -203,9 +203,9 @@ def _counts_for_sumo(rows: Sequence[Row], work: Path) -> list[str]:
     for row in rows:
         by_time[row.begin_s, row.end_s].append(row)
     root = ET.Element("data")
-    for (begin, end), own in sorted(by_time.items()):
+    for (begin, end), interval_rows in sorted(by_time.items()):
         interval = ET.SubElement(root, "interval", id="counts", begin=f"{begin}", end=f"{end}")
-        for row in own:
+        for row in interval_rows:
             count = f"{row.count:g}"
             first, last = row.roads[0], row.roads[-1]
             if turns:
@@ -220,11 +220,11 @@ def _counts_for_sumo(rows: Sequence[Row], work: Path) -> list[str]:
 
 
 def _sampled(path: Path) -> Iterator[Drive]:
-    for number, item in enumerate(parse_xml(read_bytes(path), str(path)).iter("vehicle")):
-        route = item.find("route")
+    for number, element in enumerate(parse_xml(read_bytes(path), str(path)).iter("vehicle")):
+        route = element.find("route")
         if route is not None:
             edges = tuple(route.get("edges", "").split())
-            yield Drive(f"{edges[0]}_{number}", float(item.get("depart", "0")), edges)
+            yield Drive(f"{edges[0]}_{number}", float(element.get("depart", "0")), edges)
 
 
 def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
@@ -246,11 +246,11 @@ def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
 
 def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
     """Map each road, and each turn between two roads, to the sorted departures of its vehicles."""
-    found: dict[tuple[str, ...], list[float]] = defaultdict(list)
+    passages: dict[tuple[str, ...], list[float]] = defaultdict(list)
     for drive in sorted(drives, key=lambda drive: drive.depart_s):
         for passed in chain(zip(drive.route, strict=True), pairwise(drive.route)):
-            found[passed].append(drive.depart_s)
-    return found
+            passages[passed].append(drive.depart_s)
+    return passages
 
 
 def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
@@ -312,11 +312,11 @@ def _route(trips: bytes, network: Path, out: Path, seed: int) -> None:
 
 
 def _reachable(streets: Streets, start: str) -> set[str]:
-    found, waiting = {start}, deque([start])
+    reached, waiting = {start}, deque([start])
     while waiting:
         for roads in streets.ahead.get(waiting.popleft(), {}).values():
             for road in roads:
-                if road not in found:
-                    found.add(road)
+                if road not in reached:
+                    reached.add(road)
                     waiting.append(road)
-    return found
+    return reached

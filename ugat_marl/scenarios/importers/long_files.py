@@ -51,7 +51,7 @@ def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], in
         if text.startswith("]", at):
             return
         try:
-            found, end = decoder.raw_decode(text, at)
+            parsed_object, end = decoder.raw_decode(text, at)
         except json.JSONDecodeError as error:
             piece = next(pieces, "")
             if not piece or len(text) - at > _MOST:
@@ -63,9 +63,9 @@ def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], in
             continue
         except (RecursionError, ValueError) as error:
             raise _strange(f"{path}, line {line}", error) from None
-        if not isinstance(found, dict):
+        if not isinstance(parsed_object, dict):
             raise ScenarioError(f"{path}, line {line}: an object in braces was expected here")
-        yield cast("dict[str, Any]", found), line
+        yield cast("dict[str, Any]", parsed_object), line
         line += text.count("\n", at, end)
         at = end
 
@@ -112,8 +112,8 @@ def read_json(path: Path) -> tuple[Any, str]:
 
 def _strange(where: str, error: Exception) -> ScenarioError:
     """Return the error for JSON that exceeds the limits of Python's reader."""
-    what = "nested too deeply" if isinstance(error, RecursionError) else "a number is far too long"
-    return ScenarioError(f"{where}: {what}; no file of CityFlow's is like that")
+    fault = "nested too deeply" if isinstance(error, RecursionError) else "a number is far too long"
+    return ScenarioError(f"{where}: {fault}; no file of CityFlow's is like that")
 
 
 def _texts(pieces: Pieces, path: Path) -> Iterator[str]:

@@ -136,19 +136,19 @@ def _write_settings(
     folder: Path, draft: RoadFiles, fleet: VehicleFiles, settings: Mapping[str, Any]
 ) -> tuple[str, ...]:
     """Write ``scenario.toml`` and return all notes."""
-    own = dict(draft.settings)
+    table = dict(draft.settings)
     notes = (*draft.notes, *fleet.notes)
     if draft.derive and "phases" not in settings.get("control", {}):
         kinds, more = suited(folder / draft.network)
         notes += tuple(more)
-        own["intersections"] = {tls: {"phases": kind} for tls, kind in kinds.items()}
-    control = {**own.pop("control", {}), **settings.get("control", {})}
+        table["intersections"] = {tls: {"phases": kind} for tls, kind in kinds.items()}
+    control = {**table.pop("control", {}), **settings.get("control", {})}
     content: dict[str, Any] = {
         "description": draft.description,
         "network": draft.network,
         "routes": list(fleet.routes),
         "additional": list(draft.additional),
-        **own,
+        **table,
         **{key: value for key, value in settings.items() if key != "control"},
         "control": control,
     }
@@ -171,7 +171,7 @@ def _errors_about(copied: Mapping[str, Path], folder: Path) -> Iterator[None]:
 
 def _readme(made: Made, draft: RoadFiles, command: str) -> str:
     settings = made.scenario.settings
-    phases = [len(item.phases) for item in made.network.intersections]
+    phases = [len(intersection.phases) for intersection in made.network.intersections]
     spread = f"{min(phases)} to {max(phases)}" if len(set(phases)) > 1 else f"{phases[0]}"
     others = len(made.network.uncontrolled)
     more = f"; on their own programme: {others} more" if others else ""

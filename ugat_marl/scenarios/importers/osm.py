@@ -135,18 +135,18 @@ def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
     walks: set[str] = set()
     nodes: set[str] = set()
     crossings: list[tuple[float, float]] = []
-    for item in items(source, path, reporter):
-        tags = item.tags
-        nodes.update(item.way_nodes)
-        roads += item.start.name == "way" and tags.get("highway") in _FOR_CARS
-        if item.start.name != "node" or not tags:
+    for element in items(source, path, reporter):
+        tags = element.tags
+        nodes.update(element.way_nodes)
+        roads += element.start.name == "way" and tags.get("highway") in _FOR_CARS
+        if element.start.name != "node" or not tags:
             continue
         light = "traffic_signals" in (tags.get("highway"), tags.get("crossing"))
         signals += light
         if light and ("crossing" in tags or tags.get("highway") == "crossing"):
-            walks.add(item.start.attributes.get("id", ""))
+            walks.add(element.start.attributes.get("id", ""))
         if has_light(tags):
-            crossings.append(place_of(item.start, path))
+            crossings.append(place_of(element.start, path))
         else:
             unlit += tags.get("highway") == "crossing"
     return _Extract(roads, signals, frozenset(walks), tuple(crossings), unlit, frozenset(nodes))
@@ -178,7 +178,7 @@ def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: b
     ]
     if idle:
         notes.append(f"{len(idle)} lights on plain roads were left out")
-    walked = sum(len(own) for own in crossings_of(root).values())
+    walked = sum(len(crossings) for crossings in crossings_of(root).values())
     left = extract.unlit + max(0, len(extract.crossings) - walked)
     if walked:
         notes.append(f"{walked} crossings for people on foot have a light; roads have sidewalks")
@@ -204,15 +204,15 @@ def _idle_lights(network: Path, walks: Iterable[str]) -> list[str]:
     root = parse_xml(read_bytes(network), str(network))
     foes = foes_of(root)
     kept = set(walks)
-    found: list[str] = []
+    idle: list[str] = []
     for links in links_of(root).values():
         junctions = {link.junction for link in links}
         contended = any(
             are_foes(a, b, foes) and a.from_edge != b.from_edge for a in links for b in links
         )
         if not contended and not junctions & kept:
-            found += sorted(junctions)
-    return found
+            idle += sorted(junctions)
+    return idle
 
 
 class Item(NamedTuple):
@@ -229,8 +229,8 @@ class Item(NamedTuple):
     @property
     def tags(self) -> dict[str, str]:
         """Keys and values of its tags."""
-        found = (tag.attributes for tag in self.inside if tag.name == "tag")
-        return {tag.get("k", ""): tag.get("v", "") for tag in found}
+        tag_attributes = (tag.attributes for tag in self.inside if tag.name == "tag")
+        return {tag.get("k", ""): tag.get("v", "") for tag in tag_attributes}
 
     @property
     def way_nodes(self) -> list[str]:
@@ -287,7 +287,7 @@ def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
     Raises:
         ScenarioError: As for `scan`, or the file is not an OpenStreetMap extract.
     """
-    item: Item | None = None
+    current: Item | None = None
     try:
         for number, tag in enumerate(scan(source, reporter)):
             if not number and tag.name != "osm":
@@ -296,15 +296,15 @@ def items(source: Path, path: Path, reporter: Reporter) -> Iterator[Item]:
                     f"with <{tag.name}>"
                 )
             if tag.name in ("node", "way", "relation"):
-                if item:
-                    yield item
-                item = Item(tag, [])
-            elif item and tag.name in ("tag", "nd", "member"):
-                item.inside.append(tag)
+                if current:
+                    yield current
+                current = Item(tag, [])
+            elif current and tag.name in ("tag", "nd", "member"):
+                current.inside.append(tag)
     except ScenarioError as error:
         raise ScenarioError(str(error).replace(str(source), str(path))) from None
-    if item:
-        yield item
+    if current:
+        yield current
 
 
 def write_roads(
@@ -327,13 +327,13 @@ def write_roads(
     """
     with scratch(), out.open("w", encoding="utf-8") as file:
         file.write("<?xml version='1.0' encoding='UTF-8'?>\n<osm version=\"0.6\">\n")
-        for item in items(source, path, reporter):
-            start = item.start
+        for element in items(source, path, reporter):
+            start = element.start
             corner = start.name == "node" and start.attributes.get("id") in nodes
             if corner:
                 place_of(start, path)  # netconvert would complain without a line
-            if corner or start.name == "relation" or item.way_nodes:
-                inside = "".join(f"{_open(tag)}/>" for tag in item.inside)
+            if corner or start.name == "relation" or element.way_nodes:
+                inside = "".join(f"{_open(tag)}/>" for tag in element.inside)
                 file.write(f"{_open(start)}>{inside}</{start.name}>\n")
         file.write("</osm>\n")
 

@@ -70,14 +70,14 @@ def crossings_for(root: ET.Element, places: Iterable[tuple[float, float]]) -> by
     if project is None:
         return None
     arms = _arms_at_lights(root)
-    found: dict[tuple[str, tuple[str, ...]], None] = {}
+    crossings: dict[tuple[str, tuple[str, ...]], None] = {}
     for longitude, latitude in places:
         if crossed := _crossed(project(longitude, latitude), arms):
-            found[crossed] = None
-    if not found:
+            crossings[crossed] = None
+    if not crossings:
         return None
     top = ET.Element("connections")
-    for junction, roads in found:
+    for junction, roads in crossings:
         ET.SubElement(top, "crossing", node=junction, edges=" ".join(roads), priority="true")
     return xml_bytes(top)
 
@@ -100,8 +100,8 @@ def _crossed(
             if nearest <= _NEAR_M and far_m < best_m - 1e-6:
                 names = [
                     name
-                    for (name, _), own in zip(arm.roads, apart, strict=True)
-                    if own <= nearest + _BESIDE_M
+                    for (name, _), side in zip(arm.roads, apart, strict=True)
+                    if side <= nearest + _BESIDE_M
                 ]
                 best_m, best = far_m, (junction, tuple(names))
     return best
@@ -109,16 +109,20 @@ def _crossed(
 
 def _arms_at_lights(root: ET.Element) -> dict[str, list[_Arm]]:
     lights = {
-        item.get("id", ""): np.array([float(item.get("x", "0")), float(item.get("y", "0"))])
-        for item in root.iter("junction")
-        if item.get("type", "").startswith("traffic_light")
+        element.get("id", ""): np.array(
+            [float(element.get("x", "0")), float(element.get("y", "0"))]
+        )
+        for element in root.iter("junction")
+        if element.get("type", "").startswith("traffic_light")
     }
     middles = {
-        item.get("id", ""): np.array([float(item.get("x", "0")), float(item.get("y", "0"))])
-        for item in root.iter("junction")
-        if item.get("type") != "internal"
+        element.get("id", ""): np.array(
+            [float(element.get("x", "0")), float(element.get("y", "0"))]
+        )
+        for element in root.iter("junction")
+        if element.get("type") != "internal"
     }
-    found: dict[str, list[_Arm]] = defaultdict(list)
+    arms: dict[str, list[_Arm]] = defaultdict(list)
     for edge in root.iter("edge"):
         start, end, name = edge.get("from", ""), edge.get("to", ""), edge.get("id", "")
         if edge.get("function") or not {start, end} & set(lights):
@@ -127,10 +131,10 @@ def _arms_at_lights(root: ET.Element) -> dict[str, list[_Arm]]:
         if line is None:
             line = np.array([middles[start], middles[end]])
         if end in lights:
-            _join(found[end], name, _first_metres(line[::-1]))
+            _join(arms[end], name, _first_metres(line[::-1]))
         if start in lights:
-            _join(found[start], name, _first_metres(line))
-    return found
+            _join(arms[start], name, _first_metres(line))
+    return arms
 
 
 def _join(arms: list[_Arm], name: str, line: Point) -> None:

@@ -75,16 +75,16 @@ class RoadPlan:
 
     def exits(self, approach: Road) -> dict[str, Road]:
         """Return the road after each turn (``l``, ``s``, ``r``) at the end of `approach`."""
-        found: dict[str, Road] = {}
+        by_turn: dict[str, Road] = {}
         for road in self.roads.values():
             if road.start != approach.end or road.end == approach.start:
                 continue
             bend = (self.heading_deg(road) - self.heading_deg(approach) + 180) % 360 - 180
             turn = "s" if abs(bend) < STRAIGHT_WITHIN_DEG else "l" if bend > 0 else "r"
-            if turn in found:
+            if turn in by_turn:
                 raise ScenarioError(f"{approach.id}: two roads ahead count as {TURNS[turn]}")
-            found[turn] = road
-        return found
+            by_turn[turn] = road
+        return by_turn
 
     def connections(self, approach: Road) -> list[tuple[int, Road, int]]:
         """Return (lane, road entered, lane entered) for every lane and turn of `approach`.
@@ -96,7 +96,7 @@ class RoadPlan:
         """
         exits = self.exits(approach)
         through = [lane for lane, turns in enumerate(approach.lanes) if "s" in turns]
-        found: list[tuple[int, Road, int]] = []
+        connected: list[tuple[int, Road, int]] = []
         for lane, turns in enumerate(approach.lanes):
             for turn in turns:
                 if turn not in exits:
@@ -108,8 +108,8 @@ class RoadPlan:
                     entered = range(order, count if lane == through[-1] else order + 1)
                 if not entered:
                     raise ScenarioError(f"{approach.id}: more lanes straight on than the road has")
-                found.extend((lane, exits[turn], target) for target in entered)
-        return found
+                connected.extend((lane, exits[turn], target) for target in entered)
+        return connected
 
 
 def read_road_plan(source: Mapping[str, Any]) -> RoadPlan:

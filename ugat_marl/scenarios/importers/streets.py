@@ -39,10 +39,10 @@ class Streets:
                 start[edge.get("id", "")] = edge.get("from", "")
                 end[edge.get("id", "")] = edge.get("to", "")
         ahead: dict[str, dict[str, dict[str, None]]] = defaultdict(lambda: defaultdict(dict))
-        for item in root.iter("connection"):
-            here, there = item.get("from", ""), item.get("to", "")
+        for element in root.iter("connection"):
+            here, there = element.get("from", ""), element.get("to", "")
             if here in start and there in start:
-                letter = item.get("dir", "s")
+                letter = element.get("dir", "s")
                 ahead[here][TURNS.get(letter, letter)][there] = None
         reached: set[str] = set()
         left: set[str] = set()

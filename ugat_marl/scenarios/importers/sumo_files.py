@@ -80,7 +80,7 @@ def _configured(
     kept = {key: settings[key] for key in times if settings.get(key)}
 
     def placed(documents: Sequence[Document]) -> tuple[str, ...]:
-        return tuple(_put(item, folder, link) for item in documents)
+        return tuple(_put(document, folder, link) for document in documents)
 
     return RoadFiles(
         f"SUMO configuration {path.name}",
@@ -90,20 +90,20 @@ def _configured(
         additional=placed(additional),
         settings=kept,
         copied={
-            item.name: item.path
-            for item in (network, *routes, *additional)
-            if item.path is not None and item.home is None
+            document.name: document.path
+            for document in (network, *routes, *additional)
+            if document.path is not None and document.home is None
         },
     )
 
 
 def _network_of(path: Path) -> Document:
     root: ET.Element = parse_xml(read_bytes(path), str(path))
-    for item in root.iter():
-        if item.tag in ("net-file", "net", "n"):
-            file = path.parent / item.get("value", item.get("v", ""))
+    for element in root.iter():
+        if element.tag in ("net-file", "net", "n"):
+            file = path.parent / element.get("value", element.get("v", ""))
             if not file.is_file():
-                raise ScenarioError(f"{path}: <{item.tag}> names {file}, which does not exist")
+                raise ScenarioError(f"{path}: <{element.tag}> names {file}, which does not exist")
             return Document(file.name, file)
     raise ScenarioError(f"{path}: no <net-file value=...>; a scenario needs a network")
 
@@ -135,10 +135,10 @@ def _require_new(path: Path) -> None:
 def _leads(network: Path) -> dict[str, set[str]]:
     """Return, for each edge of a network, the edges it leads to."""
     root = parse_xml(read_bytes(network), str(network))
-    found: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
-    for item in root.iter("connection"):
-        found.setdefault(item.get("from", ""), set()).add(item.get("to", ""))
-    return found
+    onward: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
+    for element in root.iter("connection"):
+        onward.setdefault(element.get("from", ""), set()).add(element.get("to", ""))
+    return onward
 
 
 def _require_known(tag: Tag, leads: Mapping[str, set[str]], path: Path) -> None:
@@ -162,17 +162,17 @@ def _require_connected(tag: Tag, leads: Mapping[str, set[str]], path: Path, netw
             )
 
 
-def _require_root(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> None:
-    for _ in _rooted(path, tags, what, reporter):
+def _require_root(path: Path, tags: Sequence[str], kind: str, reporter: Reporter) -> None:
+    for _ in _rooted(path, tags, kind, reporter):
         pass
 
 
-def _rooted(path: Path, tags: Sequence[str], what: str, reporter: Reporter) -> Iterator[Tag]:
+def _rooted(path: Path, tags: Sequence[str], kind: str, reporter: Reporter) -> Iterator[Tag]:
     """Yield all elements of a file; refuse a root that is not in `tags`."""
     for number, tag in enumerate(scan(path, reporter)):
         if not number and tag.name not in tags:
             raise ScenarioError(
-                f"{path}, line {tag.line}: a {what} begins with "
+                f"{path}, line {tag.line}: a {kind} begins with "
                 f"{' or '.join(f'<{name}>' for name in tags)}, this with <{tag.name}>"
             )
         yield tag

@@ -92,25 +92,25 @@ def walked(
         )
     left, straight, right = shares
     table = {"l": left, "s": straight, "r": right}
-    found: list[Drive] = []
+    drives: list[Drive] = []
     due = 0
     for entry in streets.entries:
         random = numpy_generator(seed, "entry", entry)
         for number, moment in enumerate(poisson_arrivals(random, vph / 3600, length_s)):
             due += 1
             if route := _walk(streets, entry, table, random):
-                found.append(Drive(f"{entry}_{number}", round(moment, 2), route))
+                drives.append(Drive(f"{entry}_{number}", round(moment, 2), route))
     if not due:
         raise ScenarioError(
             f"nobody enters within {length_s:g} s at {vph:g} vehicles an hour; raise --vph or "
             "--duration-s"
         )
-    if not found:
+    if not drives:
         raise ScenarioError(
             "no way from an entry of the network to one of its exits was found at random; give "
             "routes (--routes) or origins and destinations (--od)"
         )
-    return sorted(found, key=lambda drive: (drive.depart_s, drive.id))
+    return sorted(drives, key=lambda drive: (drive.depart_s, drive.id))
 
 
 def _walk(
@@ -138,14 +138,14 @@ def poisson_arrivals(
     random: np.random.Generator, rate_per_s: float, length_s: float
 ) -> list[float]:
     """Draw the times of Poisson arrivals in [0, length_s), s."""
-    found: list[float] = []
+    times: list[float] = []
     moment = 0.0
     while rate_per_s > 0:
         moment -= math.log(1.0 - float(random.random())) / rate_per_s
         if moment >= length_s:
             break
-        found.append(moment)
-    return found
+        times.append(moment)
+    return times
 
 
 def weighted_choice(shares: Mapping[str, float], random: np.random.Generator) -> str:
