@@ -4,14 +4,14 @@ from .charts import gap_picture as gap_picture
 from .charts import transfer_picture as transfer_picture
 from .comparison_tables import comparison_csv as comparison_csv
 from .comparison_tables import comparison_page as comparison_page
-from .comparison_tables import number_text as number_text
-from .comparison_tables import percent_text as percent_text
 from .comparison_tables import seeds_csv as seeds_csv
-from .comparison_tables import share_text as share_text
 from .comparison_tables import terminal_tables as terminal_tables
 from .diagnosis_page import commands_on_page as commands_on_page
 from .diagnosis_page import write_diagnosis_page as write_diagnosis_page
 from .diagnosis_tables import diagnosis_summary as diagnosis_summary
+from .formats import number_text as number_text
+from .formats import percent_text as percent_text
+from .formats import share_text as share_text
 from .gap_tables import gap_matrix_table as gap_matrix_table
 from .gap_tables import objective_tables as objective_tables
 from .learning_curves import curves_as_csv as curves_as_csv

@@ -23,9 +23,9 @@ from ugat_marl.reporting.figures import (
     new_picture,
     printable,
     shortened,
-    tick_text,
     write_png,
 )
+from ugat_marl.reporting.formats import tick_text
 from ugat_marl.reporting.run_records import RunRecord
 from ugat_marl.reporting.style import LIGHT, curve_style, styled
 

@@ -16,8 +16,15 @@ from rich.text import Text
 
 from ugat_marl.data import MEASURES
 from ugat_marl.experiments import LEAST_SHARE_ARRIVED, Comparison, Interval, PairedTest
-from ugat_marl.reporting.formats import PAGE_WIDTH, command_block, listed, made_with
-from ugat_marl.reporting.tables import number_text
+from ugat_marl.reporting.formats import (
+    PAGE_WIDTH,
+    command_block,
+    listed,
+    made_with,
+    number_text,
+    percent_text,
+    share_text,
+)
 
 CERTAIN = 0.05
 """Level of the paired tests in the paragraph that says what the table means."""
@@ -239,16 +246,6 @@ def with_interval(interval: Interval) -> str:
     to = " to " if interval.low < 0 else "–"
     mean, low, high = map(number_text, (interval.mean, interval.low, interval.high))
     return f"{mean} ({low}{to}{high})"
-
-
-def share_text(value: float) -> str:
-    """Return a share of the regret; a dash for nan."""
-    return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
-
-
-def percent_text(value: float) -> str:
-    """Return a signed share in per cent; a dash for nan."""
-    return "–" if math.isnan(value) else f"{'−' if value < 0 else '+'}{abs(100 * value):.0f} %"
 
 
 def _tested(test: PairedTest) -> str:

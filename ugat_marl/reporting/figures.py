@@ -215,10 +215,3 @@ def printable(text: str) -> str:
 def shortened(text: str, most: int) -> str:
     """Return a text of `most` characters at most, cut with an ellipsis."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
-
-
-def tick_text(value: float, _: Any = None) -> str:
-    """Return the text of a number on a scale; the second argument is matplotlib's and unused."""
-    if abs(value) >= 10_000:
-        return f"{value:,.0f}".replace(",", "\u2009").replace("-", "−")
-    return f"{round(value, 6):.4g}".replace("-", "−")

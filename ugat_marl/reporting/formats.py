@@ -1,4 +1,8 @@
-"""Numbers as texts for pages and for the terminal."""
+"""Numbers as texts, and texts of Markdown.
+
+`number`, `signed`, `share` and `chance` are for prose and pages, `number_text`, `share_text` and
+`percent_text` for columns of tables, which align by their decimals, and `tick_text` for axes.
+"""
 
 from __future__ import annotations
 
@@ -47,6 +51,32 @@ def chance(value: Any) -> str:
     if value is None:
         return "–"
     return "< 0.001" if value < 0.001 else f"{value:.2g}"
+
+
+def number_text(value: float) -> str:
+    """Return three significant digits, or a whole number above a hundred; "-" for nan."""
+    if math.isnan(value):
+        return "-"
+    if abs(value) >= 99.95:
+        return f"{value:.0f}"
+    return f"{value:.1f}" if abs(value) >= 0.9995 else f"{value:.2f}"
+
+
+def share_text(value: float) -> str:
+    """Return a share of the regret with two decimals; a dash for nan."""
+    return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
+
+
+def percent_text(value: float) -> str:
+    """Return a signed share in per cent; a dash for nan."""
+    return "–" if math.isnan(value) else f"{'−' if value < 0 else '+'}{abs(100 * value):.0f} %"
+
+
+def tick_text(value: float, _: Any = None) -> str:
+    """Return the text of a number on a scale; the second argument is matplotlib's and unused."""
+    if abs(value) >= 10_000:
+        return f"{value:,.0f}".replace(",", "\u2009").replace("-", "−")
+    return f"{round(value, 6):.4g}".replace("-", "−")
 
 
 PAGE_WIDTH = 140

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, domains_by_gap, gap_matrix
-from ugat_marl.reporting.tables import number_text
+from ugat_marl.reporting.formats import number_text
 
 
 def gap_matrix_table(found: Evaluation) -> RenderableType:

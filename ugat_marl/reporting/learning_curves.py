@@ -11,8 +11,7 @@ import numpy as np
 
 from ugat_marl.experiments import Curve, Curves, CurvesConfig, Interval
 from ugat_marl.reporting.comparison_tables import with_interval
-from ugat_marl.reporting.formats import command_block, made_with
-from ugat_marl.reporting.tables import number_text
+from ugat_marl.reporting.formats import command_block, made_with, number_text
 
 
 def curves_page(found: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -> str:

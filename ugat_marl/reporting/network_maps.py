@@ -18,8 +18,8 @@ from ugat_marl.reporting.figures import (
     new_picture,
     printable,
     shortened,
-    tick_text,
 )
+from ugat_marl.reporting.formats import tick_text
 from ugat_marl.reporting.style import (
     DISAGREEMENT,
     LIGHT,

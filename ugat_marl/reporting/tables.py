@@ -13,6 +13,7 @@ from rich.text import Text
 from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.experiments import Estimate, Evaluation, Tuned
+from ugat_marl.reporting.formats import number_text
 
 
 def transfer_table(found: Evaluation) -> RenderableType:
@@ -206,12 +207,3 @@ def _with_interval(estimate: Estimate) -> str:
 def _signed(estimate: Estimate) -> str:
     text = number_text(estimate.mean)
     return text if text.startswith("-") else f"+{text}"
-
-
-def number_text(value: float) -> str:
-    """Return three significant digits, or a whole number above a hundred."""
-    if math.isnan(value):
-        return "-"
-    if abs(value) >= 99.95:
-        return f"{value:.0f}"
-    return f"{value:.1f}" if abs(value) >= 0.9995 else f"{value:.2f}"
