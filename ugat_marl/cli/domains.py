@@ -48,18 +48,18 @@ class Domains:
         """Print the lists."""
         if self.gap is not None and self.gap not in GAP_KINDS:
             raise UnknownNameError("gap", self.gap, GAP_KINDS)
-        listed = [item for item in NAMED_DOMAINS.values() if self.gap in (None, item.gap)]
+        listed = [domain for domain in NAMED_DOMAINS.values() if self.gap in (None, domain.gap)]
         if self.json:
-            console.print_json(json.dumps([asdict(item) for item in listed]))
+            console.print_json(json.dumps([asdict(domain) for domain in listed]))
             return 0
         for gap in GAP_KINDS:
-            own = [item for item in listed if item.gap == gap]
-            if own:
-                console.print(_table(_TITLES[gap], own))
-                for line in _notes(own):
+            of_gap = [domain for domain in listed if domain.gap == gap]
+            if of_gap:
+                console.print(_table(_TITLES[gap], of_gap))
+                for line in _notes(of_gap):
                     console.print(Text(line, style="dim"))
                 console.print()
-        theirs = sum(bool(item.counterpart) for item in listed)
+        theirs = sum(bool(domain.counterpart) for domain in listed)
         console.print(
             f"{len(listed)} domains, {theirs} with a counterpart in Sim2Signal (arXiv:2609.01676). "
             "Effects and their units: docs/reference/effects.md, docs/reference/domains.md",
@@ -77,19 +77,19 @@ def _table(title: str, domains: list[NamedDomain]) -> Table:
     table.add_column("effects", overflow="fold")
     table.add_column("Sim2Signal", max_width=21, overflow="fold")
     aliases = {name: alias for alias, name in DOMAIN_ALIASES.items()}
-    for item in domains:
-        alias = f" ({aliases[item.name]})" if item.name in aliases else ""
-        effects = item.effects.replace("+", " + ")
-        table.add_row(Text(item.name + alias), Text(effects), Text(item.counterpart))
+    for domain in domains:
+        alias = f" ({aliases[domain.name]})" if domain.name in aliases else ""
+        effects = domain.effects.replace("+", " + ")
+        table.add_row(Text(domain.name + alias), Text(effects), Text(domain.counterpart))
     return table
 
 
 def _notes(domains: list[NamedDomain]) -> list[str]:
     """Return the notes on the listed domains, each note once."""
     said: dict[str, list[str]] = {}
-    for item in domains:
-        if item.note:
-            said.setdefault(item.note, []).append(item.name)
+    for domain in domains:
+        if domain.note:
+            said.setdefault(domain.note, []).append(domain.name)
     return [
         f"{names[0]}{f' to {names[-1]}' if len(names) > 1 else ''}: {note}"
         for note, names in said.items()

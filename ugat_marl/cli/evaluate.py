@@ -74,7 +74,7 @@ class Evaluate:
         scenario = load_scenario(self.scenario)
         domains = self._domains(scenario, console)
         with workers_of(self.workers, self.ray) as workers:
-            found = evaluate(
+            evaluation = evaluate(
                 scenario,
                 dict(zip(names_of(self.policies), map(policy_factory, self.policies), strict=True)),
                 domains,
@@ -83,20 +83,20 @@ class Evaluate:
                 workers=workers,
                 reporter=Bars(console),
             )
-        if len(domains) > MOST_IN_DETAIL and domains_by_gap(found):
-            console.print(gap_matrix_table(found))
+        if len(domains) > MOST_IN_DETAIL and domains_by_gap(evaluation):
+            console.print(gap_matrix_table(evaluation))
         else:
-            console.print(measures_table(found))
-        for table in objective_tables(found):
+            console.print(measures_table(evaluation))
+        for table in objective_tables(evaluation):
             console.print(table)
         if self.out is not None:
-            found.write(self.out)
+            evaluation.write(self.out)
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
 
     def _domains(self, scenario: Scenario, console: Console) -> list[str]:
         """Return the names of all domains, without those that do not fit the network."""
-        found: list[str] = []
+        names: list[str] = []
         for name in expand_domains(self.domains):
             if name in NAMED_DOMAINS and name not in self.domains and _may_not_fit(name):
                 try:
@@ -104,8 +104,8 @@ class Evaluate:
                 except ScenarioError as error:
                     console.print(f"{name} is left out: {error}", style="dim", markup=False)
                     continue
-            found.append(name)
-        return found
+            names.append(name)
+        return names
 
 
 def _may_not_fit(name: str) -> bool:

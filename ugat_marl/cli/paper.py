@@ -68,11 +68,11 @@ class _Paper:
             folder = self.out / file_stem(scenario) / self.table
             require_writable(folder / "table.md")
             with workers_of(self.jobs, self.ray, "--jobs") as workers:
-                found = compare(
+                comparison = compare(
                     self.table, scenario, self.config, self.runs, workers, Bars(console)
                 )
-            _write(found, folder)
-            console.print(terminal_tables(found, DIRECT))
+            _write(comparison, folder)
+            console.print(terminal_tables(comparison, DIRECT))
             console.print(f"table and pictures: {folder}\ntrainings: {self.runs}", soft_wrap=True)
         return 0
 
@@ -144,11 +144,11 @@ class Gap(_Paper):
     table: ClassVar[str] = "gap"
 
 
-def _write(found: Comparison, folder: Path) -> None:
-    write_whole(folder / "table.md", comparison_page(found, DIRECT, machine_facts()) + "\n")
-    write_whole(folder / "table.csv", comparison_csv(found))
-    write_whole(folder / "seeds.csv", seeds_csv(found))
+def _write(comparison: Comparison, folder: Path) -> None:
+    write_whole(folder / "table.md", comparison_page(comparison, DIRECT, machine_facts()) + "\n")
+    write_whole(folder / "table.csv", comparison_csv(comparison))
+    write_whole(folder / "seeds.csv", seeds_csv(comparison))
     grounded = [*GROUNDED_NAME.values(), matched_name("timed")]
-    drawn = [DIRECT, *(name for name in grounded if name in found.settings)]
-    comparison_radar(found, drawn, folder / "radar.png")
-    gap_picture(found, folder / "gaps.png")
+    drawn = [DIRECT, *(name for name in grounded if name in comparison.settings)]
+    comparison_radar(comparison, drawn, folder / "radar.png")
+    gap_picture(comparison, folder / "gaps.png")

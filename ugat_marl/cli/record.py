@@ -83,7 +83,7 @@ class Record:
             reporter=Bars(console),
         )
         write_measured(measured, self.out)
-        seen = sum(len(item) for period in measured.periods for item in period.passages.values())
+        seen = sum(len(log) for period in measured.periods for log in period.passages.values())
         console.print(
             f"{seen} passages over {len(measured.detectors)} detectors in {self.periods} "
             f"period(s): {self.out}",

@@ -113,18 +113,18 @@ def train_options(settings: Mapping[str, Any]) -> list[str]:
 
 
 def _options(settings: Mapping[str, Any], usual: Mapping[str, Any], prefix: str) -> list[str]:
-    found: list[str] = []
+    options: list[str] = []
     for key, default in usual.items():
         if key not in settings or settings[key] == default:
             continue
         value, name = settings[key], key.replace("_", "-")
         if isinstance(default, dict):
             if isinstance(value, Mapping):
-                found += _options(value, default, prefix if key in _FLAT else f"{prefix}{name}.")
+                options += _options(value, default, prefix if key in _FLAT else f"{prefix}{name}.")
         elif isinstance(default, bool):
-            found.append(f"--{prefix}{name}" if value else f"--{prefix}no-{name}")
+            options.append(f"--{prefix}{name}" if value else f"--{prefix}no-{name}")
         elif isinstance(value, list):
-            found += [f"--{prefix}{name}", *map(str, value)]
+            options += [f"--{prefix}{name}", *map(str, value)]
         else:
-            found += [f"--{prefix}{name}", str(value)]
-    return found
+            options += [f"--{prefix}{name}", str(value)]
+    return options

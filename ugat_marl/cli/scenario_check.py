@@ -146,10 +146,11 @@ def show(
 
     agents = facts.intersections
     say(
-        f"{facts.scenario}: {len(agents)} agents, {sum(len(item.phases) for item in agents)} green "
-        f"phases, {sum(item.lanes for item in agents)} lanes, "
-        f"{sum(item.movements for item in agents)} movements, "
-        f"{sum(item.conflicts for item in agents)} conflicts"
+        f"{facts.scenario}: {len(agents)} agents, "
+        f"{sum(len(light.phases) for light in agents)} green phases, "
+        f"{sum(light.lanes for light in agents)} lanes, "
+        f"{sum(light.movements for light in agents)} movements, "
+        f"{sum(light.conflicts for light in agents)} conflicts"
     )
     say(
         f"episode {facts.duration_s:g} s, {facts.decisions} decisions; shortest useful "
@@ -161,7 +162,7 @@ def show(
         say(f"no agents (fewer than two green phases): {', '.join(facts.uncontrolled)}")
     console.print(_intersections(agents))
     console.print(_approaches(agents))
-    if short := sum(len(item.short_lanes) for item in agents):
+    if short := sum(len(light.short_lanes) for light in agents):
         say(
             f"lanes at lights that are shorter than {SHORT_LANE_M:g} m: {short}. Agents see nobody "
             "upstream of them; reach_m = 100 under [control], or the effect reach=100, counts those"
@@ -188,8 +189,8 @@ def _table(title: str, *columns: str) -> Table:
 def _intersections(agents: Sequence[IntersectionFacts]) -> Table:
     """Return the table of intersections, with one row for all that are alike."""
     groups: dict[tuple[str, ...], list[str]] = {}
-    for item in agents:
-        groups.setdefault(_row(item), []).append(item.id)
+    for light in agents:
+        groups.setdefault(_row(light), []).append(light.id)
     table = _table(
         "Intersections", "agent", "lanes", "links", "movem.", "conflicts", "phases", "remarks"
     )
@@ -200,28 +201,28 @@ def _intersections(agents: Sequence[IntersectionFacts]) -> Table:
     return table
 
 
-def _row(item: IntersectionFacts) -> tuple[str, ...]:
-    permitted = sum(bool(phase.permitted) for phase in item.phases)
+def _row(light: IntersectionFacts) -> tuple[str, ...]:
+    permitted = sum(bool(phase.permitted) for phase in light.phases)
     remarks = {
-        "junctions joined": len(item.junctions) if len(item.junctions) > 1 else 0,
+        "junctions joined": len(light.junctions) if len(light.junctions) > 1 else 0,
         "phases with permitted turns": permitted,
-        "links on red after a stop": item.right_on_red,
-        "always green": item.always_green,
-        "U-turns": item.u_turns,
-        "crossings": item.crossings,
-        "crossings never green": item.unserved_crossings,
-        "phases for people on foot alone": item.foot_phases,
-        "links without a light": item.uncontrolled,
-        "links never green": len(item.unserved_links),
-        "lanes served in part": len(item.partly_served),
-        "lanes counted with those behind": len(item.lanes_behind),
+        "links on red after a stop": light.right_on_red,
+        "always green": light.always_green,
+        "U-turns": light.u_turns,
+        "crossings": light.crossings,
+        "crossings never green": light.unserved_crossings,
+        "phases for people on foot alone": light.foot_phases,
+        "links without a light": light.uncontrolled,
+        "links never green": len(light.unserved_links),
+        "lanes served in part": len(light.partly_served),
+        "lanes counted with those behind": len(light.lanes_behind),
     }
-    counts = (item.lanes, item.links, item.movements, item.conflicts, len(item.phases))
+    counts = (light.lanes, light.links, light.movements, light.conflicts, len(light.phases))
     return (*map(str, counts), "; ".join(f"{n} {what}" for what, n in remarks.items() if n))
 
 
 def _approaches(agents: Sequence[IntersectionFacts]) -> Table:
-    all_roads = [(item.id, road) for item in agents for road in item.approaches]
+    all_roads = [(light.id, road) for light in agents for road in light.approaches]
     all_roads.sort(key=lambda pair: -(pair[1].saturation or pair[1].flow_ratio))
     shown = all_roads[:MOST_APPROACHES]
     title = f"Saturation by approach, the highest {len(shown)} of {len(all_roads)}"

@@ -48,7 +48,7 @@ def _facts(name: str) -> list[str]:
         demand = check_demand(scenario, network)
     except ScenarioError as error:
         return ["", "", "", str(error)]
-    phases = [len(item.phases) for item in network.intersections]
+    phases = [len(light.phases) for light in network.intersections]
     spread = str(phases[0]) if len(set(phases)) == 1 else f"{min(phases)}-{max(phases)}"
     vehicles = f"{demand.vehicles}{'+' if demand.flows else ''}"
     return [str(len(phases)), spread, vehicles, scenario.settings.description]

@@ -111,7 +111,7 @@ class ScenarioNew:
             reporter=Bars(console),
         )
         agents = len(made.network.intersections)
-        phases = sum(len(item.phases) for item in made.network.intersections)
+        phases = sum(len(light.phases) for light in made.network.intersections)
         console.print(
             f"{self.name}: {agents} intersections with {phases} green phases, "
             f"{made.demand.vehicles} vehicles"
@@ -180,13 +180,13 @@ class ScenarioNew:
     def _command(self) -> str:
         """Return the command line that makes the same scenario again."""
         words = ["ugat-marl", "scenario", "new", str(self.name)]
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name in ("name", "force") or (
-                item.default is not MISSING and value == item.default
+        for option_field in fields(self):
+            value = getattr(self, option_field.name)
+            if option_field.name in ("name", "force") or (
+                option_field.default is not MISSING and value == option_field.default
             ):
                 continue
-            option = f"--{item.name.replace('_', '-')}"
+            option = f"--{option_field.name.replace('_', '-')}"
             values = value if isinstance(value, tuple) else () if value is True else (value,)
             words += [option, *map(str, values)]
         return shlex.join(words)

@@ -50,14 +50,14 @@ class Train:
         name = "-".join(re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in _names(config))
         directory = self.out or Path("runs") / f"{name}-s{config.seed}"
         with workers_of(None, self.ray) as workers:
-            found = transfer(
+            table = transfer(
                 config, directory, resume=self.resume, reporter=Bars(console), workers=workers
             )
         picture = directory / "gap.png"
         metrics = Metrics.read(directory / METRICS_FILE)
-        transfer_picture(found, metrics, picture)
+        transfer_picture(table, metrics, picture)
         calibration_picture(metrics, directory / "calibration.png")
-        console.print(transfer_table(found))
+        console.print(transfer_table(table))
         console.print(
             f"run: {directory}\ntable: {directory / 'table.json'}\npicture: {picture}\n"
             f"policies: {directory / 'policies'}\n"

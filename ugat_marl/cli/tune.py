@@ -67,7 +67,7 @@ class Tune:
             require_writable(self.out)
         scenario, reporter = load_scenario(self.scenario), Bars(console)
         with workers_of(self.workers, self.ray) as workers:
-            found = [
+            tuned = [
                 tune(
                     name,
                     scenario,
@@ -80,8 +80,8 @@ class Tune:
                 )
                 for name in self.rules
             ]
-        console.print(tuning_table(f"{scenario.id} in {domain_label(self.domain)}", found))
+        console.print(tuning_table(f"{scenario.id} in {domain_label(self.domain)}", tuned))
         if self.out is not None:
-            write_whole(self.out, json.dumps([asdict(each) for each in found], indent=1) + "\n")
+            write_whole(self.out, json.dumps([asdict(each) for each in tuned], indent=1) + "\n")
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0

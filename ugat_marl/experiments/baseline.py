@@ -93,8 +93,8 @@ def train_baseline(
         for mark, policy in train_through(learner, env, marks, args.seed, on_episode=note):
             if seeds:
                 played = {"it": fixed_policy(policy)}
-                found = evaluate(scenario, played, [args.domain], seeds, duration_s=length)
-                att_s[mark] = [result.scores.att_s for result in found.results]
+                evaluation = evaluate(scenario, played, [args.domain], seeds, duration_s=length)
+                att_s[mark] = [result.scores.att_s for result in evaluation.results]
         result = Result(learner.policy(), returns, att_s)
     if args.out is not None:
         result.policy.save(args.out / "policy.pt")

@@ -88,11 +88,11 @@ class Comparison:
     @functools.cached_property
     def _scores(self) -> Mapping[tuple[str, str, str], Mapping[int | None, Sequence[Scores]]]:
         """Scores of the episodes by setting, target and domain, then by training seed."""
-        found: dict[tuple[str, str, str], dict[int | None, list[Scores]]] = {}
+        by_column: dict[tuple[str, str, str], dict[int | None, list[Scores]]] = {}
         for t in self.trials:
-            seeds = found.setdefault((t.setting, t.target, t.domain), {})
+            seeds = by_column.setdefault((t.setting, t.target, t.domain), {})
             seeds.setdefault(t.training_seed, []).append(t.scores)
-        return found
+        return by_column
 
     def values(self, setting: str, target: str, measure: str, domain: str | None = None) -> Floats:
         """Return means over the episodes, one per training seed, ``(n,)``.
@@ -107,7 +107,8 @@ class Comparison:
         """
         played = self._scores.get((setting, target, target if domain is None else domain), {})
         means = {
-            seed: float(np.mean([getattr(own, measure) for own in played[seed]])) for seed in played
+            seed: float(np.mean([getattr(scores, measure) for scores in played[seed]]))
+            for seed in played
         }
         if None in means:
             return np.full(max(len(self.training_seeds), 1), means[None])
@@ -120,12 +121,13 @@ class Comparison:
 
     def median_s(self, setting: str, target: str) -> float:
         """Return the median ATT of the episodes in the target, in s."""
-        return float(np.median([own.att_s for own in self.episodes(setting, target)]))
+        return float(np.median([scores.att_s for scores in self.episodes(setting, target)]))
 
     def unserved(self, setting: str, target: str) -> float:
         """Return the share of episodes in the target that broke down."""
-        found = self.episodes(setting, target)
-        return sum(own.throughput < LEAST_SHARE_ARRIVED * own.due for own in found) / len(found)
+        played = self.episodes(setting, target)
+        failed = sum(scores.throughput < LEAST_SHARE_ARRIVED * scores.due for scores in played)
+        return failed / len(played)
 
     def estimate(
         self, setting: str, target: str, measure: str, domain: str | None = None
@@ -175,7 +177,7 @@ class Comparison:
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one flat row per setting and target: all measures, their gaps, the regret."""
-        found: list[dict[str, Any]] = []
+        rows: list[dict[str, Any]] = []
         for setting in self.settings:
             for target in self.targets:
                 if not self.has(setting, target):
@@ -199,5 +201,5 @@ class Comparison:
                         f"{name}_low": interval.low,
                         f"{name}_high": interval.high,
                     }
-                found.append(row)
-        return found
+                rows.append(row)
+        return rows

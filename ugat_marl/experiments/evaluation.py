@@ -129,7 +129,7 @@ def best_rules(
     Returns:
         Spelling of the best rule, by name of the domain.
     """
-    found: dict[str, str] = {}
+    best: dict[str, str] = {}
     for domain in domains:
         trials = race(
             scenario,
@@ -141,8 +141,8 @@ def best_rules(
             reporter=reporter,
             title=f"best rule in {domain_label(domain)}",
         )
-        found[domain_label(domain)] = trials[0].spec
-    return found
+        best[domain_label(domain)] = trials[0].spec
+    return best
 
 
 @kept_warm()
@@ -175,19 +175,19 @@ def race(
     """
     played: dict[str, list[float]] = {spec: [] for spec in specs}
     running, left = list(played), list[str]()
-    for rung, own in enumerate(seeds):
-        found = evaluate(
+    for rung, rung_seeds in enumerate(seeds):
+        evaluation = evaluate(
             scenario,
             {spec: RuleFactory(spec) for spec in running},
             [domain],
-            own,
+            rung_seeds,
             duration_s=duration_s,
             workers=workers,
             reporter=reporter,
             title=title,
         )
         for spec in running:
-            played[spec] += found.values(spec, found.domains[0], "att_s").tolist()
+            played[spec] += evaluation.values(spec, evaluation.domains[0], "att_s").tolist()
         # The sort is stable: of equal rules, the one named first stays first.
         running.sort(key=lambda spec: float(np.mean(played[spec])))
         if rung + 1 < len(seeds):

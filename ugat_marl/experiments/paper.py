@@ -319,8 +319,8 @@ class PaperConfig:
     def targets(self, table: str) -> list[str]:
         """Return the real domains of a table."""
         default = ("V1",) if table in ("ablation", "alpha") else ("V1", "V2", "V3", "V4")
-        found = [domain_label(domain) for domain in self.domains or default]
-        if left := [domain for domain in found if domain != domain_label(self.sim)]:
+        domains = [domain_label(domain) for domain in self.domains or default]
+        if left := [domain for domain in domains if domain != domain_label(self.sim)]:
             return left
         raise OptionError(
             f"table {table!r} has {self.sim} alone, to which sim is set; name domains"
@@ -332,14 +332,14 @@ class PaperConfig:
         Raises:
             UnknownNameError: The table has no row of that name.
         """
-        found = settings_of(table, self.ugat, self.sim, self.groundings, self.constants, self.spec)
+        rows = settings_of(table, self.ugat, self.sim, self.groundings, self.constants, self.spec)
         if self.reward != MATCHED_REWARD:
-            found = [setting for setting in found if not setting.matches]
-        names = [setting.name for setting in found]
+            rows = [setting for setting in rows if not setting.matches]
+        names = [setting.name for setting in rows]
         for row in self.rows:
             if row not in names:
                 raise UnknownNameError(f"row of table {table!r}:", row, names)
-        return [item for item in found if not self.rows or item.name in (DIRECT, *self.rows)]
+        return [row for row in rows if not self.rows or row.name in (DIRECT, *self.rows)]
 
 
 def compare(
@@ -415,15 +415,17 @@ class Planner:
             row: A setting of the table.
             folder: Folder that holds the jobs' folders.
         """
-        found: list[Trial] = []
+        trials: list[Trial] = []
         for target, job in self._columns(row):
             record = record_of(job, folder)
             assert record is not None
             for domain in sorted({self._config.sim, target}):
                 scores = record.played(job, job.episodes, domain)
-                for seed, own in zip(job.evaluation_seeds, scores, strict=True):
-                    found.append(Trial(row.name, target, domain_label(domain), job.seed, seed, own))
-        return found
+                for seed, episode in zip(job.evaluation_seeds, scores, strict=True):
+                    trials.append(
+                        Trial(row.name, target, domain_label(domain), job.seed, seed, episode)
+                    )
+        return trials
 
     def _columns(self, row: Setting) -> list[tuple[str, Job]]:
         seeds: Sequence[int | None] = [None] if row.recipe == "rule" else list(self._seeds)

@@ -73,9 +73,9 @@ def policy_gap(
     repaired = (
         corrected if isinstance(corrected, Scenario) else scenario_in_domain(scenario, corrected)
     )
-    found: dict[str, Evaluation] = {}
+    evaluations: dict[str, Evaluation] = {}
     for name, place in (("sim", scenario), ("corrected", repaired), ("real", world)):
-        found[name] = evaluate(
+        evaluations[name] = evaluate(
             place,
             policies,
             ["sim"],
@@ -85,17 +85,19 @@ def policy_gap(
             reporter=reporter or Silent(),
             title=f"policies in {'the real world' if name == 'real' else name}",
         )
-    return {policy: _gap(found, policy) for policy in policies}
+    return {policy: _gap(evaluations, policy) for policy in policies}
 
 
-def _gap(found: Mapping[str, Evaluation], policy: str) -> PolicyGap:
-    values = {name: item.values(policy, "sim", "att_s") for name, item in found.items()}
-    att = {name: Estimate.of(item) for name, item in values.items()}
+def _gap(evaluations: Mapping[str, Evaluation], policy: str) -> PolicyGap:
+    values = {
+        name: evaluation.values(policy, "sim", "att_s") for name, evaluation in evaluations.items()
+    }
+    att = {name: Estimate.of(att_s) for name, att_s in values.items()}
     before = abs(att["real"].mean - att["sim"].mean)
     after = abs(att["real"].mean - att["corrected"].mean)
     paired = Estimate.of(values["real"] - values["sim"])
     unseen = before == 0 or paired.low <= 0 <= paired.high  # False for the nan of a single seed
-    times = {name: _travel_time(item) for name, item in att.items()}
+    times = {name: _travel_time(estimate) for name, estimate in att.items()}
     shrink = None if unseen else 1 - after / before
     return PolicyGap(times["sim"], times["corrected"], times["real"], before, after, shrink)
 

@@ -59,12 +59,12 @@ class QueueRecord:
         base: Any = env.unwrapped
         lights = base.network.intersections
         lanes = base.network.lane_table()
-        incoming = [lanes.indices(item.incoming_lanes) for item in lights]
+        incoming = [lanes.indices(light.incoming_lanes) for light in lights]
         places = np.concatenate(incoming)
         starts = np.cumsum([0, *map(len, incoming)])[:-1]
         interval_s = base.decision_interval_s
         minutes = math.ceil(base.scenario.decisions * interval_s / 60)
-        names = tuple(item.id for item in lights)
+        names = tuple(light.id for light in lights)
         with self._lock:
             sums = self._sums.setdefault(
                 (policy, domain),

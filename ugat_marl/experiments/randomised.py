@@ -54,13 +54,13 @@ def effect_ranges(scenario: Scenario) -> tuple[Range, ...]:
         scenario: The simulation; its vehicle types hold the present values.
     """
     settings = [effect for effects in PAPER_WORLDS.values() for effect in effects]
-    found: list[Range] = []
-    for item in global_hypotheses(scenario, {effect.name for effect in settings}):
-        values = [level[0] for level in item.levels if level not in item.extreme]
-        values += [free_values(e, item)[0] for e in settings if e.name == item.name]
-        values += item.nominal or ()
-        found.append(Range(item, min(values), max(values)))
-    return tuple(found)
+    ranges: list[Range] = []
+    for hypothesis in global_hypotheses(scenario, {effect.name for effect in settings}):
+        values = [level[0] for level in hypothesis.levels if level not in hypothesis.extreme]
+        values += [free_values(e, hypothesis)[0] for e in settings if e.name == hypothesis.name]
+        values += hypothesis.nominal or ()
+        ranges.append(Range(hypothesis, min(values), max(values)))
+    return tuple(ranges)
 
 
 def drawn(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
@@ -71,11 +71,11 @@ def drawn(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
         seed: Seed of the episode.
     """
     generator = numpy_generator(seed, "randomised")
-    values = {item.name: float(generator.uniform(item.low, item.high)) for item in ranges}
+    values = {each.name: float(generator.uniform(each.low, each.high)) for each in ranges}
     for name, least in NO_SOFTER.items():
         if name in values and least in values:
             values[name] = max(values[name], values[least])
-    return ordered([item.hypothesis.effect((values[item.name],)) for item in ranges])
+    return ordered([each.hypothesis.effect((values[each.name],)) for each in ranges])
 
 
 class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):

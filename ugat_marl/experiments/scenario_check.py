@@ -51,7 +51,7 @@ def play_check_rules(
     scenario: Scenario, seed: int, workers: int | None, reporter: Reporter
 ) -> tuple[RuleEpisode, ...]:
     """Play one episode under each of `RULES`."""
-    found = evaluate(
+    evaluation = evaluate(
         scenario,
         {name: rule_factory(name) for name in RULES},
         ("sim",),
@@ -62,7 +62,7 @@ def play_check_rules(
     )
 
     def value(rule: str, measure: str) -> float:
-        return float(found.values(rule, "sim", measure)[0])
+        return float(evaluation.values(rule, "sim", measure)[0])
 
     measures = ("due", "departed", "throughput", "backlog")
     return tuple(
@@ -91,9 +91,9 @@ def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
         end_s = scenario.settings.begin_s + scenario.settings.duration_s
         run_program("sumo", [str(sumo_program("sumo")), *launch.arguments, "--end", repr(end_s)])
         waiting = {
-            item.attributes.get("id", "")
-            for item in scan_xml(chunks_of(directory / TRIPS), "SUMO's report")
-            if item.name == "tripinfo" and float(item.attributes.get("depart", "-1")) < 0
+            element.attributes.get("id", "")
+            for element in scan_xml(chunks_of(directory / TRIPS), "SUMO's report")
+            if element.name == "tripinfo" and float(element.attributes.get("depart", "-1")) < 0
         }
     all_drives = departures(scenario, routed=False)
     return Counter(edges[0] for who, _, edges in all_drives if who in waiting and edges)
@@ -109,45 +109,45 @@ def problems(
         runs: Results of `play_check_rules`.
         outside: Result of `left_outside`; None if it was not called.
     """
-    found: list[str] = []
-    for item in facts.intersections:
-        if item.unserved_lanes:
-            found.append(
-                f"traffic light {item.id!r}: no phase gives green to the lanes "
-                f'{", ".join(item.unserved_lanes)}; use phases = "conflict-free" or list them'
+    faults: list[str] = []
+    for light in facts.intersections:
+        if light.unserved_lanes:
+            faults.append(
+                f"traffic light {light.id!r}: no phase gives green to the lanes "
+                f'{", ".join(light.unserved_lanes)}; use phases = "conflict-free" or list them'
             )
-        elif item.unserved_links:
-            found.append(
-                f"traffic light {item.id!r}: never green: {', '.join(item.unserved_links)}; "
+        elif light.unserved_links:
+            faults.append(
+                f"traffic light {light.id!r}: never green: {', '.join(light.unserved_links)}; "
                 "vehicles that turn there block their lane"
             )
-        if item.clashes:
-            found.append(
-                f"traffic light {item.id!r}: people on foot have green while vehicles that cross "
-                f"their way need not wait ({'; '.join(item.clashes)}); write g for these vehicles"
+        if light.clashes:
+            faults.append(
+                f"traffic light {light.id!r}: people on foot have green while vehicles that cross "
+                f"their way need not wait ({'; '.join(light.clashes)}); write g for these vehicles"
             )
     if facts.duration_s < facts.shortest_episode_s:
-        found.append(
+        faults.append(
             f"an episode of {facts.duration_s:g} s is shorter than the shortest useful one "
             f"({facts.shortest_episode_s:g} s); set duration_s"
         )
     if text := _unsuited(facts, runs):
-        found.append(text)
+        faults.append(text)
     if runs:
         best = min(runs, key=lambda run: run.backlog)
         if is_full(runs):
             roads = Counter(outside or {}).most_common(_NAMED)
             where = "; they wait at " + ", ".join(f"{road} ({n})" for road, n in roads)
-            found.append(
+            faults.append(
                 f"{best.backlog} of {best.due} vehicles cannot enter even under {best.rule}"
                 f"{where if roads else ''}; lower the demand, or look at what blocks these roads"
             )
-    return found
+    return faults
 
 
 def _unsuited(facts: Survey, runs: Sequence[RuleEpisode]) -> str:
     """Return a message if phases serve lanes in part and a rule is far behind the programme."""
-    lanes = sum(len(item.partly_served) for item in facts.intersections)
+    lanes = sum(len(light.partly_served) for light in facts.intersections)
     att_s = {run.rule: run.att_s for run in runs}
     if not lanes or any(rule not in att_s for rule in RULES):
         return ""
@@ -169,9 +169,9 @@ def as_json(
     outside: Mapping[str, int] | None = None,
 ) -> dict[str, object]:
     """Return survey, runs, headroom and faults as values for JSON."""
-    found: dict[str, object] = asdict(facts)
-    found["runs"] = [asdict(run) for run in runs]
-    found["headroom"] = None if rows is None else [asdict(row) for row in rows]
-    found["left_outside"] = dict(outside or {})
-    found["problems"] = list(wrong)
-    return found
+    content: dict[str, object] = asdict(facts)
+    content["runs"] = [asdict(run) for run in runs]
+    content["headroom"] = None if rows is None else [asdict(row) for row in rows]
+    content["left_outside"] = dict(outside or {})
+    content["problems"] = list(wrong)
+    return content

@@ -50,8 +50,8 @@ class Estimate(Interval):
     @classmethod
     def of(cls, values: NDArray[np.float64]) -> Estimate:
         """Return the estimate from one value per seed."""
-        found = Interval.of(values)
-        return cls(found.mean, found.low, found.high, float(np.median(values)))
+        interval = Interval.of(values)
+        return cls(interval.mean, interval.low, interval.high, float(np.median(values)))
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ class Evaluation:
 
     def values(self, policy: str, domain: str, measure: str) -> NDArray[np.float64]:
         """Return one value per seed, in the order of the seeds."""
-        found = [r for r in self.results if r.policy == policy and r.domain == domain]
-        found.sort(key=lambda result: result.seed)
-        return np.array([_measured(result.scores, measure) for result in found])
+        results = [r for r in self.results if r.policy == policy and r.domain == domain]
+        results.sort(key=lambda result: result.seed)
+        return np.array([_measured(result.scores, measure) for result in results])
 
     def estimate(self, policy: str, domain: str, measure: str) -> Estimate:
         """Return mean and interval of a measure."""
@@ -203,7 +203,9 @@ class Tuned:
 def result_of(row: Mapping[str, Any]) -> Result:
     """Return an episode from its row in a record; null and missing values become nan."""
     numbers = {
-        item.name: _number(row.get(item.name)) for item in fields(Scores) if item.name != "hidden"
+        measure.name: _number(row.get(measure.name))
+        for measure in fields(Scores)
+        if measure.name != "hidden"
     }
     hidden = {str(name): _number(value) for name, value in (row.get("hidden") or {}).items()}
     scores = Scores(**numbers, hidden=hidden)
@@ -232,7 +234,7 @@ def _measured(scores: Scores, measure: str) -> float:
 
 def _without_nan(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: _without_nan(inner) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_without_nan(item) for item in value]
+        return [_without_nan(inner) for inner in value]
     return None if isinstance(value, float) and math.isnan(value) else value

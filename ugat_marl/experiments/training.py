@@ -76,9 +76,9 @@ def train_through(
     for mark in marks:
         while learner.episodes < mark:
             chunk = min(CHECKPOINT_EPISODES, mark - learner.episodes)
-            begin, own = time.perf_counter(), time.process_time()
+            begin, cpu_begin = time.perf_counter(), time.process_time()
             learner.learn(env, chunk, seed, on_episode)
-            effort = Effort(chunk, time.perf_counter() - begin, time.process_time() - own)
+            effort = Effort(chunk, time.perf_counter() - begin, time.process_time() - cpu_begin)
             if on_chunk is not None:
                 on_chunk(effort)
         yield mark, learner.policy()

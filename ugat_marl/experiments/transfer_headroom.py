@@ -74,7 +74,7 @@ def measure_headroom(
         raise OptionError("headroom needs at least one domain, one hold and one seed")
     rules = {hold_s: f"largest-queue:{hold_s}" for hold_s in holds_s}
     names = [*rules.values(), "programme"]
-    found = evaluate(
+    evaluation = evaluate(
         scenario,
         {name: rule_factory(name) for name in names},
         domains,
@@ -84,10 +84,10 @@ def measure_headroom(
     )
 
     def mean(name: str, domain: str, measure: str) -> float:
-        return float(found.values(name, domain, measure).mean())
+        return float(evaluation.values(name, domain, measure).mean())
 
     rows: list[HeadroomRow] = []
-    for domain in found.domains:
+    for domain in evaluation.domains:
         att_s = {hold_s: mean(rule, domain, "att_s") for hold_s, rule in rules.items()}
         best = min(att_s, key=lambda hold_s: att_s[hold_s])
         reference = rows[0].best_hold_s if rows else best

@@ -116,7 +116,7 @@ def tuned_rules(
     Returns:
         Spelling of the best rule, by name of the domain.
     """
-    found: dict[str, str] = {}
+    rules: dict[str, str] = {}
     for domain in domains:
         tuned = [
             tune(
@@ -130,7 +130,7 @@ def tuned_rules(
             )
             for name in names
         ]
-        found |= best_rules(
+        rules |= best_rules(
             scenario,
             [domain],
             rules=[each.best.spec for each in tuned],
@@ -139,7 +139,7 @@ def tuned_rules(
             workers=workers,
             reporter=reporter,
         )
-    return found
+    return rules
 
 
 def rungs(settings: int, budget: int) -> list[list[int]]:
@@ -154,16 +154,16 @@ def rungs(settings: int, budget: int) -> list[list[int]]:
     if settings < 2:
         return [[TUNING_SEED + k for k in range(min(budget, UNTUNED_EPISODES))]]
     fields = _fields(settings)
-    found: list[list[int]] = []
+    rungs_seeds: list[list[int]] = []
     following, left = TUNING_SEED, budget
     for rung, field in enumerate(fields):
         share = left / (len(fields) - rung)
         payable = left - sum(fields[rung + 1 :])
         episodes = max(1, int(min(share, payable) // field))
-        found.append([following + k for k in range(episodes)])
+        rungs_seeds.append([following + k for k in range(episodes)])
         following += episodes
         left -= episodes * field
-    return found
+    return rungs_seeds
 
 
 def settings_of(name: str, budget: int) -> list[str]:

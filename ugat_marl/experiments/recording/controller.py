@@ -37,13 +37,13 @@ class _LoggingEnv(TrafficEnv):
 
     def _advance(self, requested: list[int]) -> None:
         if self.options.signals == "actions":
-            for item, state, phase in zip(
+            for light, state, phase in zip(
                 self.network.intersections, self._states, requested, strict=True
             ):
                 _, segments = signals.advance(
-                    item.phases, state, phase, self.decision_interval_s, self._timing
+                    light.phases, state, phase, self.decision_interval_s, self._timing
                 )
-                log = self.commanded[item.id]
+                log = self.commanded[light.id]
                 since = self._snapshot.time_s
                 for duration, shown in segments:
                     if not log or log[-1][1] != shown:
@@ -79,17 +79,17 @@ def own_programmes(
         depends on the traffic.
     """
     policy = make(parallel_env(scenario))
-    own = set(network.uncontrolled)
+    with_programme = set(network.uncontrolled)
     if policy.env_options.get("signals") == "programme":
-        own |= {item.id for item in network.intersections}
-    if not own:
+        with_programme |= {light.id for light in network.intersections}
+    if not with_programme:
         return {}, ()
     kinds: dict[str, str] = {}
     for document in (scenario.network, *scenario.additional):
         for logic in parse_xml(document.read(), document.source).iter("tlLogic"):
             kinds[logic.get("id", "")] = logic.get("type", "static")
-    fixed = sorted(tls for tls in own if kinds.get(tls, "static") == "static")
-    watched = tuple(sorted(own - set(fixed)))
+    fixed = sorted(tls for tls in with_programme if kinds.get(tls, "static") == "static")
+    watched = tuple(sorted(with_programme - set(fixed)))
     if not fixed:
         return {}, watched
     begin, end = scenario.settings.begin_s, scenario.settings.duration_s

@@ -155,7 +155,9 @@ def record(
     if duration_s is not None:  # the domain may be another scenario
         base = base.with_duration(duration_s)
     network = Network.read(base)
-    detectors = tuple(_zone(item, detector_length_m) for item in standard_detectors(network))
+    detectors = tuple(
+        _zone(detector, detector_length_m) for detector in standard_detectors(network)
+    )
     empty = Period("", 0.0, 1.0, "fit", {}, {})
     apply_detector_effects(
         empty, effects, detectors, detector_lights(base, detectors)
@@ -297,11 +299,11 @@ def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scena
 
 def _logged(period: Period) -> Period:
     """Return a period as the detectors' electronics log it, without empty detectors."""
-    found = {
+    passages = {
         name: passages_as_written(passages, period.begin_s, period.end_s)
         for name, passages in period.passages.items()
     }
-    return replace(period, passages={name: x for name, x in found.items() if len(x)})
+    return replace(period, passages={name: x for name, x in passages.items() if len(x)})
 
 
 def _without_speed(passages: Passages) -> Passages:

@@ -47,15 +47,15 @@ def tracks(file: Path, period: str, begin_s: float, end_s: float) -> pl.DataFram
 
 def per_lane(vehicles: pl.DataFrame, detectors: Sequence[Detector], period: Period) -> pl.DataFrame:
     """Return vehicles, halting vehicles and mean speed of each lane with a detector, by second."""
-    names = sorted({item.lane for item in detectors})
+    names = sorted({detector.lane for detector in detectors})
     seconds = pl.DataFrame({"time_s": np.arange(np.ceil(period.begin_s), period.end_s)})
     grid = seconds.join(pl.DataFrame({"lane_id": names}), how="cross")
-    found = vehicles.group_by("time_s", "lane_id").agg(
+    seen = vehicles.group_by("time_s", "lane_id").agg(
         pl.len().cast(pl.Float64).alias("vehicles"),
         (pl.col("speed_mps") < HALTING_MPS).sum().cast(pl.Float64).alias("halting"),
         pl.col("speed_mps").mean().round(3).alias("mean_speed_mps"),
     )
-    joined = grid.join(found, on=["time_s", "lane_id"], how="left", maintain_order="left")
+    joined = grid.join(seen, on=["time_s", "lane_id"], how="left", maintain_order="left")
     return joined.select(
         pl.lit(period.id).alias("period_id"),
         "time_s",
