@@ -49,14 +49,14 @@ def test_it_can_be_stopped() -> None:
 
 
 def test_a_run_plays_its_roll_outs_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[Any, ...]] = []
+    asked: list[SimulatedWorld] = []
 
-    def refused(*given: Any) -> Any:
-        asked.append(given)
+    def refused(*given: Any, **_: Any) -> Any:
+        asked.extend(given[3])  # the sources of D_sim and D_real
         raise RollOutStopped
 
-    monkeypatch.setattr("ugat_marl.experiments.transfers.simulated_worlds", refused)
+    monkeypatch.setattr("ugat_marl.experiments.jobs.train_grounded", refused)
     config = TransferConfig("single-v1", duration_s=60)
     with ThreadPoolExecutor(1) as pool, pytest.raises(RollOutStopped):
         transfer(config, tmp_path, workers=pool)
-    assert asked[0][-1] is pool
+    assert [world._workers for world in asked] == [pool, pool]
