@@ -221,12 +221,12 @@ def test_rays_between_two_strengths_of_one_effect() -> None:
     one, other = directions(3)[0], directions(4)[0]
     strong = Direction(one.hypothesis, (2.0,), other.difference, one.variance, one.origin)
     weak = Direction(one.hypothesis, (0.7,), other.difference, one.variance, one.origin)
-    found = between([one, strong])
+    found = between([one, strong], (0.33, 0.67))
     assert found[:2] == [one, strong]
     assert [item.level[0] for item in found[2:]] == pytest.approx([1.665, 1.835])
     middle = found[2].difference["network"]
     straight = 0.67 * one.difference["network"] + 0.33 * other.difference["network"]
     assert middle == pytest.approx(straight)
     # Nothing lies between shorter and longer than nominal, nor between two effects.
-    assert len(between([weak, one])) == 2
-    assert len(between(directions()[:2])) == 2
+    assert len(between([weak, one], (0.33, 0.67))) == 2
+    assert len(between(directions()[:2], (0.33, 0.67))) == 2

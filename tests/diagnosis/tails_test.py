@@ -15,7 +15,7 @@ from ugat_marl.diagnosis.verdict import combined
 @pytest.mark.parametrize("z", [0.0, 0.3, -1.0, 2.5, -6.0, 40.0, 1e4])
 def test_two_sided_tails_are_those_of_the_error_function(z: float) -> None:
     soft = 6.0 * math.asinh(abs(z) / 6.0)
-    assert two_sided(z) == pytest.approx(math.erfc(soft / math.sqrt(2)), rel=1e-12)
+    assert two_sided(z, 6.0) == pytest.approx(math.erfc(soft / math.sqrt(2)), rel=1e-12)
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 20.0, 148.0, 313.0, 1e5])

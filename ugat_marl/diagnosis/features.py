@@ -467,9 +467,9 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     ):  # fmt: skip
         counter.add(name, gap[protected & (number >= low) & (number <= high)])
     steady = gap[protected & (number >= 3)]
-    counter.add("gap_spread", np.abs(steady - 2.0))
-    counter.add("gap_short", (steady < 1.7).astype(np.float64))
-    counter.add("gap_long", (steady > 2.6).astype(np.float64))
+    counter.add("gap_spread", np.abs(steady - thresholds.usual_gap_s))
+    counter.add("gap_short", (steady < thresholds.short_gap_s).astype(np.float64))
+    counter.add("gap_long", (steady > thresholds.long_gap_s).astype(np.float64))
     for name, low, high in (
         ("speed1", 0, 0), ("speed2", 1, 1), ("speed3", 2, 2), ("speed4-5", 3, 4),
         ("speed6-8", 5, 7),
@@ -484,6 +484,7 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
 
 def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
     """Count crossings in yellow and at the beginning of red, per change of signal."""
+    thresholds = counter.thresholds
     cycles = float(len(greens.start_s))
     crossed = stop.off_s[np.isfinite(stop.off_s)]
     if not cycles:
@@ -494,26 +495,31 @@ def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
     red = crossed - greens.red_s[cycle]
     counted = crossed < greens.next_s[cycle]
     counter.ratio("yellow_crossings", float((counted & (red <= 0)).sum()), cycles)
-    counter.ratio("late_crossings", float((counted & (red > 0) & (red <= 2.0)).sum()), cycles)
     counter.ratio(
-        "red_crossings",
-        float((counted & (red > 2.0) & (red <= counter.thresholds.after_red_s)).sum()),
+        "late_crossings",
+        float((counted & (red > 0) & (red <= thresholds.late_red_s)).sum()),
         cycles,
     )
-    counter.add("last_crossing", after[counted & (red <= 3.0)])
+    counter.ratio(
+        "red_crossings",
+        float((counted & (red > thresholds.late_red_s) & (red <= thresholds.after_red_s)).sum()),
+        cycles,
+    )
+    counter.add("last_crossing", after[counted & (red <= thresholds.last_crossing_s)])
 
 
 def _lengths(counter: _Counter, passages: Passages) -> None:
     """Add lengths of vehicles: measured ones, else speed times time over the detector."""
-    quick = (passages.speed_mps > 5.0) & np.isfinite(passages.on_s)
+    quick = (passages.speed_mps > counter.thresholds.measurable_mps) & np.isfinite(passages.on_s)
     length = np.where(quick, passages.speed_mps * (passages.off_s - passages.on_s), np.nan)
     length = np.where(np.isfinite(passages.length_m), passages.length_m, length)
     counter.add("vehicle_length", length)
-    counter.add("long_vehicles", (length[np.isfinite(length)] > 8.0).astype(np.float64))
+    counter.add("long_vehicles", _share(length, counter.thresholds.long_vehicle_m))
 
 
 def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: float) -> None:
     """Add gaps and speeds of moving platoons, free vehicles, and vehicles that approach red."""
+    thresholds = counter.thresholds
     known = np.isfinite(advance.on_s)
     advance = advance.at(known)
     if len(advance) < 2:
@@ -521,27 +527,36 @@ def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: f
     on, speed = advance.on_s, advance.speed_mps
     over = advance.off_s - on
     gap = np.append(np.inf, np.diff(on))
-    moving = np.where(np.isfinite(speed), speed > counter.thresholds.moving_mps, over < 1.2)
-    platoon = moving & np.append(False, moving[:-1]) & (gap < 6.0)
+    moving = np.where(
+        np.isfinite(speed), speed > thresholds.moving_mps, over < thresholds.moving_over_s
+    )
+    platoon = moving & np.append(False, moving[:-1]) & (gap < thresholds.platoon_gap_s)
     counter.add("platoon_gap", gap[platoon])
-    counter.add("platoon_short", (gap[platoon] < 1.6).astype(np.float64))
-    counter.add("platoon_middle", (gap[platoon] < 2.2).astype(np.float64))
+    counter.add("platoon_short", (gap[platoon] < thresholds.short_platoon_gap_s).astype(np.float64))
+    counter.add(
+        "platoon_middle", (gap[platoon] < thresholds.middle_platoon_gap_s).astype(np.float64)
+    )
     counter.add("platoon_time", over[platoon])
     if not len(greens.start_s):
         return
     cycle = np.searchsorted(greens.start_s, on, "right") - 1
     inside = np.maximum(cycle, 0)
     green = (cycle >= 0) & (on < greens.end_s[inside])
-    red = (cycle >= 0) & (on > greens.red_s[inside]) & (on < greens.next_s[inside] - 3.0)
-    free = green & (gap > 5.0) & (on - greens.start_s[inside] > 5.0)
+    red = (
+        (cycle >= 0)
+        & (on > greens.red_s[inside])
+        & (on < greens.next_s[inside] - thresholds.before_green_s)
+    )
+    after_s = on - greens.start_s[inside]
+    free = green & (gap > thresholds.free_gap_s) & (after_s > thresholds.settled_green_s)
     counter.add("free_speed", speed[free])
     counter.add("free_speed_spread", np.abs(speed[free] - limit_mps))
-    counter.add("free_fast", _share(speed[free], 1.05 * limit_mps))
-    counter.add("free_time", over[free & (over < 3.0)])
-    alone = red & (gap > 4.0)
+    counter.add("free_fast", _share(speed[free], thresholds.fast_share * limit_mps))
+    counter.add("free_time", over[free & (over < thresholds.free_over_s)])
+    alone = red & (gap > thresholds.lone_gap_s)
     counter.add("red_speed", speed[alone])
-    counter.add("red_slow", 1.0 - _share(speed[alone], 5.0))
-    counter.add("red_time", over[alone & (over < 4.0)])
+    counter.add("red_slow", 1.0 - _share(speed[alone], thresholds.slow_mps))
+    counter.add("red_time", over[alone & (over < thresholds.red_over_s)])
 
 
 def _share(values: Array, limit: float) -> Array:
@@ -554,7 +569,7 @@ def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
     period = counter.period
     on = np.where(np.isfinite(advance.on_s), advance.on_s, period.begin_s)
     off = np.where(np.isfinite(advance.off_s), advance.off_s, period.end_s)
-    lone = np.isfinite(advance.on_s) | (off - period.begin_s < 30.0)
+    lone = np.isfinite(advance.on_s) | (off - period.begin_s < counter.thresholds.cut_occupation_s)
     on, off = on[lone], np.maximum(off[lone], on[lone])
     times = np.concatenate(([period.begin_s], np.sort(on), np.sort(off), [period.end_s]))
     steps = np.concatenate(([0.0], np.ones(len(on)), -np.ones(len(off)), [0.0]))
@@ -576,7 +591,10 @@ def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
     red = occupied(greens.next_s) - occupied(greens.red_s)
     counter.ratio("occupied_in_green", green.sum(), (greens.end_s - greens.start_s).sum())
     counter.ratio("occupied_in_red", red.sum(), (greens.next_s - greens.red_s).sum())
-    standing = occupied(greens.start_s + 1.0) - occupied(greens.start_s - 1.0) > 1.9
+    standing = (
+        occupied(greens.start_s + 1.0) - occupied(greens.start_s - 1.0)
+        > counter.thresholds.standing_s
+    )
     counter.add("queue_over", standing.astype(np.float64))
 
 

@@ -81,16 +81,16 @@ class Fitter:
         known = {number: day.tally for number, day in found.items()}
         return Fitted(members, known, reference, distance, cost)
 
-    def refine(self, start: Fitted, rounds: int = 3) -> Fitted:
+    def refine(self, start: Fitted, rounds: int | None = None) -> Fitted:
         """Take Gauss-Newton steps from a simulated model, with finite differences.
 
         Args:
             start: The model to start from.
-            rounds: Largest number of steps.
+            rounds: Largest number of steps; None for `Thresholds.steps`.
         """
         best = start
         jacobian: Array | None = None
-        for number in range(rounds):
+        for number in range(self.thresholds.steps if rounds is None else rounds):
             if not len(best.values):
                 break
             whitener = self.whitener(best)
@@ -102,7 +102,7 @@ class Fitter:
                 break
             found = self.simulate(moved)
             if found.cost >= best.cost:
-                moved = self._moved(best, 0.4 * step)
+                moved = self._moved(best, self.thresholds.shorter_step * step)
                 if moved == best.members:
                     break
                 found = self.simulate(moved)
@@ -256,7 +256,9 @@ class Fitter:
             changed: list[float] = []
             for index, value in enumerate(values):
                 nominal = hypothesis.nominal[index] if hypothesis.nominal else value
-                most = max(abs(value - nominal), 4 * hypothesis.least, 1e-6)
+                most = max(
+                    abs(value - nominal), self.thresholds.longest_move * hypothesis.least, 1e-6
+                )
                 changed.append(value + float(np.clip(step[place], -most, most)))
                 place += 1
             moved.append((hypothesis, hypothesis.clipped(changed)))

@@ -236,16 +236,23 @@ def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:
 
 
 def both_ways(
-    hypothesis: Hypothesis, values: tuple[float, ...]
+    hypothesis: Hypothesis, values: tuple[float, ...], farther: float
 ) -> list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...]]]:
-    """Return two changes of an effect of the model: to nothing, and 40 % farther from nominal.
+    """Return two changes of an effect of the model: to nothing, and farther from nominal.
+
+    Args:
+        hypothesis: The effect.
+        values: Its present values.
+        farther: Share of the distance from nominal that the second change adds.
 
     Returns:
         Hypothesis, changed values, present values.
     """
     if not values or hypothesis.nominal is None:
         return []
-    away = tuple(1.4 * v - 0.4 * n for v, n in zip(values, hypothesis.nominal, strict=True))
+    away = tuple(
+        (1.0 + farther) * v - farther * n for v, n in zip(values, hypothesis.nominal, strict=True)
+    )
     less = hypothesis.clipped(hypothesis.nominal)
     found = [(hypothesis, level, values) for level in (less, hypothesis.clipped(away))]
     return [item for item in found if item[1] != values]

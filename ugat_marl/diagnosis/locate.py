@@ -67,7 +67,9 @@ def locate(
     found: list[Disagreement] = []
     for name, z in distance.z.items():
         if name != "time":
-            found += _statistics(layout, name, z, distance.difference[name])
+            found += _statistics(
+                layout, name, z, distance.difference[name], reference.pools.thresholds
+            )
     if span is not None:
         found += _stretches(layout, reference, distance, span)
     tested = sum(int(block.used.sum()) for block in reference.blocks.values())
@@ -89,17 +91,21 @@ def discoveries(chances: Sequence[float], tested: int, alpha: float) -> int:
     return int((stats.false_discovery_control(every)[: len(chances)] <= alpha).sum())
 
 
-def two_sided(z: float) -> float:
-    """Return the two-sided p value of a standardised difference: ``2 Phi(-6 asinh(|z| / 6))``.
+def two_sided(z: float, tail: float) -> float:
+    """Return the two-sided p value of a standardised difference: ``2 Phi(-t asinh(|z| / t))``.
 
     Its tail is heavier than that of the normal distribution, like that of simulated data sets.
+
+    Args:
+        z: Standardised difference.
+        tail: The value t up to which the tail is nearly normal.
     """
-    soft = 6.0 * math.asinh(abs(z) / 6.0)
+    soft = tail * math.asinh(abs(z) / tail)
     return max(2.0 * float(special.ndtr(-soft)), 1e-300)
 
 
 def _statistics(
-    layout: DetectorLayout, pool: str, z: Array, difference: Array
+    layout: DetectorLayout, pool: str, z: Array, difference: Array, thresholds: Thresholds
 ) -> list[Disagreement]:
     found: list[Disagreement] = []
     for member, feature in zip(*np.nonzero(z), strict=True):
@@ -109,7 +115,16 @@ def _statistics(
         size = float(difference[member, feature])
         found.append(
             Disagreement(
-                tls, approach, lane, regime, name, None, size, unit, value, two_sided(value)
+                tls,
+                approach,
+                lane,
+                regime,
+                name,
+                None,
+                size,
+                unit,
+                value,
+                two_sided(value, thresholds.heavy_tail),
             )
         )
     return found
@@ -130,6 +145,7 @@ def _stretches(
     layout: DetectorLayout, reference: Reference, distance: Distance, span: tuple[float, float]
 ) -> list[Disagreement]:
     """Find the most unusual stretch of every kind of count at every place."""
+    thresholds = reference.pools.thresholds
     z, difference = distance.z["time"], distance.difference["time"]
     used = reference.blocks["time"].used
     places = len(layout.places)
@@ -137,10 +153,10 @@ def _stretches(
     width = (span[1] - span[0]) / bins
     found: list[Disagreement] = []
     for row in range(z.shape[0]):
-        if used[row].sum() < 3:
+        if used[row].sum() < thresholds.least_bins:
             continue
         middle = float(np.median(z[row][used[row]]))
-        best = _stretch(z[row] - middle, reference.pools.thresholds)
+        best = _stretch(z[row] - middle, thresholds)
         if best is None:
             continue
         value, first, last = best
@@ -159,7 +175,7 @@ def _stretches(
                 size,
                 "s" if kind == 3 else "vehicles",
                 value,
-                min(1.0, stretches * two_sided(value)),
+                min(1.0, stretches * two_sided(value, thresholds.heavy_tail)),
             )
         )
     return found
@@ -171,7 +187,9 @@ def _stretch(z: Array, thresholds: Thresholds) -> tuple[float, int, int] | None:
     Returns:
         This sum, the first bin and the bin after the last; None without bins.
     """
-    sums = np.concatenate(([0.0], np.cumsum(np.clip(z, -15, 15))))
+    sums = np.concatenate(
+        ([0.0], np.cumsum(np.clip(z, -thresholds.largest_z, thresholds.largest_z)))
+    )
     best: tuple[float, int, int] | None = None
     for length in range(1, max(int(thresholds.longest_stretch * len(z)), 1) + 1):
         values = (sums[length:] - sums[:-length]) / math.sqrt(length)

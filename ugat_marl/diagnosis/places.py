@@ -96,6 +96,7 @@ class PlaceFinder:
         """Find origins whose demand would fit if it came sooner or later."""
         z, difference = distance.z["time"], distance.difference["time"]
         block = reference.blocks["time"]
+        least, most = self._thresholds.strengths_of_a_shift
         found: list[tuple[float, str, float]] = []
         first = BIN_FEATURES.index("count_advance") * len(self._edges)
         width = self._thresholds.bin_s * reference.pools.together
@@ -114,16 +115,21 @@ class PlaceFinder:
                 change = (_later(mean, shift / width) - mean) / np.abs(noise)
                 size = float((change**2).sum())
                 strength = float((change * z[rows]).sum()) / max(size, 1e-9)
-                if 0.5 < strength < 2.0 and strength**2 * size > self._thresholds.suspect_timing:
+                if least < strength < most and strength**2 * size > self._thresholds.suspect_timing:
                     found.append((strength**2 * size, origin, shift))
         chosen: dict[str, float] = {}
         for _, origin, shift in sorted(found, reverse=True):
             chosen.setdefault(origin, shift)
         return [
             Hypothesis(
-                "demand_timing", (("edge", origin),), ("seconds",), ((shift,),), (0.0,), 45.0
+                "demand_timing",
+                (("edge", origin),),
+                ("seconds",),
+                ((shift,),),
+                (0.0,),
+                self._thresholds.least_shift_s,
             )
-            for origin, shift in list(chosen.items())[:2]
+            for origin, shift in list(chosen.items())[: self._thresholds.places_of_a_kind]
         ]
 
     def _windows(
@@ -132,6 +138,7 @@ class PlaceFinder:
         """Propose surges and closures in the stretches of time that differ most."""
         if len({(p.begin_s, p.end_s) for p in periods}) > 1:
             return []
+        thresholds = self._thresholds
         found: list[tuple[float, Hypothesis]] = []
         for origin in self._routes.passing:
             members = [i for i, edge in enumerate(self._edges) if edge == origin]
@@ -141,8 +148,10 @@ class PlaceFinder:
             if window is not None:
                 z, begin, end, factor = window
                 fixed = (("edge", origin), ("begin_s", begin), ("end_s", end))
-                level = float(np.clip(factor, 0.1, 4.0))
-                surge = Hypothesis("demand_surge", fixed, ("factor",), ((level,),), (1.0,), 0.1)
+                level = float(np.clip(factor, *thresholds.surge_factors))
+                surge = Hypothesis(
+                    "demand_surge", fixed, ("factor",), ((level,),), (1.0,), thresholds.least_surge
+                )
                 found.append((z, surge))
         for index, lane in enumerate(self._layout.lanes):
             # The queue that leaves after a closure differs more than the closure itself, so each
@@ -155,7 +164,10 @@ class PlaceFinder:
                     found.append((z, Hypothesis("lane_closure", fixed, (), ((),), None)))
         found.sort(key=lambda item: -item[0])
         chosen: list[Hypothesis] = []
-        for kind, most in (("demand_surge", 2), ("lane_closure", 4)):
+        for kind, most in (
+            ("demand_surge", thresholds.surges),
+            ("lane_closure", thresholds.closures),
+        ):
             chosen += list(dict.fromkeys(item for _, item in found if item.name == kind))[:most]
         return chosen
 
@@ -259,10 +271,10 @@ class PlaceFinder:
                     ("factor",),
                     ((self._speed_ratio(reference, distance, edge),),),
                     (1.0,),
-                    0.02,
+                    self._thresholds.least_speed_change,
                     both=True,
                 )
-                for edge in ranked[:2]
+                for edge in ranked[: self._thresholds.places_of_a_kind]
             ]
         if len(self._layout.intersections) > 1:
             found += self._traffic_lights(distance)
@@ -271,7 +283,8 @@ class PlaceFinder:
     def _disturbed(self, distance: Distance) -> list[str]:
         """Return lanes on which a vehicle may stand: lanes with odd flow, and avoided lanes."""
         lanes = self._layout.lanes
-        z = np.clip(distance.z["lane"][: len(lanes)], -15, 15)
+        largest = self._thresholds.largest_z
+        z = np.clip(distance.z["lane"][: len(lanes)], -largest, largest)
         unusual = np.abs(z[:, [INDEX[name] for name in _FLOW]]).sum(axis=1)
         fewer = z[:, [INDEX[name] for name in _AVOIDED]].sum(axis=1)
         by_edge: dict[str, list[int]] = defaultdict(list)
@@ -279,7 +292,7 @@ class PlaceFinder:
             by_edge[lane.edge].append(index)
         edges = sorted(by_edge.values(), key=lambda members: -max(unusual[members]))
         found: list[str] = []
-        for members in edges[:2]:
+        for members in edges[: self._thresholds.places_of_a_kind]:
             avoided = sorted(members, key=lambda index: fewer[index])[:1]
             stuck = sorted(members, key=lambda index: -unusual[index])[:1]
             found += [lanes[index].id for index in dict.fromkeys((*avoided, *stuck))]
@@ -287,45 +300,75 @@ class PlaceFinder:
 
     def _speed_ratio(self, reference: Reference, distance: Distance, edge: str) -> float:
         """Return the free speed on an edge, as a multiple of the simulated one."""
+        thresholds = self._thresholds
         rows = [index for index, name in enumerate(self._edges) if name == edge]
         mean = reference.blocks["lane"].mean[rows, INDEX["free_speed"]]
         difference = distance.difference["lane"][rows, INDEX["free_speed"]]
         known = np.isfinite(mean) & (difference != 0) & (mean > 0)
         if not known.any():
-            return 0.8
+            return thresholds.usual_speed_ratio
         ratio = float(np.mean(1.0 + difference[known] / mean[known]))
-        return float(np.clip(ratio, 0.2, 2.0)) if abs(ratio - 1.0) > 0.03 else 0.8
+        if abs(ratio - 1.0) <= thresholds.least_speed_ratio:
+            return thresholds.usual_speed_ratio
+        return float(np.clip(ratio, *thresholds.speed_ratios))
 
     def _traffic_lights(self, distance: Distance) -> list[Hypothesis]:
         """Find the traffic lights whose lost time, or its trend, differs most from the rest."""
+        thresholds = self._thresholds
         lost = distance.z["intersection"][:, INDEX["lost"]]
         lost = lost - np.median(lost)
         drift = distance.z["intersection"][:, INDEX["lost_trend"]]
         drift = drift - np.median(drift)
         names = self._layout.intersections
         found: list[Hypothesis] = []
-        for index in np.argsort(-np.abs(lost))[:2]:
+        for index in np.argsort(-np.abs(lost))[: thresholds.places_of_a_kind]:
             place = (("place", names[int(index)]),)
             late_step_s = examined("late_green").step
             found.append(
-                Hypothesis("late_green", place, ("seconds",), ((2.0,),), (0.0,), 0.3, late_step_s)
+                Hypothesis(
+                    "late_green",
+                    place,
+                    ("seconds",),
+                    ((thresholds.first_late_green_s,),),
+                    (0.0,),
+                    thresholds.least_late_green_s,
+                    late_step_s,
+                )
             )
             sign = 1.0 if lost[index] > 0 else -1.0
             levels = _towards(sign, examined("signal_clock"))
-            found.append(Hypothesis("signal_clock", place, ("seconds",), levels, (0.0,), 0.2))
-        for index in np.argsort(-np.abs(drift))[:1]:
+            found.append(
+                Hypothesis(
+                    "signal_clock", place, ("seconds",), levels, (0.0,), thresholds.least_clock_s
+                )
+            )
+        for index in np.argsort(-np.abs(drift))[: thresholds.drifting_clocks]:
             sign = 1.0 if drift[index] > 0 else -1.0
             levels = _towards(sign, examined("clock_drift"))
             place = (("place", names[int(index)]),)
             found.append(
-                Hypothesis("clock_drift", place, ("seconds_per_hour",), levels, (0.0,), 0.5)
+                Hypothesis(
+                    "clock_drift",
+                    place,
+                    ("seconds_per_hour",),
+                    levels,
+                    (0.0,),
+                    thresholds.least_drift,
+                )
             )
         return found
 
 
 def _parking(lane: str, thresholds: Thresholds) -> Hypothesis:
     fixed = (("lane", lane), ("dwell_s", thresholds.dwell_s))
-    return Hypothesis("parking", fixed, ("per_hour",), ((20.0,),), (0.0,), 3.0)
+    return Hypothesis(
+        "parking",
+        fixed,
+        ("per_hour",),
+        ((thresholds.first_parking,),),
+        (0.0,),
+        thresholds.least_parking,
+    )
 
 
 def _later(counts: Array, bins: float) -> Array:
@@ -455,12 +498,18 @@ class Volume:
             for gain, origin, factor in sorted(self._origins(counts), reverse=True)[
                 : self._thresholds.places_of_a_kind
             ]:
-                level = float(np.clip(factor, 0.3, 3.0))
+                level = float(np.clip(factor, *self._thresholds.demand_factors))
                 fixed = (("edge", origin),)
                 if gain > self._thresholds.suspect_change:
                     found.append(
                         Hypothesis(
-                            "demand_level", fixed, ("factor",), ((level,),), (1.0,), 0.03, both=True
+                            "demand_level",
+                            fixed,
+                            ("factor",),
+                            ((level,),),
+                            (1.0,),
+                            self._thresholds.least_demand,
+                            both=True,
                         )
                     )
         for gain, origin, target, share in sorted(self._turns(counts, distance), reverse=True)[
@@ -468,7 +517,16 @@ class Volume:
         ]:
             fixed = (("from_edge", origin), ("to_edge", target))
             if gain > self._thresholds.suspect_change:
-                found.append(Hypothesis("turning", fixed, ("share",), ((share,),), (0.0,), 0.03))
+                found.append(
+                    Hypothesis(
+                        "turning",
+                        fixed,
+                        ("share",),
+                        ((share,),),
+                        (0.0,),
+                        self._thresholds.least_turning,
+                    )
+                )
         return found
 
     def _counts(self, distance: Distance) -> _Counts:
@@ -523,6 +581,7 @@ class Volume:
         Counts behind the intersection show the next edge, but hardly the edge before. The counts of
         the lanes that vehicles left show that one.
         """
+        thresholds = self._thresholds
         found: list[tuple[float, str, str, float]] = []
         approaches = {lane.edge for lane in self._layout.lanes}
         for origin in sorted(approaches & set(self._routes.turns)):
@@ -532,9 +591,9 @@ class Volume:
                 change = {other: -rate for other, rate in leaving.items()}
                 change[target] += total
                 strength, gain, size = counts.weighed(change)
-                if size > 4.0 and strength > 0.02:
+                if size > thresholds.visible_turn and strength > thresholds.least_turn:
                     gain += self._lanes_left(origin, target, distance)
-                    found.append((gain, origin, target, min(strength, 0.9)))
+                    found.append((gain, origin, target, min(strength, thresholds.most_turning)))
         return found
 
     def _lanes_left(self, origin: str, target: str, distance: Distance) -> float:
@@ -689,18 +748,25 @@ def fault_hypotheses(
     z = {name: float(distance.z["lane"][row]) for name, row in places.items()}
     mean = {name: float(reference.blocks["lane"].mean[row]) for name, row in places.items()}
     difference = {n: float(distance.difference["lane"][r]) for n, r in places.items()}
-    for name in sorted(z, key=lambda name: z[name])[:3]:
-        if z[name] < -2.5 and mean[name] > 0:
-            share = float(np.clip(-difference[name] / mean[name], 0.03, 0.9))
+    for name in sorted(z, key=lambda name: z[name])[: thresholds.faults_of_a_kind]:
+        if z[name] < -thresholds.short_count and mean[name] > 0:
+            share = float(np.clip(-difference[name] / mean[name], *thresholds.missed_shares))
             found.append(
-                Hypothesis("undercount", (("place", name),), ("share",), ((share,),), (0.0,), 0.02)
+                Hypothesis(
+                    "undercount",
+                    (("place", name),),
+                    ("share",),
+                    ((share,),),
+                    (0.0,),
+                    thresholds.least_undercount,
+                )
             )
     stuck = _stuck(periods, thresholds)
     on = {dict(item.fixed)["detector"] for item in stuck}
     silent = [x for x in _silent(periods, mean, thresholds) if dict(x.fixed)["detector"] not in on]
     found += stuck + silent
     kinds = {item.id: item.kind for item in layout.detectors}
-    found += _swapped(kinds, mean, difference, z)
+    found += _swapped(kinds, mean, difference, z, thresholds)
     return found
 
 
@@ -726,7 +792,7 @@ def _stuck(periods: Sequence[Period], thresholds: Thresholds) -> list[Hypothesis
             if max(w[0] for w in windows) < min(w[1] for w in windows):
                 fixed = (("detector", name), ("begin_s", begin), ("end_s", end))
                 found.append(Hypothesis("stuck", fixed, (), ((),), None))
-    return found[:3]
+    return found[: thresholds.faults_of_a_kind]
 
 
 def _silent(
@@ -748,7 +814,7 @@ def _silent(
             fixed = (("detector", name), ("begin_s", round(begin, 1)), ("end_s", round(end, 1)))
             found.append((missing, Hypothesis("dropout", fixed, (), ((),), None)))
     found.sort(key=lambda item: -item[0])
-    return [item for _, item in found[:3]]
+    return [item for _, item in found[: thresholds.faults_of_a_kind]]
 
 
 def _swapped(
@@ -756,10 +822,11 @@ def _swapped(
     mean: Mapping[str, float],
     difference: Mapping[str, float],
     z: Mapping[str, float],
+    thresholds: Thresholds,
 ) -> list[Hypothesis]:
     """Find pairs of detectors of one kind whose counts fit if they are exchanged."""
     found: list[tuple[float, Hypothesis]] = []
-    suspects = [name for name in mean if abs(z[name]) > 4.0]
+    suspects = [name for name in mean if abs(z[name]) > thresholds.swap_suspect]
     for first in suspects:
         for second in suspects:
             if first < second and kinds[first] == kinds[second]:
@@ -767,11 +834,14 @@ def _swapped(
                 change = mean[second] - mean[first]
                 before = difference[first] ** 2 + difference[second] ** 2
                 after = (difference[first] - change) ** 2 + (difference[second] + change) ** 2
-                if after < 0.3 * before and abs(change) > 3 * error:
+                if (
+                    after < thresholds.swap_left * before
+                    and abs(change) > thresholds.swap_errors * error
+                ):
                     fixed = (("detector", first), ("other", second))
                     found.append((before - after, Hypothesis("swapped", fixed, (), ((),), None)))
     found.sort(key=lambda item: -item[0])
-    return [item for _, item in found[:2]]
+    return [item for _, item in found[: thresholds.places_of_a_kind]]
 
 
 def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str, str] | None:

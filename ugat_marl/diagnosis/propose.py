@@ -50,8 +50,8 @@ class Direction:
         return self.hypothesis.clipped(values)
 
 
-def between(directions: Sequence[Direction]) -> list[Direction]:
-    """Return the directions, and those at one and two thirds between strengths of a hypothesis.
+def between(directions: Sequence[Direction], shares: Sequence[float]) -> list[Direction]:
+    """Return the directions, and those at some shares of the way between strengths.
 
     The change by an effect is not proportional to its strength, but between two simulated strengths
     it is nearly linear.
@@ -61,7 +61,7 @@ def between(directions: Sequence[Direction]) -> list[Direction]:
         near = first.hypothesis == second.hypothesis and first.origin is not None
         if not near or not first.level or _side(first) != _side(second):
             continue
-        for share in (0.33, 0.67):
+        for share in shares:
             level = tuple(
                 (1 - share) * a + share * b for a, b in zip(first.level, second.level, strict=True)
             )
@@ -110,8 +110,8 @@ def propose(
     best: dict[tuple[object, ...], Proposed] = {}
     kept = list(range(len(directions)))
     for size in range(1, len(thresholds.candidates) + 1):
-        if size == 3 and len(kept) > 40:  # all triples would take too long
-            kept = _useful(best, directions, 40)
+        if size == 3 and len(kept) > thresholds.most_in_triples:  # all triples would take too long
+            kept = _useful(best, directions, thresholds.most_in_triples)
         for chosen in itertools.combinations(kept, size):
             keys = tuple(sorted(str(directions[index].hypothesis.key) for index in chosen))
             if len(set(keys)) < size:
@@ -158,7 +158,8 @@ def _least_squares(
     part = gram[np.ix_(chosen, chosen)]
     try:
         found = np.linalg.solve(
-            part + 1e-6 * np.trace(part) * np.eye(len(chosen)), match[list(chosen)]
+            part + thresholds.strength_ridge * np.trace(part) * np.eye(len(chosen)),
+            match[list(chosen)],
         )
     except np.linalg.LinAlgError:
         return None
@@ -195,8 +196,11 @@ def promising(proposals: Sequence[Proposed], thresholds: Thresholds) -> list[Pro
     least = math.inf
     for size in range(1, len(thresholds.candidates) + 1):
         own = [item for item in proposals if len(item.members) == size]
-        if own and own[0].expected < 0.95 * least - 20.0:  # more must be gained
-            near = [item for item in own if item.expected <= 1.3 * own[0].expected + 50.0]
+        if (
+            own and own[0].expected < thresholds.larger_share * least - thresholds.larger_gain
+        ):  # more must be gained
+            most = thresholds.near_share * own[0].expected + thresholds.near_cost
+            near = [item for item in own if item.expected <= most]
             chosen += near[: thresholds.candidates[size - 1]]
             least = own[0].expected
     return list(dict.fromkeys(chosen))

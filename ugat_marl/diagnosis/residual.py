@@ -80,10 +80,13 @@ class Null:
             for _ in range(thresholds.null_draws):
                 chosen = generator.choice(len(others), size, replace=False)
                 found = model.distance([others[int(i)] for i in chosen])
-                for name, value in _statistics(found, own).items():
+                for name, value in _statistics(found, own, thresholds.added_distance).items():
                     draws.setdefault(name, []).append(value)
                 draws.setdefault("total", []).append(found.total)
-        self._moments = {name: _log_moments(values) for name, values in draws.items()}
+        self._moments = {
+            name: _log_moments(values, thresholds.least_log_spread)
+            for name, values in draws.items()
+        }
         self.expected = float(np.mean(draws["total"]))
 
     def test(
@@ -108,7 +111,7 @@ class Null:
         return replace(found, p=max(without)) if max(without) > self._thresholds.one_day else found
 
     def _judge(self, found: Distance) -> Residual:
-        values = _statistics(found, self._directed)
+        values = _statistics(found, self._directed, self._thresholds.added_distance)
         chances = {name: self._chance(name, value) for name, value in values.items()}
         smallest = min(chances.values())
         return Residual(
@@ -142,19 +145,22 @@ def log_normal_tail(value: float, mean: float, deviation: float) -> float:
     return float(special.ndtr((mean - math.log(max(value, 1e-9))) / deviation))
 
 
-def _statistics(found: Distance, directed: Directed | None) -> dict[str, float]:
-    """Return the tested statistics: distances of blocks, largest single ones, and directed ones."""
+def _statistics(found: Distance, directed: Directed | None, more: float) -> dict[str, float]:
+    """Return the tested statistics, each with `more` added.
+
+    They are the distances of blocks, the largest single ones, and directed ones.
+    """
     values = dict(found.parts)
     for name in ("lane", "time"):
         values[f"{name}, largest"] = float(np.abs(found.z[name]).max(initial=0.0)) ** 2
     if directed is not None:
         values |= directed(found)
-    return {name: value + 1.0 for name, value in values.items()}
+    return {name: value + more for name, value in values.items()}
 
 
-def _log_moments(values: Sequence[float]) -> tuple[float, float]:
+def _log_moments(values: Sequence[float], least_spread: float) -> tuple[float, float]:
     logs = np.log(np.maximum(values, 1e-9))
-    return float(logs.mean()), max(float(logs.std(ddof=1)), 0.02)
+    return float(logs.mean()), max(float(logs.std(ddof=1)), least_spread)
 
 
 # --- single effects -------------------------------------------------------------------------------
@@ -195,7 +201,9 @@ class MatchedFilters:
                 continue
             block = reference.blocks[name]
             weight = sums[name][..., 1] / len(data)
-            groups = correlation_groups(block.used & (weight >= 1.0), block.correlation)
+            groups = correlation_groups(
+                block.used & (weight >= thresholds.least_measured), block.correlation
+            )
             self._parts.append((name, groups))
             more = 0.0 if extra is None else extra[name]
             scales[name] = np.sqrt(block.noise(weight, len(data)) + more)

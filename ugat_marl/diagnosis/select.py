@@ -149,7 +149,9 @@ class Selector:
 
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Add, change or remove effects; return None if no change is worth its price."""
-        directions = between(self._library_directions(start.model, number))
+        directions = between(
+            self._library_directions(start.model, number), self._thresholds.between
+        )
         whitener = self._whitener(start.model, WIDE)
         gap = float(whitener.measured @ whitener.measured)
         chance = float(len(whitener.measured))  # expected squared length if only noise is left
@@ -254,7 +256,7 @@ class Selector:
                 jobs += [(hypothesis, level, hypothesis.nominal) for level in levels]
         if what == "library":
             for hypothesis, values in model.members:
-                jobs += both_ways(hypothesis, values)
+                jobs += both_ways(hypothesis, values, self._thresholds.farther)
         days = self._effort.bank
         directions: list[Direction] = []
         numbers = list(model.days)[:days]
@@ -350,12 +352,18 @@ def pruned(
 
     members = tuple(item for item in best.model.members if item[0].matters(item[1]))
     if members and len(members) < len(best.model.members):
-        best = test(fitter.refine(fitter.simulate(members), 2))
+        best = test(fitter.refine(fitter.simulate(members), fitter.thresholds.steps_without))
     while len(best.model.members) > 1:
         fewer: list[Fitted] = []
         with reporter.task("without single effects", len(best.model.members)) as advance:
             for part in each_left_out(best.model.members):
-                fewer.append(kept(settled(fitter.refine(fitter.simulate(part), 2))))
+                fewer.append(
+                    kept(
+                        settled(
+                            fitter.refine(fitter.simulate(part), fitter.thresholds.steps_without)
+                        )
+                    )
+                )
                 advance(note=names_of(part))
         doubtful = [fewer[place] for place in _doubtful(best, fitter.thresholds.half_interval)]
         least = min(fewer, key=cost_of)

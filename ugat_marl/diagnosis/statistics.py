@@ -90,6 +90,7 @@ class Block:
         error: Variance of `mean`, since it comes from a finite number of days.
         used: True for statistics that are used.
         correlation: Correlation between features, ``(features, features)``.
+        thinning: Least and largest factor of `variance` for unusual numbers of observations.
         doubt: Variance of `mean` that more days do not reduce.
     """
 
@@ -99,19 +100,20 @@ class Block:
     error: Array
     used: NDArray[np.bool_]
     correlation: Array
+    thinning: tuple[float, float]
     doubt: Array | float = 0.0
 
     def noise(self, weight: Array, periods: int) -> Array:
         """Return the variance of measured minus expected statistics.
 
         noise = variance * thin / periods + error + doubt, where `thin` is the usual number of
-        observations over the measured one, within 1/4 and 4.
+        observations over the measured one, within `thinning`.
 
         Args:
             weight: Observations per measured period.
             periods: Number of measured periods.
         """
-        thin = np.clip(self.weight / np.maximum(weight, 1e-9), 0.25, 4.0)
+        thin = np.clip(self.weight / np.maximum(weight, 1e-9), *self.thinning)
         return self.variance * thin / periods + self.error + self.doubt
 
 
@@ -178,7 +180,7 @@ class Reference:
         timed = name == "time"
         mean, variance, weight, residual = _moments(sums, self._thresholds)
         if timed:
-            variance = _smoothed(mean, variance)
+            variance = _smoothed(mean, variance, self._thresholds)
         error = variance / len(sums)
         if prior is not None:
             scale = len(sums) / (len(sums) + self._thresholds.few_days)
@@ -195,18 +197,20 @@ class Reference:
                 variance = np.where(moved, variance, prior.variance)
                 error = np.where(moved, error, prior.error)
         if timed:
-            used = mean > 0.5
+            used = mean > self._thresholds.least_count
         else:
             used = (weight >= self._thresholds.least_observations) & np.isfinite(mean)
             used &= ~_constant(self._speeds)[None, :]
         if timed:
             correlation = np.eye(sums.shape[2])
         elif prior is None:
-            correlation = _correlation(np.where(used, residual / np.sqrt(variance), 0.0))
+            correlation = _correlation(
+                np.where(used, residual / np.sqrt(variance), 0.0), self._thresholds.least_shrinkage
+            )
         else:
             correlation = prior.correlation
             used &= prior.used
-        return Block(mean, variance, weight, error, used, correlation)
+        return Block(mean, variance, weight, error, used, correlation, self._thresholds.thinning)
 
     def distance(
         self,
@@ -231,7 +235,7 @@ class Reference:
         for name, block in self.blocks.items():
             other = relative_to.blocks[name] if relative_to else block
             weight = sums[name][..., 1] / len(data)
-            used = other.used & (weight >= 1.0)
+            used = other.used & (weight >= self._thresholds.least_measured)
             value = sums[name][..., 0] / np.maximum(sums[name][..., 1], 1e-9)
             variance = block.noise(weight, len(data))
             if extra is not None:
@@ -279,13 +283,15 @@ def sum_of(tallies: Sequence[Tally]) -> Tally:
     return total
 
 
-def _smoothed(mean: Array, variance: Array) -> Array:
-    """Return variances of counts in bins: half the estimate, half in proportion to the mean.
+def _smoothed(mean: Array, variance: Array, thresholds: Thresholds) -> Array:
+    """Return variances of counts in bins: the estimate, mixed with the mean times a factor.
 
-    Both arguments and the result are ``(members, bins)``. The estimate of one bin is noisy.
+    Both arrays and the result are ``(members, bins)``. The estimate of one bin is noisy.
     """
     scale = variance.sum(axis=1, keepdims=True) / np.maximum(mean.sum(axis=1, keepdims=True), 1e-9)
-    return np.maximum(0.5 * variance + 0.5 * scale * mean, 0.05)
+    share = thresholds.proportional_share
+    mixed = (1.0 - share) * variance + share * scale * mean
+    return np.maximum(mixed, thresholds.least_count_variance)
 
 
 def _moments(sums: Array, thresholds: Thresholds) -> tuple[Array, Array, Array, Array]:
@@ -333,12 +339,14 @@ def _controlled(
     """
     before, _, _, other = _moments(partner, thresholds)
     spread = (other**2).sum(axis=0)
-    slope = np.clip((residual * other).sum(axis=0) / np.maximum(spread, 1e-12), 0.0, 1.5)
+    slope = np.clip(
+        (residual * other).sum(axis=0) / np.maximum(spread, 1e-12), 0.0, thresholds.steepest_control
+    )
     slope = np.where(np.isfinite(prior.mean) & np.isfinite(before), slope, 0.0)
     days = len(partner)
     left = ((residual - slope * other) ** 2).sum(axis=0) / max(days - 2, 1)
     shift = np.where(slope > 0, slope * (before - prior.mean), 0.0)
-    error = np.maximum(left, 0.1 * variance) / days + slope**2 * prior.error
+    error = np.maximum(left, thresholds.least_own_share * variance) / days + slope**2 * prior.error
     return mean - shift, error
 
 
@@ -361,11 +369,12 @@ def _constant(speeds: bool) -> NDArray[np.bool_]:
     return np.array([not speeds and name in SPEED_FEATURES for name, _, _ in FEATURES])
 
 
-def _correlation(residual: Array) -> Array:
+def _correlation(residual: Array, least_shrinkage: float) -> Array:
     """Return the shrunk correlation ``(features, features)`` over all days and members.
 
     Args:
         residual: Standardised residuals, ``(days, members, features)``.
+        least_shrinkage: Least weight of the identity.
     """
     rows = residual.reshape(-1, residual.shape[-1])
     spread = np.sqrt((rows**2).mean(axis=0))
@@ -376,7 +385,7 @@ def _correlation(residual: Array) -> Array:
     # Ledoit and Wolf (2004): C = (1 - k) S + k I, k = noise of S / distance of S from I.
     distance = ((sample - np.eye(width)) ** 2).sum()
     noise = float((((rows**2).T @ (rows**2)) / count - sample**2).sum()) / count
-    shrinkage = min(max(noise / max(distance, 1e-12), 0.02), 1.0)
+    shrinkage = min(max(noise / max(distance, 1e-12), least_shrinkage), 1.0)
     return (1 - shrinkage) * sample + shrinkage * np.eye(width)
 
 
@@ -488,7 +497,7 @@ class Whitener:
                 name, reference.pools.thresholds
             )  # 0 for blocks that are not softened
             scale = np.sqrt(noise + (max(tolerance, soft) * difference) ** 2)
-            used = chosen.blocks[name].used & (weight >= 1.0)
+            used = chosen.blocks[name].used & (weight >= reference.pools.thresholds.least_measured)
             self._parts.append((name, scale, correlation_groups(used, block.correlation)))
         self.measured = self(found.difference)
 

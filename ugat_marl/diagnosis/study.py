@@ -441,7 +441,10 @@ def timing_effects(
         total = sum(seen.values())
         if total >= thresholds.least_clearances:
             value, count = seen.most_common(1)[0]
-            if count >= thresholds.usual_share * total and abs(value - now) > 0.05:
+            if (
+                count >= thresholds.usual_share * total
+                and abs(value - now) > thresholds.least_timing_s
+            ):
                 found.append(effect_from_record({"name": name, "seconds": value}))
     return tuple(found)
 

@@ -58,6 +58,63 @@ class DayThresholds:
     after_red_s: float = 7.0
     """Time after red begins in which crossings are counted, s. By hand. Halved: late red-runners
     are missed."""
+    usual_gap_s: float = 2.0
+    """Gap of queued vehicles from which the spread of gaps is measured, s: the usual saturation
+    headway. Halved: the spread says no more than the mean gap."""
+    short_gap_s: float = 1.7
+    """Gap below which a gap of queued vehicles is short, s. By hand. Halved: hardly any gap is
+    short."""
+    long_gap_s: float = 2.6
+    """Gap above which a gap of queued vehicles is long, s. By hand. Halved: most gaps are long."""
+    late_red_s: float = 2.0
+    """Time after red begins in which a crossing is late and not a crossing on red, s. By hand: the
+    usual all-red time. Halved: late drivers count as red-runners."""
+    last_crossing_s: float = 3.0
+    """Time after red begins in which the delay of the last crossings is averaged, s. By hand.
+    Halved: delays of late drivers are cut off."""
+    measurable_mps: float = 5.0
+    """Speed from which the length of a vehicle is computed from its time on the detector, m/s. By
+    hand. Halved: vehicles that brake seem too long."""
+    long_vehicle_m: float = 8.0
+    """Length above which a vehicle is long, m: longer than cars and vans. Halved: all are long."""
+    moving_over_s: float = 1.2
+    """Time on the detector below which a vehicle without a measured speed moves in a platoon, s. By
+    hand. Halved: trucks do not belong to platoons."""
+    platoon_gap_s: float = 6.0
+    """Largest gap in a moving platoon, s. By hand. Halved: drivers with long headways are not
+    seen."""
+    short_platoon_gap_s: float = 1.6
+    """Gap below which a gap in a platoon is short, s. By hand. Halved: hardly any gap is short."""
+    middle_platoon_gap_s: float = 2.2
+    """Gap below which a gap in a platoon is short or middle, s. By hand. Halved: as above."""
+    free_gap_s: float = 5.0
+    """Gap above which a vehicle drives freely, s. By hand. Halved: followers count as free."""
+    settled_green_s: float = 5.0
+    """Time after green begins from which a vehicle may be free, s. By hand. Halved: vehicles that
+    braked for the red count as free."""
+    fast_share: float = 1.05
+    """Multiple of the speed limit above which a free vehicle is fast. By hand. Halved: all are
+    fast."""
+    free_over_s: float = 3.0
+    """Longest time of a free vehicle on the detector, s. By hand: longer ones stand. Halved: slow
+    trucks are left out."""
+    before_green_s: float = 3.0
+    """Time before green begins in which vehicles no longer approach a red, s. By hand: they see
+    that it ends. Halved: some of them count."""
+    lone_gap_s: float = 4.0
+    """Gap above which a vehicle that approaches a red brakes by itself, s. By hand. Halved: it may
+    brake for the vehicle ahead."""
+    slow_mps: float = 5.0
+    """Speed below which a vehicle that approaches a red is slow, m/s. By hand. Halved: few are."""
+    red_over_s: float = 4.0
+    """Longest time on the detector of a vehicle that approaches a red, s. By hand: longer ones
+    stand. Halved: drivers who brake early are left out."""
+    cut_occupation_s: float = 30.0
+    """Longest occupation from the begin of a period by a vehicle whose arrival was not seen, s. By
+    hand: longer ones are faults. Halved: queues that stood there already are left out."""
+    standing_s: float = 1.9
+    """Occupied time within one second of the begin of green from which a queue stands on the
+    detector, s (of 2 s). By hand. Halved: moving vehicles count as queues."""
     whole: float = 0.99
     """Share of a bin or of a period that must have been counted. By hand: only rounding may be
     missing. Halved: half-empty bins count as full ones."""
@@ -117,6 +174,30 @@ class Thresholds(DayThresholds):
     least_observations: float = 3.0
     """Observations per period below which a mean is not used. By hand. Halved: means of one or two
     vehicles are compared, with variances from as few."""
+    least_measured: float = 1.0
+    """Observations per measured period below which a mean is not compared. Halved: means of a
+    vehicle in every second period are compared."""
+    least_count: float = 0.5
+    """Vehicles per bin of time below which the bin is not compared. By hand. Halved: bins with a
+    vehicle on every fourth day are compared."""
+    thinning: tuple[float, float] = (0.25, 4.0)
+    """Least and largest factor of a variance for unusual numbers of observations. By hand. Halved:
+    means of few observations seem too exact."""
+    proportional_share: float = 0.5
+    """Weight of a variance in proportion to the mean in the variance of a count in a bin of time;
+    the rest is the estimate of that bin. By hand. Halved: these variances are noisier."""
+    least_count_variance: float = 0.05
+    """Least variance of a count in a bin of time. By hand. Halved: bins that hardly vary weigh up
+    to twice as much."""
+    steepest_control: float = 1.5
+    """Largest slope of a model's days on the same days of the scenario as it is. By hand. Halved:
+    common chance is removed only in part."""
+    least_own_share: float = 0.1
+    """Least variance of a model's mean that common chance leaves, as a share of its variance. By
+    hand. Halved: means of few days seem more exact by up to a factor of 1.4."""
+    least_shrinkage: float = 0.02
+    """Least weight of the identity in a shrunk correlation. By hand: keeps it invertible. Halved:
+    no visible change."""
     grain: float = 0.3
     """Least standard deviation of a sum over a period, in units of the feature. By hand: SUMO moves
     in steps. Halved: statistics that hardly vary have up to four times the weight."""
@@ -145,6 +226,16 @@ class Thresholds(DayThresholds):
 
     # --- locate and propose -------------------------------------------------------------------
 
+    heavy_tail: float = 6.0
+    """Standardised difference up to which its tail is nearly normal. By hand, from simulated data
+    sets. Halved: strong local differences are discovered less often."""
+    least_bins: int = 3
+    """Least number of bins of time that are scanned for a stretch. By hand. Halved: a single bin
+    may be a stretch."""
+    largest_z: float = 15.0
+    """Standardised difference at which single places and bins are cut off. By hand: one bin must
+    not decide alone. Halved: strong and very strong differences look alike."""
+
     dwell_s: float = 40.0
     """Standing time of a parked vehicle in a hypothesis, s. By hand. Halved: the fitted rate of
     parking doubles."""
@@ -157,6 +248,12 @@ class Thresholds(DayThresholds):
     suspect_timing: float = 16.0
     """Squared standardised size beyond which a shift of demand is proposed (4 deviations, for eight
     shifts). By hand. Halved: more simulations, the same result."""
+    strengths_of_a_shift: tuple[float, float] = (0.5, 2.0)
+    """Least and largest strength at which a shift of demand fits the counts; 1 is exact. By hand.
+    Halved: shifts twice as long as needed are proposed."""
+    least_shift_s: float = 45.0
+    """Shift of demand below which it does not matter, s. By hand. Halved: shifts by chance are
+    named."""
     mostly: float = 0.7
     """Share of an edge's vehicles beyond which its counts belong to one origin. By hand. Halved:
     origins are mixed up."""
@@ -167,8 +264,90 @@ class Thresholds(DayThresholds):
     """Squared standardised change beyond which an origin or a turn is examined (3 deviations). By
     hand. Halved: more simulations, the same result."""
     places_of_a_kind: int = 2
-    """Largest number of origins, and of turns, that are proposed at a time. By hand, to save time.
-    Halved: of two changed origins, one waits for the next round."""
+    """Largest number of origins, turns, edges, traffic lights or exchanged pairs of detectors that
+    are proposed at a time. By hand, to save time. Halved: of two changed origins, one waits for the
+    next round."""
+    demand_factors: tuple[float, float] = (0.3, 3.0)
+    """Least and largest factor of an origin's demand that is tried first. By hand. Halved: stronger
+    changes start too far from the solution."""
+    least_demand: float = 0.03
+    """Change of a demand's factor below which it does not matter. By hand. Halved: chance of the
+    counts is named more often."""
+    visible_turn: float = 4.0
+    """Least squared standardised change by all vehicles taking one turn. By hand. Halved: turns
+    that counts hardly show are examined."""
+    least_turn: float = 0.02
+    """Least share of vehicles that would have to take another turn. By hand. Halved: more turns are
+    examined."""
+    most_turning: float = 0.9
+    """Largest such share that is tried first. By hand. Halved: fits of strong changes start too far
+    from the solution."""
+    least_turning: float = 0.03
+    """Share of vehicles with another turn below which it does not matter. By hand. Halved: as for
+    `least_demand`."""
+    surges: int = 2
+    """Largest number of surges that are proposed at a time. By hand, to save time. Halved: of two
+    surges, one waits for the next round."""
+    closures: int = 4
+    """Largest number of closed lanes that are proposed at a time. By hand, to save time. Halved:
+    the lane beside a closed one may hide it."""
+    surge_factors: tuple[float, float] = (0.1, 4.0)
+    """Least and largest factor of a surge that is tried first. By hand. Halved: as for
+    `demand_factors`."""
+    least_surge: float = 0.1
+    """Change of a surge's factor below which it does not matter. By hand. Halved: surges by chance
+    are named."""
+    usual_speed_ratio: float = 0.8
+    """Speed on an edge that is tried first if the data show none, as a multiple of the simulated
+    one. By hand. Halved: fits start too far from the solution."""
+    least_speed_ratio: float = 0.03
+    """Difference from 1 from which a measured multiple is used instead. By hand. Halved: multiples
+    that may be chance are simulated."""
+    speed_ratios: tuple[float, float] = (0.2, 2.0)
+    """Least and largest multiple that is tried first. By hand. Halved: speeds above the simulated
+    one are not tried."""
+    least_speed_change: float = 0.02
+    """Change of such a multiple below which it does not matter. By hand. Halved: chance is named
+    more often."""
+    first_late_green_s: float = 2.0
+    """Lost time of a traffic light that is tried first, s. By hand. Halved: it changes the
+    statistics less beyond chance."""
+    least_late_green_s: float = 0.3
+    """Lost time below which it does not matter, s. By hand. Halved: chance is named more often."""
+    least_clock_s: float = 0.2
+    """Error of a signal's clock below which it does not matter, s. By hand. Halved: as above."""
+    drifting_clocks: int = 1
+    """Largest number of clocks that are proposed as drifting at a time. By hand, to save time.
+    Halved: none is."""
+    least_drift: float = 0.5
+    """Drift of a clock below which it does not matter, s per hour. By hand. Halved: as above."""
+    first_parking: float = 20.0
+    """Parked vehicles per hour and lane that are tried first. By hand. Halved: they change the
+    statistics less beyond chance."""
+    least_parking: float = 3.0
+    """Parked vehicles per hour below which parking does not matter. By hand. Halved: parking by
+    chance is named."""
+    faults_of_a_kind: int = 3
+    """Largest number of detectors that are proposed for one kind of fault. By hand, to save time.
+    Halved: further faults wait for the next round."""
+    short_count: float = 2.5
+    """Standardised lack of vehicles beyond which a detector may count too few. By hand. Halved:
+    quiet lanes are proposed, and rejected by simulation."""
+    missed_shares: tuple[float, float] = (0.03, 0.9)
+    """Least and largest share of missed vehicles that is tried first. By hand. Halved: detectors
+    that miss most start too far from the solution."""
+    least_undercount: float = 0.02
+    """Share of missed vehicles below which it does not matter. By hand. Halved: chance is named
+    more often."""
+    swap_suspect: float = 4.0
+    """Standardised difference of a count beyond which two detectors may be exchanged. By hand.
+    Halved: more pairs are compared."""
+    swap_left: float = 0.3
+    """Largest share of the squared differences that an exchange may leave. By hand. Halved: noisy
+    counts hide an exchange."""
+    swap_errors: float = 3.0
+    """Least difference of the two expected counts, in errors of the measured ones. By hand. Halved:
+    detectors with similar counts are proposed."""
     scan_s: float = 60.0
     """Step of the scan for windows, s. By hand; the fit then uses smaller steps. Halved: slower,
     equally exact."""
@@ -187,6 +366,15 @@ class Thresholds(DayThresholds):
     stuck_s: float = 240.0
     """Least time of uninterrupted occupation for a detector that may be stuck, s. By hand: longer
     than a red. Halved: long reds are proposed."""
+    between: tuple[float, ...] = (0.33, 0.67)
+    """Shares of the way between two simulated strengths at which directions are interpolated. By
+    hand: thirds. Halved: strengths just below the larger one are predicted worse."""
+    most_in_triples: int = 40
+    """Largest number of directions that are combined in threes. By hand, to save time: their number
+    enters with its third power. Halved: rarer triples are missed."""
+    strength_ridge: float = 1e-6
+    """Ridge of the normal equations for strengths, relative to their trace. By hand: only against
+    singular equations. Halved: no visible change."""
     farthest: float = 1.6
     """Largest strength along a direction, as a multiple of the simulated strength. By hand. Halved:
     the simulated strength itself cannot be reached."""
@@ -196,6 +384,21 @@ class Thresholds(DayThresholds):
     candidates: tuple[int, int, int] = (3, 2, 2)
     """Largest numbers of sets of one, two and three effects that are simulated in a round. By hand,
     to save time. Halved: the right set is missed if several are similar."""
+    larger_share: float = 0.95
+    """Share of the expected cost of a smaller set that a larger set may have at most. By hand.
+    Halved: larger sets are simulated only for large gains."""
+    larger_gain: float = 20.0
+    """Least expected gain of a larger set besides that share. By hand, above `price`. Halved: more
+    sets are simulated for small differences."""
+    near_share: float = 1.3
+    """Multiple of the least expected cost up to which sets of the same size are simulated. By hand:
+    predictions are not more exact. Halved: only the best set is simulated."""
+    near_cost: float = 50.0
+    """Expected cost that is added to that multiple. By hand. Halved: fewer sets are simulated where
+    little is left."""
+    farther: float = 0.4
+    """Share of its distance from nominal by which an effect of the model is moved away from it, for
+    a direction. By hand. Halved: directions hold more chance."""
     foresight: float = 0.05
     """Share of a difference that counts as error of the prediction along directions. By hand.
     Halved: directions are trusted where effects are not linear."""
@@ -209,6 +412,18 @@ class Thresholds(DayThresholds):
     interpolation: float = 0.02
     """Share of a measured difference that counts as noise during a fit: the simulation rounds to
     its steps, the street does not. By hand. Halved: large differences bias the values."""
+    steps: int = 3
+    """Largest number of steps of a fit. By hand: later ones gain almost nothing. Halved: values far
+    from the first simulation are not reached."""
+    steps_without: int = 2
+    """The same if one effect is left out of a fitted set. By hand: the others are near already.
+    Halved: more superfluous effects stay."""
+    shorter_step: float = 0.4
+    """Share of a step that is tried if the whole step makes the fit worse. By hand. Halved: slower
+    where derivatives are noisy."""
+    longest_move: float = 4.0
+    """Longest move of a value near nominal in one step, in units of its least effect that matters.
+    By hand. Halved: weak effects need more steps."""
     nearby: float = 0.2
     """Move of a value for a derivative, as a share of its distance from nominal. By hand. Halved:
     derivatives hold more chance."""
@@ -250,6 +465,12 @@ class Thresholds(DayThresholds):
     null_draws: int = 40
     """Data sets drawn from each half of a model's days. By hand. Halved: the distribution of chance
     is known 1.4 times less exactly."""
+    least_log_spread: float = 0.02
+    """Least standard deviation of the logarithm of a tested statistic. By hand: 80 draws may be
+    equal by chance. Halved: tiny differences count as unusual."""
+    added_distance: float = 1.0
+    """Number that is added to a tested statistic before its logarithm is taken. By hand: statistics
+    near 0 must not decide. Halved: distributions of small statistics are less nearly normal."""
     floor_deviations: float = 2.326
     """Standard deviations of the logarithm up to the noise floor: the normal quantile of 0.99.
     Halved: 12 of 100 data sets of the model itself lie above the floor."""
@@ -313,6 +534,9 @@ class Thresholds(DayThresholds):
     part: float = 0.5
     """Least share of the gap that a partial explanation must remove. By hand: the larger half.
     Halved: effects are named that explain a quarter."""
+    deciding_z: float = 5.0
+    """Standardised difference between two models that would decide, for the number of further
+    periods to measure. By hand. Halved: a quarter of these periods is asked for."""
     confirmed: float = 10.0
     """Distance by which effects must improve the held-out periods. By hand, below `price`. Halved:
     chance confirms more often."""
@@ -325,6 +549,9 @@ class Thresholds(DayThresholds):
     usual_share: float = 0.8
     """Share of the clearances that must agree. By hand. Halved: for a traffic light with two times,
     one of them is read off."""
+    least_timing_s: float = 0.05
+    """Difference of a time in the log from the scenario's that counts, s: logs have tenths of a
+    second. Halved: no change."""
     least_days: int = 3
     """Least number of days for FHWA's criteria; fewer days show too little variation
     (FHWA-HOP-18-036)."""

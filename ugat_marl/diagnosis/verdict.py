@@ -138,7 +138,11 @@ def _sufficient(
         others = "; or ".join(describe_members(rival.members) for rival in rivals)
         sentence = f"The data fit either equally well: {names}; or {others}."
         return Conclusion(
-            "not_identifiable", best, rivals, sentence, _separating(best.model, rivals[0])
+            "not_identifiable",
+            best,
+            rivals,
+            sentence,
+            _separating(best.model, rivals[0], config.thresholds.deciding_z),
         )
     them = "it" if len(best.model.members) == 1 else "them"
     sentence = f"The street has {names}; with {them}, what is left is no more than chance."
@@ -212,7 +216,7 @@ def _look_at(selection: Selected) -> str | None:
     return f"trajectories or video where most is left over: {told}"
 
 
-def _separating(best: Fitted, rival: Fitted) -> str:
+def _separating(best: Fitted, rival: Fitted, deciding_z: float) -> str:
     """Name the statistic in which two models differ most, and the number of periods to decide."""
     block, other = best.reference.blocks["network"], rival.reference.blocks["network"]
     difference = (block.mean - other.mean)[0]
@@ -220,7 +224,7 @@ def _separating(best: Fitted, rival: Fitted) -> str:
     z = np.where(block.used[0], difference / deviation, 0.0)
     index = int(np.argmax(np.abs(z)))
     name, regime, _ = FEATURES[index]
-    periods = int(np.ceil((5.0 / max(abs(float(z[index])), 0.05)) ** 2))
+    periods = int(np.ceil((deciding_z / max(abs(float(z[index])), 0.05)) ** 2))
     many = "one period" if periods == 1 else f"{periods} periods"
     return f"{statistic(name)} ({regime}) differs most between them: about {many} would decide"
 
