@@ -80,12 +80,12 @@ def locked_up(tallies: Sequence[Tally], thresholds: Thresholds, usual: float = 0
     """
     counts = _counts(tallies)
     spread = max(day_to_day(tallies), usual)
-    found = np.flatnonzero(np.abs(counts - np.median(counts)) > thresholds.locked_up * spread)
-    return found.tolist() if len(found) <= max(1.0, thresholds.rare * len(tallies)) else []
+    unusual = np.flatnonzero(np.abs(counts - np.median(counts)) > thresholds.locked_up * spread)
+    return unusual.tolist() if len(unusual) <= max(1.0, thresholds.rare * len(tallies)) else []
 
 
 def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
-    return np.array([item.bins[:3].sum() for item in tallies])
+    return np.array([day.bins[:3].sum() for day in tallies])
 
 
 # --- simulated days -------------------------------------------------------------------------------
@@ -267,10 +267,10 @@ class Engine:
         """
 
         def one(number: int) -> Replicate:
-            found = self._one(tuple(effects), number)
+            day = self._one(tuple(effects), number)
             if advance is not None:
                 advance()
-            return found
+            return day
 
         (days,) = self._together(one, [numbers])
         return days
@@ -328,18 +328,18 @@ class Engine:
     def _one(self, effects: tuple[Effect, ...], number: int) -> Replicate:
         key = self._key(effects, number)
         new = key not in self._known
-        found = self._known.get(key) or self._remembered(key)
-        if found is None:
+        day = self._known.get(key) or self._remembered(key)
+        if day is None:
             others = tuple(effect for effect in effects if not effect.on_departures)
             if self._replay.answering and len(others) < len(effects):
-                found = self._asked_for(self._one(others, number), effects, number)
+                day = self._asked_for(self._one(others, number), effects, number)
             else:
-                found = self._counted(effects, number)
-            self._remember(key, found)
-        self._known[key] = found
+                day = self._counted(effects, number)
+            self._remember(key, day)
+        self._known[key] = day
         if (tell := self._known_by) is not None and new:
             tell()
-        return found
+        return day
 
     def _counted(self, effects: tuple[Effect, ...], number: int) -> Replicate:
         """Simulate a day and count it."""
@@ -420,18 +420,18 @@ class Engine:
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
             return None  # absent or damaged: simulated again
 
-    def _remember(self, key: str, found: Replicate) -> None:
+    def _remember(self, key: str, day: Replicate) -> None:
         if self._cache is None:
             return
         content = io.BytesIO()
-        counted = found.counted or found.tally
+        counted = day.counted or day.tally
         arrays: dict[str, Any] = {
             "sums": counted.sums,
             "bins": counted.bins.astype(np.float32),
-            "travel_time_s": np.float64(found.travel_time_s),
+            "travel_time_s": np.float64(day.travel_time_s),
         }
-        if found.due is not None:
-            for name, of_edge in (("asked", found.due.asked), ("given", found.due.given)):
+        if day.due is not None:
+            for name, of_edge in (("asked", day.due.asked), ("given", day.due.given)):
                 arrays[name] = np.stack([of_edge[edge] for edge in self._edges])
         np.savez_compressed(content, **arrays)
         write_whole(self._cache / key[:2] / f"{key}.npz", content.getvalue())

@@ -106,39 +106,39 @@ class DetectorLayout:
             MeasuredDataError: No detector is at an intersection with signals.
         """
         by_lane: dict[str, dict[DetectorKind, list[str]]] = {}
-        for item in detectors:
-            by_lane.setdefault(item.lane, {}).setdefault(item.kind, []).append(item.id)
+        for detector in detectors:
+            by_lane.setdefault(detector.lane, {}).setdefault(detector.kind, []).append(detector.id)
         lanes: list[IncomingLane] = []
         exits: list[tuple[int, str, tuple[str, ...]]] = []
         owner: dict[str, str] = {}
-        for index, item in enumerate(network.intersections):
-            for lane in item.incoming_lanes:
-                found = by_lane.get(lane, {})
+        for index, intersection in enumerate(network.intersections):
+            for lane in intersection.incoming_lanes:
+                by_kind = by_lane.get(lane, {})
                 kinds: dict[DetectorKind, tuple[str, ...]] = {
-                    kind: tuple(names) for kind, names in found.items() if kind != "exit"
+                    kind: tuple(names) for kind, names in by_kind.items() if kind != "exit"
                 }
                 lanes.append(
                     IncomingLane(
                         lane,
                         network.lanes[lane].edge,
                         index,
-                        _links(item, lane),
+                        _links(intersection, lane),
                         network.lanes[lane].speed_mps,
                         kinds,
-                        _following(item, lane),
+                        _following(intersection, lane),
                     )
                 )
-                owner |= {name: item.id for names in kinds.values() for name in names}
-            for lane in item.outgoing_lanes:
+                owner |= {name: intersection.id for names in kinds.values() for name in names}
+            for lane in intersection.outgoing_lanes:
                 if names := tuple(by_lane.get(lane, {}).get("exit", ())):
                     exits.append((index, lane, names))
-                    owner |= dict.fromkeys(names, item.id)
+                    owner |= dict.fromkeys(names, intersection.id)
         if not owner:
             raise MeasuredDataError(
                 "no detector lies on a lane that leads to or from a traffic light of the network; "
                 "check lane_id in detectors.csv"
             )
-        names = tuple(item.id for item in network.intersections)
+        names = tuple(intersection.id for intersection in network.intersections)
         return cls(names, tuple(lanes), tuple(exits), tuple(detectors), owner)
 
     @functools.cached_property
@@ -161,19 +161,19 @@ class DetectorLayout:
 
     def greens(self, period: Period) -> tuple[Greens, ...]:
         """Return the greens of every lane that begin and end inside the period."""
-        found: list[Greens] = []
+        greens_of_lanes: list[Greens] = []
         for lane in self.lanes:
             log = period.signals.get(self.intersections[lane.intersection], ())
-            found.append(_greens(log, lane.links, period))
-        return tuple(found)
+            greens_of_lanes.append(_greens(log, lane.links, period))
+        return tuple(greens_of_lanes)
 
 
-def _links(item: Intersection, lane: str) -> tuple[int, ...]:
-    return tuple(sorted({link.index for link in item.links if link.from_lane == lane}))
+def _links(intersection: Intersection, lane: str) -> tuple[int, ...]:
+    return tuple(sorted({link.index for link in intersection.links if link.from_lane == lane}))
 
 
-def _following(item: Intersection, lane: str) -> frozenset[str]:
-    return frozenset(link.to_edge for link in item.links if link.from_lane == lane)
+def _following(intersection: Intersection, lane: str) -> frozenset[str]:
+    return frozenset(link.to_edge for link in intersection.links if link.from_lane == lane)
 
 
 def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
@@ -422,8 +422,8 @@ def _passages(period: Period, lane: IncomingLane, kind: str) -> Passages | None:
 
 def _merged(period: Period, names: Sequence[str]) -> Passages:
     """Return the passages of the first detector with a record, so that no vehicle counts twice."""
-    found = [period.passages[name] for name in names if name in period.passages]
-    return found[0] if found else Passages.none()
+    recorded = [period.passages[name] for name in names if name in period.passages]
+    return recorded[0] if recorded else Passages.none()
 
 
 def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
@@ -638,13 +638,13 @@ def without_gaps(
 ) -> frozenset[str]:
     """Find detectors that were counted in every period from begin to end."""
     length = pl.col("end_s").cast(pl.Float64) - pl.col("begin_s").cast(pl.Float64)
-    found = set(counts["detector_id"].to_list())
+    whole = set(counts["detector_id"].to_list())
     for period in periods:
-        own = counts.filter(pl.col("period_id") == period.id)
-        times = dict(own.group_by("detector_id").agg(length.sum()).iter_rows())
+        of_period = counts.filter(pl.col("period_id") == period.id)
+        times = dict(of_period.group_by("detector_id").agg(length.sum()).iter_rows())
         least = thresholds.whole * (period.end_s - period.begin_s)
-        found = {name for name in found if times.get(name, 0.0) >= least}
-    return frozenset(found)
+        whole = {name for name in whole if times.get(name, 0.0) >= least}
+    return frozenset(whole)
 
 
 def counts_tally(

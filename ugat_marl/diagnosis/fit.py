@@ -68,17 +68,17 @@ class Fitter:
             days: Number of days; None for the fitter's.
         """
         numbers = list(self.base_days)[: days or self.days]
-        found = self.engine.ordinary(effects_of(members), numbers)
+        simulated = self.engine.ordinary(effects_of(members), numbers)
         reference = Reference(
             self.pools,
-            [day.tally for day in found.values()],
+            [day.tally for day in simulated.values()],
             speeds=self.speeds,
             prior=self.base,
-            paired=[self.base_days[number] for number in found],
+            paired=[self.base_days[number] for number in simulated],
         )
         distance = reference.distance(self.data, relative_to=self.base)
         cost = distance.total + distance.penalty + self.thresholds.price * len(members)
-        known = {number: day.tally for number, day in found.items()}
+        known = {number: day.tally for number, day in simulated.items()}
         return Fitted(members, known, reference, distance, cost)
 
     def refine(self, start: Fitted, rounds: int | None = None) -> Fitted:
@@ -100,18 +100,18 @@ class Fitter:
             moved = self._moved(best, step)
             if moved == best.members:
                 break
-            found = self.simulate(moved)
-            if found.cost >= best.cost:
+            after = self.simulate(moved)
+            if after.cost >= best.cost:
                 moved = self._moved(best, self.thresholds.shorter_step * step)
                 if moved == best.members:
                     break
-                found = self.simulate(moved)
-                if found.cost >= best.cost:
+                after = self.simulate(moved)
+                if after.cost >= best.cost:
                     if number:
                         break
                     jacobian = None
                     continue
-            gain, best = best.cost - found.cost, found
+            gain, best = best.cost - after.cost, after
             if gain < self.thresholds.least_gain and number:
                 break
         return best
@@ -158,14 +158,14 @@ class Fitter:
                     )
                     if moved == members:
                         break
-                    found = self.simulate(moved, self.thresholds.window_days).cost
-                    if found >= cost - self.thresholds.least_gain:
+                    cost_after = self.simulate(moved, self.thresholds.window_days).cost
+                    if cost_after >= cost - self.thresholds.least_gain:
                         break
-                    members, cost = moved, found
+                    members, cost = moved, cost_after
         if members == best.members:
             return best
-        found = self.simulate(members)
-        return found if found.cost < best.cost else best
+        after = self.simulate(members)
+        return after if after.cost < best.cost else best
 
     def whitener(self, model: Fitted) -> Whitener:
         """Return the whitener for a model; it uses lanes and bins if an effect has a place."""
@@ -190,7 +190,7 @@ class Fitter:
         A move is lengthened if its change of the statistics may be chance.
         """
         whitener = self.whitener(model)
-        found: list[Change] = []
+        changes: list[Change] = []
         for place, (hypothesis, values) in enumerate(model.members):
             for index in range(len(values)):
                 change, delta = self._change(model, place, index, self.thresholds.nearby)
@@ -201,8 +201,8 @@ class Fitter:
                         self.thresholds.far,
                     )
                     change, delta = self._change(model, place, index, share)
-                found.append((change, delta))
-        return found
+                changes.append((change, delta))
+        return changes
 
     def _change(self, model: Fitted, place: int, index: int, share: float) -> Change:
         """Move one value by a share of its distance from nominal."""
@@ -219,16 +219,16 @@ class Fitter:
         Strength and duration of an effect are estimated together, so their errors are correlated.
         """
         shortest_s = self.thresholds.shortest_window_s
-        found: list[Change] = []
+        changes: list[Change] = []
         for place, (hypothesis, values) in enumerate(model.members):
             for move in ((shortest_s, 0.0), (0.0, -shortest_s)):
                 moved = _shifted(hypothesis, move, shortest_s) if values else hypothesis
                 if moved is not hypothesis:
                     members = (*model.members[:place], (moved, values), *model.members[place + 1 :])
-                    found.append(
+                    changes.append(
                         (shrunk(*self.difference(model, members), self.thresholds), shortest_s)
                     )
-        return found
+        return changes
 
     def difference(
         self, model: Fitted, members: Members, days: int | None = None
@@ -244,9 +244,9 @@ class Fitter:
             Differences and their variances, by block.
         """
         numbers = list(model.days)[: days or self.days]
-        found = self.engine.ordinary(effects_of(members), numbers)
-        before = [model.days[number] for number in found]
-        return change_between(self.pools, [day.tally for day in found.values()], before)
+        simulated = self.engine.ordinary(effects_of(members), numbers)
+        before = [model.days[number] for number in simulated]
+        return change_between(self.pools, [day.tally for day in simulated.values()], before)
 
     def _moved(self, model: Fitted, step: Array) -> Members:
         """Return the model's members after a step, clipped to the ranges and to a longest move."""
@@ -343,10 +343,10 @@ def _crookedness(
         errors: Standard errors of its free values, ``(free values,)``.
         response: Function from a change of the statistics to the change of the estimates.
     """
-    found: list[float] = []
+    squares: list[float] = []
     for place, (hypothesis, values) in enumerate(model.members):
         for index, value in enumerate(values):
-            row = len(found)
+            row = len(squares)
             moves: list[tuple[float, float]] = []
             for share in fitter.thresholds.straightness_moves:
                 changed = list(values)
@@ -358,12 +358,12 @@ def _crookedness(
             asked, got = np.array(moves).reshape(-1, 2).T
             slope = float(asked @ got) / max(float(asked @ asked), 1e-12)
             if len(moves) < 2:
-                found.append(0.0)
+                squares.append(0.0)
             elif slope < fitter.thresholds.blunt:
-                found.append(float(np.mean(asked**2)))
+                squares.append(float(np.mean(asked**2)))
             else:
-                found.append(float(((got / slope - asked) ** 2).sum()) / (len(moves) - 1))
-    return np.array(found)
+                squares.append(float(((got / slope - asked) ** 2).sum()) / (len(moves) - 1))
+    return np.array(squares)
 
 
 def uncertainty(
@@ -399,8 +399,8 @@ def uncertainty(
     inverse = np.linalg.pinv(jacobian @ jacobian.T)
     influences: list[Array] = []
     days = days or model.tallies
-    for item in days:
-        difference, _ = change_between(fitter.pools, [item], days)
+    for day in days:
+        difference, _ = change_between(fitter.pools, [day], days)
         influences.append(inverse @ (jacobian @ whitener(difference)))
     spread = np.atleast_2d(np.cov(np.stack(influences).T))
     # measured periods and simulated days both vary

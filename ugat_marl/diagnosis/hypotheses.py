@@ -50,7 +50,7 @@ class Hypothesis:
     @property
     def key(self) -> tuple[Any, ...]:
         """Name and place: a model holds each such pair once."""
-        return (self.name, tuple(item for item in self.fixed if isinstance(item[1], str)))
+        return (self.name, tuple(field for field in self.fixed if isinstance(field[1], str)))
 
     @property
     def faults_only(self) -> bool:
@@ -66,13 +66,13 @@ class Hypothesis:
     def clipped(self, values: Sequence[float]) -> tuple[float, ...]:
         """Return the values on the grid of the effect, clipped to their plausible ranges."""
         ranges = known_effects()[self.name].ranges
-        found: list[float] = []
+        clipped: list[float] = []
         for name, value in zip(self.free, values, strict=True):
             low, high = ranges[name].low, ranges[name].high
             if self.step:
                 value = self.step * round(value / self.step)
-            found.append(round(min(max(float(value), low), high), 4))
-        return tuple(found)
+            clipped.append(round(min(max(float(value), low), high), 4))
+        return tuple(clipped)
 
     def matters(self, values: Sequence[float]) -> bool:
         """Return True if the effect is strong enough to be named."""
@@ -124,7 +124,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         scenario: The scenario as it is; its vehicle types give the nominal values.
         allowed: Names of effects to examine.
     """
-    found: list[Hypothesis] = []
+    hypotheses: list[Hypothesis] = []
     step = scenario.settings.step_length_s
     for name in GLOBAL:
         if name not in allowed:
@@ -137,7 +137,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
             nominal, levels = max(nominal, step), ((2 * max(nominal, step),),)
         fixed = tuple((place, EVERYWHERE) for place in kind.texts)
         grid = step if name == "reaction_step" else entry.step
-        found.append(
+        hypotheses.append(
             Hypothesis(
                 name,
                 fixed,
@@ -152,12 +152,12 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         )
     if "driver_model" in allowed:
         now = _attribute(scenario, "carFollowModel")
-        found += [
+        hypotheses += [
             Hypothesis("driver_model", (("model", model),), (), ((),), None)
             for model in MODELS
             if now != {model}
         ]
-    return found
+    return hypotheses
 
 
 def settings_as_members(
@@ -167,8 +167,8 @@ def settings_as_members(
 
     They change several properties of drivers at once, and single effects do not lead there.
     """
-    known = {item.name: item for item in hypotheses}
-    found: list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]] = []
+    known = {hypothesis.name: hypothesis for hypothesis in hypotheses}
+    settings: list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]] = []
     for effects in PAPER_WORLDS.values():
         members = [
             (known[effect.name], free_values(effect, known[effect.name]))
@@ -176,8 +176,8 @@ def settings_as_members(
             if effect.name in known
         ]
         if len(members) > 1:
-            found.append(tuple(members))
-    return found
+            settings.append(tuple(members))
+    return settings
 
 
 def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
@@ -218,18 +218,18 @@ def _nominal(scenario: Scenario, attribute: str, default: float) -> float:
 
 def _attribute(scenario: Scenario, name: str) -> set[str]:
     """Return the values of an attribute in the vehicle types of a scenario."""
-    found: set[str] = set()
+    texts: set[str] = set()
     for document in (*scenario.additional, *scenario.routes):
         if b"<vType" in document.read():
-            found |= {
-                item.get(name, "") for item in document.parse().iter("vType") if item.get(name)
+            texts |= {
+                kind.get(name, "") for kind in document.parse().iter("vType") if kind.get(name)
             }
-    return found
+    return texts
 
 
 def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:
     """Return the values of the free fields in an effect."""
-    known = {item.name for item in fields(effect)}
+    known = {field.name for field in fields(effect)}
     if missing := [name for name in hypothesis.free if name not in known]:
         raise OptionError(f"effect {effect.name!r} has no {missing[0]!r}")
     return tuple(float(getattr(effect, name)) for name in hypothesis.free)
@@ -254,8 +254,8 @@ def both_ways(
         (1.0 + farther) * v - farther * n for v, n in zip(values, hypothesis.nominal, strict=True)
     )
     less = hypothesis.clipped(hypothesis.nominal)
-    found = [(hypothesis, level, values) for level in (less, hypothesis.clipped(away))]
-    return [item for item in found if item[1] != values]
+    changes = [(hypothesis, level, values) for level in (less, hypothesis.clipped(away))]
+    return [change for change in changes if change[1] != values]
 
 
 def a_few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
@@ -280,12 +280,12 @@ def each_left_out(members: Members) -> list[Members]:
 
 def merged(members: Members, new: Members) -> Members:
     """Return a model with further effects or other values; effects at nominal are left out."""
-    found = {hypothesis.key: (hypothesis, values) for hypothesis, values in members}
+    by_key = {hypothesis.key: (hypothesis, values) for hypothesis, values in members}
     for hypothesis, values in new:
-        found[hypothesis.key] = (hypothesis, values)
+        by_key[hypothesis.key] = (hypothesis, values)
     return tuple(
         (hypothesis, values)
-        for hypothesis, values in found.values()
+        for hypothesis, values in by_key.values()
         if hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
     )
 

@@ -64,18 +64,18 @@ def locate(
         span: Begin and end of all periods, s; None if they differ, and then bins of time are not
             compared.
     """
-    found: list[Disagreement] = []
+    candidates: list[Disagreement] = []
     for name, z in distance.z.items():
         if name != "time":
-            found += _statistics(
+            candidates += _statistics(
                 layout, name, z, distance.difference[name], reference.pools.thresholds
             )
     if span is not None:
-        found += _stretches(layout, reference, distance, span)
+        candidates += _stretches(layout, reference, distance, span)
     tested = sum(int(block.used.sum()) for block in reference.blocks.values())
-    found.sort(key=lambda item: item.p)
-    kept = discoveries([item.p for item in found], tested, alpha)
-    return tuple(_gathered(found[:kept])[:SHOWN])
+    candidates.sort(key=lambda one: one.p)
+    kept = discoveries([one.p for one in candidates], tested, alpha)
+    return tuple(_gathered(candidates[:kept])[:SHOWN])
 
 
 def discoveries(chances: Sequence[float], tested: int, alpha: float) -> int:
@@ -107,13 +107,13 @@ def two_sided(z: float, tail: float) -> float:
 def _statistics(
     layout: DetectorLayout, pool: str, z: Array, difference: Array, thresholds: Thresholds
 ) -> list[Disagreement]:
-    found: list[Disagreement] = []
+    rows: list[Disagreement] = []
     for member, feature in zip(*np.nonzero(z), strict=True):
         tls, approach, lane = _place(layout, pool, int(member))
         name, regime, unit = FEATURES[int(feature)]
         value = float(z[member, feature])
         size = float(difference[member, feature])
-        found.append(
+        rows.append(
             Disagreement(
                 tls,
                 approach,
@@ -127,7 +127,7 @@ def _statistics(
                 two_sided(value, thresholds.heavy_tail),
             )
         )
-    return found
+    return rows
 
 
 def _place(
@@ -151,7 +151,7 @@ def _stretches(
     places = len(layout.places)
     bins = z.shape[1]
     width = (span[1] - span[0]) / bins
-    found: list[Disagreement] = []
+    rows: list[Disagreement] = []
     for row in range(z.shape[0]):
         if used[row].sum() < thresholds.least_bins:
             continue
@@ -164,7 +164,7 @@ def _stretches(
         tls, approach, lane = _place(layout, "lane", place)
         size = float(difference[row, first:last].sum())
         stretches = bins * (bins + 1) / 2
-        found.append(
+        rows.append(
             Disagreement(
                 tls,
                 approach,
@@ -178,7 +178,7 @@ def _stretches(
                 min(1.0, stretches * two_sided(value, thresholds.heavy_tail)),
             )
         )
-    return found
+    return rows
 
 
 def _stretch(z: Array, thresholds: Thresholds) -> tuple[float, int, int] | None:
@@ -199,15 +199,15 @@ def _stretch(z: Array, thresholds: Thresholds) -> tuple[float, int, int] | None:
     return best
 
 
-def _gathered(found: Sequence[Disagreement]) -> list[Disagreement]:
+def _gathered(discovered: Sequence[Disagreement]) -> list[Disagreement]:
     """Keep the strongest statistic of each place, regime and kind of window."""
     best: dict[tuple[Any, ...], Disagreement] = {}
-    for item in found:
-        key = (item.tls, item.approach, item.lane, item.regime, item.window is None)
-        if key not in best or abs(item.z) > abs(best[key].z):
-            best[key] = item
-    wide = [item for item in best.values() if item.lane is None]
-    narrow = [item for item in best.values() if item.lane is not None]
-    wide.sort(key=lambda item: -abs(item.z))
-    narrow.sort(key=lambda item: -abs(item.z))
+    for one in discovered:
+        key = (one.tls, one.approach, one.lane, one.regime, one.window is None)
+        if key not in best or abs(one.z) > abs(best[key].z):
+            best[key] = one
+    wide = [one for one in best.values() if one.lane is None]
+    narrow = [one for one in best.values() if one.lane is not None]
+    wide.sort(key=lambda one: -abs(one.z))
+    narrow.sort(key=lambda one: -abs(one.z))
     return [*wide, *narrow]

@@ -67,13 +67,13 @@ class PlaceFinder:
             distance: Distance of the data from the model.
             periods: The fitted periods.
         """
-        found: list[Hypothesis] = []
-        found += self._volume.hypotheses(distance)
-        found += self._timing(reference, distance)
-        found += self._windows(reference, distance, periods)
-        found += self._places(reference, distance)
-        found += fault_hypotheses(self._layout, reference, distance, periods)
-        return [item for item in found if item.name in self.allowed]
+        hypotheses: list[Hypothesis] = []
+        hypotheses += self._volume.hypotheses(distance)
+        hypotheses += self._timing(reference, distance)
+        hypotheses += self._windows(reference, distance, periods)
+        hypotheses += self._places(reference, distance)
+        hypotheses += fault_hypotheses(self._layout, reference, distance, periods)
+        return [hypothesis for hypothesis in hypotheses if hypothesis.name in self.allowed]
 
     def everywhere(self) -> list[Hypothesis]:
         """Propose parking on every lane, if there are few lanes.
@@ -97,7 +97,7 @@ class PlaceFinder:
         z, difference = distance.z["time"], distance.difference["time"]
         block = reference.blocks["time"]
         least, most = self._thresholds.strengths_of_a_shift
-        found: list[tuple[float, str, float]] = []
+        fitting: list[tuple[float, str, float]] = []
         first = BIN_FEATURES.index("count_advance") * len(self._edges)
         width = self._thresholds.bin_s * reference.pools.together
         for origin in self._routes.passing:
@@ -116,9 +116,9 @@ class PlaceFinder:
                 size = float((change**2).sum())
                 strength = float((change * z[rows]).sum()) / max(size, 1e-9)
                 if least < strength < most and strength**2 * size > self._thresholds.suspect_timing:
-                    found.append((strength**2 * size, origin, shift))
+                    fitting.append((strength**2 * size, origin, shift))
         chosen: dict[str, float] = {}
-        for _, origin, shift in sorted(found, reverse=True):
+        for _, origin, shift in sorted(fitting, reverse=True):
             chosen.setdefault(origin, shift)
         return [
             Hypothesis(
@@ -139,7 +139,7 @@ class PlaceFinder:
         if len({(p.begin_s, p.end_s) for p in periods}) > 1:
             return []
         thresholds = self._thresholds
-        found: list[tuple[float, Hypothesis]] = []
+        ranked: list[tuple[float, Hypothesis]] = []
         for origin in self._routes.passing:
             members = [i for i, edge in enumerate(self._edges) if edge == origin]
             window = self._scan(
@@ -152,7 +152,7 @@ class PlaceFinder:
                 surge = Hypothesis(
                     "demand_surge", fixed, ("factor",), ((level,),), (1.0,), thresholds.least_surge
                 )
-                found.append((z, surge))
+                ranked.append((z, surge))
         for index, lane in enumerate(self._layout.lanes):
             # The queue that leaves after a closure differs more than the closure itself, so each
             # kind of count is scanned to the side that a closure changes.
@@ -161,14 +161,14 @@ class PlaceFinder:
                 if option is not None:
                     z, begin, end, _ = option
                     fixed = (("lane", lane.id), ("begin_s", begin), ("end_s", end))
-                    found.append((z, Hypothesis("lane_closure", fixed, (), ((),), None)))
-        found.sort(key=lambda item: -item[0])
+                    ranked.append((z, Hypothesis("lane_closure", fixed, (), ((),), None)))
+        ranked.sort(key=lambda pair: -pair[0])
         chosen: list[Hypothesis] = []
         for kind, most in (
             ("demand_surge", thresholds.surges),
             ("lane_closure", thresholds.closures),
         ):
-            chosen += list(dict.fromkeys(item for _, item in found if item.name == kind))[:most]
+            chosen += list(dict.fromkeys(pair for _, pair in ranked if pair.name == kind))[:most]
         return chosen
 
     def _scan(
@@ -254,9 +254,9 @@ class PlaceFinder:
 
     def _places(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
         """Propose parking on lanes, speeds on edges, lost time and clocks at traffic lights."""
-        found: list[Hypothesis] = []
+        hypotheses: list[Hypothesis] = []
         lanes = self._layout.lanes
-        found += [_parking(lane, self._thresholds) for lane in self._disturbed(distance)]
+        hypotheses += [_parking(lane, self._thresholds) for lane in self._disturbed(distance)]
         speed = distance.z["lane"][: len(lanes), INDEX["free_speed"]]
         by_edge: dict[str, float] = defaultdict(float)
         for lane, value in zip(lanes, speed, strict=True):
@@ -264,7 +264,7 @@ class PlaceFinder:
         if len(by_edge) > 1:
             typical = float(np.median(list(by_edge.values())))
             ranked = sorted(by_edge, key=lambda edge: -abs(by_edge[edge] - typical))
-            found += [
+            hypotheses += [
                 Hypothesis(
                     "local_speed",
                     (("edge", edge),),
@@ -277,8 +277,8 @@ class PlaceFinder:
                 for edge in ranked[: self._thresholds.places_of_a_kind]
             ]
         if len(self._layout.intersections) > 1:
-            found += self._traffic_lights(distance)
-        return found
+            hypotheses += self._traffic_lights(distance)
+        return hypotheses
 
     def _disturbed(self, distance: Distance) -> list[str]:
         """Return lanes on which a vehicle may stand: lanes with odd flow, and avoided lanes."""
@@ -291,12 +291,12 @@ class PlaceFinder:
         for index, lane in enumerate(lanes):
             by_edge[lane.edge].append(index)
         edges = sorted(by_edge.values(), key=lambda members: -max(unusual[members]))
-        found: list[str] = []
+        names: list[str] = []
         for members in edges[: self._thresholds.places_of_a_kind]:
             avoided = sorted(members, key=lambda index: fewer[index])[:1]
             stuck = sorted(members, key=lambda index: -unusual[index])[:1]
-            found += [lanes[index].id for index in dict.fromkeys((*avoided, *stuck))]
-        return found
+            names += [lanes[index].id for index in dict.fromkeys((*avoided, *stuck))]
+        return names
 
     def _speed_ratio(self, reference: Reference, distance: Distance, edge: str) -> float:
         """Return the free speed on an edge, as a multiple of the simulated one."""
@@ -320,11 +320,11 @@ class PlaceFinder:
         drift = distance.z["intersection"][:, INDEX["lost_trend"]]
         drift = drift - np.median(drift)
         names = self._layout.intersections
-        found: list[Hypothesis] = []
+        hypotheses: list[Hypothesis] = []
         for index in np.argsort(-np.abs(lost))[: thresholds.places_of_a_kind]:
             place = (("place", names[int(index)]),)
             late_step_s = examined("late_green").step
-            found.append(
+            hypotheses.append(
                 Hypothesis(
                     "late_green",
                     place,
@@ -337,7 +337,7 @@ class PlaceFinder:
             )
             sign = 1.0 if lost[index] > 0 else -1.0
             levels = _towards(sign, examined("signal_clock"))
-            found.append(
+            hypotheses.append(
                 Hypothesis(
                     "signal_clock", place, ("seconds",), levels, (0.0,), thresholds.least_clock_s
                 )
@@ -346,7 +346,7 @@ class PlaceFinder:
             sign = 1.0 if drift[index] > 0 else -1.0
             levels = _towards(sign, examined("clock_drift"))
             place = (("place", names[int(index)]),)
-            found.append(
+            hypotheses.append(
                 Hypothesis(
                     "clock_drift",
                     place,
@@ -356,7 +356,7 @@ class PlaceFinder:
                     thresholds.least_drift,
                 )
             )
-        return found
+        return hypotheses
 
 
 def _parking(lane: str, thresholds: Thresholds) -> Hypothesis:
@@ -404,8 +404,8 @@ class Routes:
 
     def share(self, origin: str, edge: str) -> float:
         """Return the share of an edge's vehicles that start at an origin, in [0, 1]."""
-        own = self.passing[origin].get(edge, 0.0)
-        return own / self.joint[edge][edge] if own else 0.0
+        flow = self.passing[origin].get(edge, 0.0)
+        return flow / self.joint[edge][edge] if flow else 0.0
 
     @classmethod
     def of(cls, scenario: Scenario) -> Routes:
@@ -486,14 +486,14 @@ class Volume:
         """Return the squared standardised sizes of the best origin and of the best turn."""
         counts = self._counts(distance)
         return {
-            "demand": max((item[0] for item in self._origins(counts)), default=0.0),
-            "turning": max((item[0] for item in self._turns(counts, distance)), default=0.0),
+            "demand": max((row[0] for row in self._origins(counts)), default=0.0),
+            "turning": max((row[0] for row in self._turns(counts, distance)), default=0.0),
         }
 
     def hypotheses(self, distance: Distance) -> list[Hypothesis]:
         """Propose the most suspicious origins and turns, with strengths estimated from counts."""
         counts = self._counts(distance)
-        found: list[Hypothesis] = []
+        hypotheses: list[Hypothesis] = []
         if len(self._routes.passing) > 1:
             for gain, origin, factor in sorted(self._origins(counts), reverse=True)[
                 : self._thresholds.places_of_a_kind
@@ -501,7 +501,7 @@ class Volume:
                 level = float(np.clip(factor, *self._thresholds.demand_factors))
                 fixed = (("edge", origin),)
                 if gain > self._thresholds.suspect_change:
-                    found.append(
+                    hypotheses.append(
                         Hypothesis(
                             "demand_level",
                             fixed,
@@ -517,7 +517,7 @@ class Volume:
         ]:
             fixed = (("from_edge", origin), ("to_edge", target))
             if gain > self._thresholds.suspect_change:
-                found.append(
+                hypotheses.append(
                     Hypothesis(
                         "turning",
                         fixed,
@@ -527,7 +527,7 @@ class Volume:
                         self._thresholds.least_turning,
                     )
                 )
-        return found
+        return hypotheses
 
     def _counts(self, distance: Distance) -> _Counts:
         hour = 60.0
@@ -568,12 +568,12 @@ class Volume:
 
     def _origins(self, counts: _Counts) -> list[tuple[float, str, float]]:
         """Return squared z, origin and factor of every origin that the counts can show."""
-        found: list[tuple[float, str, float]] = []
+        origins: list[tuple[float, str, float]] = []
         for origin, reached in self._routes.passing.items():
             strength, gain, size = counts.weighed(reached)
             if size > self._thresholds.suspect_change:
-                found.append((gain, origin, 1.0 + strength))
-        return found
+                origins.append((gain, origin, 1.0 + strength))
+        return origins
 
     def _turns(self, counts: _Counts, distance: Distance) -> list[tuple[float, str, str, float]]:
         """Return squared z, edge, next edge and share for every turn that may take more vehicles.
@@ -582,7 +582,7 @@ class Volume:
         the lanes that vehicles left show that one.
         """
         thresholds = self._thresholds
-        found: list[tuple[float, str, str, float]] = []
+        turns: list[tuple[float, str, str, float]] = []
         approaches = {lane.edge for lane in self._layout.lanes}
         for origin in sorted(approaches & set(self._routes.turns)):
             leaving = self._routes.turns[origin]
@@ -593,8 +593,8 @@ class Volume:
                 strength, gain, size = counts.weighed(change)
                 if size > thresholds.visible_turn and strength > thresholds.least_turn:
                     gain += self._lanes_left(origin, target, distance)
-                    found.append((gain, origin, target, min(strength, thresholds.most_turning)))
-        return found
+                    turns.append((gain, origin, target, min(strength, thresholds.most_turning)))
+        return turns
 
     def _lanes_left(self, origin: str, target: str, distance: Distance) -> float:
         """Return squared z of more vehicles on those lanes of an edge that lead to the target."""
@@ -621,8 +621,8 @@ class Volume:
             return 0.0
         scaled = np.array(changes) / np.array(errors)
         scaled -= scaled.mean()  # the total over the lanes is tested by `weighed` already
-        found = float(scaled @ np.array(z))
-        return max(found, 0.0) ** 2 / max(float(scaled @ scaled), 1e-9)
+        match = float(scaled @ np.array(z))
+        return max(match, 0.0) ** 2 / max(float(scaled @ scaled), 1e-9)
 
 
 # --- stretches of time ----------------------------------------------------------------------------
@@ -662,8 +662,8 @@ def _largest(difference: Array, variance: Array) -> float:
         variance: Variance of the differences, ``(rows, bins)``.
     """
     sums, noise = (
-        np.concatenate((np.zeros((len(item), 1)), np.cumsum(item, axis=1)), axis=1)
-        for item in (difference, variance)
+        np.concatenate((np.zeros((len(values), 1)), np.cumsum(values, axis=1)), axis=1)
+        for values in (difference, variance)
     )
     largest = 0.0
     for length in range(1, sums.shape[1]):
@@ -743,7 +743,7 @@ def fault_hypotheses(
 ) -> list[Hypothesis]:
     """Propose detectors that count too few, stay on, fall silent, or are exchanged."""
     thresholds = reference.pools.thresholds
-    found: list[Hypothesis] = []
+    hypotheses: list[Hypothesis] = []
     places = {name: (place, INDEX[kind]) for name, (kind, place) in layout.counted.items()}
     z = {name: float(distance.z["lane"][row]) for name, row in places.items()}
     mean = {name: float(reference.blocks["lane"].mean[row]) for name, row in places.items()}
@@ -751,7 +751,7 @@ def fault_hypotheses(
     for name in sorted(z, key=lambda name: z[name])[: thresholds.faults_of_a_kind]:
         if z[name] < -thresholds.short_count and mean[name] > 0:
             share = float(np.clip(-difference[name] / mean[name], *thresholds.missed_shares))
-            found.append(
+            hypotheses.append(
                 Hypothesis(
                     "undercount",
                     (("place", name),),
@@ -762,28 +762,28 @@ def fault_hypotheses(
                 )
             )
     stuck = _stuck(periods, thresholds)
-    on = {dict(item.fixed)["detector"] for item in stuck}
+    on = {dict(fault.fixed)["detector"] for fault in stuck}
     silent = [x for x in _silent(periods, mean, thresholds) if dict(x.fixed)["detector"] not in on]
-    found += stuck + silent
-    kinds = {item.id: item.kind for item in layout.detectors}
-    found += _swapped(kinds, mean, difference, z, thresholds)
-    return found
+    hypotheses += stuck + silent
+    kinds = {detector.id: detector.kind for detector in layout.detectors}
+    hypotheses += _swapped(kinds, mean, difference, z, thresholds)
+    return hypotheses
 
 
 def _stuck(periods: Sequence[Period], thresholds: Thresholds) -> list[Hypothesis]:
     """Find detectors that were on for minutes at the same time of every period."""
-    found: list[Hypothesis] = []
+    faults: list[Hypothesis] = []
     for name in sorted(set.intersection(*(set(p.passages) for p in periods))):
         windows: list[tuple[float, float]] = []
         for period in periods:
-            item = period.passages[name]
-            time = np.nan_to_num(item.off_s, nan=period.end_s) - np.nan_to_num(
-                item.on_s, nan=period.begin_s
+            seen = period.passages[name]
+            time = np.nan_to_num(seen.off_s, nan=period.end_s) - np.nan_to_num(
+                seen.on_s, nan=period.begin_s
             )
             longest = int(np.argmax(time))
             if time[longest] < thresholds.stuck_s:
                 break
-            on, off = float(item.on_s[longest]), float(item.off_s[longest])
+            on, off = float(seen.on_s[longest]), float(seen.off_s[longest])
             on = period.begin_s if np.isnan(on) else on
             windows.append((on, period.end_s if np.isnan(off) else off))
         if len(windows) == len(periods):
@@ -791,20 +791,20 @@ def _stuck(periods: Sequence[Period], thresholds: Thresholds) -> list[Hypothesis
             end = float(np.median([w[1] for w in windows]))
             if max(w[0] for w in windows) < min(w[1] for w in windows):
                 fixed = (("detector", name), ("begin_s", begin), ("end_s", end))
-                found.append(Hypothesis("stuck", fixed, (), ((),), None))
-    return found[: thresholds.faults_of_a_kind]
+                faults.append(Hypothesis("stuck", fixed, (), ((),), None))
+    return faults[: thresholds.faults_of_a_kind]
 
 
 def _silent(
     periods: Sequence[Period], rate: Mapping[str, float], thresholds: Thresholds
 ) -> list[Hypothesis]:
     """Find detectors that were silent at the same time of every period, against expectation."""
-    found: list[tuple[float, Hypothesis]] = []
+    ranked: list[tuple[float, Hypothesis]] = []
     for name, expected in rate.items():
         begin, end = -np.inf, np.inf
         for period in periods:
-            item = period.passages.get(name, Passages.none())
-            times = np.concatenate((item.on_s, item.off_s))
+            seen = period.passages.get(name, Passages.none())
+            times = np.concatenate((seen.on_s, seen.off_s))
             times = np.sort(times[np.isfinite(times)])
             times = np.concatenate(([period.begin_s], times, [period.end_s]))
             longest = int(np.argmax(np.diff(times)))
@@ -812,9 +812,9 @@ def _silent(
         missing = expected * (end - begin) / 60.0 * len(periods)
         if end > begin and missing > thresholds.silent:
             fixed = (("detector", name), ("begin_s", round(begin, 1)), ("end_s", round(end, 1)))
-            found.append((missing, Hypothesis("dropout", fixed, (), ((),), None)))
-    found.sort(key=lambda item: -item[0])
-    return [item for _, item in found[: thresholds.faults_of_a_kind]]
+            ranked.append((missing, Hypothesis("dropout", fixed, (), ((),), None)))
+    ranked.sort(key=lambda pair: -pair[0])
+    return [hypothesis for _, hypothesis in ranked[: thresholds.faults_of_a_kind]]
 
 
 def _swapped(
@@ -825,7 +825,7 @@ def _swapped(
     thresholds: Thresholds,
 ) -> list[Hypothesis]:
     """Find pairs of detectors of one kind whose counts fit if they are exchanged."""
-    found: list[tuple[float, Hypothesis]] = []
+    ranked: list[tuple[float, Hypothesis]] = []
     suspects = [name for name in mean if abs(z[name]) > thresholds.swap_suspect]
     for first in suspects:
         for second in suspects:
@@ -839,9 +839,9 @@ def _swapped(
                     and abs(change) > thresholds.swap_errors * error
                 ):
                     fixed = (("detector", first), ("other", second))
-                    found.append((before - after, Hypothesis("swapped", fixed, (), ((),), None)))
-    found.sort(key=lambda item: -item[0])
-    return [item for _, item in found[: thresholds.places_of_a_kind]]
+                    ranked.append((before - after, Hypothesis("swapped", fixed, (), ((),), None)))
+    ranked.sort(key=lambda pair: -pair[0])
+    return [hypothesis for _, hypothesis in ranked[: thresholds.places_of_a_kind]]
 
 
 def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str, str] | None:
@@ -853,12 +853,16 @@ def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str,
     Returns:
         Ids of the upstream and the downstream detector, or None.
     """
-    short = [dict(item.fixed)["place"] for item, _ in members if item.name == "undercount"]
-    known = {item.id: item for item in layout.detectors}
+    short = [
+        dict(hypothesis.fixed)["place"]
+        for hypothesis, _ in members
+        if hypothesis.name == "undercount"
+    ]
+    known = {detector.id: detector for detector in layout.detectors}
     lanes = {lane.id: lane for lane in layout.lanes}
-    found = [known[str(name)] for name in short if name in known]
-    for one in found:
-        for other in found:
+    suspects = [known[str(name)] for name in short if name in known]
+    for one in suspects:
+        for other in suspects:
             lane, edge = lanes.get(one.lane), edge_of(other.lane)
             if lane is None:
                 continue

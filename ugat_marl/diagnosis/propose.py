@@ -56,7 +56,7 @@ def between(directions: Sequence[Direction], shares: Sequence[float]) -> list[Di
     The change by an effect is not proportional to its strength, but between two simulated strengths
     it is nearly linear.
     """
-    found = list(directions)
+    all_directions = list(directions)
     for first, second in itertools.pairwise(directions):
         near = first.hypothesis == second.hypothesis and first.origin is not None
         if not near or not first.level or _side(first) != _side(second):
@@ -73,8 +73,8 @@ def between(directions: Sequence[Direction], shares: Sequence[float]) -> list[Di
                 name: (1 - share) ** 2 * first.variance[name] + share**2 * second.variance[name]
                 for name in first.variance
             }
-            found.append(Direction(first.hypothesis, level, mixed, noise, first.origin))
-    return found
+            all_directions.append(Direction(first.hypothesis, level, mixed, noise, first.origin))
+    return all_directions
 
 
 def _side(direction: Direction) -> bool:
@@ -117,21 +117,21 @@ def propose(
             if len(set(keys)) < size:
                 continue
             signs = tuple(directions[index].hypothesis.both for index in chosen)
-            found = _least_squares(gram, match, chosen, signs, thresholds)
-            if found is None:
+            strengths = _least_squares(gram, match, chosen, signs, thresholds)
+            if strengths is None:
                 continue
             left = start - float(
-                found @ (2 * match[list(chosen)] - gram[np.ix_(chosen, chosen)] @ found)
+                strengths @ (2 * match[list(chosen)] - gram[np.ix_(chosen, chosen)] @ strengths)
             )
             cost = left + thresholds.price * size
             if keys not in best or cost < best[keys].expected:
                 members = tuple(
                     (directions[index].hypothesis, directions[index].at(float(strength)))
-                    for index, strength in zip(chosen, found, strict=True)
+                    for index, strength in zip(chosen, strengths, strict=True)
                 )
                 if all(_is_something(hypothesis, values) for hypothesis, values in members):
                     best[keys] = Proposed(members, cost)
-    return sorted(best.values(), key=lambda item: item.expected)
+    return sorted(best.values(), key=lambda proposal: proposal.expected)
 
 
 def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
@@ -157,17 +157,17 @@ def _least_squares(
     """
     part = gram[np.ix_(chosen, chosen)]
     try:
-        found = np.linalg.solve(
+        strengths = np.linalg.solve(
             part + thresholds.strength_ridge * np.trace(part) * np.eye(len(chosen)),
             match[list(chosen)],
         )
     except np.linalg.LinAlgError:
         return None
     # a negative strength helps only if the effect has an opposite
-    size = np.where(both, np.abs(found), found)
+    size = np.where(both, np.abs(strengths), strengths)
     if (size < thresholds.least_strength).any():
         return None
-    return np.clip(found, -thresholds.farthest, thresholds.farthest)
+    return np.clip(strengths, -thresholds.farthest, thresholds.farthest)
 
 
 def _useful(
@@ -175,34 +175,35 @@ def _useful(
 ) -> list[int]:
     """Return the indices of up to `count` directions, of the hypotheses in the best sets so far."""
     keys: list[str] = []
-    for item in sorted(best.values(), key=lambda item: item.expected):
-        keys += [str(hypothesis.key) for hypothesis, _ in item.members]
+    for proposal in sorted(best.values(), key=lambda proposal: proposal.expected):
+        keys += [str(hypothesis.key) for hypothesis, _ in proposal.members]
     wanted = list(dict.fromkeys(keys))
-    found: list[int] = []
+    indices: list[int] = []
     for key in wanted:
-        found += [
+        indices += [
             i for i, direction in enumerate(directions) if str(direction.hypothesis.key) == key
         ]
-        if len(found) >= count:
+        if len(indices) >= count:
             break
-    return found[:count]
+    return indices[:count]
 
 
 def promising(proposals: Sequence[Proposed], thresholds: Thresholds) -> list[Proposed]:
     """Choose the best sets of each size; larger sets only if they promise a clearly lower cost."""
     if not proposals:
         return []
-    chosen = [item for item in proposals if len(item.members) == 1][:1]
+    chosen = [proposal for proposal in proposals if len(proposal.members) == 1][:1]
     least = math.inf
     for size in range(1, len(thresholds.candidates) + 1):
-        own = [item for item in proposals if len(item.members) == size]
+        of_size = [proposal for proposal in proposals if len(proposal.members) == size]
         if (
-            own and own[0].expected < thresholds.larger_share * least - thresholds.larger_gain
+            of_size
+            and of_size[0].expected < thresholds.larger_share * least - thresholds.larger_gain
         ):  # more must be gained
-            most = thresholds.near_share * own[0].expected + thresholds.near_cost
-            near = [item for item in own if item.expected <= most]
+            most = thresholds.near_share * of_size[0].expected + thresholds.near_cost
+            near = [proposal for proposal in of_size if proposal.expected <= most]
             chosen += near[: thresholds.candidates[size - 1]]
-            least = own[0].expected
+            least = of_size[0].expected
     return list(dict.fromkeys(chosen))
 
 

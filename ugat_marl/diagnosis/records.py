@@ -660,9 +660,9 @@ def _adapter(record: type[Any]) -> TypeAdapter[Any]:
 def _plain(value: Any) -> Any:
     """Return the value with numbers of nine digits, and None for numbers that JSON cannot hold."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_plain(entry) for entry in value]
     if isinstance(value, bool) or value is None or isinstance(value, str | int):
         return value
     number = float(value)

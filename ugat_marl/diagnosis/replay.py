@@ -149,7 +149,7 @@ class Replay:
         day = self._day(seed)
         scenario, due = _with(day, effects), None
         if self._arrivals is not None:
-            others = [item for item in effects if not item.on_departures]
+            others = [effect for effect in effects if not effect.on_departures]
             drivers = scenario if len(others) == len(effects) else _with(day, others)
             scenario, due = self._arrivals.given(scenario, drivers, period)
         scenario = shift_parking(scenario, derive_seed(seed, "parking"))
@@ -179,12 +179,12 @@ class Replay:
 
     def _day(self, seed: int) -> Scenario:
         with self._lock:
-            found = self._days.get(seed)
-            if found is None:
-                found = self._days[seed] = draw_day(self._scenario, seed)
+            day = self._days.get(seed)
+            if day is None:
+                day = self._days[seed] = draw_day(self._scenario, seed)
                 if len(self._days) > _DAYS:
                     self._days.popitem(last=False)
-            return found
+            return day
 
     def _run(self, scenario: Scenario, period: Period, seed: int, directory: Path) -> Day:
         settings = scenario.settings
@@ -225,8 +225,8 @@ def _with(scenario: Scenario, effects: Sequence[Effect]) -> Scenario:
 def _logged(period: Period) -> Period:
     """Return a period with passages as a signal controller would have logged them."""
     passages = {
-        name: passages_as_written(item, period.begin_s, period.end_s)
-        for name, item in period.passages.items()
+        name: passages_as_written(seen, period.begin_s, period.end_s)
+        for name, seen in period.passages.items()
     }
     return replace(period, passages=passages)
 
@@ -247,7 +247,7 @@ def replay_document(scenario: Scenario, period: Period, begin_s: float) -> Docum
         if not log:
             raise MeasuredDataError(f"period {period.id!r}: no signals of traffic light {tls!r}")
         late = late_green_log(log, late_s.get(tls, 0.0), step)
-        item = ET.SubElement(
+        program = ET.SubElement(
             root,
             "tlLogic",
             {"id": tls, "type": "static", "programID": "replay", "offset": repr(begin_s)},
@@ -255,7 +255,7 @@ def replay_document(scenario: Scenario, period: Period, begin_s: float) -> Docum
         for duration, state in _durations(
             _from(late, period, begin_s), period.end_s, begin_s, step
         ):
-            ET.SubElement(item, "phase", {"duration": repr(duration), "state": state})
+            ET.SubElement(program, "phase", {"duration": repr(duration), "state": state})
     return Document("replay.add.xml", None, xml_bytes(root))
 
 
@@ -368,10 +368,10 @@ class Arrivals:
         due = self._by_edge(demand, period)
         pools: dict[str, list[_Coming]] = {edge: [] for edge in self._approaches}
         stay: list[ET.Element] = []
-        for item in root:
-            coming = self._coming(item, period) if item.tag == "vehicle" else None
+        for element in root:
+            coming = self._coming(element, period) if element.tag == "vehicle" else None
             if coming is None:
-                stay.append(item)
+                stay.append(element)
             else:
                 pools[coming.approach].append(coming)
         for edge, pool in pools.items():
@@ -388,36 +388,36 @@ class Arrivals:
         """Return vehicles of a day that would reach the end of each counted edge, ``(bins,)``."""
         return self._by_edge(day.routes[0].parse(), period)
 
-    def _coming(self, item: ET.Element, period: Period) -> _Coming | None:
+    def _coming(self, element: ET.Element, period: Period) -> _Coming | None:
         """Return where and when a vehicle is first detected; None if it must stay as it is."""
-        way = self._way(_route(item))
-        if way.approach is None or item.find("stop") is not None:
+        way = self._way(_route(element))
+        if way.approach is None or element.find("stop") is not None:
             return None
-        way_s = way.approach_s / _factor(item)
-        time = depart_s(item) + way_s
+        way_s = way.approach_s / _factor(element)
+        time = depart_s(element) + way_s
         if not time >= period.begin_s:
             return None
-        return _Coming(way.approach, time, way_s, way.following, item)
+        return _Coming(way.approach, time, way_s, way.following, element)
 
     def _way(self, route: str) -> _Way:
         """Return a route at the speed limit; kept, since many vehicles share few routes."""
-        found = self._ways.get(route)
-        if found is not None:
-            return found
+        way = self._ways.get(route)
+        if way is not None:
+            return way
         edges = route.split()
         ends = np.cumsum([0.0, *(self._pace_s[edge] for edge in edges)]).tolist()
         counted = tuple(
             (edge, end) for edge, end in zip(edges, ends[1:], strict=True) if edge in self._counted
         )
-        found = _Way(counted)
+        way = _Way(counted)
         first = next((i for i, edge in enumerate(edges) if edge in self._approaches), None)
         if first is not None:
             lane = self._approaches[edges[first]][0]
             following = edges[first + 1] if first + 1 < len(edges) else None
             there = ends[first] + lane.position_m / lane.speed_mps
-            found = _Way(counted, edges[first], there, following)
-        self._ways[route] = found
-        return found
+            way = _Way(counted, edges[first], there, following)
+        self._ways[route] = way
+        return way
 
     def _came(self, edge: str, period: Period) -> list[tuple[float, frozenset[str]]]:
         """Return the arrival times at an approach, s, each with its possible next edges."""
@@ -428,9 +428,9 @@ class Arrivals:
             for one, lane in zip(seen, lanes, strict=True)
         ]
         crossed = [
-            np.sort(found.off_s[np.isfinite(found.off_s)])
+            np.sort(seen_at_stop.off_s[np.isfinite(seen_at_stop.off_s)])
             for lane in lanes
-            for found in [period.passages.get(lane.stop or "", Passages.none())]
+            for seen_at_stop in [period.passages.get(lane.stop or "", Passages.none())]
         ]
         if any(lane.stop is None for lane in lanes):
             left = times
@@ -439,26 +439,26 @@ class Arrivals:
             spread = [more[index :: len(lanes)] for index in range(len(lanes))]
             times = [np.sort(np.concatenate(pair)) for pair in zip(times, spread, strict=True)]
             left = by_lane_left(times, crossed, [lane.travel_s for lane in lanes])
-        found = [
+        arrivals = [
             (float(time), lane.following)
-            for lane, own in zip(lanes, left, strict=True)
-            for time in own
+            for lane, times_of_lane in zip(lanes, left, strict=True)
+            for time in times_of_lane
         ]
-        return sorted(found, key=lambda row: row[0])
+        return sorted(arrivals, key=lambda row: row[0])
 
     def _by_edge(self, vehicles: Iterable[ET.Element], period: Period) -> dict[str, Array]:
         """Count vehicles that would reach the end of each counted edge, ``(bins,)``."""
         bins = bins_of(period, self._thresholds)
         times: dict[str, list[float]] = {edge: [] for edge in self._counted}
-        for item in vehicles:
-            if item.tag == "vehicle":
-                depart, factor = depart_s(item), _factor(item)
-                for edge, end_s in self._way(_route(item)).counted:
+        for element in vehicles:
+            if element.tag == "vehicle":
+                depart, factor = depart_s(element), _factor(element)
+                for edge, end_s in self._way(_route(element)).counted:
                     times[edge].append(depart + end_s / factor)
         span = period.begin_s, period.end_s
         return {
-            edge: np.histogram(found, bins, span)[0].astype(np.float64)
-            for edge, found in times.items()
+            edge: np.histogram(reached, bins, span)[0].astype(np.float64)
+            for edge, reached in times.items()
         }
 
 
@@ -488,14 +488,14 @@ class _Coming:
         time_s: Time at which the vehicle reaches the advance detector in free flow, s.
         way_s: Time from departure to there, s.
         following: Next edge after the approach; None at the end of the route.
-        item: XML element of the vehicle.
+        element: XML element of the vehicle.
     """
 
     approach: str
     time_s: float
     way_s: float
     following: str | None
-    item: ET.Element
+    element: ET.Element
 
 
 def _filled(
@@ -516,9 +516,9 @@ def _filled(
         period: The measured period.
     """
     queues: dict[str | None, deque[_Coming]] = {}
-    for item in sorted(pool, key=lambda item: item.time_s):
-        queues.setdefault(item.following, deque()).append(item)
-    found: list[ET.Element] = []
+    for one in sorted(pool, key=lambda one: one.time_s):
+        queues.setdefault(one.following, deque()).append(one)
+    vehicles: list[ET.Element] = []
     turns: dict[str | None, int] = dict.fromkeys(queues, 0)
     sizes = {name: len(queue) for name, queue in queues.items()}
     for time, following in came:
@@ -534,14 +534,14 @@ def _filled(
         queue = queues[name]
         coming = queue[0]
         queue.rotate(-1)
-        item = ET.Element(coming.item.tag, dict(coming.item.attrib))
-        item.extend(coming.item)
+        vehicle = ET.Element(coming.element.tag, dict(coming.element.attrib))
+        vehicle.extend(coming.element)
         if again := turns[name] // sizes[name]:
-            item.set("id", f"{item.get('id')}+{again}")
-        item.set("depart", f"{max(time - coming.way_s, earliest_s):.2f}")
+            vehicle.set("id", f"{vehicle.get('id')}+{again}")
+        vehicle.set("depart", f"{max(time - coming.way_s, earliest_s):.2f}")
         turns[name] += 1
-        found.append(item)
-    return found
+        vehicles.append(vehicle)
+    return vehicles
 
 
 def corrected(counted: Tally, layout: DetectorLayout, due: Due) -> Tally:
@@ -576,7 +576,7 @@ def corrected(counted: Tally, layout: DetectorLayout, due: Due) -> Tally:
 
 def _approaches(layout: DetectorLayout, thresholds: DayThresholds) -> dict[str, tuple[_Lane, ...]]:
     """Find edges with an advance detector on every lane in front of the traffic light."""
-    zones = {item.id: item for item in layout.detectors}
+    zones = {detector.id: detector for detector in layout.detectors}
     lanes: dict[str, list[_Lane] | None] = {}
     for lane in layout.lanes:
         advance = lane.detectors.get("advance")
@@ -603,13 +603,13 @@ def _approaches(layout: DetectorLayout, thresholds: DayThresholds) -> dict[str, 
     return {edge: tuple(known) for edge, known in lanes.items() if known}
 
 
-def _route(item: ET.Element) -> str:
-    route = item.find("route")
+def _route(vehicle: ET.Element) -> str:
+    route = vehicle.find("route")
     return "" if route is None else route.get("edges", "")
 
 
-def _factor(item: ET.Element) -> float:
-    return float(item.get("speedFactor", "1"))
+def _factor(vehicle: ET.Element) -> float:
+    return float(vehicle.get("speedFactor", "1"))
 
 
 def unhindered(
@@ -666,7 +666,7 @@ def by_lane_left(
         Times per lane, s. Vehicles that never left stay on the lane of their arrival.
     """
     waiting = [deque(times.tolist()) for times in came]
-    found: list[list[float]] = [[] for _ in came]
+    matched: list[list[float]] = [[] for _ in came]
     events = sorted((time, lane) for lane, times in enumerate(crossed) for time in times.tolist())
     for time, lane in events:
         latest = time - travel_s[lane]
@@ -674,8 +674,8 @@ def by_lane_left(
         if not source or source[0] > latest:
             source = min(waiting, key=lambda queue: queue[0] if queue else np.inf)
         if source and source[0] <= latest:
-            found[lane].append(source.popleft())
-    return [np.array(sorted([*own, *left])) for own, left in zip(found, waiting, strict=True)]
+            matched[lane].append(source.popleft())
+    return [np.array(sorted([*times, *left])) for times, left in zip(matched, waiting, strict=True)]
 
 
 def missed(times: Array, crossed: Array, period: Period, thresholds: DayThresholds) -> Array:
@@ -745,12 +745,12 @@ class Unmeasured:
             return period
         passages = {
             name: Passages(
-                item.on_s,
-                item.off_s,
-                _blank(item.speed_mps) if name in self.speeds else item.speed_mps,
-                _blank(item.length_m) if name in self.lengths else item.length_m,
+                seen.on_s,
+                seen.off_s,
+                _blank(seen.speed_mps) if name in self.speeds else seen.speed_mps,
+                _blank(seen.length_m) if name in self.lengths else seen.length_m,
             )
-            for name, item in period.passages.items()
+            for name, seen in period.passages.items()
         }
         return replace(period, passages=passages)
 

@@ -74,15 +74,17 @@ class Null:
         draws: dict[str, list[float]] = {}
         for half in (0, 1):
             model = Reference(pools, tallies[half::2], speeds=speeds)
-            own = directed(model) if directed else None
+            directed_of_half = directed(model) if directed else None
             others = tallies[1 - half :: 2]
             size = min(periods, max(len(others) - 1, 1))
             for _ in range(thresholds.null_draws):
                 chosen = generator.choice(len(others), size, replace=False)
-                found = model.distance([others[int(i)] for i in chosen])
-                for name, value in _statistics(found, own, thresholds.added_distance).items():
+                distance = model.distance([others[int(i)] for i in chosen])
+                for name, value in _statistics(
+                    distance, directed_of_half, thresholds.added_distance
+                ).items():
                     draws.setdefault(name, []).append(value)
-                draws.setdefault("total", []).append(found.total)
+                draws.setdefault("total", []).append(distance.total)
         self._moments = {
             name: _log_moments(values, thresholds.least_log_spread)
             for name, values in draws.items()
@@ -103,19 +105,23 @@ class Null:
             data: Tallies of the periods.
             extra: Further variance of the expected statistics, for errors of the free values.
         """
-        found = self._judge(self.reference.distance(data, extra=extra))
-        if len(data) < 2 or found.p > self._thresholds.one_day:
-            return found
+        residual = self._judge(self.reference.distance(data, extra=extra))
+        if len(data) < 2 or residual.p > self._thresholds.one_day:
+            return residual
         others = [[*data[:i], *data[i + 1 :]] for i in range(len(data))]
         without = [self._judge(self.reference.distance(part, extra=extra)).p for part in others]
-        return replace(found, p=max(without)) if max(without) > self._thresholds.one_day else found
+        return (
+            replace(residual, p=max(without))
+            if max(without) > self._thresholds.one_day
+            else residual
+        )
 
-    def _judge(self, found: Distance) -> Residual:
-        values = _statistics(found, self._directed, self._thresholds.added_distance)
+    def _judge(self, distance: Distance) -> Residual:
+        values = _statistics(distance, self._directed, self._thresholds.added_distance)
         chances = {name: self._chance(name, value) for name, value in values.items()}
         smallest = min(chances.values())
         return Residual(
-            found.total,
+            distance.total,
             self.floor,
             self.expected,
             min(1.0, smallest * len(chances)),
@@ -145,16 +151,16 @@ def log_normal_tail(value: float, mean: float, deviation: float) -> float:
     return float(special.ndtr((mean - math.log(max(value, 1e-9))) / deviation))
 
 
-def _statistics(found: Distance, directed: Directed | None, more: float) -> dict[str, float]:
+def _statistics(distance: Distance, directed: Directed | None, more: float) -> dict[str, float]:
     """Return the tested statistics, each with `more` added.
 
     They are the distances of blocks, the largest single ones, and directed ones.
     """
-    values = dict(found.parts)
+    values = dict(distance.parts)
     for name in ("lane", "time"):
-        values[f"{name}, largest"] = float(np.abs(found.z[name]).max(initial=0.0)) ** 2
+        values[f"{name}, largest"] = float(np.abs(distance.z[name]).max(initial=0.0)) ** 2
     if directed is not None:
-        values |= directed(found)
+        values |= directed(distance)
     return {name: value + more for name, value in values.items()}
 
 
@@ -210,17 +216,17 @@ class MatchedFilters:
 
         def rows(changes: Sequence[Mapping[str, Array]]) -> Array:
             scaled = [{n: change[n] / scales[n] for n in scales} for change in changes]
-            return np.stack([self._whitened(item) for item in scaled])
+            return np.stack([self._whitened(change) for change in scaled])
 
-        found = rows(directions)
-        size = np.sqrt((found**2).sum(axis=1))
-        self._away = np.zeros((found.shape[1], 0))
+        filters = rows(directions)
+        size = np.sqrt((filters**2).sum(axis=1))
+        self._away = np.zeros((filters.shape[1], 0))
         if fitted:
             self._away = _spanned(rows(fitted))
-        found = found - (found @ self._away) @ self._away.T
-        left = np.sqrt((found**2).sum(axis=1))
+        filters = filters - (filters @ self._away) @ self._away.T
+        left = np.sqrt((filters**2).sum(axis=1))
         seen = (left > thresholds.least_apart * size) & (size > 0)
-        self._units = found[seen] / left[seen, None]
+        self._units = filters[seen] / left[seen, None]
 
     def __call__(self, distance: Distance) -> float:
         """Return the largest squared component along any of the directions."""

@@ -98,10 +98,10 @@ class Selector:
         complete = True
         try:
             for number in range(self._thresholds.rounds):
-                found = self._round(best, number)
-                if found is None:
+                improved = self._round(best, number)
+                if improved is None:
                     break
-                best = found
+                best = improved
                 if best.residual.p > self._alpha:
                     break
             best = pruned(
@@ -140,8 +140,8 @@ class Selector:
 
     def _days(self, model: Fitted) -> list[Tally]:
         engine = self._fitter.engine
-        found = engine.ordinary(model.effects, engine.first(self._effort.test))
-        return [item.tally for item in found.values()]
+        days = engine.ordinary(model.effects, engine.first(self._effort.test))
+        return [day.tally for day in days.values()]
 
     def _untested(self, model: Fitted, base: Tested) -> Tested:
         """Return a model with the test of the scenario as it is; there was no time for its own."""
@@ -157,7 +157,7 @@ class Selector:
         chance = float(len(whitener.measured))  # expected squared length if only noise is left
         enough = chance + self._thresholds.look_elsewhere * max(gap - chance, 0.0)
         proposals = propose(directions, whitener, self._thresholds)
-        chosen = [item.members for item in promising(proposals, self._thresholds)]
+        chosen = [proposal.members for proposal in promising(proposals, self._thresholds)]
         little = gap < self._thresholds.little * chance  # the difference is then in single places
         near = little or not proposals or proposals[0].expected > enough
         if near:
@@ -197,41 +197,43 @@ class Selector:
         Effects may act in steps, when whole vehicles cross the start of green or a detector. Linear
         prediction between strengths misses them.
         """
-        strengths = [((item, level),) for item in self._library for level in item.levels]
-        found: list[tuple[float, int]] = []
+        strengths = [
+            ((hypothesis, level),) for hypothesis in self._library for level in hypothesis.levels
+        ]
+        near: list[tuple[float, int]] = []
         base, periods = self._fitter.base, len(self._fitter.data)
         gap = squared_gap(self._first, base, periods)
         for place, members in enumerate(strengths):
             with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
                 model = self._fitter.simulate(members, self._effort.bank)
                 if squared_gap(model.distance, base, periods) < self._thresholds.nearer * gap:
-                    found.append((model.cost, place))
-        return [strengths[place] for _, place in sorted(found)[: self._thresholds.nearest]]
+                    near.append((model.cost, place))
+        return [strengths[place] for _, place in sorted(near)[: self._thresholds.nearest]]
 
     def _elsewhere(
         self, model: Fitted, directions: Sequence[Direction], number: int
     ) -> list[Members]:
         """Propose effects at places and in windows; lanes and bins of time are compared as well."""
-        present = {item.key for item in self._library}
-        found = self._place_finder.hypotheses(model.reference, model.distance, self._periods)
-        local = [item for item in found if item.key not in present]
+        present = {hypothesis.key for hypothesis in self._library}
+        proposed = self._place_finder.hypotheses(model.reference, model.distance, self._periods)
+        local = [hypothesis for hypothesis in proposed if hypothesis.key not in present]
         known = [] if number else list(self._places)  # simulated on the scenario as it is
         places = {direction.hypothesis.key for direction in known}
         added = self._bank(model, [h for h in local if h.key not in places], number, "places")
         added += known
         proposals = propose([*directions, *added], self._whitener(model, None), self._thresholds)
-        places |= {item.key for item in local}
+        places |= {hypothesis.key for hypothesis in local}
         self.examined |= self._place_finder.allowed
-        alone = [item for item in proposals if len(item.members) == 1]
+        alone = [proposal for proposal in proposals if len(proposal.members) == 1]
         best: dict[str, Members] = {}
-        for item in alone:
-            hypothesis = item.members[0][0]
+        for proposal in alone:
+            hypothesis = proposal.members[0][0]
             if hypothesis.key in places:
-                best.setdefault(hypothesis.name, item.members)
+                best.setdefault(hypothesis.name, proposal.members)
         here = list(best.values())[: self._thresholds.kinds_of_places]
         # The strength estimated from counts may be nearer than the strength along a direction.
         here += [((h, h.levels[0]),) for ((h, _),) in here if h.levels[0]]
-        return [*(item.members for item in promising(proposals, self._thresholds)), *here]
+        return [*(proposal.members for proposal in promising(proposals, self._thresholds)), *here]
 
     def _whitener(self, model: Fitted, blocks: tuple[str, ...] | None) -> Whitener:
         data, base = self._fitter.data, self._fitter.base
@@ -278,17 +280,17 @@ class Selector:
 
     def _tried(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
         """Simulate sets of effects on top of a model."""
-        found: list[Fitted] = []
+        models_tried: list[Fitted] = []
         with self._reporter.task(title, len(chosen)) as advance:
             for new in chosen:
                 members = merged(model.members, new)
                 if members:
                     try:
-                        found.append(self._kept(self._fitter.simulate(members)))
+                        models_tried.append(self._kept(self._fitter.simulate(members)))
                     except (SimulatorError, OptionError, ScenarioError) as error:
                         self._reporter.say(f"note: {names_of(members)} left out: {error}")
                 advance(note=names_of(members))
-        return found
+        return models_tried
 
     def _refined(self, models: Sequence[Fitted], count: int, gap: float) -> Fitted | None:
         """Fit the most promising models and the best single effect; return the best of them.
@@ -305,8 +307,8 @@ class Selector:
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
                 if best is None or gap - model.cost > self._thresholds.hopeful * (gap - best.cost):
-                    found = self._kept(self._fitter.fitted(model))
-                    best = found if best is None or found.cost < best.cost else best
+                    fitted = self._kept(self._fitter.fitted(model))
+                    best = fitted if best is None or fitted.cost < best.cost else best
                 advance(note=names_of(model.members))
         return best
 
@@ -350,7 +352,7 @@ def pruned(
     def settled(model: Fitted) -> Fitted:
         return fitter.simulate(model.members, fitter.thresholds.settling_days)
 
-    members = tuple(item for item in best.model.members if item[0].matters(item[1]))
+    members = tuple(member for member in best.model.members if member[0].matters(member[1]))
     if members and len(members) < len(best.model.members):
         best = test(fitter.refine(fitter.simulate(members), fitter.thresholds.steps_without))
     while len(best.model.members) > 1:
@@ -386,7 +388,7 @@ def pruned(
 
 def _doubtful(tested: Tested, half_interval: float) -> list[int]:
     """Return indices of effects whose intervals hold the nominal values: they may be absent."""
-    found: list[int] = []
+    doubtful: list[int] = []
     first = 0
     for place, (hypothesis, values) in enumerate(tested.model.members):
         errors = tested.errors[first : first + len(values)]
@@ -394,5 +396,5 @@ def _doubtful(tested: Tested, half_interval: float) -> list[int]:
         if values and hypothesis.nominal is not None:
             away = np.abs(np.subtract(values, hypothesis.nominal))
             if (away <= half_interval * errors).all():
-                found.append(place)
-    return found
+                doubtful.append(place)
+    return doubtful

@@ -63,17 +63,17 @@ class Pools:
         blocks["lane"] = np.eye(places)
         return cls(blocks, thresholds, together)
 
-    def pool(self, item: Tally) -> dict[str, Array]:
+    def pool(self, tally: Tally) -> dict[str, Array]:
         """Return sums and weights ``(members, features, 2)`` of every block.
 
         In the block "time" the members are pairs of bin feature and place, and the features are the
         bins of time.
         """
         pooled = {
-            name: np.einsum("mp,fpc->mfc", matrix, item.sums)
+            name: np.einsum("mp,fpc->mfc", matrix, tally.sums)
             for name, matrix in self.blocks.items()
         }
-        bins, counted = item.gathered(self.together)
+        bins, counted = tally.gathered(self.together)
         time = np.stack([bins, counted], axis=-1)
         pooled["time"] = time.reshape(-1, *time.shape[2:])
         return pooled
@@ -271,15 +271,15 @@ def _softness(block: str, thresholds: Thresholds) -> float:
 
 def _stack(pools: Pools, tallies: Sequence[Tally]) -> dict[str, Array]:
     """Return pooled sums of several days, ``(days, members, features, 2)``."""
-    pooled = [pools.pool(item) for item in tallies]
-    return {name: np.stack([item[name] for item in pooled]) for name in pooled[0]}
+    pooled = [pools.pool(tally) for tally in tallies]
+    return {name: np.stack([sums[name] for sums in pooled]) for name in pooled[0]}
 
 
 def sum_of(tallies: Sequence[Tally]) -> Tally:
     """Return the tally of several periods together."""
     total = tallies[0]
-    for item in tallies[1:]:
-        total = total + item
+    for tally in tallies[1:]:
+        total = total + tally
     return total
 
 
@@ -434,22 +434,24 @@ def shrunk(
 
     Noise in a derivative makes the steps of a fit too short and its standard errors too small.
     """
-    found: dict[str, Array] = {}
+    smaller: dict[str, Array] = {}
     for name, values in difference.items():
         squared = np.maximum(values**2, 1e-300)
-        found[name] = values * np.maximum(1.0 - thresholds.certain * variance[name] / squared, 0.0)
-    return found
+        smaller[name] = values * np.maximum(
+            1.0 - thresholds.certain * variance[name] / squared, 0.0
+        )
+    return smaller
 
 
 def without_noise(
     difference: Mapping[str, Array], variance: Mapping[str, Array], thresholds: Thresholds
 ) -> dict[str, Array]:
     """Return differences; in blocks of `SINGLE`, those that may be chance are set to 0."""
-    found: dict[str, Array] = {}
+    certain_changes: dict[str, Array] = {}
     for name, values in difference.items():
         certain = values**2 > thresholds.certain * variance[name]
-        found[name] = np.where(certain, values, 0.0) if name in SINGLE else values
-    return found
+        certain_changes[name] = np.where(certain, values, 0.0) if name in SINGLE else values
+    return certain_changes
 
 
 # --- whitening ------------------------------------------------------------------------------------
@@ -484,7 +486,7 @@ class Whitener:
         blocks: Collection[str] | None = None,
     ) -> None:
         chosen = relative_to or reference
-        found = reference.distance(data, relative_to=chosen)
+        distance = reference.distance(data, relative_to=chosen)
         sums = reference.pools.pool(sum_of(data))
         self._parts: list[tuple[str, Array, list[Group]]] = []
         for name, block in reference.blocks.items():
@@ -492,14 +494,14 @@ class Whitener:
                 continue
             weight = sums[name][..., 1] / len(data)
             noise = block.noise(weight, len(data))
-            difference = found.difference[name]
+            difference = distance.difference[name]
             soft = 1.0 / _softness(
                 name, reference.pools.thresholds
             )  # 0 for blocks that are not softened
             scale = np.sqrt(noise + (max(tolerance, soft) * difference) ** 2)
             used = chosen.blocks[name].used & (weight >= reference.pools.thresholds.least_measured)
             self._parts.append((name, scale, correlation_groups(used, block.correlation)))
-        self.measured = self(found.difference)
+        self.measured = self(distance.difference)
 
     def __call__(self, differences: Mapping[str, Array]) -> Array:
         """Return whitened differences of all blocks, ``(statistics,)``."""

@@ -137,7 +137,7 @@ class Study:
         noted = (*measured.findings, *unreached(scenario, measured, detectors))
         measured = replace(measured, findings=noted)
         layout = DetectorLayout.of(network, detectors)
-        ruled_out = frozenset(name for item in measured.findings for name in item.rules_out)
+        ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
         periods = measured.of("fit")
         if not periods:
@@ -244,8 +244,8 @@ class Study:
             filters = {} if directions is None else directions.filters(reference, self.fit)
 
             def statistics(distance: Distance) -> dict[str, float]:
-                found = self.place_finder.directed(distance)
-                return found | {name: matched(distance) for name, matched in filters.items()}
+                values = self.place_finder.directed(distance)
+                return values | {name: matched(distance) for name, matched in filters.items()}
 
             return statistics
 
@@ -278,10 +278,10 @@ class Study:
             return None
         if effects not in self._doubts:
             numbers = range(min(self.config.thresholds.doubt_days, self.effort.base))
-            own = self.engine.ordinary(effects, numbers)
+            replayed = self.engine.ordinary(effects, numbers)
             other = self.other_days.ordinary(effects, numbers)
-            both = [number for number in own if number in other]
-            days = [[found[number].tally for number in both] for found in (own, other)]
+            both = [number for number in replayed if number in other]
+            days = [[model[number].tally for number in both] for model in (replayed, other)]
             apart, _ = change_between(self.pools, *days)
             self._doubts[effects] = {
                 name: (self.config.thresholds.left_open * values) ** 2
@@ -335,9 +335,15 @@ def heard(measured: Measured) -> tuple[Detector, ...]:
     """
     if not measured.has_events:
         return measured.detectors
-    seen = {x for period in measured.periods for x, item in period.passages.items() if len(item)}
-    found = tuple(item for item in measured.detectors if item.id in seen)
-    return found if found and 2 * len(found) <= len(measured.detectors) else measured.detectors
+    seen = {
+        x for period in measured.periods for x, passages in period.passages.items() if len(passages)
+    }
+    detectors = tuple(detector for detector in measured.detectors if detector.id in seen)
+    return (
+        detectors
+        if detectors and 2 * len(detectors) <= len(measured.detectors)
+        else measured.detectors
+    )
 
 
 def _tallies(
@@ -374,7 +380,7 @@ def unreached(
     Raises:
         MeasuredDataError: No route leads over any of the measured edges.
     """
-    edges = {item.id: edge_of(item.lane) for item in detectors}
+    edges = {detector.id: edge_of(detector.lane) for detector in detectors}
     counted: dict[str, int] = {}
     for period in measured.periods:
         for name, passages in period.passages.items():
@@ -428,13 +434,13 @@ def timing_effects(
     """
     yellow: Counter[float] = Counter()
     red: Counter[float] = Counter()
-    controlled = {item.id: item for item in network.intersections}
+    controlled = {intersection.id: intersection for intersection in network.intersections}
     for period in measured.periods:
         for tls, log in period.signals.items():
             if tls in controlled and not _own(log, controlled[tls].programme):
                 for kind, duration in _clearances(log):
                     (yellow if kind == "y" else red)[round(duration, 1)] += 1
-    found: list[Effect] = []
+    effects: list[Effect] = []
     control = scenario.control
     clearances = (yellow, control.yellow_s), (red, control.all_red_s)
     for name, (seen, now) in zip(IN_THE_LOG, clearances, strict=True):
@@ -445,8 +451,8 @@ def timing_effects(
                 count >= thresholds.usual_share * total
                 and abs(value - now) > thresholds.least_timing_s
             ):
-                found.append(effect_from_record({"name": name, "seconds": value}))
-    return tuple(found)
+                effects.append(effect_from_record({"name": name, "seconds": value}))
+    return tuple(effects)
 
 
 def _own(log: SignalLog, programme: tuple[tuple[float, str], ...]) -> bool:
@@ -459,16 +465,16 @@ def _clearances(log: SignalLog) -> list[tuple[str, float]]:
 
     Other links may be green at the same time. Red-yellow does not count as yellow.
     """
-    found: list[tuple[str, float]] = []
+    durations: list[tuple[str, float]] = []
     began = ended = math.nan
     for (_, before), (time_s, state) in itertools.pairwise(log):
         pairs = list(zip(before, state, strict=False))
         if any(new in _AMBER and old not in _AMBER for old, new in pairs):
             began = time_s
         if any(old in _AMBER and new not in _AMBER for old, new in pairs):
-            found.append(("y", time_s - began))
+            durations.append(("y", time_s - began))
             ended = time_s
         if any(new in GREEN and old not in GREEN for old, new in pairs):
-            found.append(("r", time_s - ended))
+            durations.append(("r", time_s - ended))
             ended = math.nan
-    return [(kind, duration) for kind, duration in found if duration == duration]
+    return [(kind, duration) for kind, duration in durations if duration == duration]

@@ -172,7 +172,7 @@ def _rivals(selection: Selected, selector: Selector, config: DiagnosisConfig) ->
     """Find other sets of effects that leave no more than chance at nearly the same cost."""
     best = selection.best.model
     names = _kinds(best.members)
-    found: list[Fitted] = []
+    sufficient: list[Fitted] = []
     near = [
         rival
         for rival in selection.rivals
@@ -183,20 +183,20 @@ def _rivals(selection: Selected, selector: Selector, config: DiagnosisConfig) ->
     for rival in near[: config.thresholds.rivals_tested]:
         tested = selector.test(rival)
         if tested.residual.p > config.alpha:
-            found.append(rival)
-    return tuple(found)
+            sufficient.append(rival)
+    return tuple(sufficient)
 
 
 def _at_an_end(members: Members) -> str:
     """Describe values at an end of their plausible range; natural limits such as 0 do not count."""
-    found: list[str] = []
+    texts: list[str] = []
     for hypothesis, values in members:
         ranges = known_effects()[hypothesis.name].ranges
         for name, value in zip(hypothesis.free, values, strict=True):
             natural = {0.0, 1.0} if not ranges[name].unit else {0.0}
             if value in {ranges[name].low, ranges[name].high} - natural:
-                found.append(f"{hypothesis.name.replace('_', ' ')} of {value:g}")
-    return " and ".join(found)
+                texts.append(f"{hypothesis.name.replace('_', ' ')} of {value:g}")
+    return " and ".join(texts)
 
 
 def _kinds(members: Members) -> set[str]:
@@ -245,10 +245,10 @@ def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
     if window:
         text += f" from {clock(window[0])} to {clock(window[1])}"
     nominal = hypothesis.nominal or (0.0,) * len(values)
-    for name, value, own in zip(hypothesis.free, values, nominal, strict=True):
+    for name, value, present in zip(hypothesis.free, values, nominal, strict=True):
         text += amount(name, value, ranges[name].unit)
-        if own and name not in ("factor", "share"):
-            text += f" (scenario: {own:.3g})"
+        if present and name not in ("factor", "share"):
+            text += f" (scenario: {present:.3g})"
     return text
 
 

@@ -193,9 +193,9 @@ class Criteria:
     systematic_error: float
 
 
-def hourly(item: Tally) -> Array:
+def hourly(tally: Tally) -> Array:
     """Return vehicles per hour at every stop and exit detector, 0 without one; ``(2 places,)``."""
-    sums = item.sums[[INDEX[name] for name in _COUNTED]].reshape(-1, 2)
+    sums = tally.sums[[INDEX[name] for name in _COUNTED]].reshape(-1, 2)
     return 60.0 * sums[:, 0] / np.maximum(sums[:, 1], 1e-9)
 
 

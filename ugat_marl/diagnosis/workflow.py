@@ -85,8 +85,8 @@ def diagnose(
     except OutOfTime:
         diagnosis = _nothing_simulated(study, timing)
     else:
-        diagnosis, found = _compared(study, base, timing, reporter)
-        named += found
+        diagnosis, searched = _compared(study, base, timing, reporter)
+        named += searched
     place = directory / CORRECTED
     if (place / "scenario.toml").is_file():  # written by an earlier diagnosis
         shutil.rmtree(place)
