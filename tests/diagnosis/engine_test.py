@@ -76,6 +76,7 @@ def an_engine(
     periods: Sequence[Period] = PERIODS,
     deadline: float | None = None,
     base_days: int = 0,
+    thresholds: Thresholds = THRESHOLDS,
 ) -> tuple[Engine, Streets]:
     streets = Streets(layout)
     made = Engine(
@@ -84,7 +85,7 @@ def an_engine(
         streets,
         periods,
         seed,
-        THRESHOLDS,
+        thresholds,
         cache=cache,
         deadline=deadline,
         workers=3,
@@ -116,6 +117,21 @@ def test_a_remembered_day_is_the_simulated_day_to_the_last_digit(
     assert silent.calls == []
     assert again.simulated == 0
     assert all(same(one, two) for one, two in zip(simulated, remembered, strict=True))
+
+
+def test_a_day_counted_by_other_thresholds_is_not_remembered(
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path
+) -> None:
+    first, _ = an_engine(scenario, layout, tmp_path)
+    first.replicates((), [0])
+    finer, streets = an_engine(
+        scenario, layout, tmp_path, thresholds=replace(THRESHOLDS, bin_s=THRESHOLDS.bin_s / 2)
+    )
+    finer.replicates((), [0])
+    assert len(streets.calls) == 1
+    judged, silent = an_engine(scenario, layout, tmp_path, thresholds=replace(THRESHOLDS, price=1))
+    judged.replicates((), [0])
+    assert silent.calls == [], "the price of an effect changes no day"
 
 
 @pytest.mark.parametrize("speeds", [True, False])
