@@ -452,7 +452,8 @@ class Thresholds(DayThresholds):
     shortest_window_s: float = 60.0
     """Shortest window after such steps, s. By hand. Halved: no change in practice."""
     half_interval: float = 1.96
-    """Half width of a 95 % interval, in standard errors: the normal quantile of 0.975."""
+    """Half width of a 95 % interval, in standard errors: the normal quantile of 0.975. Halved:
+    intervals hold two of three values, and weak effects are dropped less often."""
     straightness_moves: tuple[float, ...] = (-5.0, -2.0, 2.0, 5.0)
     """Moves of a value that test if its estimate is linear, in standard errors. By hand. Halved:
     steps by whole vehicles are not found."""
@@ -553,8 +554,8 @@ class Thresholds(DayThresholds):
     """Difference of a time in the log from the scenario's that counts, s: logs have tenths of a
     second. Halved: no change."""
     least_days: int = 3
-    """Least number of days for FHWA's criteria; fewer days show too little variation
-    (FHWA-HOP-18-036)."""
+    """Least number of days for FHWA's criteria (FHWA-HOP-18-036). Halved: two days, which show too
+    little variation."""
     interval_s: float = 900.0
     """Interval of FHWA's criteria, s (FHWA-HOP-18-036, chapter 5). Halved: counts are noisier and
     fail the criteria."""
