@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from ugat_marl.data import Metrics, Scores
 from ugat_marl.effects import Domain, domain_label
-from ugat_marl.experiments import Evaluation, TransferConfig
+from ugat_marl.experiments import Evaluation, Job, TransferConfig
+from ugat_marl.experiments.jobs import JOB, perform
 from ugat_marl.experiments.scores import Result
 from ugat_marl.grounding import FitConfig, UgatConfig
 from ugat_marl.policies import DQNConfig, NetworkPolicy
+from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Scenario
 
 JOBS = "ugat_marl.experiments.jobs"
@@ -86,3 +90,15 @@ def play_nothing(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(f"{JOBS}.evaluate", evaluate)
     patch.setattr(f"{JOBS}.best_rules", best_rules)
+
+
+def perform_in_this_process(patch: pytest.MonkeyPatch) -> None:
+    """Let the driver perform its jobs here, one at a time: an interpreter for each takes longer."""
+    one_at_a_time = threading.Lock()
+
+    def perform_job(folder: str, _: object) -> None:
+        job = TypeAdapter(Job).validate_json(Path(folder, JOB).read_bytes())
+        with one_at_a_time:
+            perform(job, Path(folder), Silent())
+
+    patch.setattr("ugat_marl.experiments.driver._perform_apart", perform_job)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ugat_marl.experiments.learning_curves as module
+from tests.runs import perform_in_this_process
 from ugat_marl.data import Scores
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -114,6 +115,7 @@ def test_the_page_by_hand() -> None:
 def test_what_is_there_is_not_trained_again_and_failures_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    perform_in_this_process(monkeypatch)
     short = replace(CONFIG, seeds=1, episodes=1, evaluation_seeds=1, rule_budget=2, duration_s=60.0)
     scenario = load_scenario("single-v1").with_duration(60)
     found = learn_curves(scenario, "single-v1", short, tmp_path, 2, Silent())

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.runs import perform_in_this_process
 from ugat_marl.__main__ import main
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import DIRECT, QUEUES, TIMED, PaperConfig, read_queues
@@ -181,8 +182,13 @@ def test_the_simulation_is_no_real_domain_of_its_own_table() -> None:
 
 @pytest.mark.parametrize("learner", [(), ("--learner", "ippo")])
 def test_a_table_from_the_command_line(
-    learner: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    learner: tuple[str, ...],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    if learner:  # without one, its jobs have processes of their own
+        perform_in_this_process(monkeypatch)
     call = [
         "paper", "gap", "--domains", "V4", "--episodes", "1", "--seeds", "1", "--duration-s", "120",
         "--evaluation-seeds", "2", "--rule-budget", "2", *learner,

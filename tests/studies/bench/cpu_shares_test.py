@@ -27,7 +27,7 @@ def burn(seconds):
 def one_call(seconds):
     began = time.process_time()
     while time.process_time() < began + seconds:
-        sum(range(300_000))  # one call into C, longer than the interval of the samples
+        sum(range(150_000))  # one call into C, longer than the interval of the samples
 """
 
 
